@@ -1,0 +1,3 @@
+"""kcal: camera calibration and long-range stereo localisation for PyTorch."""
+
+__version__ = "0.1.0"

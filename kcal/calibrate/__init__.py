@@ -1,0 +1,1 @@
+"""From observations to cameras and rigs (floor 3)."""

@@ -1,0 +1,34 @@
+"""Checks of tensors at the doors of the library: clear errors instead of silent broadcasting or rounding."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+
+
+def as_points(name: str, value: Tensor, last: int) -> Tensor:
+    """Return `value` as float64 after checking that it is a real floating tensor of shape (..., last).
+
+    Integers are refused: a pixel rounded to an integer is a measurement thrown away, and whoever passes one should
+    say so with `.double()`. float16 to float32 are promoted.
+
+    Raises:
+        InputError: not a tensor, not floating point, or another last dimension.
+    """
+    if not isinstance(value, Tensor):
+        raise InputError(f"{name}: a torch tensor is needed, got {type(value).__name__}")
+    if not value.is_floating_point():
+        raise InputError(f"{name}: floating point is needed, got {value.dtype}; convert with .double()")
+    if value.ndim < 1 or value.shape[-1] != last:
+        raise InputError(f"{name}: shape (..., {last}) is needed, got {tuple(value.shape)}")
+    return value.to(torch.float64)
+
+
+def require_finite(name: str, value: Tensor) -> None:
+    """Raise `InputError` if any element is NaN or infinite."""
+    bad = ~torch.isfinite(value)
+    if bool(bad.any()):
+        where = tuple(int(i) for i in bad.nonzero()[0])
+        raise InputError(f"{name}: {int(bad.sum())} of {value.numel()} values are not finite, first at {where}")

@@ -1,0 +1,48 @@
+"""The `kcal` command."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+import kcal
+from kcal.cli.console import err
+from kcal.errors import KcalError
+
+app = typer.Typer(
+    name="kcal",
+    help="Calibrate cameras, solve stereo rigs, and locate what they see on the Earth.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"kcal {kcal.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Run the command line: one line on the error stream and exit code 1 for what kcal refuses."""
+    try:
+        app()
+    except KcalError as error:
+        err.print(f"[bold red]error:[/] {error}".replace("\n", " "), markup=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        err.print("interrupted; nothing was written")
+        sys.exit(130)

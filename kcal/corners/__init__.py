@@ -1,0 +1,1 @@
+"""Boards, detection, sub-pixel refinement and observation files (floor 2)."""

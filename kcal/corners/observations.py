@@ -1,0 +1,102 @@
+"""What was seen: the corners of one camera's views, in memory and in a file."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import pydantic
+import torch
+from torch import Tensor
+
+from kcal.corners.board import Board
+from kcal.errors import InputError
+from kcal.files import NativeFile
+
+Pixel = tuple[float, float]
+
+
+class View(pydantic.BaseModel):
+    """One image in which the board was found.
+
+    Args:
+        name: unique name in the file, usually the image's file name; views of two cameras are paired by it.
+        pixels: one (u, v) a board corner in the board's order, or None where a corner was not seen. Integer
+            coordinates are centres of pixels.
+        image: where the image was read from, relative or absolute.
+        sha256: of the image file's bytes, so that a changed image is noticed.
+    """
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    name: str = pydantic.Field(min_length=1)
+    pixels: tuple[Pixel | None, ...]
+    image: str | None = None
+    sha256: str | None = None
+
+
+class Failure(pydantic.BaseModel):
+    """An image that gave no view, and why."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    reason: str
+
+
+class Observations(NativeFile):
+    """All views of one camera (file kind `observations`, version 1).
+
+    Args:
+        board: the board that was shown.
+        image_size: (width, height) in pixels, the same for all views.
+        refinement: how corners were made sub-pixel.
+        views: the views in which the board was found.
+        failures: the images that gave none.
+    """
+
+    KIND: ClassVar[str] = "observations"
+    VERSION: ClassVar[int] = 1
+
+    board: Board
+    image_size: tuple[pydantic.PositiveInt, pydantic.PositiveInt]
+    refinement: Literal["saddle", "opencv", "skimage", "none"] = "saddle"
+    views: tuple[View, ...]
+    failures: tuple[Failure, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _consistent(self) -> Observations:
+        names = [view.name for view in self.views]
+        if len(set(names)) != len(names):
+            twice = sorted({name for name in names if names.count(name) > 1})
+            raise ValueError(f"two views share the name {twice[0]!r}")
+        for view in self.views:
+            if len(view.pixels) != self.board.corners:
+                raise ValueError(f"view {view.name!r} has {len(view.pixels)} corners, the board {self.board.corners}")
+        return self
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The views' names, in order."""
+        return tuple(view.name for view in self.views)
+
+    def pixels(self) -> Tensor:
+        """Corners as (views, corners, 2) float64 pixels; NaN where a corner was not seen.
+
+        Raises:
+            InputError: there is no view.
+        """
+        if not self.views:
+            raise InputError("no view with a board; check the board's size and the images")
+        nowhere = (float("nan"), float("nan"))
+        return torch.tensor(
+            [[nowhere if pixel is None else pixel for pixel in view.pixels] for view in self.views],
+            dtype=torch.float64,
+        )
+
+    def subset(self, names: list[str]) -> Observations:
+        """The same file with only the named views, in the order given."""
+        by_name = {view.name: view for view in self.views}
+        missing = [name for name in names if name not in by_name]
+        if missing:
+            raise InputError(f"no view named {missing[0]!r}")
+        return self.model_copy(update={"views": tuple(by_name[name] for name in names)})

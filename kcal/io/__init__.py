@@ -1,0 +1,1 @@
+"""kcal's camera and rig files, and foreign formats (floor 2)."""

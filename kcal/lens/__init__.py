@@ -1,0 +1,1 @@
+"""Lens models, cameras and rigs in pure torch (floor 1)."""

@@ -1,0 +1,1 @@
+"""From pixel pairs to positions on the Earth (floor 4)."""

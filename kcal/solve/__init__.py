@@ -1,0 +1,1 @@
+"""Nonlinear least squares that knows nothing of cameras (floor 1)."""
