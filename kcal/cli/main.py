@@ -6,6 +6,7 @@ import sys
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
 import kcal
 from kcal.cli.console import err
@@ -41,7 +42,7 @@ def main() -> None:
     try:
         app()
     except KcalError as error:
-        err.print(f"[bold red]error:[/] {error}".replace("\n", " "), markup=True)
+        err.print("[bold red]error:[/]", escape(" ".join(str(error).split())))
         sys.exit(1)
     except KeyboardInterrupt:
         err.print("interrupted; nothing was written")
