@@ -1,0 +1,222 @@
+"""The distortion of Eq. 4 and Eq. 10 with its closed-form derivatives, for any orders.
+
+Convention: `normalized` points are (x, y) on the plane z = 1 of the camera, y down. The terms apply in this order:
+
+    s = x² + y²,  g = (1 + k1 s + k2 s² + ...) / (1 + k4 s + k5 s² + ...)
+    x_I = g x + 2 p1 x y + p2 (s + 2 x²) + s1 s + s2 s² + ...
+    y_I = g y + p1 (s + 2 y²) + 2 p2 x y + s3 s + s4 s² + ...
+    x_D = cos τx x_I / w,  y_D = (cos τy y_I - sin τx sin τy x_I) / w,
+    w = sin τy x_I - cos τy sin τx y_I + cos τy cos τx
+
+The last two lines are OpenCV's tilted-sensor homography multiplied out. Sources: the paper's Eq. 4 and 10; OpenCV's
+camera-calibration documentation for the tilt.
+
+Inside, coordinates are separate tensors (..., N): the solver's inner loop is bound by memory, and this layout touches
+each number once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.checks import as_points
+from kcal.errors import InputError
+from kcal.lens.model import LensModel
+
+Pair = tuple[Tensor, Tensor]
+
+
+class Distorted(NamedTuple):
+    """Distorted coordinates with what validity and derivatives need; every tensor is (..., N).
+
+    `point` holds ∂x/∂x, ∂x/∂y, ∂y/∂x, ∂y/∂y; `positive` is true where both the radial denominator and the tilt's
+    w are positive, that is, before any pole.
+    """
+
+    x: Tensor
+    y: Tensor
+    point: tuple[Tensor, Tensor, Tensor, Tensor]
+    coefficients: list[Pair]
+    positive: Tensor
+
+
+def _polynomial(s: Tensor, coefficients: Sequence[Tensor], constant: float) -> Pair:
+    """Horner: constant + c1 s + c2 s² + ... and its derivative by s."""
+    value, slope = torch.zeros_like(s), torch.zeros_like(s)
+    for coefficient in reversed(coefficients):
+        slope = slope * s + value
+        value = value * s + coefficient
+    # value is (p - constant) / s here.
+    return constant + value * s, value + slope * s
+
+
+def _powers(s: Tensor, count: int) -> list[Tensor]:
+    powers = [s]
+    while len(powers) < count:
+        powers.append(powers[-1] * s)
+    return powers
+
+
+def distort_components(
+    x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel, wanted: Sequence[int] = ()
+) -> Distorted:
+    """Distort separate coordinates x, y (..., N); `wanted` lists the coefficients whose derivatives are needed.
+
+    Args:
+        x: (..., N) coordinates on the plane z = 1.
+        y: likewise.
+        coefficients: (..., P) in the order of `model.names`, broadcast against the leading shape of x.
+        model: which terms there are.
+        wanted: indices into the P coefficients, for `Distorted.coefficients`, in that order.
+    """
+    c = [coefficients[..., i, None] for i in range(model.size)]
+    xx, xy, yy = x * x, x * y, y * y
+    s = xx + yy
+
+    numerator, numerator_slope = _polynomial(s, [c[i] for i in model.numerator_index], 1.0)
+    denominator, denominator_slope = _polynomial(s, [c[i] for i in model.denominator_index], 1.0)
+    inverse = 1.0 / denominator
+    g = numerator * inverse
+    g_slope = (numerator_slope - g * denominator_slope) * inverse
+    prism_x, prism_x_slope = _polynomial(s, [c[i] for i in model.prism_index[0]], 0.0)
+    prism_y, prism_y_slope = _polynomial(s, [c[i] for i in model.prism_index[1]], 0.0)
+
+    u, v = g * x + prism_x, g * y + prism_y
+    cross = 2.0 * g_slope * xy
+    a = g + 2.0 * (g_slope * xx + prism_x_slope * x)
+    b = cross + 2.0 * prism_x_slope * y
+    d = cross + 2.0 * prism_y_slope * x
+    e = g + 2.0 * (g_slope * yy + prism_y_slope * y)
+    if model.tangential:
+        p1, p2 = c[model.names.index("p1")], c[model.names.index("p2")]
+        u = u + 2.0 * p1 * xy + p2 * (s + 2.0 * xx)
+        v = v + p1 * (s + 2.0 * yy) + 2.0 * p2 * xy
+        shear = 2.0 * (p1 * x + p2 * y)
+        a, b = a + 2.0 * p1 * y + 6.0 * p2 * x, b + shear
+        d, e = d + shear, e + 6.0 * p1 * y + 2.0 * p2 * x
+    positive = denominator > 0
+
+    columns = _columns(x, y, s, xx, xy, yy, g, inverse, model, wanted)
+    if not model.tilt:
+        return Distorted(u, v, (a, b, d, e), [pair for pair in columns if pair is not None], positive)
+
+    tau_x, tau_y = c[model.names.index("tau_x")], c[model.names.index("tau_y")]
+    cos_x, sin_x, cos_y, sin_y = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
+    w = sin_y * u - cos_y * sin_x * v + cos_y * cos_x
+    scale = 1.0 / w
+    x_tilted = cos_x * u * scale
+    y_tilted = (cos_y * v - sin_x * sin_y * u) * scale
+    # The 2x2 Jacobian of the homography.
+    m00, m01 = (cos_x - sin_y * x_tilted) * scale, cos_y * sin_x * x_tilted * scale
+    m10, m11 = -sin_y * (sin_x + y_tilted) * scale, cos_y * (1.0 + sin_x * y_tilted) * scale
+    by_angle = {
+        "tau_x": (-sin_x * u, -cos_x * sin_y * u, -cos_y * (cos_x * v + sin_x)),
+        "tau_y": (torch.zeros_like(u), -sin_x * cos_y * u - sin_y * v, cos_y * u + sin_y * (sin_x * v - cos_x)),
+    }
+    tilted = []
+    for index, pair in zip(wanted, columns, strict=True):
+        if pair is None:
+            x_rate, y_rate, w_rate = by_angle[model.names[index]]
+            tilted.append(((x_rate - x_tilted * w_rate) * scale, (y_rate - y_tilted * w_rate) * scale))
+        else:
+            tilted.append((m00 * pair[0] + m01 * pair[1], m10 * pair[0] + m11 * pair[1]))
+    point = (m00 * a + m01 * d, m00 * b + m01 * e, m10 * a + m11 * d, m10 * b + m11 * e)
+    return Distorted(x_tilted, y_tilted, point, tilted, positive & (w > 0))
+
+
+def _columns(
+    x: Tensor,
+    y: Tensor,
+    s: Tensor,
+    xx: Tensor,
+    xy: Tensor,
+    yy: Tensor,
+    g: Tensor,
+    inverse: Tensor,
+    model: LensModel,
+    wanted: Sequence[int],
+) -> list[Pair | None]:
+    """Derivatives before the tilt by the wanted coefficients; None stands for a tilt angle."""
+    if not wanted:
+        return []
+    powers = _powers(s, max(model.numerator, model.denominator, model.prism))
+    zero = torch.zeros_like(s)
+    x_radial, y_radial = x * inverse, y * inverse
+    table: dict[int, Pair] = {}
+    for j, i in enumerate(model.numerator_index):
+        if i in wanted:
+            table[i] = (x_radial * powers[j], y_radial * powers[j])
+    for j, i in enumerate(model.denominator_index):
+        if i in wanted:
+            ratio = -g * powers[j]
+            table[i] = (x_radial * ratio, y_radial * ratio)
+    for j, i in enumerate(model.prism_index[0]):
+        table[i] = (powers[j], zero)
+    for j, i in enumerate(model.prism_index[1]):
+        table[i] = (zero, powers[j])
+    if model.tangential:
+        table[model.names.index("p1")] = (2.0 * xy, s + 2.0 * yy)
+        table[model.names.index("p2")] = (s + 2.0 * xx, 2.0 * xy)
+    return [table.get(i) for i in wanted]
+
+
+def check_coefficients(coefficients: Tensor, model: LensModel) -> Tensor:
+    """Return the coefficients as float64 (..., P) after checking that P fits the model."""
+    coefficients = torch.as_tensor(coefficients)
+    if coefficients.ndim < 1 or coefficients.shape[-1] != model.size:
+        raise InputError(
+            f"coefficients: shape (..., {model.size}) is needed for {model}, got {tuple(coefficients.shape)}"
+        )
+    return coefficients.to(torch.float64)
+
+
+def distort(normalized: Tensor, coefficients: Tensor, model: LensModel | str) -> Tensor:
+    """Distort points on the plane z = 1 (Eq. 4, Eq. 10).
+
+    Args:
+        normalized: (..., N, 2) undistorted coordinates.
+        coefficients: (..., P) in the order of `model.names`.
+        model: a `LensModel` or a preset's name.
+
+    Returns:
+        (..., N, 2) distorted coordinates, float64. Beyond a pole or fold the numbers mean nothing;
+        `Camera.project` flags such points.
+
+    Raises:
+        InputError: wrong shapes or an integer dtype.
+
+    Example:
+        >>> point = torch.tensor([[0.5, 0.0]], dtype=torch.float64)
+        >>> k = torch.tensor([-0.25, 0.0, 0.0, 0.0], dtype=torch.float64)
+        >>> distort(point, k, "opencv4").tolist()
+        [[0.46875, 0.0]]
+    """
+    return distort_with_jacobian(normalized, coefficients, model)[0]
+
+
+def distort_with_jacobian(
+    normalized: Tensor, coefficients: Tensor, model: LensModel | str
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `distort`, with its Jacobians in closed form.
+
+    Returns:
+        distorted (..., N, 2); its derivative by the point (..., N, 2, 2); by the coefficients (..., N, 2, P).
+    """
+    model = LensModel.named(model)
+    normalized = as_points("normalized", normalized, 2)
+    coefficients = check_coefficients(coefficients, model)
+    result = distort_components(normalized[..., 0], normalized[..., 1], coefficients, model, range(model.size))
+    a, b, d, e = result.point
+    by_point = torch.stack([torch.stack([a, b], -1), torch.stack([d, e], -1)], -2)
+    if result.coefficients:
+        shape = result.x.shape
+        by_coefficients = torch.stack(
+            [torch.stack([u.expand(shape), v.expand(shape)], -1) for u, v in result.coefficients], -1
+        )
+    else:
+        by_coefficients = result.x.new_zeros((*result.x.shape, 2, 0))
+    return torch.stack([result.x, result.y], -1), by_point, by_coefficients
