@@ -1,0 +1,212 @@
+"""Image files to grey pixels, or a reason why not; and which files the user meant.
+
+Pixels are always in the order in which the sensor wrote them: an EXIF orientation tag is ignored, because a phone that
+was turned between two shots would otherwise swap width and height, and the lens does not turn with the tag.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+import tempfile
+import threading
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from kcal.errors import FileError, InputError
+
+Grey = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm", ".jp2"})
+MIN_SIDE = 16
+
+_decoding = threading.Lock()
+# libjpeg paints what it could not decode in grey and only mutters. Spare bytes before the end mark (0xd9) are harmless
+# and usual in frames of web cameras.
+_BROKEN_JPEG = re.compile(
+    rb"(Corrupt JPEG data: (?!\d+ extraneous bytes before marker 0xd9)[^\r\n]*|Premature end of JPEG[^\r\n]*)"
+)
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        FileError: missing, a folder, empty or not readable.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
+    if not data:
+        raise FileError(f"{path}: the file is empty; copy it again")
+    return data
+
+
+def decode_grey(data: bytes, source: str | Path) -> Grey:
+    """Decode an image file's bytes to grey levels, (H, W) uint8 or uint16 as stored; `source` names it in errors.
+
+    Colours become grey by OpenCV's weights (ITU-R BT.601). The EXIF orientation is ignored: row 0 is the row the
+    sensor read first.
+
+    Raises:
+        FileError: not an image, truncated or corrupt (also where the decoder would fill the rest with grey), pixels
+            other than 8 or 16 bit unsigned, smaller than 16 pixels, or one flat grey.
+    """
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image, complaints = _imdecode(data, flags)
+    broken = _BROKEN_JPEG.search(complaints)
+    if image is None and data.startswith((b"\xff\xd8", b"\x89PNG", b"II*\0", b"MM\0*", b"BM", b"RIFF")):
+        raise FileError(f"{source}: the image is truncated or corrupt; copy it again or leave it out")
+    if image is None:
+        raise FileError(f"{source}: not an image that can be read; use JPEG, PNG, TIFF, BMP, WebP or PGM")
+    if broken:
+        raise FileError(f"{source}: {broken.group().decode(errors='replace').strip()}; copy it again or leave it out")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise FileError(f"{source}: pixels are {image.dtype}; store the image with 8 or 16 bits unsigned")
+    height, width = image.shape
+    if min(height, width) < MIN_SIDE:
+        raise FileError(f"{source}: {width}x{height} pixels are too few; {MIN_SIDE} each way are needed")
+    if image.min() == image.max():
+        raise FileError(f"{source}: every pixel has the same grey level; the image shows nothing")
+    return image
+
+
+def read_grey(path: str | Path) -> Grey:
+    """Read an image file to grey levels, (H, W) uint8 or uint16 as stored; see `decode_grey`.
+
+    Raises:
+        FileError: missing, empty, not an image, corrupt, or of no use.
+
+    Example:
+        >>> import cv2, numpy as np, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = cv2.imwrite(f"{folder}/ramp.png", np.arange(65536, dtype=np.uint16).reshape(256, 256))
+        ...     image = read_grey(f"{folder}/ramp.png")
+        >>> image.dtype, image.shape
+        (dtype('uint16'), (256, 256))
+    """
+    return decode_grey(read_bytes(path), path)
+
+
+def to_8bit(image: Grey) -> npt.NDArray[np.uint8]:
+    """Eight bits a pixel for detectors; refinement should use the full depth.
+
+    uint8 is returned as it is. uint16 is stretched linearly so that its 0.1 % darkest pixels become 0 and its 0.1 %
+    brightest 255: cameras store 10, 12 or 14 bits in 16, and a few hot pixels must not make the board black.
+
+    Example:
+        >>> to_8bit(np.array([[0, 2048, 4095]], dtype=np.uint16))
+        array([[  0, 128, 255]], dtype=uint8)
+    """
+    if image.dtype == np.uint8:
+        return image.astype(np.uint8, copy=False)
+    low, high = (float(level) for level in np.percentile(image, (0.1, 99.9)))
+    if not high > low:
+        low, high = float(image.min()), float(image.max())
+    stretched = (image.astype(np.float32) - low) * (255.0 / max(high - low, 1.0))
+    return np.clip(np.rint(stretched), 0, 255).astype(np.uint8)
+
+
+def expand_images(inputs: Sequence[str | Path]) -> list[Path]:
+    """The image files that files, folders and wildcards stand for, each file once.
+
+    A folder stands for the images directly inside it (known by their suffix), a wildcard for the files it matches;
+    both in natural order (`2.jpg` before `10.jpg`).
+
+    Raises:
+        InputError: no input at all.
+        FileError: a file or folder that does not exist, a folder without images, a wildcard without a match.
+
+    Example:
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for name in ("10.jpg", "2.jpg", "notes.txt"):
+        ...         _ = Path(folder, name).write_bytes(b"x")
+        ...     [path.name for path in expand_images([folder])]
+        ['2.jpg', '10.jpg']
+    """
+    if not inputs:
+        raise InputError("no images given; name image files, folders or wildcards")
+    found: dict[Path, Path] = {}
+    for given in inputs:
+        for path in _expand_one(Path(given)):
+            found.setdefault(path.resolve(), path)
+    return list(found.values())
+
+
+def unique_names(paths: Sequence[Path]) -> list[str]:
+    """A short unique name for each file: its file name, with as many folders before it as are needed.
+
+    Example:
+        >>> unique_names([Path("a/1/x.jpg"), Path("b/1/x.jpg"), Path("y.jpg")])
+        ['a/1/x.jpg', 'b/1/x.jpg', 'y.jpg']
+    """
+    parts = [path.parts for path in paths]
+    deepest = max((len(part) for part in parts), default=1)
+    names = [path.name for path in paths]
+    for depth in range(2, deepest + 1):
+        twice = {name for name in names if names.count(name) > 1}
+        if not twice:
+            break
+        names = [
+            "/".join(part[-depth:]) if name in twice else name for name, part in zip(names, parts, strict=True)
+        ]
+    return names
+
+
+def _expand_one(path: Path) -> list[Path]:
+    if path.is_dir():
+        inside = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
+        images = _natural(file for file in inside if not file.name.startswith("."))
+        if not images:
+            raise FileError(f"{path}: no image in this folder (looked for {', '.join(sorted(SUFFIXES))})")
+        return images
+    if path.exists():
+        return [path]
+    if glob.has_magic(str(path)):
+        matches = _natural(Path(match) for match in glob.glob(str(path), recursive=True) if not os.path.isdir(match))
+        if not matches:
+            raise FileError(f"{path}: no file matches")
+        return matches
+    raise FileError(f"{path}: no such file or folder")
+
+
+def _natural(paths: Iterable[Path]) -> list[Path]:
+    def key(path: Path) -> list[tuple[int, int, str]]:
+        pieces = re.split(r"(\d+)", str(path))
+        return [(0, int(piece), "") if piece.isdecimal() else (1, 0, piece.casefold()) for piece in pieces]
+
+    return sorted(paths, key=lambda path: (key(path), str(path)))
+
+
+def _imdecode(data: bytes, flags: int) -> tuple[npt.NDArray[Any] | None, bytes]:
+    """`cv2.imdecode`, with what the decoders print to the error stream as the second value.
+
+    The C libraries report damage nowhere else, so the stream itself is caught for the milliseconds of one decode.
+    """
+    with _decoding, tempfile.TemporaryFile() as caught:
+        try:
+            saved = os.dup(2)
+        except OSError:  # no error stream at all (a service): nothing to catch
+            return _decode(data, flags), b""
+        try:
+            os.dup2(caught.fileno(), 2)
+            image = _decode(data, flags)
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+        caught.seek(0)
+        return image, caught.read()
+
+
+def _decode(data: bytes, flags: int) -> npt.NDArray[Any] | None:
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        return None
