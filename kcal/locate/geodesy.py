@@ -1,0 +1,181 @@
+"""From the rig to the Earth: the cameras' attitude, and east-north-up to WGS84 latitude, longitude and height.
+
+Conventions, all of them pinned by tests:
+
+* ENU: x east, y north, z up, tangent to the WGS84 ellipsoid at the origin, metres. Up is not height: at 5 km the
+  ellipsoid has fallen 1.96 m below the tangent plane, and the conversion here accounts for it.
+* Heights are ellipsoidal (WGS84, what GNSS receivers call HAE), not above mean sea level; the two differ by up to
+  100 m. Refraction of light is not modelled (0.26 m of height at 5 km in standard air).
+* Headings count clockwise from true north, not from magnetic or grid north.
+* Order is latitude, longitude, height everywhere but in GeoJSON.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import pyproj
+import torch
+from torch import Tensor
+
+from kcal.checks import as_points, require_finite
+from kcal.errors import InputError
+
+
+def enu_from_cam(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Tensor:
+    """Rotation that takes camera axes (x right, y down, z forward) to east, north, up.
+
+    Starting from a level camera that looks north, it is turned clockwise (seen from above) by the heading, raised by
+    the pitch about its own x axis, and then rolled about its own optical axis.
+
+    Args:
+        heading_deg: azimuth of the optical axis, degrees clockwise from true north.
+        pitch_deg: elevation of the optical axis above the horizontal plane, degrees, positive up.
+        roll_deg: degrees, positive clockwise as seen from behind the camera: the right side goes down.
+
+    Returns:
+        (3, 3) float64, the columns being the camera's right, down and forward axes in ENU.
+
+    Raises:
+        InputError: an angle that is not finite, a pitch beyond ±90, or a heading or roll beyond ±360.
+
+    Example:
+        >>> enu_from_cam(90.0)[:, 2].round(decimals=12).abs().tolist()
+        [1.0, 0.0, 0.0]
+    """
+    for name, value, limit in (("heading", heading_deg, 360.0), ("pitch", pitch_deg, 90.0), ("roll", roll_deg, 360.0)):
+        if not abs(value) <= limit:
+            raise InputError(f"{name} {value}: degrees between -{limit:g} and {limit:g} are needed")
+    heading, pitch, roll = (math.radians(value) for value in (heading_deg, pitch_deg, roll_deg))
+    east, north = math.sin(heading), math.cos(heading)
+    forward = (east * math.cos(pitch), north * math.cos(pitch), math.sin(pitch))
+    right = (north, -east, 0.0)
+    down = (east * math.sin(pitch), north * math.sin(pitch), -math.cos(pitch))
+    columns = (
+        [r * math.cos(roll) + d * math.sin(roll) for r, d in zip(right, down, strict=True)],
+        [d * math.cos(roll) - r * math.sin(roll) for r, d in zip(right, down, strict=True)],
+        forward,
+    )
+    return torch.tensor(columns, dtype=torch.float64).T
+
+
+def azimuth_elevation(enu: Tensor) -> Tensor:
+    """Azimuth (degrees clockwise from true north, 0 to 360) and elevation (degrees) of vectors (..., 3).
+
+    Example:
+        >>> azimuth_elevation(torch.tensor([-1.0, 0.0, 1.0])).round(decimals=6).tolist()
+        [270.0, 45.0]
+    """
+    enu = as_points("enu", enu, 3)
+    azimuth = torch.rad2deg(torch.atan2(enu[..., 0], enu[..., 1])) % 360.0
+    elevation = torch.rad2deg(torch.atan2(enu[..., 2], torch.hypot(enu[..., 0], enu[..., 1])))
+    return torch.stack([azimuth, elevation], -1)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Origin:
+    """Where ENU is anchored: for a rig the projection centre of its left camera.
+
+    Args:
+        lat: geodetic latitude in degrees, -90 to 90.
+        lon: longitude in degrees, -180 to 180.
+        height: metres above the WGS84 ellipsoid, not above sea level.
+
+    Raises:
+        InputError: a value out of range; swapped latitude and longitude are named where they can be told.
+
+    Example:
+        >>> Origin.parse("-33.9, 151.2, 10")
+        Origin(lat=-33.9, lon=151.2, height=10.0)
+    """
+
+    lat: float
+    lon: float
+    height: float
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(value) for value in (self.lat, self.lon, self.height)):
+            raise InputError(f"origin: latitude, longitude and height must be finite, got {self}")
+        if abs(self.lat) > 90:
+            hint = "; longitude came first? write LAT,LON,HEIGHT" if abs(self.lon) <= 90 else ""
+            raise InputError(f"origin: latitude {self.lat:g} is outside -90 to 90{hint}")
+        if abs(self.lon) > 180:
+            hint = f"; write {self.lon - 360:g}" if 180 < self.lon <= 360 else ""
+            raise InputError(f"origin: longitude {self.lon:g} is outside -180 to 180{hint}")
+        if not -1000 <= self.height <= 100_000:
+            raise InputError(f"origin: height {self.height:g} m is outside -1000 to 100000; metres are needed")
+
+    @classmethod
+    def parse(cls, text: str) -> Origin:
+        """Read `"LAT,LON,HEIGHT"`: degrees, degrees, metres above the WGS84 ellipsoid.
+
+        Raises:
+            InputError: not three numbers, or a value out of range.
+        """
+        fields = text.split(",")
+        try:
+            values = [float(field) for field in fields]
+        except ValueError:
+            values = []
+        if len(values) != 3:
+            raise InputError(f"origin {text!r}: write three numbers LAT,LON,HEIGHT, for example 19.07,72.87,14")
+        return cls(lat=values[0], lon=values[1], height=values[2])
+
+
+@functools.lru_cache(maxsize=16)
+def _pipeline(origin: Origin) -> pyproj.Transformer:
+    """Geodetic longitude, latitude (degrees), height to ENU and, inverted, back."""
+    return pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        f"+step +proj=topocentric +ellps=WGS84 +lat_0={origin.lat!r} +lon_0={origin.lon!r} +h_0={origin.height!r}"
+    )
+
+
+def enu_to_geodetic(enu: Tensor, origin: Origin) -> Tensor:
+    """Latitude, longitude (degrees) and ellipsoidal WGS84 height (metres) of ENU points.
+
+    Args:
+        enu: (..., 3) metres.
+        origin: where (0, 0, 0) is.
+
+    Returns:
+        (..., 3) float64 on the CPU, without gradient; longitudes in [-180, 180).
+
+    Raises:
+        InputError: wrong shape or dtype, or a value that is not finite.
+
+    Source: PROJ's topocentric and cart conversions (EPSG methods 9836 and 9602).
+
+    Example:
+        >>> origin = Origin(lat=0.0, lon=180.0, height=0.0)
+        >>> enu_to_geodetic(torch.tensor([[1000.0, 0.0, 0.0]]), origin).round(decimals=4).tolist()
+        [[0.0, -179.991, 0.0784]]
+    """
+    enu = as_points("enu", enu, 3)
+    require_finite("enu", enu)
+    east, north, up = (axis.numpy() for axis in enu.detach().cpu().unbind(-1))
+    lon, lat, height = _pipeline(origin).transform(east, north, up, direction="INVERSE")
+    lat, lon, height = (torch.as_tensor(value, dtype=torch.float64) for value in (lat, lon, height))
+    return torch.stack([lat, (lon + 180.0) % 360.0 - 180.0, height], -1)
+
+
+def geodetic_to_enu(geodetic: Tensor, origin: Origin) -> Tensor:
+    """ENU metres of (..., 3) latitude, longitude (degrees), ellipsoidal WGS84 height (metres).
+
+    Raises:
+        InputError: wrong shape or dtype, a value that is not finite, or a latitude outside ±90.
+
+    Example:
+        >>> origin = Origin(lat=19.07, lon=72.87, height=14.0)
+        >>> geodetic_to_enu(torch.tensor([[19.07, 72.87, 24.0]]).double(), origin).abs().round(decimals=6).tolist()
+        [[0.0, 0.0, 10.0]]
+    """
+    geodetic = as_points("geodetic", geodetic, 3)
+    require_finite("geodetic", geodetic)
+    lat, lon, height = (axis.numpy() for axis in geodetic.detach().cpu().unbind(-1))
+    if (abs(lat) > 90).any():
+        raise InputError("geodetic: a latitude is outside -90 to 90; the order is latitude, longitude, height")
+    enu = _pipeline(origin).transform(lon, lat, height)
+    return torch.stack([torch.as_tensor(axis, dtype=torch.float64) for axis in enu], -1)
