@@ -1,0 +1,66 @@
+"""Rigid motions as a rotation matrix and a translation, moved by small steps from the left.
+
+A step is six numbers: a rotation vector ω (radians) and a translation v (metres), R ← exp([ω]×) R, t ← t + v.
+"""
+
+from __future__ import annotations
+
+import torch
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
+from torch import Tensor
+
+
+def rotation_from_vector(vector: Tensor) -> Tensor:
+    """Rotation vectors (..., 3) in radians to matrices (..., 3, 3), exact and differentiable at zero too.
+
+    Example:
+        >>> rotation_from_vector(torch.zeros(3)).diagonal().tolist()
+        [1.0, 1.0, 1.0]
+    """
+    flat: Tensor = axis_angle_to_rotation_matrix(vector.reshape(-1, 3))
+    return flat.reshape(*vector.shape, 3)
+
+
+def vector_from_rotation(rotation: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) to rotation vectors (..., 3) of length at most π.
+
+    Example:
+        >>> vector_from_rotation(torch.eye(3)).tolist()
+        [0.0, 0.0, 0.0]
+    """
+    flat: Tensor = rotation_matrix_to_axis_angle(rotation.reshape(-1, 3, 3))
+    return flat.reshape(*rotation.shape[:-2], 3)
+
+
+def nearest_rotation(matrix: Tensor) -> Tensor:
+    """The rotation closest to matrices (..., 3, 3) in the Frobenius norm (orthogonal Procrustes).
+
+    Example:
+        >>> nearest_rotation(2 * torch.eye(3)).diagonal().tolist()
+        [1.0, 1.0, 1.0]
+    """
+    u, _, vh = torch.linalg.svd(matrix)
+    sign = torch.linalg.det(u @ vh)
+    u = torch.cat([u[..., :2], u[..., 2:] * sign[..., None, None]], -1)
+    return u @ vh
+
+
+def move(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+    """Apply steps (..., 6) to rotations (..., 3, 3) and translations (..., 3)."""
+    return rotation_from_vector(step[..., :3]) @ rotation, translation + step[..., 3:]
+
+
+def step_rows(by_point: Tensor, rotated: Tensor) -> Tensor:
+    """Derivatives by the six numbers of a step, from derivatives by the moved point.
+
+    Args:
+        by_point: (..., 3, 2, N) derivatives of N pixels by their points in the moved frame.
+        rotated: (..., 3, N) points after the rotation and before the translation.
+
+    Returns:
+        (..., 6, 2, N): by ω (through ω × point), then by v.
+    """
+    x, y, z = (rotated[..., i, None, :] for i in range(3))
+    by_x, by_y, by_z = by_point.unbind(-3)
+    turned = torch.stack([by_z * y - by_y * z, by_x * z - by_z * x, by_y * x - by_x * y], -3)
+    return torch.cat([turned, by_point], -3)

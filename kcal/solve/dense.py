@@ -1,0 +1,60 @@
+"""Dense least squares: any residual function, Jacobians by `torch.func`, batched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from kcal.solve.result import State
+
+
+class DenseLinearisation:
+    """Normal equations of one dense Jacobian (..., R, P), columns scaled to length one."""
+
+    def __init__(self, residuals: Tensor, jacobian: Tensor) -> None:
+        self.cost = 0.5 * (residuals * residuals).sum(-1)
+        norm = torch.linalg.vector_norm(jacobian, dim=-2)
+        # A column of zeros (a parameter that nothing depends on) keeps its place and never moves.
+        self._scale = torch.where(norm > 0, 1.0 / norm, 1.0)
+        scaled = jacobian * self._scale[..., None, :]
+        self._normal = scaled.transpose(-1, -2) @ scaled
+        self._gradient = (scaled * residuals[..., None]).sum(-2)
+
+    def step(self, damping: Tensor) -> tuple[State, Tensor]:
+        """See `Linearisation.step`."""
+        identity = torch.eye(self._normal.shape[-1], dtype=self._normal.dtype, device=self._normal.device)
+        factor, info = torch.linalg.cholesky_ex(self._normal + damping[..., None, None] * identity)
+        delta = -torch.cholesky_solve(self._gradient[..., None], factor)[..., 0]
+        predicted = 0.5 * (damping * (delta * delta).sum(-1) - (self._gradient * delta).sum(-1))
+        return (delta * self._scale,), torch.where(info == 0, predicted, torch.nan)
+
+
+class DenseProblem:
+    """Residuals r(x, data) for x (..., P), the leading dimensions a batch of independent problems."""
+
+    def __init__(self, residual: Callable[..., Tensor], batch: tuple[int, ...], data: tuple[Tensor, ...] = ()) -> None:
+        self.batch = tuple(batch)
+        self._data = tuple(tensor.detach() for tensor in data)
+        value, jacobian = residual, torch.func.jacfwd(residual)
+        for _ in self.batch:
+            value, jacobian = torch.func.vmap(value), torch.func.vmap(jacobian)
+        self._value, self._jacobian = value, jacobian
+        self.residual_count = 1
+
+    def cost(self, state: State) -> Tensor:
+        """See `Problem.cost`."""
+        residuals = self._value(state[0], *self._data)
+        self.residual_count = residuals.shape[-1]
+        return 0.5 * (residuals * residuals).sum(-1)
+
+    def linearise(self, state: State) -> DenseLinearisation:
+        """See `Problem.linearise`."""
+        residuals = self._value(state[0], *self._data)
+        self.residual_count = residuals.shape[-1]
+        return DenseLinearisation(residuals, self._jacobian(state[0], *self._data))
+
+    def retract(self, state: State, step: State) -> State:
+        """Plain addition."""
+        return (state[0] + step[0],)

@@ -1,0 +1,170 @@
+"""Levenberg-Marquardt with trust-region damping, and its `nn.Module` for any residual function."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kcal.checks import require_finite
+from kcal.errors import InputError
+from kcal.solve.dense import DenseProblem
+from kcal.solve.problem import Problem
+from kcal.solve.result import Result, State, Status
+
+# Called after each trial step with (trial, cost (...)); returning True stops.
+Callback = Callable[[int, Tensor], bool | None]
+
+_LOWEST_DAMPING, _HIGHEST_DAMPING = 1e-14, 1e10
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LMOptions:
+    """Options of `minimise`.
+
+    Args:
+        max_iterations: trial steps at the most, rejected ones counted.
+        tolerance: stop when the next step is predicted to lower the cost by less than this fraction. 1e-12 of the
+            cost is 5e-13 of the RMS.
+        initial_damping: λ at the start, in units of the scaled normal matrix, whose diagonal is one.
+        residual_floor: a root-mean-square residual below this counts as zero.
+    """
+
+    max_iterations: int = 300
+    tolerance: float = 1e-12
+    initial_damping: float = 1e-3
+    residual_floor: float = 1e-12
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 1 or not 0 <= self.tolerance < 1:
+            raise InputError("LMOptions: max_iterations must be at least 1 and tolerance in [0, 1)")
+        if not self.initial_damping > 0 or not self.residual_floor >= 0:
+            raise InputError("LMOptions: initial_damping must be positive, residual_floor not negative")
+
+
+def _where(mask: Tensor, new: State, old: State) -> State:
+    return tuple(
+        torch.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b) for a, b in zip(new, old, strict=True)
+    )
+
+
+@torch.no_grad()
+def minimise(
+    problem: Problem, start: State, options: LMOptions | None = None, callback: Callback | None = None
+) -> Result:
+    """Minimise half the sum of squares by Levenberg and Marquardt's method.
+
+    θ_new = θ - (JᵀJ + λ D)⁻¹ Jᵀr, the paper's Eq. 6 with r = f(θ) - y and with D = diag(JᵀJ) in place of the
+    identity, so that the units of the parameters do not matter. A step that raises the cost, or makes it NaN, is
+    never taken. λ follows the gain ratio (Nielsen 1999). Every element of a batch has its own λ, its own decisions
+    and its own reason for stopping.
+
+    Args:
+        problem: see `kcal.solve.problem.Problem`.
+        start: the state to begin with.
+        options: see `LMOptions`.
+        callback: called after each trial with the trial's number and the best cost; return True to stop.
+
+    Returns:
+        The best state with its status. Nothing is raised for a failure to converge: read `status`.
+    """
+    options = options or LMOptions()
+    state = start
+    linear = problem.linearise(state)
+    cost = linear.cost
+    damping = torch.full_like(cost, options.initial_damping)
+    growth = torch.full_like(cost, 2.0)
+    status = torch.zeros_like(cost, dtype=torch.int64)
+    iterations = torch.zeros_like(status)
+    status = torch.where(torch.isfinite(cost), status, int(Status.BAD_START))
+    floor = 0.5 * problem.residual_count * options.residual_floor**2
+    status = torch.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
+    history = [cost]
+
+    for trial in range(1, options.max_iterations + 1):
+        running = status == Status.RUNNING
+        if not bool(running.any()):
+            break
+        step, predicted = linear.step(damping)
+        candidate = problem.retract(state, step)
+        new_cost = problem.cost(candidate)
+        solved = torch.isfinite(predicted)
+        gain = (cost - new_cost) / torch.where(solved & (predicted > 0), predicted, torch.inf)
+        accept = running & solved & torch.isfinite(new_cost) & (new_cost < cost)
+        iterations = iterations + running
+
+        # A tiny prediction means a minimum only where little damping shaped the step.
+        flat = running & solved & (predicted <= options.tolerance * cost) & (damping <= 1e-3)
+        shrink = torch.clamp(1.0 - (2.0 * gain - 1.0) ** 3, min=1.0 / 10.0)
+        damping = torch.where(accept, damping * shrink, torch.where(running, damping * growth, damping))
+        damping = damping.clamp(min=_LOWEST_DAMPING)
+        growth = torch.where(accept, 2.0, torch.where(running, growth * 2.0, growth))
+        state = _where(accept, candidate, state)
+        cost = torch.where(accept, new_cost, cost)
+        history.append(cost)
+
+        status = torch.where(flat, int(Status.CONVERGED), status)
+        status = torch.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
+        stalled = (status == 0) & ~accept & (damping > _HIGHEST_DAMPING)
+        status = torch.where(stalled, int(Status.STALLED), status)
+        if callback is not None and callback(trial, cost):
+            status = torch.where(status == 0, int(Status.INTERRUPTED), status)
+        if bool((accept & (status == 0)).any()):
+            linear = problem.linearise(state)
+
+    status = torch.where(status == 0, int(Status.ITERATION_LIMIT), status)
+    return Result(state=state, cost=cost, status=status, iterations=iterations, history=torch.stack(history))
+
+
+class LevenbergMarquardt(nn.Module):
+    """Levenberg-Marquardt for any residual function, batched over leading dimensions.
+
+    Args:
+        residual: maps x (P,) and the data of one element to residuals (R,), in operations that `torch.func` can
+            differentiate.
+        options: see `LMOptions`.
+
+    Convention: float64 only, because squared condition numbers leave float32 nothing. The result carries no
+    gradient.
+
+    Example:
+        >>> def rosenbrock(x):
+        ...     return torch.stack([1 - x[0], 10 * (x[1] - x[0] ** 2)])
+        >>> result = LevenbergMarquardt(rosenbrock)(torch.tensor([-1.2, 1.0], dtype=torch.float64))
+        >>> [round(float(value), 9) for value in result.x], result.message
+        ([1.0, 1.0], 'converged: the residual is zero to rounding')
+    """
+
+    def __init__(self, residual: Callable[..., Tensor], options: LMOptions | None = None) -> None:
+        super().__init__()
+        self.residual = residual
+        self.options = options or LMOptions()
+
+    def forward(self, start: Tensor, *data: Tensor, callback: Callback | None = None) -> Result:
+        """Minimise from `start` (..., P); each data tensor has the same leading shape (...).
+
+        Returns:
+            A `Result` with `x` (..., P) and a status for each element.
+
+        Raises:
+            InputError: a start that is not float64 or not finite, or data whose leading shape differs.
+        """
+        if start.dtype != torch.float64:
+            raise InputError(f"LevenbergMarquardt: the start must be float64, got {start.dtype}; use .double()")
+        require_finite("LevenbergMarquardt start", start)
+        for tensor in data:
+            if tensor.shape[: start.ndim - 1] != start.shape[:-1]:
+                raise InputError(
+                    f"LevenbergMarquardt: data of shape {tuple(tensor.shape)} do not begin with the batch shape "
+                    f"{tuple(start.shape[:-1])}"
+                )
+        problem = DenseProblem(self.residual, start.shape[:-1], data)
+        return minimise(problem, (start.detach(),), self.options, callback)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Result:
+        """See `forward`."""
+        result: Result = super().__call__(*args, **kwargs)
+        return result

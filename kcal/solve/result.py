@@ -1,0 +1,80 @@
+"""What a solver returns: the best state, its cost, and an honest reason for stopping."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+import torch
+from torch import Tensor
+
+State = tuple[Tensor, ...]
+
+
+class Status(enum.IntEnum):
+    """Why the solver stopped; one for each element of a batch.
+
+    `CONVERGED`: no step can lower the cost by more than the tolerance. `EXACT`: the residual is zero to rounding.
+    `ITERATION_LIMIT`: still improving. `STALLED`: a lower cost was predicted but no step, however short, gave one.
+    `BAD_START`: the cost at the start is not finite. `INTERRUPTED`: the caller's callback asked to stop.
+    """
+
+    RUNNING = 0
+    CONVERGED = 1
+    EXACT = 2
+    ITERATION_LIMIT = 3
+    STALLED = 4
+    BAD_START = 5
+    INTERRUPTED = 6
+
+    @property
+    def message(self) -> str:
+        """One sentence for people."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Status.RUNNING: "still running",
+    Status.CONVERGED: "converged: no step lowers the cost by more than the tolerance",
+    Status.EXACT: "converged: the residual is zero to rounding",
+    Status.ITERATION_LIMIT: "stopped at the iteration limit while still improving",
+    Status.STALLED: "stalled: no step lowers the cost although one was predicted",
+    Status.BAD_START: "the cost at the start is not finite",
+    Status.INTERRUPTED: "interrupted; this is the best state so far",
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Result:
+    """The outcome of `minimise`.
+
+    Args:
+        state: the best state found, in the problem's own form.
+        cost: (...) half the sum of squared residuals there.
+        status: (...) int64 values of `Status`.
+        iterations: (...) int64, trial steps taken.
+        history: (iterations + 1, ...) cost after each trial step, the start first.
+    """
+
+    state: State
+    cost: Tensor
+    status: Tensor
+    iterations: Tensor
+    history: Tensor
+
+    @property
+    def x(self) -> Tensor:
+        """The solution where the state is a single tensor."""
+        return self.state[0]
+
+    @property
+    def converged(self) -> Tensor:
+        """(...) whether the element is at a minimum: `CONVERGED` or `EXACT`."""
+        return (self.status == Status.CONVERGED) | (self.status == Status.EXACT)
+
+    @property
+    def message(self) -> str:
+        """The reason for stopping in words; for a batch, each reason with its count."""
+        found, counts = torch.unique(self.status, return_counts=True)
+        parts = [(Status(int(value)).message, int(n)) for value, n in zip(found, counts, strict=True)]
+        return parts[0][0] if self.status.ndim == 0 else "; ".join(f"{n} x {text}" for text, n in parts)
