@@ -1,0 +1,266 @@
+"""kcal's own camera file: every parameter by its name, its error bars, and where it came from.
+
+JSON, `"kcal": "camera"`, version 1. Numbers are float64 and read back to the last bit. Parameters are stored by name,
+so that a value cannot slip into another one's place.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pydantic
+import torch
+
+import kcal
+from kcal.errors import InputError
+from kcal.files import NativeFile
+from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
+from kcal.lens.projection import INTRINSICS
+
+
+class Record(pydantic.BaseModel):
+    """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class LensOrders(Record):
+    """The lens model by its orders, so that the file does not depend on the names of presets."""
+
+    numerator: int
+    denominator: int
+    tangential: bool
+    prism: int
+    tilt: bool
+
+    @pydantic.model_validator(mode="after")
+    def _known(self) -> LensOrders:
+        self.model()
+        return self
+
+    def model(self) -> LensModel:
+        """The `LensModel` with these orders."""
+        return LensModel(**self.model_dump())
+
+
+class Intrinsics(Record):
+    """Focal lengths, principal point and skew (γ of Eq. 3), pixels."""
+
+    fx: pydantic.PositiveFloat
+    fy: pydantic.PositiveFloat
+    cx: float
+    cy: float
+    skew: float
+
+
+class Exclusion(Record):
+    """A view or a pair that was left out, and why."""
+
+    name: str
+    reason: str
+
+
+class BoardRecord(Record):
+    """The board as plain fields: inner corners, and the side of a square in metres."""
+
+    columns: pydantic.PositiveInt
+    rows: pydantic.PositiveInt
+    square: pydantic.PositiveFloat
+
+
+class CameraCalibration(Record):
+    """How a camera was calibrated.
+
+    Args:
+        rms: sqrt(mean ‖r‖²) over the points that were used, pixels.
+        views: how many views were used.
+        points: how many corners were used.
+        per_view_rms: view name -> RMS in pixels, for the views used.
+        excluded: views left out, with the reason.
+        board: the board that was shown.
+        board_warp: height of the board's bend in x and y, metres; None if it was not estimated.
+        stop_reason: why the solver stopped.
+        iterations: of the solver.
+        observations: name of the observations file, if there was one.
+        kcal_version: the version that calibrated; see `provenance`.
+        created: when, with its time zone.
+    """
+
+    rms: pydantic.NonNegativeFloat
+    views: pydantic.PositiveInt
+    points: pydantic.PositiveInt
+    per_view_rms: dict[str, pydantic.NonNegativeFloat]
+    excluded: tuple[Exclusion, ...] = ()
+    board: BoardRecord
+    board_warp: tuple[float, float] | None = None
+    stop_reason: str
+    iterations: pydantic.NonNegativeInt
+    observations: str | None = None
+    kcal_version: str
+    created: pydantic.AwareDatetime
+
+    @pydantic.model_validator(mode="after")
+    def _counted(self) -> CameraCalibration:
+        if self.views != len(self.per_view_rms):
+            raise ValueError(f"views is {self.views}, but per_view_rms has {len(self.per_view_rms)}")
+        return self
+
+
+class CameraFile(NativeFile):
+    """One camera (file kind `camera`, version 1).
+
+    Convention: pixels as in `Camera`: (0, 0) is the centre of the first pixel, y down. Coefficients are stored by
+    name in the order of `LensModel.names`; a reader goes by the names, since JSON objects have no order of their own.
+
+    Args:
+        name: free text that tells cameras apart, for example `"left"`.
+        image_size: (width, height) in pixels.
+        model: orders of the lens model.
+        intrinsics: fx, fy, cx, cy, skew in pixels.
+        coefficients: name -> value, exactly the names of the model.
+        standard_deviations: name -> one sigma of the parameter, None where it was held fixed; the whole is None
+            when no covariance was computed.
+        calibration: how the camera was calibrated, if it was.
+
+    Example:
+        >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080),
+        ...                       coefficients=[-0.1, 0.01], model="opencv4")
+        >>> file = camera_to_file(camera, name="left")
+        >>> file.coefficients
+        {'k1': -0.1, 'k2': 0.01, 'p1': 0.0, 'p2': 0.0}
+        >>> file.camera().fingerprint == camera.fingerprint
+        True
+    """
+
+    KIND: ClassVar[str] = "camera"
+    VERSION: ClassVar[int] = 1
+
+    name: str
+    image_size: tuple[pydantic.PositiveInt, pydantic.PositiveInt]
+    model: LensOrders
+    intrinsics: Intrinsics
+    coefficients: dict[str, float]
+    standard_deviations: dict[str, pydantic.NonNegativeFloat | None] | None = None
+    calibration: CameraCalibration | None = None
+
+    @pydantic.field_validator("coefficients", "standard_deviations")
+    @classmethod
+    def _named(cls, value: dict[str, Any] | None, info: pydantic.ValidationInfo) -> dict[str, Any] | None:
+        if value is None or "model" not in info.data:
+            return value
+        names: tuple[str, ...] = info.data["model"].model().names
+        if info.field_name == "standard_deviations":
+            names = (*INTRINSICS, *names)
+        missing, unknown = [n for n in names if n not in value], [n for n in value if n not in names]
+        if missing or unknown:
+            what = f"{missing[0]} is missing" if missing else f"{unknown[0]} is unknown"
+            raise ValueError(f"{what}; the lens model needs exactly {', '.join(names) or 'nothing'}")
+        return {name: value[name] for name in names}
+
+    def camera(self) -> Camera:
+        """The camera, equal to the stored one to the last bit."""
+        values = [*(getattr(self.intrinsics, name) for name in INTRINSICS), *self.coefficients.values()]
+        return Camera(torch.tensor(values, dtype=torch.float64), size=self.image_size, model=self.model.model())
+
+
+def provenance() -> dict[str, Any]:
+    """The fields `kcal_version` and `created` of a calibration made now.
+
+    Example:
+        >>> sorted(provenance())
+        ['created', 'kcal_version']
+    """
+    return {
+        "kcal_version": kcal.__version__,
+        "created": datetime.datetime.now(datetime.UTC).replace(microsecond=0),
+    }
+
+
+def camera_to_file(
+    camera: Camera,
+    *,
+    name: str = "",
+    standard_deviations: Mapping[str, float | None] | None = None,
+    calibration: CameraCalibration | None = None,
+) -> CameraFile:
+    """Put a camera in the form in which it is stored.
+
+    Args:
+        camera: a single camera, not a batch.
+        name: free text that tells cameras apart.
+        standard_deviations: parameter name -> one sigma; names left out, and None, stand for parameters held fixed.
+        calibration: how the camera was calibrated.
+
+    Raises:
+        InputError: a batch of cameras, a parameter that is not finite, or a name that the camera does not have.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> camera_to_file(camera, standard_deviations={"fx": 0.5}).standard_deviations["fy"] is None
+        True
+    """
+    values = camera.parameters_vector.detach()
+    if values.ndim != 1:
+        raise InputError(f"a camera file holds one camera, got a batch of shape {tuple(values.shape[:-1])}")
+    if standard_deviations is not None:
+        unknown = [key for key in standard_deviations if key not in camera.names]
+        if unknown:
+            raise InputError(f"standard deviation of {unknown[0]!r}: the camera has {', '.join(camera.names)}")
+        standard_deviations = {key: standard_deviations.get(key) for key in camera.names}
+    stored = dict(zip(camera.names, values.tolist(), strict=True))
+    model = camera.model
+    try:
+        return CameraFile(
+            name=name,
+            image_size=camera.size,
+            model=LensOrders(
+                numerator=model.numerator,
+                denominator=model.denominator,
+                tangential=model.tangential,
+                prism=model.prism,
+                tilt=model.tilt,
+            ),
+            intrinsics=Intrinsics(**{key: stored[key] for key in INTRINSICS}),
+            coefficients={key: stored[key] for key in model.names},
+            standard_deviations=standard_deviations,
+            calibration=calibration,
+        )
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"this camera cannot be stored: {where}: {first['msg']}") from error
+
+
+def save_camera(camera: Camera, path: str | Path, *, name: str = "") -> Path:
+    """Write a camera without its calibration record; `camera_to_file(...).save(path)` writes one with it.
+
+    Raises:
+        InputError: see `camera_to_file`.
+        FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     load_camera(save_camera(camera, Path(folder, "camera.json"))).focal.tolist()
+        [800.0, 800.0]
+    """
+    return camera_to_file(camera, name=name).save(path)
+
+
+def load_camera(path: str | Path) -> Camera:
+    """Read the camera of a kcal camera file.
+
+    Raises:
+        FileError: missing, not JSON, another kind of file (a rig, say), or a field that is wrong; it names the path.
+
+    Example:
+        >>> load_camera("no-such-file.json")
+        Traceback (most recent call last):
+        kcal.errors.FileError: no-such-file.json: cannot read: No such file or directory
+    """
+    return CameraFile.load(path).camera()

@@ -1,0 +1,251 @@
+"""kcal's camera and rig files: exact, and refused when they do not fit."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from kcal.errors import FileError, InputError
+from kcal.io.camera_file import (
+    BoardRecord,
+    CameraCalibration,
+    CameraFile,
+    Exclusion,
+    camera_to_file,
+    load_camera,
+    provenance,
+    save_camera,
+)
+from kcal.io.rig_file import RigCalibration, RigFile, load_rig, rig_to_file, save_rig
+from kcal.lens.camera import Camera
+from kcal.lens.model import PRESETS, LensModel
+from kcal.lens.rig import StereoRig
+
+
+def awkward_camera(model: str | LensModel) -> Camera:
+    """A camera whose numbers have no short decimal form."""
+    generator = torch.Generator().manual_seed(7)
+    lens = torch.randn(LensModel.named(model).size, generator=generator, dtype=torch.float64) * 1e-3
+    head = torch.tensor([1600.0 / 3, 1601.0 / 7, 959.5 + 1e-13, -math.pi, 1e-300], dtype=torch.float64)
+    return Camera(torch.cat([head, lens]), size=(1920, 1080), model=model)
+
+
+def rotation_about(axis: list[float], angle: float) -> torch.Tensor:
+    x, y, z = axis
+    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.linalg.matrix_exp(angle * skew)
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    return awkward_camera("ext20")
+
+
+@pytest.fixture(scope="module")
+def rig(camera: Camera) -> StereoRig:
+    rotation = rotation_about([0.6, 0.0, 0.8], 0.1)
+    return StereoRig(camera, awkward_camera("opencv5"), rotation, torch.tensor([-10.1, 0.2, 1 / 3]).double())
+
+
+def camera_calibration() -> CameraCalibration:
+    return CameraCalibration(
+        rms=0.157,
+        views=2,
+        points=108,
+        per_view_rms={"a.jpg": 0.1, "b.jpg": 0.2},
+        excluded=(Exclusion(name="c.jpg", reason="no board found"),),
+        board=BoardRecord(columns=9, rows=6, square=0.025),
+        board_warp=(1e-4, -2e-4),
+        stop_reason="cost no longer falls",
+        iterations=12,
+        observations="left.json",
+        **provenance(),
+    )
+
+
+def rig_calibration(baseline: float) -> RigCalibration:
+    return RigCalibration(
+        rms=0.3,
+        rms_left=0.2,
+        rms_right=0.4,
+        pairs=1,
+        per_pair_rms={"01": 0.3},
+        flipped=("01",),
+        excluded=(Exclusion(name="02", reason="seen by one camera only"),),
+        baseline_m=baseline,
+        **provenance(),
+    )
+
+
+class TestCamera:
+    @pytest.mark.parametrize("model", [*PRESETS, LensModel(numerator=1, denominator=4, prism=1)], ids=str)
+    def test_round_trip_is_exact(self, tmp_path: Path, model: str | LensModel) -> None:
+        before = awkward_camera(model)
+        after = load_camera(save_camera(before, tmp_path / "camera.json"))
+        assert torch.equal(after.parameters_vector, before.parameters_vector)
+        assert (after.model, after.size, after.fingerprint) == (before.model, before.size, before.fingerprint)
+
+    def test_record_round_trip(self, tmp_path: Path, camera: Camera) -> None:
+        sigma = {name: 0.1 / (1 + i) for i, name in enumerate(camera.names) if name != "skew"}
+        before = camera_to_file(camera, name="left", standard_deviations=sigma, calibration=camera_calibration())
+        after = CameraFile.load(before.save(tmp_path / "camera.json"))
+        assert after == before
+        assert after.standard_deviations is not None
+        assert after.standard_deviations["skew"] is None
+        assert after.standard_deviations["fy"] == 0.1 / 2
+        assert tuple(after.standard_deviations) == camera.names
+
+    def test_stored_form(self) -> None:
+        # The format, spelled out: whoever reads these files elsewhere depends on it.
+        camera = Camera.build(focal=(800, 801), center=(320, 240), size=(640, 480), coefficients=[0.1], model="opencv4")
+        assert camera_to_file(camera, name="left").dump() == {
+            "kcal": "camera",
+            "version": 1,
+            "name": "left",
+            "image_size": [640, 480],
+            "model": {"numerator": 2, "denominator": 0, "tangential": True, "prism": 0, "tilt": False},
+            "intrinsics": {"fx": 800.0, "fy": 801.0, "cx": 320.0, "cy": 240.0, "skew": 0.0},
+            "coefficients": {"k1": 0.1, "k2": 0.0, "p1": 0.0, "p2": 0.0},
+            "standard_deviations": None,
+            "calibration": None,
+        }
+
+    def test_values_go_by_name(self, tmp_path: Path, camera: Camera) -> None:
+        content = camera_to_file(camera).dump()
+        content["coefficients"] = dict(reversed(content["coefficients"].items()))
+        path = tmp_path / "reordered.json"
+        path.write_text(json.dumps(content))
+        assert torch.equal(load_camera(path).parameters_vector, camera.parameters_vector)
+
+    @pytest.mark.parametrize(
+        ("path_in_file", "value", "message"),
+        [
+            (["coefficients", "k99"], 0.0, "k99 is unknown"),
+            (["coefficients", "k1"], math.nan, "finite"),
+            (["coefficients", "k1"], math.inf, "finite"),
+            (["coefficients", "k1"], "fast", "number"),
+            (["model", "numerator"], 4, "missing|unknown"),
+            (["model", "numerator"], 99, "0 to 7"),
+            (["model", "fisheye"], True, "Extra"),
+            (["intrinsics", "fx"], 0.0, "greater than 0"),
+            (["intrinsics", "cx"], math.nan, "finite"),
+            (["image_size"], [640, 0], "greater than 0"),
+            (["image_size"], [640], "required"),
+            (["standard_deviations"], {"fx": 1.0}, "fy is missing"),
+            (["standard_deviations", "fx"], -1.0, "greater than or equal to 0"),
+            (["calibration", "views"], 3, "per_view_rms has 2"),
+            (["calibration", "created"], "2026-01-01T00:00:00", "timezone"),
+            (["version"], 2, "version 2"),
+            (["colour"], "red", "Extra"),
+        ],
+    )
+    def test_wrong_field(
+        self, tmp_path: Path, camera: Camera, path_in_file: list[str], value: Any, message: str
+    ) -> None:
+        sigma = dict.fromkeys(camera.names, 0.1)
+        content = camera_to_file(camera, standard_deviations=sigma, calibration=camera_calibration()).dump()
+        block = content
+        for key in path_in_file[:-1]:
+            block = block[key]
+        block[path_in_file[-1]] = value
+        path = tmp_path / "wrong.json"
+        path.write_text(json.dumps(content))
+        with pytest.raises(FileError, match=message) as error:
+            load_camera(path)
+        assert "wrong.json" in str(error.value)
+
+    def test_missing_coefficient(self, tmp_path: Path, camera: Camera) -> None:
+        content = camera_to_file(camera).dump()
+        del content["coefficients"]["s6"]
+        path = tmp_path / "short.json"
+        path.write_text(json.dumps(content))
+        with pytest.raises(FileError, match=r"short\.json.*s6 is missing"):
+            load_camera(path)
+
+    def test_refused_when_stored(self, camera: Camera) -> None:
+        with pytest.raises(InputError, match="k99"):
+            camera_to_file(camera, standard_deviations={"k99": 0.1})
+        with pytest.raises(InputError, match="finite"):
+            camera_to_file(camera, standard_deviations={"fx": math.nan})
+        with pytest.raises(InputError, match="batch"):
+            camera_to_file(Camera(camera.parameters_vector.expand(3, -1), size=camera.size, model=camera.model))
+        broken = copy.deepcopy(camera)
+        with torch.no_grad():
+            broken.parameters_vector[7] = math.nan
+        with pytest.raises(InputError, match="finite"):
+            camera_to_file(broken)
+
+
+class TestRig:
+    def test_round_trip_is_exact(self, tmp_path: Path, rig: StereoRig) -> None:
+        after = load_rig(save_rig(rig, tmp_path / "rig.json"))
+        assert after.left.fingerprint == rig.left.fingerprint
+        assert after.right.fingerprint == rig.right.fingerprint
+        assert torch.equal(after.right_from_left_rotation, rig.right_from_left_rotation)
+        assert torch.equal(after.right_from_left_translation, rig.right_from_left_translation)
+
+    def test_record_round_trip(self, tmp_path: Path, rig: StereoRig) -> None:
+        left = camera_to_file(rig.left, name="west", calibration=camera_calibration())
+        before = rig_to_file(rig, left=left, calibration=rig_calibration(float(rig.baseline)))
+        after = RigFile.load(before.save(tmp_path / "rig.json"))
+        assert after == before
+        assert (after.left.name, after.right.name) == ("west", "right")
+        assert after.calibration is not None
+        assert after.calibration.frame == "left camera"
+
+    def test_kinds_are_told_apart(self, tmp_path: Path, rig: StereoRig) -> None:
+        rig_path = save_rig(rig, tmp_path / "rig.json")
+        camera_path = save_camera(rig.left, tmp_path / "camera.json")
+        with pytest.raises(FileError, match=r"rig\.json: this is a kcal rig file; a kcal camera file is needed"):
+            load_camera(rig_path)
+        with pytest.raises(FileError, match=r"camera\.json: this is a kcal camera file; a kcal rig file is needed"):
+            load_rig(camera_path)
+
+    @pytest.mark.parametrize(
+        ("path_in_file", "value", "message"),
+        [
+            (["right_from_left", "rotation", 0, 0], 0.5, "no rotation"),
+            (["right_from_left", "rotation"], [[1, 0, 0], [0, 1, 0], [0, 0, -1]], "no rotation"),
+            (["right_from_left", "rotation", 2, 2], math.nan, "finite"),
+            (["right_from_left", "rotation"], [[1, 0], [0, 1]], "required"),
+            (["right_from_left", "translation"], [1.0, 2.0], "required"),
+            (["right_from_left", "translation", 0], -10.2, "baseline_m"),
+            (["left", "coefficients", "k1"], math.inf, "finite"),
+            (["right", "coefficients", "k9"], 0.0, "k9 is unknown"),
+            (["calibration", "frame"], "right camera", "left camera"),
+            (["calibration", "pairs"], 5, "per_pair_rms has 1"),
+        ],
+    )
+    def test_wrong_field(
+        self, tmp_path: Path, rig: StereoRig, path_in_file: list[Any], value: Any, message: str
+    ) -> None:
+        content = rig_to_file(rig, calibration=rig_calibration(float(rig.baseline))).dump()
+        block: Any = content
+        for key in path_in_file[:-1]:
+            block = block[key]
+        block[path_in_file[-1]] = value
+        path = tmp_path / "wrong.json"
+        path.write_text(json.dumps(content))
+        with pytest.raises(FileError, match=message) as error:
+            load_rig(path)
+        assert "wrong.json" in str(error.value)
+
+    def test_another_camera_is_refused(self, rig: StereoRig) -> None:
+        with pytest.raises(InputError, match="right camera file"):
+            rig_to_file(rig, right=camera_to_file(rig.left))
+
+    def test_old_file_survives_a_refused_save(self, tmp_path: Path, rig: StereoRig) -> None:
+        path = save_rig(rig, tmp_path / "rig.json")
+        text = path.read_text()
+        broken = copy.deepcopy(rig)
+        broken.right_from_left_translation[0] = math.nan
+        with pytest.raises(InputError, match="cannot be stored"):
+            save_rig(broken, path)
+        assert path.read_text() == text
+        assert [file.name for file in tmp_path.iterdir()] == ["rig.json"]
