@@ -1,0 +1,253 @@
+"""Find a checkerboard in an image, and in many."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple, get_args
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from kcal.corners.board import Board
+from kcal.corners.grid import grid_trouble, local_side
+from kcal.corners.images import Grey, decode_grey, read_bytes, to_8bit, unique_names
+from kcal.corners.observations import Failure, Observations, Pixel, View
+from kcal.corners.order import canonical_order
+from kcal.corners.refine import Refinement, refine_corners
+from kcal.corners.saddle import Status
+from kcal.errors import FileError, InputError
+
+SEARCH_SIDES = (1200, 2400)  # pixels: the longer side of the image that is searched, small first
+MIN_GOOD = 0.5  # share of the corners that must survive refinement
+
+_CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+_SECTOR = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
+_REASONS = {
+    Status.OUTSIDE: "too near the image's edge",
+    Status.NO_SADDLE: "not a corner",
+    Status.MOVED: "moved too far",
+    Status.RESTLESS: "did not settle",
+}
+
+
+class Detection(NamedTuple):
+    """A board in an image: `pixels` (corners, 2) float64 in the board's order, NaN where not seen, or None and why."""
+
+    pixels: Tensor | None
+    reason: str = ""
+
+
+def detect_board(image: Grey, board: Board, refine: Refinement = "saddle") -> Detection:
+    """Find the inner corners of a checkerboard.
+
+    OpenCV's `findChessboardCorners` searches first; where it fails, `findChessboardCornersSB` (A. Duda and U. Frese,
+    BMVC 2018). Images above 1200 px are searched small and refined upwards in steps of two. What was found must look
+    like the whole board (`kcal.corners.grid.grid_trouble`) and is put into the board's order
+    (`kcal.corners.order.canonical_order`) before it is refined at the image's full size and depth.
+
+    Args:
+        image: (H, W) uint8 or uint16.
+        board: at least 3 inner corners each way, all of them in the image.
+        refine: see `kcal.corners.refine.refine_corners`.
+
+    Returns:
+        The corners, or None with a reason that a person can act on.
+
+    Raises:
+        InputError: not a grey uint8 or uint16 image, a board with 2 inner corners in a row, an unknown `refine`.
+
+    Example:
+        >>> y, x = np.mgrid[:120, :160]
+        >>> on = (x >= 20) & (x < 140) & (y >= 20) & (y < 100)
+        >>> image = np.where(on & ((x // 20 + y // 20) % 2 == 0), 40, 220).astype(np.uint8)
+        >>> found = detect_board(image, Board(columns=5, rows=3, square=0.02))
+        >>> [round(value, 3) for value in found.pixels[0].tolist()]
+        [39.5, 39.5]
+        >>> detect_board(image, Board(columns=6, rows=5, square=0.02)).reason
+        'no board of 6x5 inner corners found'
+    """
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"image: (H, W) uint8 or uint16 is needed, got {image.shape} {image.dtype}")
+    if min(board.columns, board.rows) < 3:
+        raise InputError(f"board {board.columns}x{board.rows}: at least 3 inner corners each way can be detected")
+    if refine not in get_args(Refinement):
+        raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
+    pixels, factor, reason = _search(to_8bit(image), board)
+    if pixels is None:
+        return Detection(None, reason)
+    if refine != "none":
+        pixels = _climb(image, pixels, board, factor)
+    side = local_side(pixels, board.columns, board.rows)
+    refined = refine_corners(image, pixels, side, refine)
+    good = int((refined.status == Status.GOOD).sum())
+    if good < MIN_GOOD * board.corners:
+        counts = Counter(refined.status.tolist())
+        why = ", ".join(f"{counts[code]} {text}" for code, text in _REASONS.items() if counts[code])
+        return Detection(None, f"only {good} of {board.corners} corners are sharp enough to be refined ({why})")
+    return Detection(refined.pixels)
+
+
+def detect_images(
+    paths: Sequence[str | Path],
+    board: Board,
+    refine: Refinement = "saddle",
+    progress: Callable[[str], None] | None = None,
+) -> Observations:
+    """Find the board in the images of one camera.
+
+    An image that cannot be read or shows no board becomes a `Failure` with its reason; the others become views, named
+    by their file names (with folders where two files share one).
+
+    Args:
+        paths: image files, for example from `kcal.corners.images.expand_images`.
+        board: the board.
+        refine: see `kcal.corners.refine.refine_corners`.
+        progress: called with each image's name when it is done.
+
+    Raises:
+        InputError: no images, images of two sizes, or no board in any image.
+
+    Example:
+        >>> import tempfile
+        >>> y, x = np.mgrid[:120, :160]
+        >>> on = (x >= 20) & (x < 140) & (y >= 20) & (y < 100)
+        >>> image = np.where(on & ((x // 20 + y // 20) % 2 == 0), 40, 220).astype(np.uint8)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = cv2.imwrite(f"{folder}/a.png", image), Path(folder, "b.png").write_bytes(b"")
+        ...     seen = detect_images([f"{folder}/a.png", f"{folder}/b.png"], Board(columns=5, rows=3, square=0.02))
+        >>> seen.names, seen.image_size, seen.failures[0].reason
+        (('a.png',), (160, 120), 'the file is empty; copy it again')
+    """
+    if not paths:
+        raise InputError("no images given")
+    files = [Path(path) for path in paths]
+    names = unique_names(files)
+    views: list[View] = []
+    failures: list[Failure] = []
+    size: tuple[int, int] | None = None
+    for name, file in zip(names, files, strict=True):
+        try:
+            data = read_bytes(file)
+            image = decode_grey(data, file)
+        except FileError as error:
+            failures.append(Failure(name=name, reason=str(error).removeprefix(f"{file}: ")))
+        else:
+            size = size or _size(image)
+            if _size(image) != size:
+                raise InputError(_sizes_differ(files, names))
+            found = detect_board(image, board, refine)
+            if found.pixels is None:
+                failures.append(Failure(name=name, reason=found.reason))
+            else:
+                digest = hashlib.sha256(data).hexdigest()
+                views.append(View(name=name, pixels=_listed(found.pixels), image=str(file), sha256=digest))
+        if progress is not None:
+            progress(name)
+    if size is None or not views:
+        first = f"{failures[0].name}: {failures[0].reason}"
+        raise InputError(f"no board in any of {len(files)} images ({first}){_hint(files, board)}")
+    return Observations(
+        board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures)
+    )
+
+
+def _search(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor | None, float, str]:
+    """Corners to about a pixel of the searched size, how much smaller that size was, and a reason if there are none."""
+    reason = f"no board of {board.columns}x{board.rows} inner corners found"
+    tried: set[float] = set()
+    for longest in SEARCH_SIDES:
+        factor = max(1.0, max(image.shape) / longest)
+        if factor in tried:
+            break
+        tried.add(factor)
+        small, scale = _shrunk(image, factor)
+        for find in (_find_classic, _find_sector):
+            corners = find(small, board)
+            if corners is None:
+                continue
+            trouble = grid_trouble(small, corners, board.columns, board.rows)
+            if trouble is None:
+                ordered = canonical_order(small, corners, board)
+                return _scaled(ordered, scale), factor, ""
+            reason = trouble
+    return None, 1.0, reason
+
+
+def _find_classic(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
+    found, corners = cv2.findChessboardCorners(image, (board.columns, board.rows), flags=_CLASSIC)
+    return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
+
+
+def _find_sector(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
+    found, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=_SECTOR)
+    return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
+
+
+def _climb(image: Grey, pixels: Tensor, board: Board, factor: float) -> Tensor:
+    """Bring corners found on an image `factor` times smaller near enough for refinement at full size."""
+    while factor > 1:
+        small, scale = _shrunk(image, factor)
+        start = (pixels + 0.5) / scale - 0.5
+        refined = refine_corners(small, start, local_side(start, board.columns, board.rows), "saddle")
+        good = (refined.status == Status.GOOD)[:, None]
+        pixels = _scaled(torch.where(good, refined.pixels, start), scale)
+        factor = factor / 2
+    return pixels
+
+
+def _shrunk(image: Grey, factor: float) -> tuple[Grey, Tensor]:
+    """The image made `factor` times smaller by averaging, and the exact scale (x, y) back."""
+    height, width = image.shape
+    if factor <= 1:
+        return image, torch.ones(2, dtype=torch.float64)
+    size = round(width / factor), round(height / factor)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return small, torch.tensor([width / size[0], height / size[1]], dtype=torch.float64)
+
+
+def _scaled(pixels: Tensor, scale: Tensor) -> Tensor:
+    """Pixels of a shrunk image as pixels of the image: edges coincide at -0.5, not the centres of the first pixels."""
+    return (pixels + 0.5) * scale - 0.5
+
+
+def _size(image: Grey) -> tuple[int, int]:
+    return image.shape[1], image.shape[0]
+
+
+def _listed(pixels: Tensor) -> tuple[Pixel | None, ...]:
+    return tuple(None if u != u else (u, v) for u, v in pixels.tolist())
+
+
+def _sizes_differ(files: list[Path], names: list[str]) -> str:
+    by_size: dict[tuple[int, int], list[str]] = {}
+    for name, file in zip(names, files, strict=True):
+        try:
+            by_size.setdefault(_size(decode_grey(read_bytes(file), file)), []).append(name)
+        except FileError:
+            continue
+    groups = []
+    for (width, height), group in sorted(by_size.items(), key=lambda item: -len(item[1])):
+        shown = ", ".join(group[:3]) + (f" and {len(group) - 3} more" if len(group) > 3 else "")
+        groups.append(f"{width}x{height} ({shown})")
+    return f"images of different sizes: {'; '.join(groups)}; give the images of one camera at one resolution"
+
+
+def _hint(files: list[Path], board: Board) -> str:
+    """The usual slip: squares were counted instead of inner corners."""
+    if min(board.columns, board.rows) < 4:
+        return ""
+    fewer = Board(columns=board.columns - 1, rows=board.rows - 1, square=board.square)
+    for file in files[:3]:
+        try:
+            image = decode_grey(read_bytes(file), file)
+        except FileError:
+            continue
+        if _search(to_8bit(image), fewer)[0] is not None:
+            return f"; a board of {fewer.columns}x{fewer.rows} is there: count inner corners, not squares"
+    return ""

@@ -1,0 +1,184 @@
+"""What a detected grid of corners must look like: sizes of its squares, their colours, and whether it is a board."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from kcal.checks import as_points
+from kcal.errors import InputError
+
+MAX_BEND = 0.25  # of a square: how far a corner may lie from its neighbours' homography; a wrong grid is off by 1
+MIN_ALTERNATING = 0.9  # share of neighbouring squares that differ as they must; glare may spoil a few
+GOES_ON = 0.75  # of the contrast across a corner: an outer corner of the board's edge has half, one more row all
+MIN_SIDE = 5.0  # pixels: below this, blur decides where the corner seems to be
+
+
+def as_grid(pixels: Tensor, columns: int, rows: int) -> Tensor:
+    """Corners (rows * columns, 2) as (rows, columns, 2) float64.
+
+    Raises:
+        InputError: another number of corners.
+    """
+    pixels = as_points("pixels", pixels, 2)
+    if pixels.shape != (rows * columns, 2):
+        raise InputError(f"pixels: shape ({rows * columns}, 2) is needed for {columns}x{rows}, got {tuple(pixels.shape)}")
+    return pixels.reshape(rows, columns, 2)
+
+
+def local_side(pixels: Tensor, columns: int, rows: int) -> Tensor:
+    """The distance in pixels from each corner to the nearest of its neighbours in the grid, (rows * columns,).
+
+    This is what a refinement window must be measured by: a fixed one swallows the next corner of a distant board.
+
+    Example:
+        >>> corners = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [3.0, 4.0]])
+        >>> local_side(corners, 2, 2).tolist()
+        [3.0, 3.0, 3.0, 3.0]
+    """
+    grid = as_grid(pixels, columns, rows)
+    side = torch.full((rows, columns), float("inf"), dtype=torch.float64, device=grid.device)
+    across = torch.linalg.vector_norm(grid[:, 1:] - grid[:, :-1], dim=-1)
+    down = torch.linalg.vector_norm(grid[1:] - grid[:-1], dim=-1)
+    side[:, 1:] = torch.minimum(side[:, 1:], across)
+    side[:, :-1] = torch.minimum(side[:, :-1], across)
+    side[1:] = torch.minimum(side[1:], down)
+    side[:-1] = torch.minimum(side[:-1], down)
+    return side.reshape(-1)
+
+
+def cell_levels(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> Tensor:
+    """Mean grey level in the middle of each square between four corners, (rows - 1, columns - 1) float64.
+
+    Sampled at 25 points over the middle half of the square, so that corners off by a few pixels change nothing.
+    """
+    grid = as_grid(pixels, columns, rows)
+    share = torch.linspace(0.25, 0.75, 5, dtype=torch.float64)
+    b, a = torch.meshgrid(share, share, indexing="ij")
+    a, b = a.reshape(-1, 1), b.reshape(-1, 1)
+    top = grid[:-1, :-1, None] * (1 - a) + grid[:-1, 1:, None] * a
+    bottom = grid[1:, :-1, None] * (1 - a) + grid[1:, 1:, None] * a
+    return _levels(image, top * (1 - b) + bottom * b).mean(-1)
+
+
+def first_square_dark(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> tuple[bool, float]:
+    """Whether the square diagonally outside corner 0 is dark, and the share of neighbouring squares that agree.
+
+    Colours alternate, so that square has the colour of the first one inside; comparing only neighbours makes uneven
+    light harmless.
+    """
+    levels = cell_levels(image, pixels, columns, rows)
+    i, j = torch.meshgrid(torch.arange(rows - 1), torch.arange(columns - 1), indexing="ij")
+    sign = 1.0 - 2.0 * ((i + j) % 2)
+    across = (levels[:, 1:] - levels[:, :-1]) * sign[:, :-1]
+    down = (levels[1:] - levels[:-1]) * sign[:-1]
+    differences = torch.cat([across.reshape(-1), down.reshape(-1)])
+    lighter = float((differences > 0).double().mean())
+    return lighter > 0.5, max(lighter, float((differences < 0).double().mean()))
+
+
+def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> str | None:
+    """Why a detected grid cannot be the board, or None.
+
+    Every square must turn the same way, every block of up to 3 x 3 corners must fit a homography (by least squares;
+    one homography for the whole board would refuse wide lenses), and dark and light must alternate.
+    """
+    grid = as_grid(pixels, columns, rows)
+    if not bool(torch.isfinite(grid).all()):
+        return "a corner is not finite"
+    side = local_side(pixels, columns, rows)
+    if float(side.min()) < MIN_SIDE:
+        return f"the smallest square is only {float(side.min()):.1f} px wide; come closer or use larger squares"
+    areas = _corner_areas(grid)
+    if not (bool((areas > 0).all()) or bool((areas < 0).all())):
+        return "the grid found is folded: not the board"
+    if float(_bend(grid)) > MAX_BEND:
+        return "the grid found is uneven: not the board, or another number of corners"
+    if first_square_dark(image, pixels, columns, rows)[1] < MIN_ALTERNATING:
+        return "the squares of the grid found do not alternate between dark and light"
+    if goes_on(image, pixels, columns, rows):
+        return f"the squares go on beyond {columns}x{rows}: the board has more inner corners than that"
+    return None
+
+
+def goes_on(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> bool:
+    """Whether the checkerboard continues beyond the grid, so that the grid is only a part of a larger board.
+
+    Detectors do return parts: asked for 8x6, OpenCV finds such a part on most views of a 9x6 board, and not the same
+    part for each camera. One step beyond each side, four squares meet again only if there is another row of corners;
+    on the board's own edge three of the four places have one colour.
+    """
+    grid = as_grid(pixels, columns, rows)
+    sides = (grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0))
+    return any(_goes_on_above(image, side) for side in sides if len(side) >= 3)
+
+
+def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
+    along = torch.gradient(grid, dim=1)[0]
+    # Second-order steps outwards, so that perspective does not move the place by a good part of a square.
+    beyond = 3 * grid[0] - 3 * grid[1] + grid[2]
+    places = torch.stack([beyond, grid[0]])[:, :, None]
+    out = torch.stack([beyond - grid[0], (grid[0] - grid[1] + beyond - grid[0]) / 2])[:, :, None]
+    step = along[0][None, :, None]
+    share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
+    signs = torch.tensor([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]], dtype=torch.float64)
+    four = torch.stack(
+        [_levels(image, places + share * (a * step + b * out)).mean(-1) for a, b in signs.tolist()]
+    )
+    contrast = four[0] + four[1] - four[2] - four[3]  # (beyond or own, along)
+    reach = beyond + 0.5 * out[0, :, 0]
+    limit = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)
+    inside = ((reach >= 0) & (reach <= limit)).all(-1)
+    if int(inside.sum()) * 2 < len(inside):
+        return False
+    own = torch.where(contrast[1].abs() < 1e-9, 1e-9, contrast[1])
+    return float((-contrast[0] / own)[inside].median()) > GOES_ON
+
+
+def _levels(image: npt.NDArray[np.generic], where: Tensor) -> Tensor:
+    """Grey levels at the pixels nearest to `where` (..., 2), (...) float64; the image's edge goes on outside."""
+    x, y = where.round().long().unbind(-1)
+    x, y = x.clamp(0, image.shape[1] - 1), y.clamp(0, image.shape[0] - 1)
+    return torch.from_numpy(image[y.numpy(), x.numpy()].astype(np.float64))
+
+
+def _corner_areas(grid: Tensor) -> Tensor:
+    """Twice the signed area of the triangle at each of a square's four corners; positive where x to y is clockwise."""
+    p, q, r, s = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
+
+    def cross(a: Tensor, b: Tensor) -> Tensor:
+        return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+    return torch.stack([cross(q - p, s - p), cross(r - q, p - q), cross(s - r, q - r), cross(p - s, r - s)])
+
+
+def _bend(grid: Tensor) -> Tensor:
+    """Largest distance of a corner from the homography of its block, in units of the block's smallest square."""
+    rows, columns = grid.shape[:2]
+    high, wide = min(3, rows), min(3, columns)
+    blocks = grid.unfold(0, high, 1).unfold(1, wide, 1)  # (i, j, 2, high, wide)
+    blocks = blocks.reshape(-1, 2, high, wide)
+    side = torch.minimum(
+        torch.linalg.vector_norm(blocks.diff(dim=2), dim=1).amin((1, 2)),
+        torch.linalg.vector_norm(blocks.diff(dim=3), dim=1).amin((1, 2)),
+    )
+    flat = blocks.flatten(2).transpose(1, 2)
+    centre = flat.mean(1, keepdim=True)
+    u, v = ((flat - centre) / side[:, None, None]).unbind(-1)
+    y, x = torch.meshgrid(torch.arange(high).double() - 1, torch.arange(wide).double() - 1, indexing="ij")
+    x, y = x.reshape(1, -1).expand_as(u), y.reshape(1, -1).expand_as(u)
+    one, zero = torch.ones_like(u), torch.zeros_like(u)
+    # The linear homography equations, with the last element fixed: its plane at infinity never crosses a block.
+    first = torch.stack([x, y, one, zero, zero, zero, -u * x, -u * y], -1)
+    second = torch.stack([zero, zero, zero, x, y, one, -v * x, -v * y], -1)
+    solution = torch.linalg.lstsq(
+        torch.cat([first, second], 1), torch.cat([u, v], 1)[..., None], driver="gelsd"
+    ).solution[..., 0]
+    a = solution[:, None]
+    w = a[..., 6] * x + a[..., 7] * y + 1
+    miss = torch.hypot(
+        (a[..., 0] * x + a[..., 1] * y + a[..., 2]) / w - u, (a[..., 3] * x + a[..., 4] * y + a[..., 5]) / w - v
+    )
+    return miss.max()
