@@ -10,6 +10,7 @@ from rich.markup import escape
 
 import kcal
 from kcal.cli.console import err
+from kcal.cli.locate import locate
 from kcal.errors import KcalError
 
 app = typer.Typer(
@@ -35,6 +36,9 @@ def _root(
     ] = False,
 ) -> None:
     pass
+
+
+app.command("locate")(locate)
 
 
 def main() -> None:

@@ -162,19 +162,23 @@ def enu_to_geodetic(enu: Tensor, origin: Origin) -> Tensor:
 
 
 def geodetic_to_enu(geodetic: Tensor, origin: Origin) -> Tensor:
-    """ENU metres of (..., 3) latitude, longitude (degrees), ellipsoidal WGS84 height (metres).
+    """ENU metres of (..., 3) latitude, longitude (degrees), ellipsoidal WGS84 height (metres), float64.
 
     Raises:
-        InputError: wrong shape or dtype, a value that is not finite, or a latitude outside ±90.
+        InputError: wrong shape, less than float64 (a float32 degree is rounded by up to 0.8 m), a value that is
+            not finite, or a latitude outside ±90.
 
     Example:
         >>> origin = Origin(lat=19.07, lon=72.87, height=14.0)
-        >>> geodetic_to_enu(torch.tensor([[19.07, 72.87, 24.0]]).double(), origin).abs().round(decimals=6).tolist()
+        >>> above = torch.tensor([[19.07, 72.87, 24.0]], dtype=torch.float64)
+        >>> geodetic_to_enu(above, origin).abs().round(decimals=6).tolist()
         [[0.0, 0.0, 10.0]]
     """
-    geodetic = as_points("geodetic", geodetic, 3)
-    require_finite("geodetic", geodetic)
-    lat, lon, height = (axis.numpy() for axis in geodetic.detach().cpu().unbind(-1))
+    checked = as_points("geodetic", geodetic, 3)
+    if geodetic.dtype != torch.float64:
+        raise InputError(f"geodetic: float64 is needed; {geodetic.dtype} has already rounded degrees by up to a metre")
+    require_finite("geodetic", checked)
+    lat, lon, height = (axis.numpy() for axis in checked.detach().cpu().unbind(-1))
     if (abs(lat) > 90).any():
         raise InputError("geodetic: a latitude is outside -90 to 90; the order is latitude, longitude, height")
     enu = _pipeline(origin).transform(lon, lat, height)

@@ -1,0 +1,128 @@
+"""`kcal locate`: pixel pairs to positions on the Earth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from kcal.locate.positions import Located, Position
+
+
+def locate(
+    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
+    points: Annotated[Path, typer.Argument(help="CSV with the columns name,left_u,left_v,right_u,right_v.")],
+    origin: Annotated[
+        str,
+        typer.Option(metavar="LAT,LON,HEIGHT", help="Left camera: degrees, degrees, metres above the WGS84 ellipsoid."),
+    ],
+    heading: Annotated[
+        float, typer.Option(metavar="DEG", help="Azimuth of the left camera's axis, clockwise from true north.")
+    ],
+    pitch: Annotated[float, typer.Option(metavar="DEG", help="Elevation of the left camera's axis, up.")] = 0.0,
+    roll: Annotated[
+        float, typer.Option(metavar="DEG", help="Roll of the left camera, clockwise as seen from behind it.")
+    ] = 0.0,
+    pixel_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of the marks along each axis.")] = 0.3,
+    output: Annotated[
+        list[Path] | None, typer.Option("--output", "-o", help="A .geojson or .csv file to write; may be repeated.")
+    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="A .png file for the map.")] = None,
+) -> None:
+    """Locate what was marked in both images: latitude, longitude, height and an honest range interval.
+
+    The interval holds the true range for 95 % of marks with the given noise. Errors of the calibration, the heading
+    and the origin come on top: 0.01° of relative yaw is 436 m at 5 km with a baseline of 10 m. Where the parallax is
+    below three sigma only the bearing is given. Heights are ellipsoidal, not above sea level.
+
+    Ends with exit code 1 if nothing at all could be located.
+
+    **Examples**
+
+    `kcal locate rig.json points.csv --origin 19.07,72.87,14 --heading 35 -o points.geojson`
+
+    `kcal locate rig.json points.csv --origin -33.9,151.2,10 --heading 250 --pitch -1.5 -o p.geojson -o p.csv
+    --picture map.png`
+    """
+    from kcal.cli.console import out, steps
+    from kcal.errors import DegenerateError
+    from kcal.files import check_writable
+    from kcal.io.rig_file import load_rig
+    from kcal.locate.export import check_format, write_positions
+    from kcal.locate.geodesy import Origin
+    from kcal.locate.marks import read_marks
+    from kcal.locate.positions import locate as locate_pairs
+    from kcal.report.positions import check_picture_format, save_positions_picture
+
+    outputs = output or []
+    for path in outputs:
+        check_format(path)
+        check_writable(path)
+    if picture is not None:
+        check_picture_format(picture)
+        check_writable(picture)
+    place = Origin.parse(origin)
+    marks = read_marks(points)
+    located = locate_pairs(
+        load_rig(rig),
+        marks.left,
+        marks.right,
+        origin=place,
+        heading_deg=heading,
+        pitch_deg=pitch,
+        roll_deg=roll,
+        pixel_sigma=pixel_sigma,
+        names=marks.names,
+    )
+    with steps("writing", len(outputs) + (picture is not None)) as advance:
+        for path in outputs:
+            write_positions(path, located)
+            advance(path.name)
+        if picture is not None:
+            save_positions_picture(picture, located)
+            advance(picture.name)
+    out.print(_table(located))
+    out.print(f"Interval: 95 % of the marks' noise ({pixel_sigma:g} px); calibration errors are not included.")
+    for path in [*outputs, *([picture] if picture is not None else [])]:
+        out.print(f"wrote {path}", markup=False)
+    if located.count == 0:
+        raise DegenerateError(f"{points}: none of the {len(located.positions)} pairs could be located; see the table")
+
+
+def _table(located: Located) -> object:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("name")
+    for column in ("lat °", "lon °", "height m", "range m", "interval m"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("status")
+    for position in located.positions:
+        status = position.status.name.lower().replace("_", " ")
+        table.add_row(
+            escape(position.name),
+            *_numbers(position),
+            escape(f"{status}: {position.reason}" if position.reason else status),
+        )
+    return table
+
+
+def _numbers(position: Position) -> tuple[str, str, str, str, str]:
+    low, high = position.range_low_m, position.range_high_m
+    interval = "" if low is None or high is None else f"{_metres(low)} – {_metres(high)}"
+    if position.lat is None or position.lon is None or position.height is None or position.range_m is None:
+        return "", "", "", "", interval
+    return (
+        f"{position.lat:.7f}",
+        f"{position.lon:.7f}",
+        f"{position.height:.1f}",
+        _metres(position.range_m),
+        interval,
+    )
+
+
+def _metres(value: float) -> str:
+    return "∞" if value == float("inf") else f"{value:.1f}" if value < 1000 else f"{value:.0f}"

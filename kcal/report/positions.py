@@ -1,0 +1,296 @@
+"""A picture of located points: a map with a logarithmic range scale, and the range intervals side by side."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.files import write_atomic
+from kcal.locate.positions import Located, Position
+from kcal.locate.stereo import Status
+
+Array = NDArray[np.float64]
+
+_LEFT, _RIGHT, _POINT, _TRUE, _FAINT, _UNSURE = "#2b6cb0", "#dd7a1f", "#111827", "#c02a6b", "#9aa3af", "#8a5a00"
+# The arcs of the paper's figure first, then rounder fillers where there is room.
+_ARCS = [250, 1000, 5000, 100, 500, 2500, *(k * 10.0**e for e in (0, 1, 4, 5) for k in (1, 2.5, 5)), 10.0**6]
+_NAMED = 40
+_HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
+
+
+def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
+    """Draw located points as seen from above, north up, and their range intervals.
+
+    Distances from the left camera are drawn as log(1 + range / r0), azimuths as they are, so that 100 m and 5 km can
+    both be read. A bar along the line of sight is the 95 % range interval of the marks' noise (calibration errors are
+    not in it); with an arrow head it goes on to infinity.
+
+    Args:
+        located: from `kcal.locate.positions.locate`.
+        truth: (N, 3) true east, north, up in metres, NaN where unknown; an arrow leads from each to its estimate.
+
+    Returns:
+        A matplotlib figure that belongs to no window and no global state.
+
+    Raises:
+        InputError: a truth of the wrong shape.
+    """
+    true_enu = None if truth is None else truth.detach().cpu().double().numpy()
+    if true_enu is not None and true_enu.shape != (len(located.positions), 3):
+        raise InputError(f"truth: shape ({len(located.positions)}, 3) is needed, got {true_enu.shape}")
+    shown = [i for i, position in enumerate(located.positions) if position.range_low_m is not None]
+    scale = _RangeScale(located, true_enu)
+    figure = Figure(figsize=(13.0, 7.4), dpi=130, facecolor="white")
+    FigureCanvasAgg(figure)
+    plan, ranges = figure.subplots(1, 2, width_ratios=[1.45, 1.0])
+    _draw_plan(plan, located, true_enu, shown, scale)
+    _draw_ranges(ranges, located, true_enu, shown, scale)
+    figure.suptitle(
+        f"{located.count} of {len(located.positions)} points located from "
+        f"{located.origin.lat:.6f}°, {located.origin.lon:.6f}°, heading {located.heading_deg:g}°",
+        x=0.015,
+        ha="left",
+        fontsize=14,
+    )
+    figure.text(0.015, 0.02, _footer(located), fontsize=9, color="#4b5563", va="bottom", linespacing=1.4)
+    figure.subplots_adjust(left=0.015, right=0.975, top=0.91, bottom=0.17, wspace=0.14)
+    return figure
+
+
+def save_positions_picture(path: str | Path, located: Located, truth: Tensor | None = None) -> Path:
+    """Write the picture of `positions_figure` as a PNG, atomically.
+
+    Raises:
+        InputError: a suffix other than .png, or a truth of the wrong shape.
+        FileError: the file cannot be written.
+    """
+    check_picture_format(path)
+    data = io.BytesIO()
+    positions_figure(located, truth).savefig(data, format="png")
+    return write_atomic(path, data.getvalue())
+
+
+def check_picture_format(path: str | Path) -> None:
+    """Raise `InputError` unless `path` ends with .png."""
+    if Path(path).suffix.lower() != ".png":
+        raise InputError(f"{path}: the picture is a PNG; the file name must end with .png")
+
+
+class _RangeScale:
+    """ENU metres to the plane of the map: azimuth kept, range turned into log(1 + range / r0), the rim at 1."""
+
+    def __init__(self, located: Located, true_enu: Array | None) -> None:
+        ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
+        if true_enu is not None:
+            ranges += list(np.hypot(true_enu[:, 0], true_enu[:, 1]))
+        ranges = [value for value in ranges if math.isfinite(value) and value > 0] or [100.0, 1000.0]
+        highs = [p.range_high_m for p in located.positions if p.status == Status.OK and p.range_high_m is not None]
+        # One wide interval must not squeeze everything else.
+        reach = max([max(ranges), *(min(high, 2.5 * max(ranges)) for high in highs)])
+        self.nearest, self.rim = min(ranges), 1.25 * reach
+        self._r0 = max(self.nearest / 2.0, self.rim / 1000.0)
+
+    def radius(self, metres: float | Array) -> Array:
+        return np.asarray(np.log1p(np.minimum(metres, self.rim) / self._r0) / math.log1p(self.rim / self._r0))
+
+    def place(self, enu: Array) -> Array:
+        """(..., 2 or more) east, north in metres to map coordinates (..., 2)."""
+        distance = np.hypot(enu[..., 0], enu[..., 1])[..., None]
+        return np.asarray(enu[..., :2] / np.maximum(distance, 1e-9) * self.radius(distance))
+
+    def polar(self, azimuth_deg: float | Array, metres: float | Array) -> Array:
+        azimuth = np.radians(azimuth_deg)
+        return np.stack([np.sin(azimuth) * self.radius(metres), np.cos(azimuth) * self.radius(metres)], -1)
+
+    def arcs(self) -> list[float]:
+        """Round ranges far enough from each other to be labelled."""
+        chosen: list[float] = []
+        for arc in _ARCS:
+            apart = all(abs(self.radius(arc) - self.radius(other)) > 0.09 for other in chosen)
+            if self.nearest / 4 <= arc < 0.97 * self.rim and apart:
+                chosen.append(float(arc))
+        return sorted(chosen)
+
+
+def _xy(place: Array) -> tuple[float, float]:
+    return float(place[0]), float(place[1])
+
+
+def _length(metres: float) -> str:
+    return f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
+
+
+def _draw_plan(axes: Axes, located: Located, true_enu: Array | None, shown: list[int], scale: _RangeScale) -> None:
+    # Azimuths count from the heading here, so that a view across north is one stretch.
+    edges = [(a - located.heading_deg + 180) % 360 - 180 for c in located.cameras for a in c.azimuths_deg or ()]
+    low, high = (min(edges), max(edges)) if edges else (-180.0, 180.0)
+    seen = [(located.positions[i].azimuth_deg or 0.0) - located.heading_deg for i in shown]
+    seen = [(a + 180) % 360 - 180 for a in seen]
+    low, high = min([low, *seen]) - 4, max([high, *seen]) + 4
+    sweep = np.linspace(low, high, 200) + located.heading_deg
+    extent = [np.zeros((1, 2))]
+    for arc in scale.arcs():
+        line = scale.polar(sweep, arc)
+        extent.append(line)
+        axes.plot(*line.T, color=_FAINT, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
+        direction = line[-1] - line[-2]
+        place = line[-1] + direction / np.hypot(*direction) * 0.012
+        turn = (90.0 - sweep[-1]) - 90.0
+        turn = (turn + 90) % 180 - 90
+        outward = direction[0] >= 0
+        axes.text(
+            place[0], place[1], _length(arc), fontsize=8.5, color="#4b5563", rotation=turn, rotation_mode="anchor",
+            ha="left" if outward else "right", va="center",
+        )  # fmt: skip
+    for camera, colour in zip(located.cameras, (_LEFT, _RIGHT), strict=True):
+        foot = np.asarray(camera.enu[:2])
+        if camera.azimuths_deg is not None:
+            first, last = camera.azimuths_deg
+            fan = np.radians(np.linspace(first, first + (last - first) % 360, 120))
+            rim = foot + scale.rim * np.stack([np.sin(fan), np.cos(fan)], -1)
+            # Straight lines from a camera beside the centre are curved on a logarithmic map: follow them.
+            steps = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 60)])[:, None]
+            outline = np.concatenate([foot + steps * (rim[0] - foot), rim, (foot + steps * (rim[-1] - foot))[::-1]])
+            wedge = scale.place(outline)
+            extent.append(wedge)
+            axes.fill(*wedge.T, facecolor=colour, alpha=0.07, edgecolor="none", zorder=0)
+            axes.plot(*wedge.T, color=colour, alpha=0.55, linewidth=0.9, zorder=1)
+        axes.plot(*scale.place(foot), "o", color=colour, markersize=7, zorder=6, label=f"{camera.name} camera")
+    for i in shown:
+        position = located.positions[i]
+        _draw_sight(axes, position, scale)
+        if true_enu is not None and np.isfinite(true_enu[i]).all():
+            _draw_truth(axes, position, scale.place(true_enu[i]), scale)
+    points = [scale.place(np.asarray(located.positions[i].enu)) for i in shown if located.positions[i].enu]
+    if points:
+        axes.plot(
+            *np.stack(points).T, "o", color=_POINT, markerfacecolor="white", markersize=6, zorder=7, label="estimated"
+        )
+    if true_enu is not None:
+        axes.plot([], [], "x", color=_TRUE, markeredgewidth=1.6, label="true (arrow to estimated)")
+    if len(shown) <= _NAMED:
+        _draw_names(axes, located, shown, scale)
+    box = np.concatenate(extent)
+    (left, bottom), (right, top) = box.min(0) - 0.05, box.max(0) + 0.05
+    axes.set(xlim=(left - 0.04, right + 0.08), ylim=(bottom, top), aspect="equal", anchor="C")
+    axes.axis("off")
+    axes.annotate(
+        "", (0.03, 1.0), (0.03, 0.89), xycoords="axes fraction",
+        arrowprops={"arrowstyle": "-|>", "color": "#374151", "linewidth": 1.4},
+    )  # fmt: skip
+    axes.text(0.03, 0.88, "N", transform=axes.transAxes, ha="center", va="top", fontsize=11, color="#374151")
+    axes.legend(
+        loc="upper center", bbox_to_anchor=(0.5, -0.005), ncols=4, fontsize=9, frameon=False, handletextpad=0.3,
+        columnspacing=1.4,
+    )  # fmt: skip
+    axes.set_title("From above, range on a logarithmic scale", fontsize=10.5, loc="center", color="#374151")
+
+
+def _draw_sight(axes: Axes, position: Position, scale: _RangeScale) -> None:
+    """The interval along the line of sight; dashed where only the bearing is known."""
+    low, high, azimuth = position.range_low_m, position.range_high_m, position.azimuth_deg
+    if low is None or high is None or azimuth is None or math.isinf(low):
+        return
+    tilt = math.cos(math.radians(position.elevation_deg or 0.0))
+    known = position.status == Status.OK
+    start, end = scale.polar(azimuth, low * tilt), scale.polar(azimuth, min(high * tilt, scale.rim))
+    colour = _POINT if known else _UNSURE
+    style = {"linewidth": 2.6, "alpha": 0.45} if known else {"linewidth": 1.4, "linestyle": (0, (3, 2))}
+    axes.plot(*np.stack([start, end]).T, color=colour, solid_capstyle="butt", zorder=3, **style)
+    if high * tilt > scale.rim:
+        axes.annotate(
+            "", _xy(end), _xy(start + 0.97 * (end - start)), zorder=3,
+            arrowprops={"arrowstyle": "-|>", "color": colour, "alpha": 0.8, "shrinkA": 0, "shrinkB": 0},
+        )  # fmt: skip
+
+
+def _draw_truth(axes: Axes, position: Position, true: Array, scale: _RangeScale) -> None:
+    axes.plot(*true, "x", color=_TRUE, markersize=7, markeredgewidth=1.6, zorder=8)
+    if position.enu is not None:
+        estimate = scale.place(np.asarray(position.enu))
+        if np.hypot(*(estimate - true)) > 0.012:
+            axes.annotate(
+                "", _xy(estimate), _xy(true), zorder=8,
+                arrowprops={"arrowstyle": "->", "color": _TRUE, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 2},
+            )  # fmt: skip
+
+
+def _draw_names(axes: Axes, located: Located, shown: list[int], scale: _RangeScale) -> None:
+    """Each name beside its point, on the side with more room."""
+    anchors = []
+    for i in shown:
+        position = located.positions[i]
+        if position.enu is not None:
+            anchors.append(scale.place(np.asarray(position.enu)))
+        else:
+            low = position.range_low_m if position.range_low_m and math.isfinite(position.range_low_m) else scale.rim
+            anchors.append(scale.polar(position.azimuth_deg or 0.0, low))
+    for i, anchor in zip(shown, anchors, strict=True):
+        others = [other - anchor for other in anchors if other is not anchor]
+        crowded = any(0 < other[0] < 0.2 and abs(other[1]) < 0.03 for other in others)
+        side = -1 if crowded else 1
+        axes.annotate(
+            located.positions[i].name, _xy(anchor), (8 * side, 0), textcoords="offset points", fontsize=9, zorder=9,
+            ha="left" if side > 0 else "right", va="center", path_effects=_HALO,
+        )  # fmt: skip
+
+
+def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: list[int], scale: _RangeScale) -> None:
+    axes.set_title("Range and its 95 % interval", fontsize=10.5, color="#374151")
+    order = sorted(shown, key=lambda i: located.positions[i].range_m or located.positions[i].range_low_m or 0.0)
+    left = max(scale.nearest / 2, scale.rim / 1e5)
+    right = scale.rim * 1.15
+    for row, i in enumerate(order):
+        position = located.positions[i]
+        low, high = position.range_low_m, position.range_high_m
+        if low is None or high is None:
+            continue
+        colour = _POINT if position.status == Status.OK else _UNSURE
+        low = min(max(low, left), right)
+        axes.plot([low, min(high, right)], [row, row], color=colour, linewidth=4, alpha=0.4, solid_capstyle="butt")
+        if high > right:
+            axes.plot(right, row, ">", color=colour, markersize=7, clip_on=False)
+        if position.range_m is not None:
+            axes.plot(position.range_m, row, "o", color=_POINT, markerfacecolor="white", markersize=6, zorder=3)
+        if true_enu is not None and np.isfinite(true_enu[i]).all():
+            axes.plot(np.linalg.norm(true_enu[i]), row, "x", color=_TRUE, markersize=7, markeredgewidth=1.6, zorder=4)
+    ticks = [arc for arc in scale.arcs() if left <= arc <= right]
+    axes.set_xscale("log")
+    axes.set(xlim=(left, right), ylim=(len(order) - 0.3, -0.7))
+    axes.set_xticks(ticks, [_length(tick) for tick in ticks], fontsize=9)
+    axes.set_xticks([], minor=True)
+    names = [f"{located.positions[i].name}  {_estimate(located.positions[i])}" for i in order]
+    axes.set_yticks(range(len(order)) if len(order) <= _NAMED else [])
+    if len(order) <= _NAMED:
+        axes.set_yticklabels(names, fontsize=9 if len(order) <= 20 else 7)
+    axes.grid(axis="x", color="#e5e7eb", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+
+
+def _estimate(position: Position) -> str:
+    return "bearing only" if position.range_m is None else f"{position.range_m:,.0f} m"
+
+
+def _footer(located: Located) -> str:
+    lines = [
+        f"Bars: 95 % range interval from marks with {located.pixel_sigma:g} px of noise. "
+        "Errors of the calibration and of the heading are not included."
+    ]
+    failed: Sequence[Position] = [p for p in located.positions if p.range_low_m is None]
+    lines += [f"{p.name}: {p.reason}" for p in failed[:3]]
+    if len(failed) > 3:
+        lines.append(f"and {len(failed) - 3} more without a bearing")
+    return "\n".join(lines)
