@@ -7,7 +7,8 @@ the pose of the board in each view. Everything is in the frame of the first came
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -42,7 +43,7 @@ class BoardState:
     def pack(self) -> State:
         """As the solver's tuple."""
         return (
-            torch.cat(self.parameters),
+            torch.cat(self.parameters, -1),
             self.warp,
             self.cam_from_first_rotation,
             self.cam_from_first_translation,
@@ -63,7 +64,7 @@ def warp_shape(board_points: Tensor) -> Tensor:
 
 
 class BoardProblem(SchurProblem):
-    """Reprojection residuals (pixels) of boards.
+    """Reprojection residuals (pixels) of boards; every tensor of a state may have leading batch dimensions.
 
     Args:
         board_points: (N, 3) metres, z = 0.
@@ -71,7 +72,7 @@ class BoardProblem(SchurProblem):
         models: one lens model a camera.
         free: for each camera the indices of its free parameters.
         free_warp: whether the board's warp is estimated.
-        weights: (V, C, N) multiplies residuals, 1 / σ for example; default 1.
+        batch: leading shape of the states, () for one solve.
     """
 
     local_size = 6
@@ -84,123 +85,121 @@ class BoardProblem(SchurProblem):
         free: Sequence[Sequence[int]],
         *,
         free_warp: bool = False,
-        weights: Tensor | None = None,
+        batch: tuple[int, ...] = (),
     ) -> None:
         self.models = tuple(models)
         self.free = tuple(tuple(indices) for indices in free)
         self.free_warp = free_warp
+        self.batch = batch
         self._board = board_points.T.contiguous()
         self._shape = warp_shape(board_points)
-        seen = torch.isfinite(pixels).all(-1)
-        weight = seen.to(pixels.dtype) if weights is None else torch.where(seen, weights, 0.0)
-        self._weight = weight[:, :, None, :]
-        self._used = weight > 0
-        self._target = torch.where(seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
-        self.residual_count = 2 * int(self._used.sum())
+        self._seen = torch.isfinite(pixels).all(-1)
+        self._all_seen = bool(self._seen.all())
+        self._target = torch.where(self._seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
+        self.residual_count = 2 * int(self._seen.sum())
         self._sizes = [len(INTRINSICS) + model.size for model in self.models]
-        counts = [len(indices) for indices in self.free]
-        self._camera_slots = [slice(6 + sum(counts[:c]), 6 + sum(counts[: c + 1])) for c in range(len(self.models))]
-        after = 6 + sum(counts)
-        self._pose_slots = [slice(after + 6 * c, after + 6 * c + 6) for c in range(len(self.models) - 1)]
-        self._warp_slot = after + 6 * (len(self.models) - 1)
-        self.shared_size = self._warp_slot - 6 + 2 * free_warp
+        # Where each block of shared parameters stands in a step: cameras, poses of the further cameras, warp.
+        counts = [*(len(indices) for indices in self.free), *[6] * (len(self.models) - 1), 2 * free_warp]
+        ends = list(itertools.accumulate(counts))
+        slots = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+        self._camera_slots = slots[: len(self.models)]
+        self._pose_slots = slots[len(self.models) : -1]
+        self._warp_slot = slots[-1]
+        self.shared_size = ends[-1]
 
     def unpack(self, state: State) -> BoardState:
         """The solver's tuple as named tensors."""
         parameters, *rest = state
         return BoardState(
-            parameters=tuple(parameters.split(self._sizes)),
-            **dict(zip([f.name for f in dataclasses.fields(BoardState)][1:], rest, strict=True)),
+            parameters=tuple(parameters.split(self._sizes, -1)),
+            **dict(zip([field.name for field in dataclasses.fields(BoardState)][1:], rest, strict=True)),
         )
 
     def _points(self, s: BoardState) -> tuple[Tensor, Tensor]:
-        """Board points rotated into the first camera (V, 3, N), and moved there."""
+        """Board points rotated into the first camera (..., V, 3, N), and moved there."""
         flat = self._board
         if self.free_warp or bool(s.warp.any()):
-            flat = torch.cat([flat[:2], flat[2:] + s.warp @ self._shape], 0)
+            height = (s.warp[..., None, :] @ self._shape)[..., None, :, :]
+            plane = flat[:2].expand(*height.shape[:-2], -1, -1)
+            flat = torch.cat([plane, height], -2)
         rotated = s.first_from_board_rotation @ flat
         return rotated, rotated + s.first_from_board_translation[..., None]
 
-    def residuals(self, state: State) -> Tensor:
-        """See `SchurProblem.residuals`; NaN where a used corner lies behind a camera or beyond a pole."""
-        s = self.unpack(state)
+    def _views(self, s: BoardState) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+        """For each camera: its number, points rotated by its pose, points in its frame, its parameters."""
         _, points = self._points(s)
-        out = []
-        for c, model in enumerate(self.models):
-            if c > 0:
-                points_c = s.cam_from_first_rotation[c - 1] @ points + s.cam_from_first_translation[c - 1][:, None]
+        for c, parameters in enumerate(s.parameters):
+            if c == 0:
+                yield c, points, points, parameters[..., None, :]
             else:
-                points_c = points
-            projected = project_components(points_c, s.parameters[c], model)
-            bad = self._used[:, c] & ~projected.positive
-            error = (projected.pixels - self._target[:, c]) * self._weight[:, c]
-            out.append(torch.where(bad[:, None, :], torch.nan, error))
-        return torch.stack(out, 1).flatten(1)
+                rotated = s.cam_from_first_rotation[..., None, c - 1, :, :] @ points
+                moved = rotated + s.cam_from_first_translation[..., None, c - 1, :, None]
+                yield c, rotated, moved, parameters[..., None, :]
+
+    def residuals(self, state: State) -> Tensor:
+        """See `SchurProblem.residuals`; NaN where a seen corner lies behind a camera, beyond a pole or a fold."""
+        out = []
+        for c, _, points, parameters in self._views(self.unpack(state)):
+            projected = project_components(points, parameters, self.models[c])
+            error = projected.pixels - self._target[:, c]
+            seen = self._seen[:, c, None]
+            bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
+            out.append(torch.where(seen, error + bad, 0.0))
+        return torch.stack(out, -3).flatten(-3)
 
     def rows(self, state: State) -> Tensor:
         """See `SchurProblem.rows`."""
         s = self.unpack(state)
-        rotated, points = self._points(s)
-        views, _, count = points.shape
-        cameras = len(self.models)
-        rows = points.new_zeros((views, 6 + self.shared_size + 1, cameras, 2, count))
-        for c, model in enumerate(self.models):
-            if c > 0:
-                turn = s.cam_from_first_rotation[c - 1]
-                rotated_c = turn @ points
-                points_c = rotated_c + s.cam_from_first_translation[c - 1][:, None]
-            else:
-                points_c = points
-            projected = project_components(points_c, s.parameters[c], model, self.free[c])
+        rotated_board, points = self._points(s)
+        shape = (*points.shape[:-2], 6 + self.shared_size + 1, len(self.models), 2, points.shape[-1])
+        rows = points.new_zeros(shape)
+        shared = rows[..., 6:-1, :, :, :]
+        for c, rotated, moved, parameters in self._views(s):
+            projected = project_components(moved, parameters, self.models[c], self.free[c])
             by_first = projected.by_point
             if c > 0:
-                rows[:, self._pose_slots[c - 1], c] = step_rows(projected.by_point, rotated_c)
-                by_first = torch.einsum("vkun,kj->vjun", projected.by_point, turn)
-            rows[:, :6, c] = step_rows(by_first, rotated)
-            rows[:, self._camera_slots[c], c] = projected.by_camera
+                turn = s.cam_from_first_rotation[..., c - 1, :, :]
+                shared[..., self._pose_slots[c - 1], c, :, :] = step_rows(projected.by_point, rotated)
+                by_first = torch.einsum("...vkun,...kj->...vjun", projected.by_point, turn)
+            rows[..., :6, c, :, :] = step_rows(by_first, rotated_board)
+            shared[..., self._camera_slots[c], c, :, :] = projected.by_camera
             if self.free_warp:
-                along = torch.einsum("vkun,vk->vun", by_first, s.first_from_board_rotation[..., 2])
-                rows[:, self._warp_slot : self._warp_slot + 2, c] = along[:, None] * self._shape[:, None]
-            rows[:, -1, c] = projected.pixels - self._target[:, c]
-        rows *= self._weight[:, None]
-        # A corner that was not seen may have no finite derivative either.
-        return (
-            torch.where(self._used[:, None, :, None], rows, 0.0).flatten(2)
-            if not bool(self._used.all())
-            else (rows.flatten(2))
-        )
+                normal = s.first_from_board_rotation[..., 2]
+                along = torch.einsum("...vkun,...vk->...vun", by_first, normal)
+                shared[..., self._warp_slot, c, :, :] = along[..., None, :, :] * self._shape[:, None]
+            rows[..., -1, c, :, :] = projected.pixels - self._target[:, c]
+        if not self._all_seen:
+            rows = torch.where(self._seen[:, None, :, None], rows, 0.0)
+        return rows.flatten(-3)
 
     def retract(self, state: State, step: State) -> State:
         """See `SchurProblem.retract`."""
         s = self.unpack(state)
         shared, local = step
         parameters = []
-        for c, indices in enumerate(self.free):
-            moved = s.parameters[c].clone()
-            moved[list(indices)] += shared[self._camera_slots[c].start - 6 : self._camera_slots[c].stop - 6]
-            parameters.append(moved)
-        warp = s.warp + shared[self._warp_slot - 6 :] if self.free_warp else s.warp
-        cameras = len(self.models) - 1
-        poses = shared[self._warp_slot - 6 - 6 * cameras : self._warp_slot - 6].reshape(cameras, 6)
-        if cameras:
-            rotation, translation = move(s.cam_from_first_rotation, s.cam_from_first_translation, poses)
-        else:
-            rotation, translation = s.cam_from_first_rotation, s.cam_from_first_translation
-        board_rotation, board_translation = move(s.first_from_board_rotation, s.first_from_board_translation, local)
+        for before, indices, slot in zip(s.parameters, self.free, self._camera_slots, strict=True):
+            after = before.clone()
+            after[..., list(indices)] += shared[..., slot]
+            parameters.append(after)
+        rotation, translation = s.cam_from_first_rotation, s.cam_from_first_translation
+        if self._pose_slots:
+            poses = torch.stack([shared[..., slot] for slot in self._pose_slots], -2)
+            rotation, translation = move(rotation, translation, poses)
+        board = move(s.first_from_board_rotation, s.first_from_board_translation, local)
         return BoardState(
             parameters=tuple(parameters),
-            warp=warp,
+            warp=s.warp + shared[..., self._warp_slot] if self.free_warp else s.warp,
             cam_from_first_rotation=rotation,
             cam_from_first_translation=translation,
-            first_from_board_rotation=board_rotation,
-            first_from_board_translation=board_translation,
+            first_from_board_rotation=board[0],
+            first_from_board_translation=board[1],
         ).pack()
 
-    def tidy(self, state: State) -> BoardState:
+    def tidy(self, state: State) -> State:
         """The state with its rotations made orthonormal again after many small steps."""
         s = self.unpack(state)
         return dataclasses.replace(
             s,
             cam_from_first_rotation=nearest_rotation(s.cam_from_first_rotation),
             first_from_board_rotation=nearest_rotation(s.first_from_board_rotation),
-        )
+        ).pack()

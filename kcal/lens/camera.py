@@ -142,10 +142,14 @@ class Camera(nn.Module):
     def normalize(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Map pixels to undistorted coordinates on the plane z = 1: (normalized (..., N, 2), valid (..., N))."""
         pixels = as_points("pixels", pixels, 2)
+        # Taken out before any arithmetic: 0 * NaN in the backward pass would spoil the gradients of the parameters.
+        finite = torch.isfinite(pixels).all(-1)
+        pixels = torch.where(finite[..., None], pixels, self.center[..., None, :])
         fx, fy, cx, cy, skew = (self.parameters_vector[..., i, None] for i in range(5))
         y = (pixels[..., 1] - cy) / fy
         x = (pixels[..., 0] - cx - skew * y) / fx
-        return undistort(torch.stack([x, y], -1), self.coefficients, self.model, self.valid_radius)
+        normalized, valid = undistort(torch.stack([x, y], -1), self.coefficients, self.model, self.valid_radius)
+        return normalized, valid & finite
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Map pixels to rays.

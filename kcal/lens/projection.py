@@ -33,13 +33,13 @@ class Projection(NamedTuple):
         pixels: (..., 2, N).
         by_point: (..., 3, 2, N), by X, Y, Z of the point in the camera frame.
         by_camera: (..., C, 2, N), by the wanted camera parameters.
-        positive: (..., N), in front of the camera and before any pole.
+        regular: (..., N), in front of the camera, before any pole, and not folded over (det J > 0).
     """
 
     pixels: Tensor
     by_point: Tensor
     by_camera: Tensor
-    positive: Tensor
+    regular: Tensor
 
 
 def project_components(
@@ -62,12 +62,12 @@ def project_components(
     lens = distort_components(x, y, parameters[..., offset:], model, lens_wanted)
     fx, fy, cx, cy, skew = (parameters[..., i, None] for i in range(offset))
     pixels = torch.stack([fx * lens.x + skew * lens.y + cx, fy * lens.y + cy], -2)
-    positive = lens.positive & (Z > 0)
+    a, b, d, e = lens.point
+    regular = lens.positive & (Z > 0) & (a * e - b * d > 0)
     if wanted is None:
         empty = pixels.new_zeros((*pixels.shape[:-2], 0, *pixels.shape[-2:]))
-        return Projection(pixels, empty, empty, positive)
+        return Projection(pixels, empty, empty, regular)
 
-    a, b, d, e = lens.point
     ux, uy = (fx * a + skew * d) * inverse, (fx * b + skew * e) * inverse
     vx, vy = fy * d * inverse, fy * e * inverse
     columns = [ux, vx, uy, vy, -(ux * x + uy * y), -(vx * x + vy * y)]
@@ -87,4 +87,4 @@ def project_components(
         by_camera = torch.stack(torch.broadcast_tensors(*flat), -2).unflatten(-2, (len(wanted), 2))
     else:
         by_camera = pixels.new_zeros((*pixels.shape[:-2], 0, *pixels.shape[-2:]))
-    return Projection(pixels, by_point, by_camera, positive)
+    return Projection(pixels, by_point, by_camera, regular)

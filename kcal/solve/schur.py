@@ -18,50 +18,49 @@ class SchurLinearisation:
     """Normal equations built from each view's rows of derivatives.
 
     Args:
-        rows: (V, L + S + 1, R): for each view the derivatives of its R residuals by its L local parameters, by the S
-            shared ones, and the residuals themselves.
+        rows: (..., V, L + S + 1, R): for each view the derivatives of its R residuals by its L local parameters, by
+            the S shared ones, and the residuals themselves.
         local_size: L.
     """
 
     def __init__(self, rows: Tensor, local_size: int) -> None:
         L = local_size
         gram = rows @ rows.transpose(-1, -2)
-        self.cost = 0.5 * gram[:, -1, -1].sum()
-        local, coupling, shared = gram[:, :L, :L], gram[:, :L, L:-1], gram[:, L:-1, L:-1].sum(0)
-        diagonal = local.diagonal(dim1=-2, dim2=-1)
-        self._local_scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
-        self._shared_scale = torch.where(shared.diagonal() > 0, shared.diagonal(), 1.0).rsqrt()
-        self._local = local * self._local_scale[:, :, None] * self._local_scale[:, None, :]
-        self._coupling = coupling * self._local_scale[:, :, None] * self._shared_scale
-        self._shared = shared * self._shared_scale[:, None] * self._shared_scale
-        self._local_gradient = gram[:, :L, -1] * self._local_scale
-        self._shared_gradient = gram[:, L:-1, -1].sum(0) * self._shared_scale
+        total = gram[..., L:, L:].sum(-3)
+        self.cost = 0.5 * total[..., -1, -1]
+        local, coupling, shared = gram[..., :L, :L], gram[..., :L, L:-1], total[..., :-1, :-1]
+        self._local_scale = _inverse_root(local.diagonal(dim1=-2, dim2=-1))
+        self._shared_scale = _inverse_root(shared.diagonal(dim1=-2, dim2=-1))
+        self._local = local * self._local_scale[..., :, None] * self._local_scale[..., None, :]
+        self._coupling = coupling * self._local_scale[..., :, None] * self._shared_scale[..., None, None, :]
+        self._shared = shared * self._shared_scale[..., :, None] * self._shared_scale[..., None, :]
+        self._local_gradient = gram[..., :L, -1] * self._local_scale
+        self._shared_gradient = total[..., :-1, -1] * self._shared_scale
 
     def _reduce(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Eliminate the local blocks: reduced matrix, reduced gradient, D⁻¹[B, g] of the views, failures."""
-        damped = self._local + damping * torch.eye(self._local.shape[-1]).to(self._local)
-        factor, info = torch.linalg.cholesky_ex(damped)
+        factor, info = torch.linalg.cholesky_ex(_damped(self._local, damping[..., None]))
         right = torch.cat([self._coupling, self._local_gradient[..., None]], -1)
         solved = torch.cholesky_solve(right, factor)
         # One product over all views at once: (S, V L) times (V L, S + 1).
-        folded = self._coupling.flatten(0, 1).T @ solved.flatten(0, 1)
-        matrix = self._shared + damping * torch.eye(self._shared.shape[-1]).to(self._shared) - folded[:, :-1]
-        return matrix, self._shared_gradient - folded[:, -1], solved, info.any()
+        folded = self._coupling.flatten(-3, -2).transpose(-1, -2) @ solved.flatten(-3, -2)
+        matrix = _damped(self._shared, damping) - folded[..., :-1]
+        return matrix, self._shared_gradient - folded[..., -1], solved, (info != 0).any(-1)
 
     def step(self, damping: Tensor) -> tuple[State, Tensor]:
-        """See `Linearisation.step`; the step is (shared (S,), local (V, L))."""
+        """See `Linearisation.step`; the step is (shared (..., S), local (..., V, L))."""
         matrix, gradient, solved, failed = self._reduce(damping)
         factor, info = torch.linalg.cholesky_ex(matrix)
-        shared = -torch.cholesky_solve(gradient[:, None], factor)[:, 0]
-        local = -(solved[..., -1] + solved[..., :-1] @ shared)
-        squared = (shared * shared).sum() + (local * local).sum()
-        along = (self._shared_gradient * shared).sum() + (self._local_gradient * local).sum()
+        shared = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
+        local = -(solved[..., -1] + (solved[..., :-1] @ shared[..., None, :, None])[..., 0])
+        squared = (shared * shared).sum(-1) + (local * local).sum((-2, -1))
+        along = (self._shared_gradient * shared).sum(-1) + (self._local_gradient * local).sum((-2, -1))
         predicted = 0.5 * (damping * squared - along)
         predicted = torch.where(failed | (info != 0), torch.nan, predicted)
         return (shared * self._shared_scale, local * self._local_scale), predicted
 
     def information(self) -> tuple[Tensor, Tensor]:
-        """The reduced normal matrix of the shared parameters, scaled, with the scale of each: (S, S), (S,).
+        """The reduced normal matrix of the shared parameters, scaled, with the scale of each: (..., S, S), (..., S).
 
         Its inverse, multiplied by scale ⊗ scale and by the noise variance, is the covariance of the shared
         parameters with the local ones free.
@@ -70,32 +69,42 @@ class SchurLinearisation:
         return matrix, self._shared_scale
 
 
+def _inverse_root(diagonal: Tensor) -> Tensor:
+    """Scale of each column; a column of zeros keeps its place and never moves."""
+    return torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
+
+
+def _damped(matrix: Tensor, damping: Tensor) -> Tensor:
+    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    return matrix + damping[..., None, None] * identity
+
+
 class SchurProblem(ABC):
     """Base of problems with a state (shared, local), `local` beginning with the views.
 
     Subclasses give `rows`, `residuals` and `retract`.
     """
 
-    batch: tuple[int, ...] = ()
+    batch: tuple[int, ...]
     local_size: int
     residual_count: int
 
     @abstractmethod
     def residuals(self, state: State) -> Tensor:
-        """(V, R) residuals."""
+        """(..., V, R) residuals."""
 
     @abstractmethod
     def rows(self, state: State) -> Tensor:
-        """(V, L + S + 1, R), see `SchurLinearisation`."""
+        """(..., V, L + S + 1, R), see `SchurLinearisation`."""
 
     @abstractmethod
     def retract(self, state: State, step: State) -> State:
-        """Apply a step (shared (S,), local (V, L))."""
+        """Apply a step (shared (..., S), local (..., V, L))."""
 
     def cost(self, state: State) -> Tensor:
         """See `Problem.cost`."""
         residuals = self.residuals(state)
-        return 0.5 * (residuals * residuals).sum()
+        return 0.5 * (residuals * residuals).sum((-2, -1))
 
     def linearise(self, state: State) -> SchurLinearisation:
         """See `Problem.linearise`."""
