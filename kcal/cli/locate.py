@@ -76,7 +76,8 @@ def locate(
         pixel_sigma=pixel_sigma,
         names=marks.names,
     )
-    with steps("writing", len(outputs) + (picture is not None)) as advance:
+    written = [*outputs, *([] if picture is None else [picture])]
+    with steps("writing", len(written)) as advance:
         for path in outputs:
             write_positions(path, located)
             advance(path.name)
@@ -84,8 +85,11 @@ def locate(
             save_positions_picture(picture, located)
             advance(picture.name)
     out.print(_table(located))
+    for position in located.positions:
+        if position.reason:
+            out.print(f"* {position.name}: {position.reason}", markup=False)
     out.print(f"Interval: 95 % of the marks' noise ({pixel_sigma:g} px); calibration errors are not included.")
-    for path in [*outputs, *([picture] if picture is not None else [])]:
+    for path in written:
         out.print(f"wrote {path}", markup=False)
     if located.count == 0:
         raise DegenerateError(f"{points}: none of the {len(located.positions)} pairs could be located; see the table")
@@ -99,13 +103,13 @@ def _table(located: Located) -> object:
     table.add_column("name")
     for column in ("lat °", "lon °", "height m", "range m", "interval m"):
         table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("status")
+    table.add_column("status", no_wrap=True)
     for position in located.positions:
         status = position.status.name.lower().replace("_", " ")
         table.add_row(
             escape(position.name),
             *_numbers(position),
-            escape(f"{status}: {position.reason}" if position.reason else status),
+            status + (" *" if position.reason else ""),
         )
     return table
 

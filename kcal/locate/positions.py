@@ -216,20 +216,26 @@ def _reason(status: Status, result: Triangulation, i: int, pixel_sigma: float) -
 def _viewpoints(rig: StereoRig, enu_from_left: Tensor, origin: Origin) -> tuple[Viewpoint, Viewpoint]:
     rotation, translation = rig.right_from_left_rotation.cpu(), rig.right_from_left_translation.cpu()
     enu_from_right = enu_from_left @ rotation.T
-    left = _viewpoint("left", rig.left, torch.zeros(3, dtype=torch.float64), enu_from_left, origin)
-    return left, _viewpoint("right", rig.right, -enu_from_right @ translation, enu_from_right, origin)
+    enu = -enu_from_right @ translation
+    lat, lon, height = enu_to_geodetic(enu, origin).tolist()
+    here = (origin.lat, origin.lon, origin.height)
+    return (
+        _viewpoint("left", rig.left, torch.zeros_like(enu), enu_from_left, here),
+        _viewpoint("right", rig.right, enu, enu_from_right, (lat, lon, height)),
+    )
 
 
-def _viewpoint(name: str, camera: Camera, enu: Tensor, enu_from_camera: Tensor, origin: Origin) -> Viewpoint:
+def _viewpoint(
+    name: str, camera: Camera, enu: Tensor, enu_from_camera: Tensor, geodetic: tuple[float, float, float]
+) -> Viewpoint:
     width, height = camera.size
     ends = camera.focal.new_tensor([[-0.5, (height - 1) / 2], [width - 0.5, (height - 1) / 2]])
     rays, valid = camera.unproject(ends)
     first, last = azimuth_elevation(rays.cpu() @ enu_from_camera.T)[:, 0].tolist()
     east, north, up = enu.tolist()
-    lat, lon, ellipsoidal = enu_to_geodetic(enu, origin).tolist()
     return Viewpoint(
         name=name,
         enu=(east, north, up),
-        geodetic=(lat, lon, ellipsoidal),
+        geodetic=geodetic,
         azimuths_deg=(first, last) if bool(valid.all()) else None,
     )

@@ -36,6 +36,10 @@ class Status(enum.IntEnum):
     BEARING_ONLY = 6
 
 
+# Plain numbers: torch.compile cannot compare a tensor with an enum's member.
+_OK, _AT_INFINITY = int(Status.OK), int(Status.PARALLEL)
+
+
 class Triangulation(NamedTuple):
     """Result of `Triangulate`; no tensor holds NaN, whatever went in.
 
@@ -121,7 +125,7 @@ class Triangulate(nn.Module):
         finite = (torch.isfinite(pixels_left) & torch.isfinite(pixels_right)).all(-1)
 
         pair = _epipolar(rays_left, rays_right @ rotation, -translation @ rotation)
-        code = torch.full(rays_left.shape[:-1], Status.OK, dtype=torch.int8, device=rays_left.device)
+        code = torch.full(rays_left.shape[:-1], _OK, dtype=torch.int8, device=rays_left.device)
         for condition, status in (
             ((pair.parallax <= _PARALLEL) | pair.along_baseline, Status.PARALLEL),
             (pair.opposite & ~pair.along_baseline, Status.BEHIND),
@@ -129,21 +133,21 @@ class Triangulate(nn.Module):
             (~inside, Status.OUTSIDE_IMAGE),
             (~finite, Status.NOT_FINITE),
         ):
-            code = torch.where(condition, code.new_full((), status), code)
+            code = torch.where(condition, code.new_full((), int(status)), code)
 
         left_from_rig = torch.eye(3, 4, dtype=torch.float64, device=rotation.device)
         cameras = torch.stack([left_from_rig, torch.cat([rotation, translation[:, None]], -1)])
         points, solved = triangulate_linear(cameras, torch.stack([rays_left, rays_right], -2))
-        code = torch.where((code == Status.OK) & ~solved, code.new_full((), Status.PARALLEL), code)
+        code = torch.where((code == _OK) & ~solved, code.new_full((), _AT_INFINITY), code)
 
-        ok = (code == Status.OK)[..., None]
+        ok = (code == _OK)[..., None]
         points = torch.where(ok, points, rays_left)
         reprojected_left, _ = self.rig.left.project(points)
         reprojected_right, _ = self.rig.right.project(points @ rotation.T + translation)
         misses = torch.stack([reprojected_left - pixels_left, reprojected_right - pixels_right], -2)
         reprojection = torch.linalg.vector_norm(torch.where(ok[..., None], misses, 0.0), dim=-1)
 
-        known = ok[..., 0] | (code == Status.PARALLEL)
+        known = ok[..., 0] | (code == _AT_INFINITY)
         with torch.no_grad():
             sizes = (
                 _pixel_angle(self.rig.left, rays_left, pair.turn_left, pair.normal_left),

@@ -73,7 +73,7 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Te
 
     cameras = torch.cat([rotation, local], -1)[..., None, :, :, :]
     # (..., N, C, 3, 4): the ray crossed with each column of [R | t].
-    system = torch.linalg.cross(units[..., None], cameras, dim=-2).flatten(-3, -2)
+    system = torch.linalg.cross(*torch.broadcast_tensors(units[..., None], cameras), dim=-2).flatten(-3, -2)
     solution, determined = _null_vector(system)
     weight = solution[..., 3:]
     nearer = weight.abs() * _HORIZON > torch.linalg.vector_norm(solution[..., :3], dim=-1, keepdim=True)

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from locate_rigs import pinhole_rig, real_rig, tensor
+
+from kcal.locate.ranges import range_from_parallax, range_interval
+from kcal.locate.stereo import Status, Triangulate
+
+N = 20_000
+
+
+@pytest.mark.parametrize("z", [1000.0, 5000.0, 16_000.0])
+def test_interval_covers_95_percent_of_noisy_marks(z: float) -> None:
+    # f b = 16 000 px m: 16, 3.2 and 1 px of disparity against 0.42 px of noise in it.
+    rig = pinhole_rig(1600.0, 10.0)
+    point = tensor([150.0, -40.0, z])
+    left, right, _ = rig(point)
+    generator = torch.Generator().manual_seed(11)
+    noise = 0.3 * torch.randn(2, N, 2, dtype=torch.float64, generator=generator)
+    result = Triangulate(rig, pixel_sigma=0.3)(left + noise[0], right + noise[1])
+    true_range = point.norm()
+    covered = (result.range_low <= true_range) & (true_range <= result.range_high)
+    # 20 000 draws know 95 % to 0.15 %; the approximations of the interval must fit in the rest.
+    assert 0.94 < covered.double().mean().item() < 0.96
+    below, above = (true_range < result.range_low).double().mean(), (true_range > result.range_high).double().mean()
+    assert 0.02 < below.item() < 0.03
+    assert 0.02 < above.item() < 0.03
+
+
+def test_interval_covers_through_real_lenses_and_off_axis() -> None:
+    rig = real_rig()
+    point = tensor([900.0, 500.0, 2000.0])
+    left, right, seen = rig(point)
+    assert seen.all()
+    generator = torch.Generator().manual_seed(12)
+    noise = 0.5 * torch.randn(2, N, 2, dtype=torch.float64, generator=generator)
+    result = Triangulate(rig, pixel_sigma=0.5)(left + noise[0], right + noise[1])
+    covered = (result.range_low <= point.norm()) & (point.norm() <= result.range_high)
+    assert 0.94 < covered.double().mean().item() < 0.96
+
+
+def test_disparity_at_and_below_zero_is_bearing_only_with_an_open_end() -> None:
+    rig = pinhole_rig(1600.0, 10.0)
+    disparity = tensor(3.2, 1.3, 1.25, 0.2, 0.0, -0.2, -5.0)
+    left = torch.stack([960.0 + disparity, torch.full_like(disparity, 540.0)], -1)
+    right = torch.stack([torch.full_like(disparity, 960.0), torch.full_like(disparity, 540.0)], -1)
+    result = Triangulate(rig, pixel_sigma=0.3)(left, right)
+    # 3 sigma of the disparity are 3 * 0.3 * sqrt(2) = 1.27 px; 1.96 sigma are 0.83 px.
+    assert result.bearing_only.tolist() == [False, False, True, True, True, True, True]
+    assert torch.isinf(result.range_high).tolist() == [False, False, False, True, True, True, True]
+    assert [Status(s).name for s in result.status.tolist()] == ["OK"] * 4 + ["PARALLEL"] * 3
+    # Nearest possible: 16 000 px m / (d + 0.83 px); diverging by 5 px no range explains the marks.
+    expected = [16_000 / (d + 1.959964 * 0.3 * math.sqrt(2)) for d in (3.2, 1.3, 1.25, 0.2, 0.0, -0.2)]
+    # Disparity over focal length is the tangent of the parallax: 1e-5 relative at these angles.
+    assert result.range_low[:6].tolist() == pytest.approx(expected, rel=1e-4)
+    assert result.range_low[6].item() == math.inf
+
+
+def test_interval_is_skewed_outward() -> None:
+    # Half a pixel of noise in the disparity at 5 km: 95 % is 3.8 to 7.2 km, not 5 ± 1.5.
+    f = 1600.0
+    interval = range_interval(10.0, tensor(math.pi / 2), tensor(3.2 / f), tensor(0.5 / f))
+    assert interval.low.item() == pytest.approx(3828, abs=1)
+    assert interval.high.item() == pytest.approx(7207, abs=1)
+
+
+@given(
+    bearing=st.floats(0.05, 3.09),
+    parallax=st.floats(1e-6, 3.0),
+    baseline=st.floats(0.1, 100),
+)
+def test_range_closes_the_triangle(bearing: float, parallax: float, baseline: float) -> None:
+    got = range_from_parallax(baseline, tensor(bearing), tensor(parallax)).item()
+    third = math.pi - bearing - parallax
+    if third <= 0:
+        assert got == 0.0
+        return
+    # The cosine rule between the two sides from the point and the angle there must give the baseline.
+    other = baseline * math.sin(bearing) / math.sin(parallax)
+    # Both sides are up to 1e6 baselines long and cancel.
+    assert got**2 + other**2 - 2 * got * other * math.cos(parallax) == pytest.approx(
+        baseline**2, rel=1e-9, abs=1e-14 * (got**2 + other**2)
+    )
+
+
+def test_gradients_are_finite_at_infinity() -> None:
+    parallax = tensor(1e-3, 0.0, -1e-3).requires_grad_()
+    ranges = range_from_parallax(10.0, torch.full((3,), math.pi / 2, dtype=torch.float64), parallax)
+    gradient = torch.autograd.grad(ranges[torch.isfinite(ranges)].sum(), parallax)[0]
+    assert gradient[0].item() == pytest.approx(-1e7, rel=1e-5)
+    assert gradient[1:].tolist() == [0.0, 0.0]

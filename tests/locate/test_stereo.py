@@ -1,0 +1,223 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turned
+
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.rig import StereoRig
+from kcal.locate.stereo import Status, Triangulate
+
+RIG = real_rig()
+
+
+def test_exact_marks_give_the_point_back_through_real_lenses() -> None:
+    points = spread_points(torch.logspace(1.8, 4, 60, dtype=torch.float64))
+    left, right, seen = RIG(points)
+    assert seen.all()
+    result = Triangulate(RIG)(left, right)
+    near = points[:, 2] < 1000
+    assert (result.status == Status.OK).all()
+    # Pixels near 1000 hold 1e-13; at range Z that is Z² / (f b) * 1e-13 m.
+    assert (result.points - points)[near].norm(dim=-1).max() < 1e-9
+    assert ((result.points - points).norm(dim=-1) / points.norm(dim=-1)).max() < 1e-10
+    assert result.reprojection.max() < 1e-10
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    depth=st.floats(20, 10_000),
+    x=st.floats(-0.4, 0.4),
+    y=st.floats(-0.25, 0.25),
+    yaw=st.floats(-8, 8),
+    pitch=st.floats(-5, 5),
+    roll=st.floats(-20, 20),
+    baseline=st.floats(1, 50),
+    angle=st.floats(0, 2 * math.pi),
+)
+def test_round_trip_for_any_rig(
+    depth: float, x: float, y: float, yaw: float, pitch: float, roll: float, baseline: float, angle: float
+) -> None:
+    camera = Camera.build(focal=(900, 900), center=(959.5, 539.5), size=SIZE, coefficients=[-0.1, 0.01])
+    rotation = turned(yaw, pitch, roll)
+    offset = -baseline * tensor(math.cos(angle), math.sin(angle), 0.1)
+    rig = StereoRig(camera, camera, rotation, rotation @ offset)
+    point = depth * tensor([x, y, 1.0])
+    left, right, seen = rig(point)
+    result = Triangulate(rig)(left, right)
+    if bool(seen[0]) and bool(rig.left.inside(left)[0] & rig.right.inside(right)[0]):
+        assert result.status.item() == Status.OK
+        # Parallax 1e-4 rad at the worst, pixels rounded to 1e-13.
+        assert torch.allclose(result.points, point, rtol=1e-8)
+        assert result.range_low < result.points.norm() < result.range_high
+    else:
+        assert result.status.item() != Status.OK
+
+
+def test_range_slope_is_z_squared_over_focal_times_baseline() -> None:
+    focal, baseline, z = 1600.0, 10.0, 5000.0
+    rig = pinhole_rig(focal, baseline)
+    left, right, _ = rig(tensor([0.0, 0.0, z]))
+    left.requires_grad_()
+    right.requires_grad_()
+    Triangulate(rig)(left, right).points[0, 2].backward()
+    slope = z * z / (focal * baseline)
+    # More u on the left is more disparity: nearer. v carries no range.
+    assert left.grad[0, 0].item() == pytest.approx(-slope, rel=1e-9)
+    assert right.grad[0, 0].item() == pytest.approx(slope, rel=1e-9)
+    # A vertical slip of 1 px moves y, not Z: 1e-6 of the horizontal slope is rounding.
+    assert abs(left.grad[0, 1].item()) < 1e-6 * slope
+
+
+def test_gradients_through_the_lenses() -> None:
+    left, right, _ = RIG(spread_points(tensor(60.0, 150.0, 300.0)))
+    right = right + tensor([0.0, 0.4])
+    triangulate = Triangulate(RIG)
+
+    def outputs(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        result = triangulate(left, right)
+        # range_low and range_high are left out: they hold the noise of the parallax fixed on purpose.
+        return result.points, result.reprojection, 1e3 * result.parallax
+
+    inputs = (left.requires_grad_(), right.requires_grad_())
+    # Central differences of pixels: 1e-4 steps against values of 300 m held to 1e-12.
+    assert torch.autograd.gradcheck(outputs, inputs, eps=1e-4, rtol=1e-6, atol=1e-6)
+
+
+def test_batches_and_dtypes() -> None:
+    points = spread_points(torch.linspace(50, 3000, 12, dtype=torch.float64))
+    left, right, _ = RIG(points)
+    triangulate = Triangulate(RIG)
+    flat = triangulate(left, right)
+    deep = triangulate(left.reshape(2, 1, 6, 2), right.reshape(2, 1, 6, 2))
+    assert deep.points.shape == (2, 1, 6, 3)
+    assert deep.reprojection.shape == (2, 1, 6, 2)
+    for name in ("status", "parallax", "parallax_sigma", "range_low", "range_high", "bearing_only"):
+        assert getattr(deep, name).shape == (2, 1, 6)
+    assert torch.allclose(deep.points.reshape(12, 3), flat.points, rtol=1e-12)
+    assert triangulate(left[:0], right[:0]).points.shape == (0, 3)
+
+    single = triangulate(left.float(), right.float())
+    assert single.points.dtype == torch.float64
+    # The pixels were rounded to 6e-5 px by whoever made them float32; nothing was lost after that.
+    assert torch.equal(single.points, triangulate(left.float().double(), right.float().double()).points)
+    with pytest.raises(InputError, match="floating point"):
+        triangulate(left.long(), right.long())
+    with pytest.raises(InputError, match="same shape"):
+        triangulate(left, right[:1])
+    with pytest.raises(InputError, match="same shape"):
+        triangulate(left[0], right[0])
+    with pytest.raises(InputError, match="pixel_sigma"):
+        Triangulate(RIG, pixel_sigma=0.0)
+    camera = RIG.left
+    with pytest.raises(DegenerateError, match="same place"):
+        Triangulate(StereoRig(camera, camera, torch.eye(3), torch.zeros(3)))
+
+
+def test_low_precision_around_the_module_changes_nothing() -> None:
+    left, right, _ = RIG(spread_points(torch.linspace(50, 5000, 9, dtype=torch.float64)))
+    expected = Triangulate(RIG)(left, right)
+    halved = Triangulate(real_rig()).half()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        got = halved(left, right)
+    for a, b in zip(expected, got, strict=True):
+        assert torch.equal(a, b)
+
+
+BAD_MARKS = [
+    # left, right, status; the pinhole rig has f = 1600 px, b = 10 m and its centre at (959.5, 539.5)
+    ((980.0, 540.0), (970.0, 540.0), Status.OK),
+    ((970.0, 540.0), (970.0, 540.0), Status.PARALLEL),
+    ((960.0, 540.0), (970.0, 540.0), Status.PARALLEL),
+    ((math.nan, 540.0), (970.0, 540.0), Status.NOT_FINITE),
+    ((980.0, 540.0), (970.0, math.inf), Status.NOT_FINITE),
+    ((-0.6, 540.0), (-20.0, 540.0), Status.OUTSIDE_IMAGE),
+    ((980.0, 540.0), (970.0, 1079.51), Status.OUTSIDE_IMAGE),
+    ((-0.5, 1079.5), (-0.5, 1079.5), Status.PARALLEL),
+]
+
+
+def test_statuses_and_no_nan_in_values_or_gradients() -> None:
+    left = tensor(*(row[0] for row in BAD_MARKS)).requires_grad_()
+    right = tensor(*(row[1] for row in BAD_MARKS)).requires_grad_()
+    result = Triangulate(pinhole_rig())(left, right)
+    assert result.status.dtype == torch.int8
+    assert [Status(s).name for s in result.status.tolist()] == [row[2].name for row in BAD_MARKS]
+    for name, value in result._asdict().items():
+        assert not torch.isnan(value).any(), name
+    assert (result.points[1:] == 0).all()
+    finite = torch.where(torch.isfinite(result.range_high), result.range_high, 0.0)
+    low = torch.where(torch.isfinite(result.range_low), result.range_low, 0.0)
+    total = result.points.sum() + result.reprojection.sum() + result.parallax.sum() + low.sum() + finite.sum()
+    for gradient in torch.autograd.grad(total, (left, right)):
+        assert torch.isfinite(gradient).all()
+        assert (gradient[0] != 0).any()
+        assert (gradient[3:7] == 0).all()
+
+
+def test_outside_the_lens() -> None:
+    # x - x³/12 turns back at r = 2: distorted 4/3, that is 1333 px from the centre of a wide sensor.
+    camera = Camera.build(
+        focal=(1000, 1000), center=(2000, 500), size=(4001, 1001), coefficients=[-1 / 12], model="opencv4"
+    )
+    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+    result = Triangulate(rig)(tensor([3400.0, 500.0], [2100.0, 500.0]), tensor([3390.0, 500.0], [2090.0, 500.0]))
+    assert [Status(s).name for s in result.status.tolist()] == ["OUTSIDE_LENS", "OK"]
+
+
+def test_lines_that_cross_behind_one_camera() -> None:
+    # The right camera stands 10 m ahead and looks the same way: it is ahead of the crossing point of these lines.
+    camera = Camera.build(focal=(800, 800), center=(959.5, 539.5), size=SIZE, model="pinhole")
+    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, -10.0]))
+    # The lines meet at (0.5 m, 0, 4 m): 6 m behind the right camera, whose ray leads away from it.
+    behind = Triangulate(rig)(tensor([959.5 + 800 / 8, 539.5]), tensor([959.5 + 800 / 12, 539.5]))
+    left, right, _ = rig(tensor([3.0, 0.0, 20.0]))
+    ahead = Triangulate(rig)(left, right)
+    assert Status(int(ahead.status)).name == "OK"
+    assert Status(int(behind.status)).name == "BEHIND"
+    assert behind.points.abs().max() == 0
+
+
+def test_along_the_baseline_there_is_no_range() -> None:
+    camera = Camera.build(focal=(800, 800), center=(959.5, 539.5), size=SIZE, model="pinhole")
+    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([0.0, 0.0, -10.0]))
+    marks = tensor([959.5, 539.5]).requires_grad_()
+    result = Triangulate(rig)(marks, marks)
+    assert Status(int(result.status)).name == "PARALLEL"
+    assert (result.range_low.item(), result.range_high.item()) == (0.0, math.inf)
+    assert torch.isfinite(torch.autograd.grad(result.points.sum() + result.parallax.sum(), marks)[0]).all()
+
+
+def test_parallax_and_its_noise_use_the_local_size_of_a_pixel() -> None:
+    focal, sigma = 1600.0, 0.3
+    rig = pinhole_rig(focal, 1e-3)
+    # A baseline of 1 mm: both cameras see the point at the same place in the image.
+    points = tensor([0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, 0.3, 1.0])
+    left, right, _ = rig(points)
+    result = Triangulate(rig, sigma)(left, right)
+    # Along u, off axis by angle a: d(angle)/du = cos²(a) / f; above the axis only the distance grows: cos(a) / f.
+    expected = tensor(1.0, 1 / 1.25, 1 / math.sqrt(1.09)) * math.sqrt(2) * sigma / focal
+    # The two views differ by 1e-3 in angle, the differences by 1e-8.
+    assert torch.allclose(result.parallax_sigma, expected, rtol=1e-3)
+    assert result.parallax[0].item() == pytest.approx(math.atan(1e-3), rel=1e-9)
+
+
+class ClosedForm(Camera):
+    """A pinhole whose inverse needs no iterations, so that tracing it takes no time."""
+
+    def normalize(self, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return (pixels - self.center) / self.focal, torch.isfinite(pixels).all(-1)
+
+
+def test_compiles_as_one_graph() -> None:
+    camera = ClosedForm.build(focal=(1600, 1600), center=(959.5, 539.5), size=SIZE, model="pinhole")
+    triangulate = Triangulate(StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])))
+    left, right = tensor([980.0, 540.0], [960.0, 540.0]), tensor([970.0, 540.0], [970.0, 540.0])
+    compiled = torch.compile(triangulate, fullgraph=True, backend="eager")
+    for a, b in zip(triangulate(left, right), compiled(left, right), strict=True):
+        assert torch.allclose(a, b, rtol=1e-9)
