@@ -9,7 +9,9 @@ import typer
 from rich.markup import escape
 
 import kcal
+from kcal.cli.board import board
 from kcal.cli.console import err
+from kcal.cli.detect import detect
 from kcal.cli.locate import locate
 from kcal.errors import KcalError
 
@@ -38,6 +40,8 @@ def _root(
     pass
 
 
+app.command("board")(board)
+app.command("detect")(detect)
 app.command("locate")(locate)
 
 

@@ -24,6 +24,7 @@ from kcal.corners.saddle import Status
 from kcal.errors import FileError, InputError
 
 SEARCH_SIDES = (1200, 2400)  # pixels: the longer side of the image that is searched, small first
+MIN_CLIMB_SIDE = 8.0  # pixels: squares smaller than this in a shrunk image are not refined there
 MIN_GOOD = 0.5  # share of the corners that must survive refinement
 
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -152,9 +153,7 @@ def detect_images(
     if size is None or not views:
         first = f"{failures[0].name}: {failures[0].reason}"
         raise InputError(f"no board in any of {len(files)} images ({first}){_hint(files, board)}")
-    return Observations(
-        board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures)
-    )
+    return Observations(board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures))
 
 
 def _search(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor | None, float, str]:
@@ -190,12 +189,18 @@ def _find_sector(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
 
 
 def _climb(image: Grey, pixels: Tensor, board: Board, factor: float) -> Tensor:
-    """Bring corners found on an image `factor` times smaller near enough for refinement at full size."""
+    """Bring corners found on an image `factor` times smaller near enough for refinement at full size.
+
+    The first steps are on images four and two times smaller still, because OpenCV leaves single corners 3 px off
+    where its own refinement failed, out of reach at full size. The squares must still be large enough there.
+    """
+    factor = 4 * factor
     while factor > 1:
         small, scale = _shrunk(image, factor)
         start = (pixels + 0.5) / scale - 0.5
-        refined = refine_corners(small, start, local_side(start, board.columns, board.rows), "saddle")
-        good = (refined.status == Status.GOOD)[:, None]
+        side = local_side(start, board.columns, board.rows)
+        refined = refine_corners(small, start, side, "saddle")
+        good = ((refined.status == Status.GOOD) & (side >= MIN_CLIMB_SIDE))[:, None]
         pixels = _scaled(torch.where(good, refined.pixels, start), scale)
         factor = factor / 2
     return pixels
@@ -207,7 +212,7 @@ def _shrunk(image: Grey, factor: float) -> tuple[Grey, Tensor]:
     if factor <= 1:
         return image, torch.ones(2, dtype=torch.float64)
     size = round(width / factor), round(height / factor)
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(image.dtype, copy=False)
     return small, torch.tensor([width / size[0], height / size[1]], dtype=torch.float64)
 
 

@@ -24,7 +24,9 @@ def as_grid(pixels: Tensor, columns: int, rows: int) -> Tensor:
     """
     pixels = as_points("pixels", pixels, 2)
     if pixels.shape != (rows * columns, 2):
-        raise InputError(f"pixels: shape ({rows * columns}, 2) is needed for {columns}x{rows}, got {tuple(pixels.shape)}")
+        raise InputError(
+            f"pixels: shape ({rows * columns}, 2) is needed for {columns}x{rows}, got {tuple(pixels.shape)}"
+        )
     return pixels.reshape(rows, columns, 2)
 
 
@@ -124,9 +126,7 @@ def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
     step = along[0][None, :, None]
     share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
     signs = torch.tensor([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]], dtype=torch.float64)
-    four = torch.stack(
-        [_levels(image, places + share * (a * step + b * out)).mean(-1) for a, b in signs.tolist()]
-    )
+    four = torch.stack([_levels(image, places + share * (a * step + b * out)).mean(-1) for a, b in signs.tolist()])
     contrast = four[0] + four[1] - four[2] - four[3]  # (beyond or own, along)
     reach = beyond + 0.5 * out[0, :, 0]
     limit = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from kcal.errors import FileError, InputError
 
-Grey = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+Grey = npt.NDArray[np.uint8 | np.uint16]
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm", ".jp2"})
 MIN_SIDE = 16
@@ -154,9 +154,7 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
         twice = {name for name in names if names.count(name) > 1}
         if not twice:
             break
-        names = [
-            "/".join(part[-depth:]) if name in twice else name for name, part in zip(names, parts, strict=True)
-        ]
+        names = ["/".join(part[-depth:]) if name in twice else name for name, part in zip(names, parts, strict=True)]
     return names
 
 

@@ -46,11 +46,7 @@ def canonical_order(image: npt.NDArray[np.generic], pixels: Tensor, board: Board
     if board.columns == board.rows:
         quarter = grid.transpose(0, 1).flip(1)
         turns += [quarter, quarter.flip(0, 1)]
-    dark = [
-        turn
-        for turn in turns
-        if first_square_dark(image, turn.reshape(-1, 2), board.columns, board.rows)[0]
-    ]
+    dark = [turn for turn in turns if first_square_dark(image, turn.reshape(-1, 2), board.columns, board.rows)[0]]
     return max(dark or turns, key=_uprightness).reshape(-1, 2)
 
 

@@ -88,9 +88,7 @@ def _skimage(image: Grey, start: Tensor, half: int) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(found[:, ::-1], dtype=np.float64))
 
 
-def _judge(
-    start: Tensor, moved: Tensor, seen: Tensor, side: Tensor, margin: Tensor, size: tuple[int, int]
-) -> Refined:
+def _judge(start: Tensor, moved: Tensor, seen: Tensor, side: Tensor, margin: Tensor, size: tuple[int, int]) -> Refined:
     given_up = ~torch.isfinite(moved).all(-1)
     x, y = torch.where((seen & given_up)[:, None], start, moved).unbind(-1)
     inside = (x >= margin) & (x <= size[0] - 1 - margin) & (y >= margin) & (y <= size[1] - 1 - margin)

@@ -109,7 +109,7 @@ def saddle(image: Tensor, pixels: Tensor, side: Tensor | float) -> Refined:
         (Status.OUTSIDE, inside),
         (Status.MISSING, seen),
     )
-    status = torch.zeros(batch + (start.shape[-2],), dtype=torch.int64, device=image.device)
+    status = torch.zeros((*batch, start.shape[-2]), dtype=torch.int64, device=image.device)
     for code, passed in checks:  # the most basic trouble last, so that it is the one reported
         status = torch.where(passed, status, int(code))
     return Refined(torch.where((status == Status.GOOD)[..., None], result, float("nan")), status)

@@ -22,9 +22,7 @@ def homography(board: Board, size, square, tilt=(0.0, 0.0), roll=0.0, shift=(0.0
     perspective[2, :2] = np.array(tilt) / (np.array([board.columns + 1, board.rows + 1]) / 2)
     c, s = np.cos(roll), np.sin(roll)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    place = np.array(
-        [[square, 0, (width - 1) / 2 + shift[0]], [0, square, (height - 1) / 2 + shift[1]], [0, 0, 1.0]]
-    )
+    place = np.array([[square, 0, (width - 1) / 2 + shift[0]], [0, square, (height - 1) / 2 + shift[1]], [0, 0, 1.0]])
     return place @ turn @ perspective @ centre
 
 

@@ -1,0 +1,139 @@
+"""Black shapes and short texts on a page of known size, written as SVG or PDF at true scale.
+
+Both formats are vector text of a few kilobytes, without dates or tool names, so that the same board always gives the
+same bytes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from xml.sax.saxutils import escape
+
+from kcal.errors import InputError
+
+_POINT = 72 / 25.4  # PDF points in a millimetre
+_FONTS = "Helvetica, Arial, sans-serif"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rectangle:
+    """A filled black rectangle; millimetres from the page's top left corner."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Text:
+    """A line of text whose baseline begins at (x, y) millimetres from the top left corner."""
+
+    x: float
+    y: float
+    size: float
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawing:
+    """A page and what is on it, in millimetres."""
+
+    width: float
+    height: float
+    title: str
+    rectangles: tuple[Rectangle, ...]
+    texts: tuple[Text, ...] = ()
+
+
+def to_svg(drawing: Drawing) -> str:
+    """The drawing as SVG 1.1, one user unit a millimetre.
+
+    Example:
+        >>> page = Drawing(width=10, height=5, title="t", rectangles=(Rectangle(x=1, y=1, width=2.5, height=3),))
+        >>> "M1 1h2.5v3h-2.5z" in to_svg(page)
+        True
+    """
+    width, height = _number(drawing.width), _number(drawing.height)
+    path = "".join(
+        f"M{_number(r.x)} {_number(r.y)}h{_number(r.width)}v{_number(r.height)}h{_number(-r.width)}z"
+        for r in drawing.rectangles
+    )
+    texts = "".join(
+        f'<text x="{_number(t.x)}" y="{_number(t.y)}" font-size="{_number(t.size)}">{escape(t.text)}</text>\n'
+        for t in drawing.texts
+    )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        f'<svg xmlns="http://www.w3.org/2000/svg" version="1.1" width="{width}mm" height="{height}mm" '
+        f'viewBox="0 0 {width} {height}" font-family="{_FONTS}">\n'
+        f"<title>{escape(drawing.title)}</title>\n"
+        f'<rect width="{width}" height="{height}" fill="#fff"/>\n'
+        f'<path d="{path}" fill="#000"/>\n'
+        f"{texts}</svg>\n"
+    )
+
+
+def to_pdf(drawing: Drawing) -> bytes:
+    """The drawing as a PDF 1.4 of one page; texts in the built-in Helvetica (Latin-1 characters only).
+
+    Viewers are told not to scale it when printing (`/PrintScaling /None`).
+
+    Raises:
+        InputError: a character that Latin-1 does not have.
+
+    Example:
+        >>> to_pdf(Drawing(width=25.4, height=50.8, title="t", rectangles=()))[:8]
+        b'%PDF-1.4'
+    """
+
+    def flip(y: float) -> str:
+        return _number((drawing.height - y) * _POINT)
+
+    content = ["0 g"]
+    for r in drawing.rectangles:
+        corner = f"{_number(r.x * _POINT)} {flip(r.y + r.height)}"
+        content.append(f"{corner} {_number(r.width * _POINT)} {_number(r.height * _POINT)} re")
+    content.append("f" if drawing.rectangles else "")
+    for t in drawing.texts:
+        content.append(
+            f"BT /F1 {_number(t.size * _POINT)} Tf {_number(t.x * _POINT)} {flip(t.y)} Td ({_literal(t.text)}) Tj ET"
+        )
+    stream = _latin("\n".join(content))
+    box = f"[0 0 {_number(drawing.width * _POINT)} {_number(drawing.height * _POINT)}]"
+    objects = [
+        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        f"<< /Type /Page /Parent 2 0 R /MediaBox {box} /Contents 4 0 R "
+        "/Resources << /Font << /F1 5 0 R >> >> >>".encode(),
+        b"<< /Length %d >>\nstream\n%s\nendstream" % (len(stream), stream),
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
+        b"<< /Title (%s) >>" % _latin(_literal(drawing.title)),
+    ]
+    data = b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n"
+    offsets = []
+    for number, body in enumerate(objects, 1):
+        offsets.append(len(data))
+        data += b"%d 0 obj\n%s\nendobj\n" % (number, body)
+    table = b"".join(b"%010d 00000 n \n" % offset for offset in offsets)
+    count = len(objects) + 1
+    return data + (
+        b"xref\n0 %d\n0000000000 65535 f \n%strailer\n<< /Size %d /Root 1 0 R /Info 6 0 R >>\nstartxref\n%d\n%%%%EOF\n"
+        % (count, table, count, len(data))
+    )
+
+
+def _number(value: float) -> str:
+    """A number to 0.1 micrometre, without a needless fraction."""
+    return f"{value:.4f}".rstrip("0").rstrip(".")
+
+
+def _literal(text: str) -> str:
+    return text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
+
+
+def _latin(text: str) -> bytes:
+    try:
+        return text.encode("latin-1")
+    except UnicodeEncodeError as error:
+        raise InputError(f"{text!r}: a PDF text can hold Latin-1 characters only") from error

@@ -1,0 +1,143 @@
+"""Checkerboards to print at true scale."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from kcal.corners.board import Board
+from kcal.corners.drawing import Drawing, Rectangle, Text
+from kcal.errors import InputError
+
+# Millimetres, upright; ISO 216 and the North American sizes.
+PAGES: dict[str, tuple[float, float]] = {
+    "A5": (148.0, 210.0),
+    "A4": (210.0, 297.0),
+    "A3": (297.0, 420.0),
+    "A2": (420.0, 594.0),
+    "A1": (594.0, 841.0),
+    "A0": (841.0, 1189.0),
+    "letter": (215.9, 279.4),
+    "legal": (215.9, 355.6),
+    "tabloid": (279.4, 431.8),
+}
+EDGE = 5.0  # mm at each edge that printers leave white
+RULER = 100.0  # mm
+_THIN = 0.2  # mm
+_GAP = 4.0  # mm between ruler and caption
+_LINE = 3.6  # mm from one line of text to the next
+_TEXT = 2.5  # mm, height of the caption's letters
+_LETTER = 0.6  # mean width of a letter in text heights
+
+
+class Sheet(NamedTuple):
+    """A board on a page: the `drawing`, the page's name, and the white round the board in squares (narrowest side)."""
+
+    drawing: Drawing
+    page: str
+    quiet: float
+
+
+def board_sheet(board: Board, page: str = "auto") -> Sheet:
+    """Lay a board out on a page, in the board's own order: corner 0 at the top left, its outer square black.
+
+    Below the board are a ruler of 100 mm, to measure after printing, and a caption with the board's size. The board is
+    centred above them; the page lies upright or across, whichever leaves more white. One square of white all
+    round is what detectors like best.
+
+    Args:
+        board: the board.
+        page: a name in `PAGES` in any case, or `auto` for a page just large enough for one square of white all round.
+
+    Raises:
+        InputError: an unknown page, or one that is too small; the message names the smallest that would do.
+
+    Example:
+        >>> sheet = board_sheet(Board(columns=9, rows=6, square=0.025), "A4")
+        >>> sheet.drawing.width, sheet.drawing.height, len(sheet.drawing.rectangles) > 35
+        (297.0, 210.0, True)
+    """
+    square = board.square * 1000
+    wide, high = (board.columns + 1) * square, (board.rows + 1) * square
+    name, (page_wide, page_high) = _page(board, page, wide, high)
+    left, top = _margins(board, page_wide, page_high)
+    squares = tuple(
+        Rectangle(x=left + column * square, y=top + row * square, width=square, height=square)
+        for row in range(board.rows + 1)
+        for column in range(board.columns + 1)
+        if (row + column) % 2 == 0
+    )
+    ruler, texts = _foot(board, page_wide, page_high)
+    drawing = Drawing(
+        width=page_wide, height=page_high, title=f"Board {board}", rectangles=squares + ruler, texts=texts
+    )
+    return Sheet(drawing, name, min(left, top) / square)
+
+
+def _page(board: Board, page: str, wide: float, high: float) -> tuple[str, tuple[float, float]]:
+    square = board.square * 1000
+    if page.lower() == "auto":
+        margin = max(square, EDGE)
+        page_wide = max(wide + 2 * margin, RULER + 2 * EDGE)
+        return "auto", (page_wide, high + 2 * margin + _foot_height(board, page_wide))
+    names = {name.lower(): name for name in PAGES}
+    if page.lower() not in names:
+        raise InputError(f"page {page!r}: choose one of auto, {', '.join(PAGES)}")
+    name = names[page.lower()]
+    size = _turned(board, PAGES[name])
+    if size is None:
+        fitting = [other for other, paper in PAGES.items() if _turned(board, paper) is not None]
+        smallest = min(fitting, key=lambda other: PAGES[other][0] * PAGES[other][1], default=None)
+        advice = f"{smallest} would do" if smallest else "use auto or smaller squares"
+        width, height = PAGES[name]
+        raise InputError(
+            f"a board of {board.columns + 1}x{board.rows + 1} squares of {square:g} mm is {wide:g}x{high:g} mm and "
+            f"does not fit {name} ({width:g}x{height:g} mm) with its margins and ruler; {advice}"
+        )
+    return name, size
+
+
+def _margins(board: Board, page_wide: float, page_high: float) -> tuple[float, float]:
+    """White left and right of the board, and above it as well as between it and the foot."""
+    square = board.square * 1000
+    left = (page_wide - (board.columns + 1) * square) / 2
+    return left, (page_high - _foot_height(board, page_wide) - (board.rows + 1) * square) / 2
+
+
+def _turned(board: Board, paper: tuple[float, float]) -> tuple[float, float] | None:
+    """The page upright or across, whichever leaves more white, or None where the board fits neither way."""
+    ways = [(min(_margins(board, *size)), size) for size in (paper, paper[::-1]) if size[0] >= RULER + 2 * EDGE]
+    best, size = max(ways)
+    return size if best >= EDGE else None
+
+
+def _captions(board: Board) -> tuple[str, str]:
+    turned = "" if board.unambiguous else " Looks the same turned by 180 degrees: not for stereo."
+    size = f"{board.columns}x{board.rows} (inner corners), {board.square * 1000:g} mm squares."
+    return "Print at 100 %; the ruler is 100 mm long.", f"kcal board {size}{turned}"
+
+
+def _beside(board: Board, page_wide: float) -> bool:
+    """Whether the caption fits to the right of the ruler."""
+    longest = max(len(text) for text in _captions(board)) * _TEXT * _LETTER
+    return 2 * EDGE + RULER + _GAP + longest <= page_wide
+
+
+def _foot_height(board: Board, page_wide: float) -> float:
+    return EDGE + (2 if _beside(board, page_wide) else 4) * _LINE
+
+
+def _foot(board: Board, page_wide: float, page_high: float) -> tuple[tuple[Rectangle, ...], tuple[Text, ...]]:
+    """The ruler with its ticks, and to its right, or above it on a narrow page, the caption."""
+    base = page_high - EDGE
+    ticks = [
+        Rectangle(x=EDGE + along - _THIN / 2, y=base - height, width=_THIN, height=height)
+        for along in range(0, int(RULER) + 1, 10)
+        for height in (3.0 if along % 50 == 0 else 1.8,)
+    ]
+    line = Rectangle(x=EDGE, y=base - _THIN, width=RULER, height=_THIN)
+    x, lowest = (EDGE + RULER + _GAP, 0) if _beside(board, page_wide) else (EDGE, 1)
+    texts = tuple(
+        Text(x=x, y=base - (lowest + row) * _LINE - (0.6 if lowest else 0), size=_TEXT, text=text)
+        for row, text in zip((1, 0), _captions(board), strict=True)
+    )
+    return (line, *ticks), texts
