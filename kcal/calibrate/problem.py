@@ -68,7 +68,7 @@ class BoardProblem(SchurProblem):
 
     Args:
         board_points: (N, 3) metres, z = 0.
-        pixels: (V, C, N, 2) observed corners; NaN where not seen.
+        pixels: (..., V, C, N, 2) observed corners; NaN where not seen. Leading dimensions broadcast with `batch`.
         models: one lens model a camera.
         free: for each camera the indices of its free parameters.
         free_warp: whether the board's warp is estimated.
@@ -96,7 +96,7 @@ class BoardProblem(SchurProblem):
         self._seen = torch.isfinite(pixels).all(-1)
         self._all_seen = bool(self._seen.all())
         self._target = torch.where(self._seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
-        self.residual_count = 2 * int(self._seen.sum())
+        self.residual_count = 2 * int(self._seen.sum((-3, -2, -1)).max())
         self._sizes = [len(INTRINSICS) + model.size for model in self.models]
         # Where each block of shared parameters stands in a step: cameras, poses of the further cameras, warp.
         counts = [*(len(indices) for indices in self.free), *[6] * (len(self.models) - 1), 2 * free_warp]
@@ -141,8 +141,8 @@ class BoardProblem(SchurProblem):
         out = []
         for c, _, points, parameters in self._views(self.unpack(state)):
             projected = project_components(points, parameters, self.models[c])
-            error = projected.pixels - self._target[:, c]
-            seen = self._seen[:, c, None]
+            error = projected.pixels - self._target[..., c, :, :]
+            seen = self._seen[..., c, None, :]
             bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
             out.append(torch.where(seen, error + bad, 0.0))
         return torch.stack(out, -3).flatten(-3)
@@ -167,9 +167,9 @@ class BoardProblem(SchurProblem):
                 normal = s.first_from_board_rotation[..., 2]
                 along = torch.einsum("...vkun,...vk->...vun", by_first, normal)
                 shared[..., self._warp_slot, c, :, :] = along[..., None, :, :] * self._shape[:, None]
-            rows[..., -1, c, :, :] = projected.pixels - self._target[:, c]
+            rows[..., -1, c, :, :] = projected.pixels - self._target[..., c, :, :]
         if not self._all_seen:
-            rows = torch.where(self._seen[:, None, :, None], rows, 0.0)
+            rows = torch.where(self._seen[..., None, :, None, :], rows, 0.0)
         return rows.flatten(-3)
 
     def retract(self, state: State, step: State) -> State:

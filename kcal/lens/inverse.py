@@ -27,7 +27,7 @@ def valid_radius(coefficients: Tensor, model: LensModel | str) -> Tensor:
     """Radius of the disc on the plane z = 1 inside which the lens neither folds nor meets a pole.
 
     Walks outward along 64 directions, 1/6° a step, to the first place where the Jacobian's determinant, the radial
-    denominator or the tilt's w is no longer positive, refines it by bisection, and takes the smallest.
+    denominator or the tilt's w is no longer positive, narrows it down, and takes the smallest.
 
     Args:
         coefficients: (..., P).
@@ -43,33 +43,26 @@ def valid_radius(coefficients: Tensor, model: LensModel | str) -> Tensor:
     """
     model = LensModel.named(model)
     coefficients = check_coefficients(coefficients, model)
-    direction = torch.arange(64, dtype=torch.float64, device=coefficients.device) * (2 * math.pi / 64)
-    cosine, sine = torch.cos(direction), torch.sin(direction)
-    radii = torch.tan(torch.linspace(0, math.radians(89.0), 535, dtype=torch.float64, device=coefficients.device))
-    batch = coefficients.shape[:-1]
+    kind, place = torch.float64, coefficients.device
+    direction = torch.arange(64, dtype=kind, device=place) * (2 * math.pi / 64)
 
     def good(radius: Tensor) -> Tensor:
-        """Radius (..., 64) or (64 * K,) along each direction -> whether the lens is regular there."""
-        x, y = radius * cosine, radius * sine
+        """Radii (..., K, 64), one column a direction -> how many from the first on are regular, (..., 64)."""
+        x, y = (radius * torch.cos(direction)).flatten(-2), (radius * torch.sin(direction)).flatten(-2)
         lens = distort_components(x, y, coefficients, model)
         a, b, d, e = lens.point
-        return lens.positive & (a * e - b * d > 0)
+        regular = (lens.positive & (a * e - b * d > 0)).unflatten(-1, (-1, 64))
+        return regular.to(torch.int64).cumprod(-2).sum(-2)
 
-    low = torch.zeros((*batch, 64), dtype=torch.float64, device=coefficients.device)
-    high = torch.full_like(low, MAX_RADIUS)
-    walking = torch.ones_like(low, dtype=torch.bool)
-    for radius in radii[1:]:
-        ok = good(radius.expand(64))
-        high = torch.where(walking & ~ok, radius, high)
-        walking = walking & ok
-        low = torch.where(walking, radius, low)
-        if not bool(walking.any()):
-            break
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        ok = good(middle)
-        low, high = torch.where(ok, middle, low), torch.where(ok, high, middle)
-    return torch.where(walking, high, low).amin(-1)
+    # From the axis out, then each interval split in 32 again until it is as narrow as rounding.
+    radii = torch.tan(torch.linspace(0, math.radians(89.0), 535, dtype=kind, device=place))[:, None].expand(-1, 64)
+    for _ in range(11):
+        count = good(radii)
+        radii = radii.expand(*count.shape[:-1], -1, -1)
+        low = torch.gather(radii, -2, (count - 1)[..., None, :])
+        high = torch.gather(radii, -2, count.clamp(max=radii.shape[-2] - 1)[..., None, :])
+        radii = low + (high - low) * torch.linspace(0, 1, 33, dtype=kind, device=place)[:, None]
+    return low[..., 0, :].amin(-1)
 
 
 def _untilt(x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:
@@ -163,10 +156,10 @@ def _newton(
         error = torch.where(lens.positive, torch.hypot(error_x, error_y), math.inf)
         return (e * error_x - b * error_y) * inverse, (a * error_y - d * error_x) * inverse, error
 
-    x, y = inside(*_untilt(target_x, target_y, coefficients, model))
+    x, y = _untilt(target_x, target_y, coefficients, model)
     step_x, step_y, error = evaluate(x, y)
-    # Outside any preimage the start may already be past a pole; the axis is always regular.
-    lost = ~torch.isfinite(error)
+    # Never start on the rim: beside a pole Newton only doubles its distance a step. The axis is always regular.
+    lost = ~torch.isfinite(error) | ~(torch.hypot(x, y) < limit)
     x, y = torch.where(lost, 0.0, x), torch.where(lost, 0.0, y)
     step_x, step_y, error = evaluate(x, y)
     tolerance = _TOLERANCE * (1.0 + torch.hypot(target_x, target_y))

@@ -1,0 +1,282 @@
+"""Calibrating one camera from views of a board (Algorithm 1 of the paper)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.covariance import Spread, spread
+from kcal.calibrate.init import homographies, intrinsics_candidates, poses_from_homographies, radial_start
+from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
+from kcal.calibrate.poses import unflip
+from kcal.calibrate.problem import BoardProblem
+from kcal.corners.observations import Observations
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
+from kcal.lens.projection import INTRINSICS, parameter_names
+from kcal.solve.lm import LMOptions, minimise
+from kcal.solve.result import State, Status
+
+_MINIMUM_VIEWS = 3
+_MINIMUM_CORNERS = 6
+# A focal length known to worse than this is not a calibration: 5 % of range at every distance.
+_MAX_FOCAL_SIGMA = 0.05
+# A first fit worse than this many pixels is retried from other focal lengths.
+_SUSPICIOUS_RMS = 2.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CalibrationOptions:
+    """Options of `calibrate_camera`.
+
+    Args:
+        model: lens model, by name or as a `LensModel`.
+        board_warp: estimate how the board bends (two more parameters).
+        solver: options of the Levenberg-Marquardt solver.
+    """
+
+    model: LensModel | str = "opencv5"
+    board_warp: bool = False
+    solver: LMOptions = dataclasses.field(default_factory=lambda: LMOptions(max_iterations=1000))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CameraCalibrationResult:
+    """A calibrated camera and what it rests on.
+
+    Args:
+        camera: the camera.
+        rms: sqrt(mean ‖r‖²) over all corners, pixels (Eq. 5).
+        per_view_rms: (V,) likewise for each view, in the order of the observations.
+        residuals: (V, N, 2) projected minus observed, pixels; NaN where a corner was not seen.
+        cam_from_board_rotation: (V, 3, 3).
+        cam_from_board_translation: (V, 3) metres.
+        board_warp: (2,) metres of bend along x and y, or None if not estimated.
+        sigma: name -> standard deviation of each free parameter; None where the data do not determine it.
+        status: why the solver stopped.
+        iterations: trial steps of the solver, all starts and models together.
+        warnings: sentences about what the user should doubt.
+    """
+
+    camera: Camera
+    rms: float
+    per_view_rms: Tensor
+    residuals: Tensor
+    cam_from_board_rotation: Tensor
+    cam_from_board_translation: Tensor
+    board_warp: Tensor | None
+    sigma: dict[str, float | None]
+    status: Status
+    iterations: int
+    warnings: tuple[str, ...]
+
+
+def _silent(_: str) -> None:
+    return None
+
+
+def calibrate_camera(
+    observations: Observations, options: CalibrationOptions | None = None, progress: Progress = _silent
+) -> CameraCalibrationResult:
+    """Find a camera's intrinsics and lens from views of a board.
+
+    Zhang's method (2000): homographies, closed-form intrinsics, poses and radial terms, then Levenberg-Marquardt on
+    the reprojection error of all corners over all parameters, board poses eliminated by the Schur complement. Rich
+    lens models are reached through the models nested in them, from several starts (see `kcal.calibrate.ladder`);
+    board poses that settled in the mirrored tilt are found and solved again.
+
+    Args:
+        observations: the views of one camera.
+        options: see `CalibrationOptions`.
+        progress: told what has just been finished.
+
+    Returns:
+        the camera with its residuals and error bars. Skew stays 0.
+
+    Raises:
+        DegenerateError: fewer than three views, too few corners for the model, or views that do not determine the
+            focal length (all parallel to the image, for example).
+        InputError: the data and the model do not fit at all.
+
+    Example:
+        >>> from kcal.corners.board import Board
+        >>> from kcal.corners.observations import View
+        >>> from kcal.lens.pose import rotation_from_vector
+        >>> board = Board(columns=7, rows=6, square=0.05)
+        >>> truth = Camera.build(focal=(800, 805), center=(322, 238), size=(640, 480), coefficients=[-0.1, 0.02])
+        >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)
+        >>> views = []
+        >>> for i, rotation in enumerate(rotation_from_vector(tilts)):
+        ...     points = board.points @ rotation.T + torch.tensor([-0.15, -0.12, 0.6], dtype=torch.float64)
+        ...     views.append(View(name=str(i), pixels=truth.project(points)[0].tolist()))
+        >>> seen = Observations(board=board, image_size=(640, 480), views=views)
+        >>> result = calibrate_camera(seen)
+        >>> round(float(result.camera.focal[0]), 6), result.rms < 1e-6
+        (800.0, True)
+    """
+    options = options or CalibrationOptions()
+    model = LensModel.named(options.model)
+    board = observations.board.points
+    pixels = observations.pixels()
+    _check(observations, pixels, model, options.board_warp)
+
+    solver = options.solver
+    ladder = steps_to(model)
+    first, cold = _first(board, pixels, observations.image_size, ladder[0], options)
+    progress(f"start ({ladder[0]})")
+    seen = pixels[:, None]
+    minimum = climb(board, seen, first, cold, ladder, solver, free_warp=options.board_warp, progress=progress)
+
+    # Poses once more, under the final lens.
+    state, flipped = unflip(board, seen, [model], minimum.state, solver)
+    problem = BoardProblem(board, seen, [model], [_free(model)], free_warp=options.board_warp)
+    if flipped:
+        result = minimise(problem, state, solver)
+        minimum = Minimum(state=result.state, result=result, iterations=minimum.iterations + int(result.iterations))
+    state = problem.tidy(minimum.state)
+    return _result(observations, problem, state, minimum, model)
+
+
+def _free(model: LensModel) -> list[int]:
+    return [i for i, name in enumerate(parameter_names(model)) if name != "skew"]
+
+
+def _check(observations: Observations, pixels: Tensor, model: LensModel, warp: bool) -> None:
+    seen = torch.isfinite(pixels).all(-1).sum(-1)
+    if len(pixels) < _MINIMUM_VIEWS:
+        raise DegenerateError(
+            f"{len(pixels)} view(s) of the board: at least {_MINIMUM_VIEWS} at different tilts are needed, "
+            "10 to 40 are good"
+        )
+    poor = (seen < _MINIMUM_CORNERS).nonzero()[:, 0].tolist()
+    if poor:
+        raise InputError(
+            f"view {observations.names[poor[0]]!r} has {int(seen[poor[0]])} corners; at least {_MINIMUM_CORNERS} are "
+            "needed: remove the view"
+        )
+    unknowns = 4 + model.size + 2 * warp + 6 * len(pixels)
+    if 2 * int(seen.sum()) <= unknowns:
+        raise DegenerateError(
+            f"{int(seen.sum())} corners cannot determine {unknowns} parameters: add views or choose a smaller model"
+        )
+
+
+def _first(
+    board: Tensor, pixels: Tensor, size: tuple[int, int], model: LensModel, options: CalibrationOptions
+) -> tuple[State, State]:
+    """The first model's solution and a start without distortion, from the closed forms."""
+    homography = homographies(board, pixels)
+    best: tuple[float, State, State] | None = None
+    for intrinsics in intrinsics_candidates(homography, size):
+        rotation, translation = poses_from_homographies(homography, intrinsics)
+        zero = torch.zeros(len(INTRINSICS) + model.size, dtype=torch.float64)
+        zero[:4] = intrinsics
+        lens = zero.clone()
+        if model.numerator >= 2:
+            k1, k2 = (len(INTRINSICS) + i for i in model.numerator_index[:2])
+            lens[[k1, k2]] = radial_start(board, pixels, intrinsics, rotation, translation)
+        rest = (
+            torch.zeros(2, dtype=torch.float64),
+            torch.zeros(0, 3, 3, dtype=torch.float64),
+            torch.zeros(0, 3, dtype=torch.float64),
+            rotation,
+            translation,
+        )
+        problem = BoardProblem(board, pixels[:, None], [model], [_free(model)], free_warp=options.board_warp)
+        cold: State = (zero, *rest)
+        for start in ((lens, *rest), cold):
+            result = minimise(problem, start, options.solver)
+            if result.status != Status.BAD_START:
+                break
+        state, _ = unflip(board, pixels[:, None], [model], result.state, options.solver)
+        result = minimise(problem, state, options.solver)
+        cost = float(result.cost)
+        if cost == cost and (best is None or cost < best[0]):
+            best = (cost, result.state, cold)
+        if best is not None and _rms(best[0], pixels) < _SUSPICIOUS_RMS:
+            break
+    if best is None:
+        raise InputError("no start explains the corners: are all views of this board and from this camera?")
+    return best[1], best[2]
+
+
+def _rms(cost: float, pixels: Tensor) -> float:
+    return float((2.0 * cost / int(torch.isfinite(pixels).all(-1).sum())) ** 0.5)
+
+
+def _result(
+    observations: Observations, problem: BoardProblem, state: State, minimum: Minimum, model: LensModel
+) -> CameraCalibrationResult:
+    s = problem.unpack(state)
+    pixels = observations.pixels()
+    camera = Camera(s.parameters[0], size=observations.image_size, model=model)
+    residuals = problem.residuals(state).unflatten(-1, (2, -1)).transpose(-1, -2)
+    seen = torch.isfinite(pixels).all(-1)
+    squared = (residuals**2).sum(-1)
+    per_view = torch.sqrt(squared.sum(-1) / seen.sum(-1))
+    rms = float(torch.sqrt(squared.sum() / seen.sum()))
+    count = problem.shared_size + 6 * len(pixels)
+    uncertainty = spread(problem.linearise(state), problem.residual_count, count)
+    names = [name for name in camera.names if name != "skew"]
+    _check_focal(uncertainty, s.parameters[0])
+    status = Status(int(minimum.result.status))
+    return CameraCalibrationResult(
+        camera=camera,
+        rms=rms,
+        per_view_rms=per_view,
+        residuals=torch.where(seen[..., None], residuals, torch.nan),
+        cam_from_board_rotation=s.first_from_board_rotation,
+        cam_from_board_translation=s.first_from_board_translation,
+        board_warp=s.warp if problem.free_warp else None,
+        sigma={
+            name: float(sigma) if bool(known) else None for name, sigma, known in zip(names, *uncertainty, strict=False)
+        },
+        status=status,
+        iterations=minimum.iterations,
+        warnings=tuple(_warnings(observations, camera, rms, per_view, uncertainty, names, status)),
+    )
+
+
+def _check_focal(uncertainty: Spread, parameters: Tensor) -> None:
+    worst = float((uncertainty.sigma[:2] / parameters[:2]).max())
+    if not worst <= _MAX_FOCAL_SIGMA:
+        known = "not at all" if worst == float("inf") else f"only to ±{100 * worst:.1f} %"
+        raise DegenerateError(
+            f"the views determine the focal length {known}: they are parallel to the image or too much alike; add "
+            "views with the board tilted by 30 to 45 degrees in different directions"
+        )
+
+
+def _warnings(
+    observations: Observations,
+    camera: Camera,
+    rms: float,
+    per_view: Tensor,
+    uncertainty: Spread,
+    names: list[str],
+    status: Status,
+) -> list[str]:
+    found = []
+    if status not in (Status.CONVERGED, Status.EXACT):
+        found.append(f"the solver {status.message}")
+    if rms > 1.0:
+        found.append(f"RMS {rms:.2f} px is high: corners, board or lens model do not fit each other")
+    typical = float(per_view.median())
+    for i in (per_view > max(3.0 * typical, 0.1)).nonzero()[:, 0].tolist():
+        found.append(
+            f"view {observations.names[i]}: RMS {float(per_view[i]):.2f} px against {typical:.2f} px typically"
+        )
+    lost = [name for name, known in zip(names, uncertainty.determined.tolist(), strict=False) if not known]
+    if lost:
+        found.append(f"the views do not determine {', '.join(lost)}: choose a smaller model or add views")
+    width, height = camera.size
+    u, v = torch.linspace(0, width - 1, 33).double(), torch.linspace(0, height - 1, 25).double()
+    grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+    _, valid = camera.unproject(grid)
+    if not bool(valid.all()):
+        share = 100.0 * float((~valid).double().mean())
+        found.append(f"the lens model folds inside the image: {share:.0f} % of it gives no ray")
+    return found
