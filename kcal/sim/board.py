@@ -1,0 +1,162 @@
+"""The simulator's checkerboard: its size, its pose, its true corners, and its colours averaged over small areas."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from kcal.checks import as_points, require_finite
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+
+
+class BoardLike(Protocol):
+    """Anything that says how many inner corners a board has and how large its squares are, in metres."""
+
+    @property
+    def columns(self) -> int:
+        """Inner corners in a row."""
+
+    @property
+    def rows(self) -> int:
+        """Inner corners in a column."""
+
+    @property
+    def square(self) -> float:
+        """Side of a square in metres."""
+
+
+class BoardSize(NamedTuple):
+    """A checkerboard with `columns` x `rows` inner corners and squares of `square` metres."""
+
+    columns: int
+    rows: int
+    square: float
+
+
+class BoardPose(NamedTuple):
+    """cam_from_board: `points_cam = rotation @ points_board + translation`; (3, 3) and (3,) float64 metres."""
+
+    rotation: Tensor
+    translation: Tensor
+
+
+def check_board(board: BoardLike) -> None:
+    """Raise `InputError` unless the board has at least 2 x 2 inner corners and squares of a positive size."""
+    if board.columns < 2 or board.rows < 2 or not (board.square > 0 and math.isfinite(board.square)):
+        raise InputError(
+            f"board {board.columns}x{board.rows}, squares of {board.square} m: at least 2x2 inner corners and a "
+            "positive size are needed"
+        )
+
+
+def check_pose(cam_from_board: tuple[Tensor, Tensor]) -> BoardPose:
+    """Return the pose as float64.
+
+    Raises:
+        InputError: wrong shapes, values that are not finite, or a matrix that is no rotation.
+    """
+    rotation = as_points("cam_from_board rotation", cam_from_board[0], 3)
+    translation = as_points("cam_from_board translation", cam_from_board[1], 3)
+    if rotation.shape != (3, 3) or translation.shape != (3,):
+        raise InputError(
+            f"cam_from_board: shapes (3, 3) and (3,) are needed, got {tuple(rotation.shape)} and "
+            f"{tuple(translation.shape)}"
+        )
+    require_finite("cam_from_board rotation", rotation)
+    require_finite("cam_from_board translation", translation)
+    identity = torch.eye(3, dtype=torch.float64, device=rotation.device)
+    if not torch.allclose(rotation @ rotation.T, identity, atol=1e-6) or torch.linalg.det(rotation) < 0:
+        raise InputError("cam_from_board rotation: not a rotation matrix (R Rᵀ must be 1 and det R = +1)")
+    return BoardPose(rotation, translation)
+
+
+def board_points(board: BoardLike, border: int = 0) -> Tensor:
+    """Corner positions on the board, row by row: (columns * rows, 3) float64 metres, corner 0 at the origin.
+
+    With `border` the grid goes on by so many squares on every side; 1 reaches the outer edge of the outer squares.
+
+    Example:
+        >>> board_points(BoardSize(3, 2, 0.5))[:, :2].tolist()
+        [[0.0, 0.0], [0.5, 0.0], [1.0, 0.0], [0.0, 0.5], [0.5, 0.5], [1.0, 0.5]]
+        >>> board_points(BoardSize(3, 2, 0.5), border=1).shape
+        torch.Size([20, 3])
+    """
+    check_board(board)
+    y, x = torch.meshgrid(
+        torch.arange(-border, board.rows + border, dtype=torch.float64),
+        torch.arange(-border, board.columns + border, dtype=torch.float64),
+        indexing="ij",
+    )
+    return torch.stack([x.reshape(-1), y.reshape(-1), torch.zeros(x.numel(), dtype=torch.float64)], -1) * board.square
+
+
+def project_board(camera: Camera, cam_from_board: tuple[Tensor, Tensor], board: BoardLike) -> tuple[Tensor, Tensor]:
+    """True pixels of the inner corners.
+
+    Args:
+        camera: a single camera.
+        cam_from_board: rotation (3, 3) and translation (3,).
+        board: its size.
+
+    Returns:
+        pixels (N, 2) in the order of `board_points`, and visible (N,): projected validly and inside the image.
+
+    Raises:
+        InputError: a board or pose that cannot be.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
+        >>> pose = BoardPose(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
+        >>> pixels, visible = project_board(camera, pose, BoardSize(9, 6, 0.05))
+        >>> pixels[1].tolist(), bool(visible.all())
+        ([339.5, 239.5], True)
+    """
+    rotation, translation = check_pose(cam_from_board)
+    pixels, valid = camera.project(board_points(board) @ rotation.T + translation)
+    return pixels, valid & camera.inside(pixels)
+
+
+class Colours(NamedTuple):
+    """Shares (0 to 1) of a small area that are paper (board and its white margin), and that are black squares."""
+
+    paper: Tensor
+    black: Tensor
+
+
+def area_colours(a: Tensor, b: Tensor, width_a: Tensor, width_b: Tensor, board: BoardLike, margin: int) -> Colours:
+    """The pattern averaged over boxes around board positions: exact integrals, so that edges never move.
+
+    The black share of a checkerboard is (1 + q(a) q(b)) / 2 with a square wave q along each axis. Box averages of
+    both factors come from their antiderivatives (the triangle wave for q), as in I. Quilez, "Box-filtered procedural
+    textures".
+
+    Args:
+        a: board x in squares from corner 0, any shape.
+        b: board y likewise.
+        width_a: width of each box along x in squares, positive.
+        width_b: width along y.
+        board: its size.
+        margin: width of the white margin in squares.
+
+    Example:
+        >>> a = torch.tensor([-0.5, 0.5, 0.0], dtype=torch.float64)
+        >>> narrow = torch.full_like(a, 0.1)
+        >>> area_colours(a, a[:1], narrow, narrow[:1], BoardSize(9, 6, 0.05), 1).black.round(decimals=9).abs().tolist()
+        [1.0, 0.0, 0.5]
+    """
+
+    def averages(t: Tensor, width: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        low, high = t - 0.5 * width, t + 0.5 * width
+        paper = high.clamp(-1 - margin, count + margin) - low.clamp(-1 - margin, count + margin)
+        low, high = low.clamp(-1, count), high.clamp(-1, count)
+        # |t mod 2 - 1| falls with slope 1 on (0, 1), so that q = +1 there and -1 on (-1, 0).
+        wave = (low.remainder(2) - 1).abs() - (high.remainder(2) - 1).abs()
+        return paper / width, (high - low) / width, wave / width
+
+    paper_a, squares_a, wave_a = averages(a, width_a, board.columns)
+    paper_b, squares_b, wave_b = averages(b, width_b, board.rows)
+    return Colours(paper_a * paper_b, 0.5 * (squares_a * squares_b + wave_a * wave_b))

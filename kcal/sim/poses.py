@@ -1,0 +1,235 @@
+"""Where to hold a board: poses that are completely seen, tilted in all directions, and spread over image and depth.
+
+Poses are drawn at random, those that are not completely seen are dropped, and of the rest those are kept that lie
+farthest from each other (greedy farthest-point choice: T. Gonzalez, "Clustering to minimize the maximum intercluster
+distance", 1985). Extremes come first, which is what a calibration needs, and no draw is ever repeated endlessly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import StereoRig
+from kcal.sim.board import BoardLike, BoardPose, board_points
+
+_DRAWS = 4096
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseOptions:
+    """How boards are held.
+
+    Args:
+        max_tilt: largest angle between the board's normal and the line of sight, radians.
+        max_roll: largest turn of the board about its normal, radians.
+        border: squares around the inner corners that must be in the image too; 1 keeps all squares whole.
+        margin: pixels between them and the image's edge.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    max_tilt: float = math.radians(45.0)
+    max_roll: float = math.radians(25.0)
+    border: int = 1
+    margin: float = 4.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.max_tilt <= math.radians(80.0):
+            raise InputError("pose option max_tilt: radians from 0 to 80 degrees are needed")
+        if not 0 <= self.max_roll <= math.pi:
+            raise InputError("pose option max_roll: radians from 0 to pi are needed")
+        if not isinstance(self.border, int) or self.border < 0 or not 0 <= self.margin < math.inf:
+            raise InputError("pose options border and margin: a whole number of squares and pixels, not negative")
+
+
+def sample_board_poses(
+    camera: Camera,
+    board: BoardLike,
+    count: int,
+    generator: torch.Generator,
+    *,
+    fill: tuple[float, float] = (0.4, 0.9),
+    options: PoseOptions | None = None,
+) -> list[BoardPose]:
+    """Poses for the calibration of one camera: over the whole image, at several distances, tilted in all directions.
+
+    Args:
+        camera: a single camera.
+        board: its size.
+        count: how many poses.
+        generator: source of the draws; the same state gives the same poses.
+        fill: smallest and largest share of the image's width or height that the board takes when it is not tilted.
+        options: limits of tilt, roll and margins.
+
+    Returns:
+        cam_from_board poses; the first lies near the middle of all.
+
+    Raises:
+        InputError: fewer than `count` of 4096 drawn boards are completely seen, or an argument out of range.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
+        >>> from kcal.sim.board import BoardSize, project_board
+        >>> board = BoardSize(9, 6, 0.025)
+        >>> poses = sample_board_poses(camera, board, 12, torch.Generator().manual_seed(1))
+        >>> all(bool(project_board(camera, pose, board)[1].all()) for pose in poses)
+        True
+    """
+    options = options or PoseOptions()
+    _check(count, "fill", fill)
+    width, height = camera.size
+    extent = ((board.columns + 1) * board.square, (board.rows + 1) * board.square)
+    focal = camera.focal.detach()
+    unit = max(float(focal[0]) * extent[0] / width, float(focal[1]) * extent[1] / height)
+    drawn = _draw(camera, board, (unit / fill[1], unit / fill[0]), None, generator, options)
+    still = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    return _choose(drawn, [(camera, *still)], board, count, options)
+
+
+def sample_pair_poses(
+    rig: StereoRig,
+    board: BoardLike,
+    count: int,
+    generator: torch.Generator,
+    *,
+    distance: tuple[float, float],
+    options: PoseOptions | None = None,
+) -> list[BoardPose]:
+    """Poses that both cameras of a rig see completely, tilted against the line from the rig's middle.
+
+    Args:
+        rig: two cameras.
+        board: its size.
+        count: how many poses.
+        generator: source of the draws; the same state gives the same poses.
+        distance: nearest and farthest distance of the board's centre from the left camera, metres.
+        options: limits of tilt, roll and margins.
+
+    Returns:
+        left_from_board poses; `rig_pose` gives those of the right camera.
+
+    Raises:
+        InputError: fewer than `count` of 4096 drawn boards are completely seen by both, or an argument out of range.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
+        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+        >>> from kcal.sim.board import BoardSize, project_board
+        >>> board = BoardSize(9, 6, 0.1)
+        >>> poses = sample_pair_poses(rig, board, 4, torch.Generator().manual_seed(1), distance=(4.0, 6.0))
+        >>> bool(project_board(rig.right, rig_pose(rig, poses[0]), board)[1].all())
+        True
+    """
+    options = options or PoseOptions()
+    _check(count, "distance", distance)
+    rotation, translation = rig.right_from_left_rotation, rig.right_from_left_translation
+    middle = -0.5 * rotation.T @ translation
+    drawn = _draw(rig.left, board, distance, middle, generator, options)
+    still = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    return _choose(drawn, [(rig.left, *still), (rig.right, rotation, translation)], board, count, options)
+
+
+def rig_pose(rig: StereoRig, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
+    """right_from_board of a board whose pose in the left camera is given."""
+    rotation, translation = left_from_board
+    return BoardPose(rig.right_from_left_rotation @ rotation, rig.right_from_left(translation))
+
+
+def _check(count: int, name: str, limits: tuple[float, float]) -> None:
+    if not isinstance(count, int) or not 1 <= count <= _DRAWS:
+        raise InputError(f"count: a whole number from 1 to {_DRAWS} is needed, got {count!r}")
+    if not 0 < limits[0] <= limits[1] < math.inf:
+        raise InputError(f"{name} {limits}: two positive numbers are needed, the smaller first")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Drawn:
+    """Random poses, and where they lie in the space in which they are to be spread out (draws, 3)."""
+
+    rotation: Tensor
+    translation: Tensor
+    features: Tensor
+
+
+def _draw(
+    camera: Camera,
+    board: BoardLike,
+    distance: tuple[float, float],
+    eye: Tensor | None,
+    generator: torch.Generator,
+    options: PoseOptions,
+) -> _Drawn:
+    random = torch.rand((_DRAWS, 6), dtype=torch.float64, generator=generator)
+    with torch.no_grad():
+        aim = random[:, :2] * torch.tensor(camera.size, dtype=torch.float64) - 0.5
+        # A pixel beyond the lens's fold gives the optical axis: one more board in the middle.
+        rays, _ = camera.unproject(aim)
+    near, far = distance
+    depth = near * (far / near) ** random[:, 2]
+    centre = rays * depth[:, None]
+    sight = centre - eye if eye is not None else centre
+    # Between a quarter of the largest tilt and all of it: boards square to the sight say nothing of the focal length.
+    tilt, towards = options.max_tilt * (0.25 + 0.75 * random[:, 3]), 2 * math.pi * random[:, 4]
+    roll = options.max_roll * (2 * random[:, 5] - 1)
+    zero = torch.zeros_like(tilt)
+    axis = torch.stack([torch.cos(towards), torch.sin(towards), zero], -1)
+    rotation = _turn_to(sight) @ rotation_from_vector(tilt[:, None] * axis)
+    rotation = rotation @ rotation_from_vector(torch.stack([zero, zero, roll], -1))
+    points = board_points(board)
+    middle = 0.5 * (points[0] + points[-1])
+    translation = centre - rotation @ middle
+    features = [
+        tilt / max(options.max_tilt, 1e-9) * torch.cos(towards),
+        tilt / max(options.max_tilt, 1e-9) * torch.sin(towards),
+        random[:, 2],
+    ]
+    return _Drawn(rotation=rotation, translation=translation, features=0.4 * torch.stack(features, -1))
+
+
+def _choose(
+    drawn: _Drawn, cameras: list[tuple[Camera, Tensor, Tensor]], board: BoardLike, count: int, options: PoseOptions
+) -> list[BoardPose]:
+    points = board_points(board, options.border)
+    points_rig = points @ drawn.rotation.transpose(-1, -2) + drawn.translation[:, None]
+    seen = torch.ones(_DRAWS, dtype=torch.bool)
+    features = [drawn.features]
+    for camera, rotation, translation in cameras:
+        with torch.no_grad():
+            pixels, valid = camera.project(points_rig @ rotation.T + translation)
+        size = torch.tensor(camera.size, dtype=torch.float64)
+        inside = (pixels >= options.margin) & (pixels <= size - 1 - options.margin)
+        seen &= (valid & inside.all(-1)).all(-1)
+        # The right camera adds nothing to the left one but the parallax.
+        features.append(pixels.mean(1) / size / len(cameras))
+    found = int(seen.sum())
+    if found < count:
+        raise InputError(
+            f"only {found} of {_DRAWS} drawn boards are completely seen and {count} are needed; "
+            "use a smaller board, another distance, less tilt or a smaller margin"
+        )
+    rotation, translation = drawn.rotation[seen], drawn.translation[seen]
+    places = torch.cat(features, -1)[seen]
+    chosen = [int(torch.linalg.vector_norm(places - places.mean(0), dim=-1).argmin())]
+    apart = torch.full((found,), math.inf, dtype=torch.float64)
+    while len(chosen) < count:
+        apart = torch.minimum(apart, torch.linalg.vector_norm(places - places[chosen[-1]], dim=-1))
+        chosen.append(int(apart.argmax()))
+    return [BoardPose(rotation[i].clone(), translation[i].clone()) for i in chosen]
+
+
+def _turn_to(sight: Tensor) -> Tensor:
+    """The smallest rotations that turn the z axis to directions (N, 3), which must not point straight back."""
+    direction = sight / torch.linalg.vector_norm(sight, dim=-1, keepdim=True)
+    x, y, z = direction.unbind(-1)
+    sine = torch.hypot(x, y)
+    safe = sine.clamp_min(1e-12)
+    angle = torch.atan2(sine, z) / safe
+    return rotation_from_vector(torch.stack([-y * angle, x * angle, torch.zeros_like(x)], -1))

@@ -1,0 +1,225 @@
+"""Images of a checkerboard through a distorting lens, with true corners: light first, then optics, then the sensor.
+
+Every pixel is unprojected through the exact inverse of the lens, meets the board's plane, and receives the pattern
+averaged over the pixel's area. Then come blur (in linear light), vignetting, noise and rounding to 8 bits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.sim.board import BoardLike, BoardPose, area_colours, board_points, check_board, check_pose
+from kcal.sim.window import Window, grow, invert_window, pixel_axes
+
+_FAR = 1e9  # squares: nothing is painted there
+_SAMPLES = 4  # boxes along each side of a pixel that an edge crosses
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions:
+    """How a rendered image looks; grey levels are 0 to 255.
+
+    Args:
+        black: grey level of the black squares.
+        white: of the white squares and the margin.
+        background: mean level around the board; it varies slowly by a fifth.
+        margin: width of the white margin in squares.
+        blur: sigma of the optics' Gaussian in pixels, on top of the averaging over the pixel's area.
+        noise: sigma of the sensor's noise in grey levels.
+        vignetting: share of light lost in the image's corners.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    black: float = 40.0
+    white: float = 215.0
+    background: float = 115.0
+    margin: int = 1
+    blur: float = 0.7
+    noise: float = 2.0
+    vignetting: float = 0.15
+
+    def __post_init__(self) -> None:
+        for name in ("black", "white", "background"):
+            if not 0 <= getattr(self, name) <= 255:
+                raise InputError(f"render option {name}: a grey level from 0 to 255 is needed")
+        for name, high in (("blur", 20.0), ("noise", 255.0), ("vignetting", 1.0)):
+            if not 0 <= getattr(self, name) <= high:
+                raise InputError(f"render option {name}: a value from 0 to {high:g} is needed")
+        if not isinstance(self.margin, int) or not 1 <= self.margin <= 20:
+            raise InputError("render option margin: a whole number of squares from 1 to 20 is needed")
+
+
+def render_board(
+    camera: Camera,
+    cam_from_board: tuple[Tensor, Tensor],
+    board: BoardLike,
+    options: RenderOptions | None = None,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Image of a checkerboard as the camera sees it.
+
+    The square diagonally outside corner 0 is black; see `board_points` for where corners lie and `project_board`
+    for their true pixels. A board that reaches beyond the image, or beyond what the lens can image, is drawn as far
+    as it is seen; `project_board` says which corners are.
+
+    An edge is placed to better than 0.001 px: the lens is inverted every 8 px and interpolated by cubics, and the
+    pattern is integrated in 4 x 4 boxes per pixel, each an exact integral.
+
+    Args:
+        camera: a single camera.
+        cam_from_board: rotation (3, 3) and translation (3,) in metres.
+        board: columns, rows and square.
+        options: how the image looks.
+        generator: source of the noise; needed when `options.noise` is not zero.
+
+    Returns:
+        (height, width) uint8.
+
+    Raises:
+        InputError: a batch of cameras, a board that reaches behind the camera or is seen from its back, a bad board
+            or pose, or noise without a generator.
+
+    Example:
+        >>> from kcal.sim.board import BoardSize
+        >>> camera = Camera.build(focal=(400, 400), center=(159.5, 119.5), size=(320, 240))
+        >>> pose = BoardPose(torch.eye(3), torch.tensor([-0.2, -0.125, 1.0]))
+        >>> image = render_board(camera, pose, BoardSize(9, 6, 0.05), RenderOptions(noise=0, vignetting=0))
+        >>> image.shape, int(image[60, 70]), int(image[60, 90])
+        (torch.Size([240, 320]), 40, 215)
+    """
+    options = options or RenderOptions()
+    if camera.parameters_vector.ndim != 1:
+        raise InputError("render_board: a single camera is needed, got a batch")
+    check_board(board)
+    pose = check_pose(cam_from_board)
+    if options.noise > 0 and generator is None:
+        raise InputError("render_board: noise needs a torch.Generator; give one or set noise to 0")
+    with torch.no_grad():
+        radius = math.ceil(4 * options.blur)
+        width, height = camera.size
+        image = _background(Window(0, 0, width, height), camera.size, options)
+        paper = _paper_window(camera, pose, board, options.margin, radius)
+        if paper.width > 0 and paper.height > 0:
+            # What is just outside the window is blurred into it.
+            light = _light(camera, pose, board, grow(paper, radius), options)
+            rows, columns = slice(paper.top, paper.top + paper.height), slice(paper.left, paper.left + paper.width)
+            image[rows, columns] = _blur(light, options.blur, radius)
+        x, y = pixel_axes(Window(0, 0, width, height))
+        x, y = x - (width - 1) / 2, y - (height - 1) / 2
+        image *= 1 - options.vignetting * (x**2 + y[:, None] ** 2) / (x[-1] ** 2 + y[-1] ** 2)
+        if options.noise > 0:
+            image += options.noise * torch.randn(image.shape, dtype=torch.float64, generator=generator)
+        return image.round_().clamp_(0, 255).to(torch.uint8)
+
+
+def _light(camera: Camera, pose: BoardPose, board: BoardLike, window: Window, options: RenderOptions) -> Tensor:
+    """Grey levels of a window, averaged over each pixel's area, before optics and sensor."""
+    around = _background(window, camera.size, options)
+    grown_a, grown_b = _board_coordinates(camera, pose, board, grow(window, 1))
+    a, b = grown_a[1:-1, 1:-1], grown_b[1:-1, 1:-1]
+    tiny = torch.tensor(1e-6, dtype=torch.float64)
+    light = _paint(a, b, tiny, tiny, board, options, around).reshape(-1)
+
+    # Board squares per pixel, along x and y. Every edge of the pattern and of the paper lies at a whole number.
+    a_x, a_y, b_x, b_y = *_slopes(grown_a), *_slopes(grown_b)
+    edge_a = (a - a.round()).abs() <= 0.5 * (a_x.abs() + a_y.abs())
+    edge_b = (b - b.round()).abs() <= 0.5 * (b_x.abs() + b_y.abs())
+    outside = 1.5 + options.margin
+    near = (a > -outside) & (a < board.columns - 1 + outside) & (b > -outside) & (b < board.rows - 1 + outside)
+    index = ((edge_a | edge_b) & near).reshape(-1).nonzero()[:, 0]
+    a, b, a_x, a_y, b_x, b_y, around = (value.reshape(-1)[index] for value in (a, b, a_x, a_y, b_x, b_y, around))
+    # Boxes with the variance of a small square along the board's axes: exact for aligned edges, never off centre.
+    width_a = torch.hypot(a_x, a_y).clamp_min(1e-9) / _SAMPLES
+    width_b = torch.hypot(b_x, b_y).clamp_min(1e-9) / _SAMPLES
+    offsets = [(i + 0.5) / _SAMPLES - 0.5 for i in range(_SAMPLES)]
+    mixed = torch.zeros_like(a)
+    for dx in offsets:
+        for dy in offsets:
+            mixed += _paint(a + a_x * dx + a_y * dy, b + b_x * dx + b_y * dy, width_a, width_b, board, options, around)
+    light[index] = mixed / _SAMPLES**2
+    return light.reshape(window.height, window.width)
+
+
+def _slopes(grown: Tensor) -> tuple[Tensor, Tensor]:
+    """Change per pixel along x and y, one pixel smaller on every side."""
+    return 0.5 * (grown[1:-1, 2:] - grown[1:-1, :-2]), 0.5 * (grown[2:, 1:-1] - grown[:-2, 1:-1])
+
+
+def _paint(
+    a: Tensor, b: Tensor, width_a: Tensor, width_b: Tensor, board: BoardLike, options: RenderOptions, around: Tensor
+) -> Tensor:
+    """Grey levels of boxes around board positions, where the background has the grey levels `around`."""
+    paper, black = area_colours(a, b, width_a, width_b, board, options.margin)
+    return around + (options.white - around) * paper - (options.white - options.black) * black
+
+
+def _board_coordinates(camera: Camera, pose: BoardPose, board: BoardLike, window: Window) -> tuple[Tensor, Tensor]:
+    """Where each pixel's ray meets the board's plane, x and y in squares; far away where it does not."""
+    normalized, valid = invert_window(camera, window)
+    x, y = normalized.unbind(-1)
+    plane = torch.stack([pose.rotation[:, 0], pose.rotation[:, 1], pose.translation / board.square], -1)
+    a, b, depth = (row[0] * x + row[1] * y + row[2] for row in torch.linalg.inv(plane))
+    # depth is 1 / z of the meeting point: not positive for rays that leave the plane behind.
+    unseen = ~valid | (depth <= 1e-12)
+    return (a / depth).masked_fill_(unseen, _FAR), (b / depth).masked_fill_(unseen, _FAR)
+
+
+def _paper_window(camera: Camera, pose: BoardPose, board: BoardLike, margin: int, radius: int) -> Window:
+    """The part of the image that the paper and its blur reach; the whole image where that is uncertain."""
+    outline = _outline(board, 1 + margin) @ pose.rotation.T + pose.translation
+    if bool((outline[:, 2] <= 0).any()):
+        raise InputError("render_board: the board reaches behind the camera; move it forward (z is depth)")
+    if float(pose.rotation[:, 2] @ pose.translation) <= 0:
+        raise InputError("render_board: the board shows its back; its z axis must point away from the camera")
+    width, height = camera.size
+    pixels, valid = camera.project(outline)
+    if not bool(valid.all()):
+        return Window(0, 0, width, height)
+    # The outline is known at points only, and bends a little between them.
+    low, high = pixels.amin(0), pixels.amax(0)
+    pad = radius + 3 + 0.01 * float((high - low).max())
+    left, top = (max(0, math.floor(float(value) - pad)) for value in low)
+    right, bottom = (
+        min(size, math.ceil(float(value) + pad) + 1) for size, value in zip(camera.size, high, strict=True)
+    )
+    return Window(left, top, max(0, right - left), max(0, bottom - top))
+
+
+def _outline(board: BoardLike, border: int) -> Tensor:
+    """Points around the rectangle that lies `border` squares outside the inner corners, (4 * 64, 3) metres."""
+    corners = board_points(board, border)
+    columns = board.columns + 2 * border
+    ring = corners[[0, columns - 1, -1, -columns, 0]]
+    share = torch.arange(64, dtype=torch.float64)[:, None, None] / 64
+    return ((1 - share) * ring[:-1] + share * ring[1:]).reshape(-1, 3)
+
+
+def _background(window: Window, size: tuple[int, int], options: RenderOptions) -> Tensor:
+    x, y = pixel_axes(window)
+    wave = torch.sin(4.0 * x / size[0] + (2.5 * y / size[1])[:, None] + 0.5)
+    return options.background * (1 + 0.2 * wave)
+
+
+def _blur(light: Tensor, sigma: float, radius: int) -> Tensor:
+    """Gaussian blur; the result is smaller by `radius` on every side."""
+    if radius == 0:
+        return light
+    offset = torch.arange(-radius, radius + 1, dtype=torch.float64)
+    kernel = torch.exp(-0.5 * (offset / sigma) ** 2)
+    weights = (kernel / kernel.sum()).tolist()
+    rows, columns = light.shape[0] - 2 * radius, light.shape[1] - 2 * radius
+    vertical = torch.zeros((rows, light.shape[1]), dtype=torch.float64)
+    result = torch.zeros((rows, columns), dtype=torch.float64)
+    for i, weight in enumerate(weights):
+        vertical.add_(light[i : i + rows], alpha=weight)
+    for i, weight in enumerate(weights):
+        result.add_(vertical[:, i : i + columns], alpha=weight)
+    return result

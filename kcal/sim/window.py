@@ -1,0 +1,95 @@
+"""The inverse of a lens at every pixel of a rectangle: exact on a grid, interpolated in between, never past a fold."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.lens.camera import Camera
+
+_STEP = 8  # pixels between the places where the lens is inverted; cubic interpolation between them
+_FOLD = 6  # steps around a place without inverse that are inverted pixel by pixel
+_CHUNK = 1 << 15  # pixels inverted at a time; more would leave the processor's cache
+
+
+class Window(NamedTuple):
+    """A rectangle of pixels; it may reach beyond the image."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+def pixel_axes(window: Window) -> tuple[Tensor, Tensor]:
+    """Positions x of every column (width,) and y of every row (height,), float64."""
+    x = window.left + torch.arange(window.width, dtype=torch.float64)
+    y = window.top + torch.arange(window.height, dtype=torch.float64)
+    return x, y
+
+
+def grow(window: Window, by: int) -> Window:
+    """The window with `by` more pixels on every side."""
+    return Window(window.left - by, window.top - by, window.width + 2 * by, window.height + 2 * by)
+
+
+@torch.no_grad()
+def invert_window(camera: Camera, window: Window) -> tuple[Tensor, Tensor]:
+    """Undistorted coordinates of every pixel of a window.
+
+    The lens is inverted by `camera.normalize` at every eighth pixel and interpolated by cubic Lagrange polynomials,
+    which errs by 2e-6 px for the demonstration's lenses and by 5e-4 px at most close to a fold (measured by projecting
+    back); around places that the lens cannot have imaged, every pixel is inverted.
+
+    Returns:
+        normalized (height, width, 2) and valid (height, width).
+
+    Example:
+        >>> camera = Camera.build(focal=(400, 400), center=(159.5, 119.5), size=(320, 240))
+        >>> normalized, valid = invert_window(camera, Window(100, 50, 20, 10))
+        >>> [round(value, 9) for value in normalized[0, 0].tolist()], bool(valid.all())
+        ([-0.14875, -0.17375], True)
+    """
+    across, nodes_x = _lagrange(window.left, window.width)
+    down, nodes_y = _lagrange(window.top, window.height)
+    node_y, node_x = torch.meshgrid(nodes_y, nodes_x, indexing="ij")
+    nodes, valid_nodes = _normalize(camera, torch.stack([node_x, node_y], -1).reshape(-1, 2))
+    shape = (len(nodes_y), len(nodes_x))
+    normalized = torch.stack([down @ nodes[:, i].reshape(shape) @ across.T for i in (0, 1)], -1)
+
+    invalid = (~valid_nodes).reshape(1, 1, *shape).double()
+    near = torch.nn.functional.max_pool2d(invalid, 2 * _FOLD + 1, stride=1, padding=_FOLD)[0, 0]
+    exact = (down.ne(0).double() @ near @ across.ne(0).double().T) > 0
+    valid = ~exact
+    if bool(exact.any()):
+        x, y = pixel_axes(window)
+        pixels = torch.stack([x.expand(exact.shape)[exact], y[:, None].expand(exact.shape)[exact]], -1)
+        normalized[exact], valid[exact] = _normalize(camera, pixels)
+    return normalized, valid
+
+
+def _normalize(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    parts = [camera.normalize(part) for part in pixels.split(_CHUNK)]
+    return torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
+
+
+def _lagrange(start: int, count: int) -> tuple[Tensor, Tensor]:
+    """Cubic interpolation at start, start + 1, ... from nodes `_STEP` apart: weights (count, nodes), node positions."""
+    nodes = start + _STEP * torch.arange(-1, (count - 1) // _STEP + 3, dtype=torch.float64)
+    where = torch.arange(count)
+    first = where // _STEP  # of the four nodes used
+    t = (where % _STEP).double() / _STEP  # from the second node to the third
+    basis = torch.stack(
+        [
+            -t * (t - 1) * (t - 2) / 6,
+            (t + 1) * (t - 1) * (t - 2) / 2,
+            -(t + 1) * t * (t - 2) / 2,
+            (t + 1) * t * (t - 1) / 6,
+        ],
+        -1,
+    )
+    weights = torch.zeros((count, len(nodes)), dtype=torch.float64)
+    weights.scatter_(1, first[:, None] + torch.arange(4), basis)
+    return weights, nodes
