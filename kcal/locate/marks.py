@@ -61,7 +61,7 @@ def read_marks(path: str | Path) -> Marks:
         raise FileError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from error
     if "\0" in text:
         raise FileError(f"{path}: not a text file; save it as CSV in UTF-8")
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True, skipinitialspace=True)
     try:
         rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except csv.Error as error:

@@ -33,8 +33,9 @@ class Position:
 
     Latitude, longitude (degrees) and the ellipsoidal WGS84 `height` (metres), `enu` and the best estimate `range_m`
     are there only if the status is `OK`. Azimuth and elevation in degrees and the range interval are also there if
-    it is `BEARING_ONLY` or `PARALLEL`. Ranges are metres from the left camera; `range_high_m` may be infinite. The
-    interval covers 95 % of the marks' noise, and no error of the calibration. `reason` is empty, says why there is no
+    it is `BEARING_ONLY` or `PARALLEL`, the interval only if some range explains the marks. Ranges are metres from the
+    left camera; `range_high_m` may be infinite. The interval covers 95 % of the marks' noise, and no error of the
+    calibration. `reason` is empty, says why there is no
     position, or warns of one that looks wrong.
     """
 
@@ -161,13 +162,10 @@ def locate(
             status = Status.BEARING_ONLY
         position = Position(name=name, status=status, reason=_reason(status, result, i, pixel_sigma))
         if status in (Status.OK, Status.BEARING_ONLY, Status.PARALLEL):
-            position = dataclasses.replace(
-                position,
-                range_low_m=float(result.range_low[i]),
-                range_high_m=float(result.range_high[i]),
-                azimuth_deg=angles[i][0],
-                elevation_deg=angles[i][1],
-            )
+            position = dataclasses.replace(position, azimuth_deg=angles[i][0], elevation_deg=angles[i][1])
+            low, high = float(result.range_low[i]), float(result.range_high[i])
+            if math.isfinite(low):
+                position = dataclasses.replace(position, range_low_m=low, range_high_m=high)
         if status in (Status.OK, Status.BEARING_ONLY):
             left, right = result.reprojection[i].tolist()
             position = dataclasses.replace(position, reprojection_px=(left, right))

@@ -200,7 +200,7 @@ def _draw_plan(axes: Axes, located: Located, true_enu: Array | None, shown: list
 def _draw_sight(axes: Axes, position: Position, scale: _RangeScale) -> None:
     """The interval along the line of sight; dashed where only the bearing is known."""
     low, high, azimuth = position.range_low_m, position.range_high_m, position.azimuth_deg
-    if low is None or high is None or azimuth is None or math.isinf(low):
+    if low is None or high is None or azimuth is None:
         return
     tilt = math.cos(math.radians(position.elevation_deg or 0.0))
     known = position.status == Status.OK
@@ -234,8 +234,7 @@ def _draw_names(axes: Axes, located: Located, shown: list[int], scale: _RangeSca
         if position.enu is not None:
             anchors.append(scale.place(np.asarray(position.enu)))
         else:
-            low = position.range_low_m if position.range_low_m and math.isfinite(position.range_low_m) else scale.rim
-            anchors.append(scale.polar(position.azimuth_deg or 0.0, low))
+            anchors.append(scale.polar(position.azimuth_deg or 0.0, position.range_low_m or 0.0))
     for i, anchor in zip(shown, anchors, strict=True):
         others = [other - anchor for other in anchors if other is not anchor]
         crowded = any(0 < other[0] < 0.2 and abs(other[1]) < 0.03 for other in others)
@@ -292,5 +291,5 @@ def _footer(located: Located) -> str:
     failed: Sequence[Position] = [p for p in located.positions if p.range_low_m is None]
     lines += [f"{p.name}: {p.reason}" for p in failed[:3]]
     if len(failed) > 3:
-        lines.append(f"and {len(failed) - 3} more without a bearing")
+        lines.append(f"and {len(failed) - 3} more")
     return "\n".join(lines)

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from kcal.cli.main import main
+from kcal.io.rig_file import save_rig
+from kcal.lens.camera import Camera
+from kcal.lens.rig import StereoRig
+
+HEADER = "name,left_u,left_v,right_u,right_v\n"
+ORIGIN = "-33.9,151.2,10"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+    save_rig(StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])), tmp_path / "rig.json")
+    (tmp_path / "points.csv").write_text(HEADER + "[b]mast,975.5,539.5,959.5,539.5\nlost,-40,5,1,5\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    return tmp_path
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["kcal", "locate", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    code = stopped.value.code
+    return code if isinstance(code, int) else 0
+
+
+@pytest.mark.parametrize("origin", [["--origin", ORIGIN], [f"--origin={ORIGIN}"]])
+def test_writes_files_and_a_table(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], origin: list[str]
+) -> None:
+    outputs = ["-o", "out.geojson", "-o", "out.csv", "--picture", "map.png"]
+    assert run(monkeypatch, "rig.json", "points.csv", *origin, "--heading", "-90", *outputs) == 0
+    printed = capsys.readouterr().out
+    line = next(line for line in printed.splitlines() if line.startswith("[b]mast"))
+    # 1 km west (0.01081 degrees) and 10 m north (9.0e-5); a straight line west bends 5 cm north of the parallel.
+    assert line.split()[1:5] == ["-33.8999094", "151.1891880", "10.1", "1000"]
+    assert "lost: a mark lies outside its image" in printed
+    assert "calibration errors are not included" in printed
+    features = json.loads((folder / "out.geojson").read_text())["features"]
+    assert [feature["properties"]["name"] for feature in features[2:]] == ["[b]mast", "lost"]
+    with (folder / "out.csv").open() as file:
+        assert [row["status"] for row in csv.DictReader(file)] == ["ok", "outside_image"]
+    assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_nothing_located_is_a_failure_with_its_reasons(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "points.csv").write_text(HEADER + "lost,-40,5,1,5\n")
+    assert run(monkeypatch, "rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0") == 1
+    printed = capsys.readouterr()
+    assert "lost: a mark lies outside its image" in printed.out
+    assert printed.err.splitlines()[-1].startswith("error: points.csv: none of the 1 pairs")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["rig.json", "points.csv", "--origin", "151.2,-33.9,10", "--heading", "0"], "longitude came first"),
+        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "nan"], "heading nan"),
+        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--pixel-sigma", "0"], "pixel_sigma"),
+        (["rig.json", "nothing.csv", "--origin", ORIGIN, "--heading", "0"], "nothing.csv: cannot read"),
+        (["points.csv", "points.csv", "--origin", ORIGIN, "--heading", "0"], "points.csv: not a JSON file"),
+        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "-o", "a.kml"], "a.kml: unknown format"),
+        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "-o", "no/a.csv"], "does not exist"),
+        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--picture", "a.pdf"], "end with .png"),
+    ],
+)
+def test_refusals_are_one_line_and_write_nothing(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    before = sorted(folder.iterdir())
+    assert run(monkeypatch, *arguments) == 1
+    printed = capsys.readouterr()
+    assert printed.err.startswith("error: ")
+    assert message in printed.err
+    assert len(printed.err.splitlines()) == 1
+    assert sorted(folder.iterdir()) == before
+
+
+def test_help_needs_no_heavy_imports() -> None:
+    code = "import sys, kcal.cli.main; print([m for m in ('torch', 'matplotlib', 'pyproj') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pyproj
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from locate_rigs import tensor
+
+from kcal.errors import InputError
+from kcal.locate.geodesy import Origin, azimuth_elevation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
+
+ORIGINS = [
+    Origin(lat=0.0, lon=0.0, height=0.0),
+    Origin(lat=19.07, lon=72.87, height=14.0),
+    Origin(lat=-33.9, lon=151.2, height=250.0),
+    Origin(lat=80.0, lon=-179.999, height=-20.0),
+    Origin(lat=-80.0, lon=180.0, height=3000.0),
+]
+
+
+def test_attitude_conventions() -> None:
+    right, down, forward = 0, 1, 2
+    north = enu_from_cam(0.0)
+    assert torch.allclose(north, tensor([1, 0, 0], [0, 0, 1], [0, -1, 0]), atol=1e-15)
+    # Heading 90 looks east; its right hand is south.
+    east = enu_from_cam(90.0)
+    assert torch.allclose(east[:, forward], tensor(1, 0, 0), atol=1e-15)
+    assert torch.allclose(east[:, right], tensor(0, -1, 0), atol=1e-15)
+    # Pitch raises the view: 30 degrees up has sin 30 of up.
+    assert enu_from_cam(0.0, 30.0)[:, forward].tolist() == pytest.approx([0, math.sqrt(0.75), 0.5], abs=1e-15)
+    assert enu_from_cam(123.0, 30.0)[2, forward].item() == pytest.approx(0.5, abs=1e-15)
+    # Roll clockwise as seen from behind: the right side goes down, the axis stays.
+    rolled = enu_from_cam(0.0, 0.0, 30.0)
+    assert rolled[:, right].tolist() == pytest.approx([math.sqrt(0.75), 0, -0.5], abs=1e-15)
+    assert torch.allclose(rolled[:, forward], north[:, forward], atol=1e-15)
+    assert rolled[:, down].tolist() == pytest.approx([-0.5, 0, -math.sqrt(0.75)], abs=1e-15)
+
+
+@given(st.floats(-360, 360), st.floats(-89.9, 89.9), st.floats(-180, 180))
+def test_attitude_is_a_rotation_whose_axis_has_the_heading_and_pitch(heading: float, pitch: float, roll: float) -> None:
+    rotation = enu_from_cam(heading, pitch, roll)
+    assert torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-14)
+    assert torch.linalg.det(rotation).item() == pytest.approx(1.0, abs=1e-14)
+    azimuth, elevation = azimuth_elevation(rotation[:, 2]).tolist()
+    # Azimuths lose digits towards the zenith: 1 / cos(89.9°) = 573.
+    assert math.sin(math.radians(azimuth - heading)) == pytest.approx(0.0, abs=1e-12)
+    assert elevation == pytest.approx(pitch, abs=1e-10)
+
+
+@pytest.mark.parametrize("angles", [(math.nan, 0, 0), (361, 0, 0), (0, 91, 0), (0, 0, math.inf)])
+def test_bad_angles_are_refused(angles: tuple[float, float, float]) -> None:
+    with pytest.raises(InputError, match="degrees between"):
+        enu_from_cam(*angles)
+
+
+def ecef(lat: float, lon: float, height: float) -> np.ndarray:
+    """WGS84 in closed form, independent of PROJ."""
+    a, f = 6378137.0, 1 / 298.257223563
+    e2 = f * (2 - f)
+    phi, lam = math.radians(lat), math.radians(lon)
+    n = a / math.sqrt(1 - e2 * math.sin(phi) ** 2)
+    return np.array(
+        [
+            (n + height) * math.cos(phi) * math.cos(lam),
+            (n + height) * math.cos(phi) * math.sin(lam),
+            (n * (1 - e2) + height) * math.sin(phi),
+        ]
+    )
+
+
+def ecef_from_enu(origin: Origin) -> np.ndarray:
+    phi, lam = math.radians(origin.lat), math.radians(origin.lon)
+    sp, cp, sl, cl = math.sin(phi), math.cos(phi), math.sin(lam), math.cos(lam)
+    return np.array([[-sl, -sp * cl, cp * cl], [cl, -sp * sl, cp * sl], [0, cp, sp]])
+
+
+def around(distance: float) -> torch.Tensor:
+    azimuth = torch.deg2rad(torch.arange(0, 360, 15, dtype=torch.float64))
+    up = torch.linspace(-200, 400, len(azimuth), dtype=torch.float64)
+    return torch.stack([distance * azimuth.sin(), distance * azimuth.cos(), up], -1)
+
+
+@pytest.mark.parametrize("origin", ORIGINS, ids=str)
+@pytest.mark.parametrize("distance", [0.0, 100.0, 5000.0, 10_000.0])
+def test_positions_agree_with_closed_form_ecef_and_round_trip(origin: Origin, distance: float) -> None:
+    enu = around(distance)
+    geodetic = enu_to_geodetic(enu, origin)
+    base = ecef(origin.lat, origin.lon, origin.height)
+    for point, (lat, lon, height) in zip(enu.numpy(), geodetic.tolist(), strict=True):
+        expected = base + ecef_from_enu(origin) @ point
+        # Coordinates of 6e6 m hold 1e-9 m; PROJ's latitude is good to 1e-8 m. The requirement is 1 mm.
+        assert np.abs(ecef(lat, lon, height) - expected).max() < 1e-7
+        assert -180 <= lon < 180
+    assert (geodetic_to_enu(geodetic, origin) - enu).abs().max() < 1e-7
+
+
+@pytest.mark.parametrize("origin", ORIGINS, ids=str)
+def test_distances_and_azimuths_agree_with_geodesics(origin: Origin) -> None:
+    geod = pyproj.Geod(ellps="WGS84")
+    on_ellipsoid = Origin(lat=origin.lat, lon=origin.lon, height=0.0)
+    azimuths = np.arange(0.0, 360.0, 15.0)
+    for distance in (100.0, 5000.0, 10_000.0):
+        start = np.full_like(azimuths, origin.lon), np.full_like(azimuths, origin.lat)
+        lon, lat, _ = geod.fwd(*start, azimuths, np.full_like(azimuths, distance))
+        target = torch.tensor(np.stack([lat, lon, np.zeros_like(lat)], -1))
+        enu = geodetic_to_enu(target, on_ellipsoid)
+        # The chord is shorter than the geodesic by d³ / 24 R²: 1.03 mm at 10 km.
+        chord = distance - distance**3 / (24 * 6.371e6**2)
+        assert (enu.norm(dim=-1) - chord).abs().max() < 1e-4
+        # Normal-section and geodesic azimuths differ by less than 1e-6 degrees at 10 km: 0.2 mm.
+        difference = (azimuth_elevation(enu)[:, 0] - torch.tensor(azimuths) + 180) % 360 - 180
+        assert difference.abs().max() < 1e-6
+
+
+def test_up_is_not_height() -> None:
+    # A point 5 km off on the tangent plane is 1.96 m above the ellipsoid (d² / 2 R).
+    origin = Origin(lat=19.07, lon=72.87, height=0.0)
+    heights = enu_to_geodetic(around(5000.0) * tensor(1, 1, 0), origin)[:, 2]
+    assert heights.tolist() == pytest.approx([1.96] * len(heights), abs=0.02)
+
+
+def test_longitude_is_normalised_across_the_antimeridian() -> None:
+    east = enu_to_geodetic(tensor([5000.0, 0.0, 0.0]), Origin(lat=10.0, lon=179.99, height=0.0))[0, 1].item()
+    west = enu_to_geodetic(tensor([-5000.0, 0.0, 0.0]), Origin(lat=10.0, lon=-179.99, height=0.0))[0, 1].item()
+    # 5 km is 0.0456 degrees of longitude at 10 degrees north.
+    assert east == pytest.approx(-179.9644, abs=1e-4)
+    assert west == pytest.approx(179.9644, abs=1e-4)
+
+
+def test_shapes_and_bad_points() -> None:
+    origin = ORIGINS[1]
+    assert enu_to_geodetic(torch.zeros(2, 4, 3), origin).shape == (2, 4, 3)
+    assert enu_to_geodetic(torch.zeros(3), origin).tolist() == pytest.approx([19.07, 72.87, 14.0], abs=1e-8)
+    assert enu_to_geodetic(torch.zeros(0, 3), origin).shape == (0, 3)
+    with pytest.raises(InputError, match="not finite"):
+        enu_to_geodetic(tensor([0.0, math.nan, 0.0]), origin)
+    with pytest.raises(InputError, match="float64"):
+        geodetic_to_enu(torch.tensor([[19.07, 72.87, 14.0]]), origin)
+    with pytest.raises(InputError, match="latitude, longitude, height"):
+        geodetic_to_enu(tensor([[151.2, -33.9, 14.0]])[0], origin)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("19.07,72.87", "three numbers"),
+        ("19.07 72.87 14", "three numbers"),
+        ("19.07,72.87,14,1", "three numbers"),
+        ("19.07N,72.87E,14", "three numbers"),
+        ("", "three numbers"),
+        ("151.2,-33.9,10", "longitude came first"),
+        ("95,120,10", "latitude 95 is outside"),
+        ("10,190,0", "write -170"),
+        ("10,400,0", "longitude 400 is outside"),
+        ("nan,0,0", "finite"),
+        ("10,20,inf", "finite"),
+        ("10,20,200000", "metres are needed"),
+    ],
+)
+def test_bad_origins_say_what_to_write(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Origin.parse(text)
+
+
+def test_origin_keeps_every_digit() -> None:
+    assert Origin.parse(" -33.856784123456, 151.2152961234 ,-1e1") == Origin(
+        lat=-33.856784123456, lon=151.2152961234, height=-10.0
+    )

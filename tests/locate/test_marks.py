@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from kcal.errors import FileError
+from kcal.locate.marks import read_marks
+
+HEADER = "name,left_u,left_v,right_u,right_v\n"
+
+
+def write(folder: Path, text: str | bytes) -> Path:
+    path = folder / "points.csv"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
+
+
+def test_reads_names_and_pixels(tmp_path: Path) -> None:
+    marks = read_marks(write(tmp_path, HEADER + 'mast,960.25,540,957.05,-3e0\n\n "hill, west", 1,2,3,4\n'))
+    assert marks.names == ("mast", "hill, west")
+    assert marks.left.tolist() == [[960.25, 540.0], [1.0, 2.0]]
+    assert marks.right.tolist() == [[957.05, -3.0], [3.0, 4.0]]
+
+
+def test_columns_in_any_order_without_names_with_notes(tmp_path: Path) -> None:
+    text = "note,right_v,right_u,left_v,left_u\nseen at dusk,4,3,2,1\n,8,7,6,5\n"
+    marks = read_marks(write(tmp_path, text))
+    assert marks.names == ("1", "2")
+    assert marks.left.tolist() == [[1.0, 2.0], [5.0, 6.0]]
+    assert marks.right.tolist() == [[3.0, 4.0], [7.0, 8.0]]
+
+
+def test_spreadsheet_files_with_a_byte_order_mark(tmp_path: Path) -> None:
+    marks = read_marks(write(tmp_path, b"\xef\xbb\xbf" + HEADER.encode() + b"a,1,2,3,4\r\n"))
+    assert marks.names == ("a",)
+
+
+ROW = "a,1,2,3,4\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "the file is empty"),
+        ("\n\n", "the file is empty"),
+        (HEADER, "no rows under the header"),
+        ("name,left_u,left_y,right_u,right_v\n" + ROW, "line 1: unknown column 'left_y'; did you mean 'left_v'"),
+        ("name,Left_U,left_v,right_u,right_v\n" + ROW, "did you mean 'left_u'"),
+        ("name,left_u,left_v,right_u,right_v,temperature\n" + ROW, "unknown column 'temperature'; the header is"),
+        ("name,left_u,left_v,right_u\na,1,2,3\n", "line 1: the column 'right_v' is missing"),
+        ("name,left_u,left_u,right_u,right_v\n" + ROW, "'left_u' is there twice"),
+        (ROW, "line 1: unknown column 'a'"),
+        ("name;left_u;left_v;right_u;right_v\na;1,5;2;3;4\n", "line 1: fields are separated by semicolons"),
+        ("name\tleft_u\tleft_v\tright_u\tright_v\n", "line 1: fields are separated by tabs"),
+        (HEADER + ROW + "b,1,2,3\n", "line 3: 4 fields, the header has 5"),
+        (HEADER + ROW + "b,1,2,3,4,5\n", "line 3: 6 fields"),
+        (HEADER + ROW + "\nb,1,,3,4\n", "line 4: left_v is empty"),
+        (HEADER + ROW + "b,1,nan,3,4\n", "line 3: left_v is 'nan'"),
+        (HEADER + ROW + "b,1,2,inf,4\n", "line 3: right_u is 'inf'"),
+        (HEADER + ROW + "b,1,2,three,4\n", "line 3: right_u is 'three'"),
+        (HEADER + ROW + "b,1,2,1_000,4\n", "line 3: right_u is '1_000'"),
+        (HEADER + ROW + ",1,2,3,4\n", "line 3: the name is empty"),
+        (HEADER + ROW + "b,1,2,3,4\na,5,6,7,8\n", "line 4: the name 'a' was used on line 2"),
+        (HEADER + '"a,1,2,3,4\n', "check the quotation marks"),
+        (HEADER.encode("utf-16"), "not UTF-8"),
+        (b"name,left_u\0", "not a text file"),
+    ],
+)
+def test_bad_files_name_the_line_and_the_remedy(tmp_path: Path, text: str | bytes, message: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(FileError, match=message) as caught:
+        read_marks(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match=r"nothing\.csv: cannot read"):
+        read_marks(tmp_path / "nothing.csv")

@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from locate_rigs import pinhole_rig, tensor
+from matplotlib.figure import Figure
+
+from kcal.errors import InputError
+from kcal.locate.geodesy import Origin, enu_from_cam
+from kcal.locate.positions import Located, locate
+from kcal.report.positions import positions_figure, save_positions_picture
+
+HEADING = 300.0
+TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])
+
+
+def scene() -> tuple[Located, torch.Tensor]:
+    rig = pinhole_rig()
+    left, right, _ = rig(TRUTH)
+    # One pair more, outside the image, of which the truth is not known.
+    left, right = torch.cat([left, tensor([5000.0, 1.0])]), torch.cat([right, tensor([1.0, 1.0])])
+    right = right + tensor([0.3, 0.0])
+    located = locate(
+        rig,
+        left,
+        right,
+        origin=Origin(lat=10.0, lon=20.0, height=0.0),
+        heading_deg=HEADING,
+        names=["gate", "mast", "ship", "cloud", "lost"],
+    )
+    enu = torch.cat([TRUTH @ enu_from_cam(HEADING).T, torch.full((1, 3), math.nan)])
+    return located, enu
+
+
+def texts(figure: Figure) -> list[str]:
+    found = [text.get_text() for axes in figure.axes for text in axes.texts]
+    found += [label.get_text() for label in figure.axes[1].get_yticklabels()]
+    return found + [text.get_text() for text in figure.texts]
+
+
+def markers(figure: Figure, marker: str, axes: int = 0) -> np.ndarray:
+    lines = [line for line in figure.axes[axes].lines if line.get_marker() == marker and len(line.get_xdata())]
+    return np.concatenate([np.stack([line.get_xdata(), line.get_ydata()], -1) for line in lines])
+
+
+def test_names_arcs_and_the_limits_of_the_interval_are_written() -> None:
+    found = texts(positions_figure(*scene()))
+    for name in ("gate", "mast", "ship", "cloud", "N", "250 m", "1 km", "5 km"):
+        assert name in found
+    assert "cloud  bearing only" in found
+    assert any("calibration" in text and "not included" in text for text in found)
+    assert any(text.endswith("lost: a mark lies outside its image") for text in found)
+    assert any(text.startswith("3 of 5 points located") for text in found)
+
+
+def test_points_are_drawn_along_their_azimuths_north_up_and_in_order_of_range() -> None:
+    located, enu = scene()
+    figure = positions_figure(located, enu)
+    true = markers(figure, "x")
+    assert len(true) == 4
+    azimuths = np.degrees(np.arctan2(true[:, 0], true[:, 1])) % 360
+    expected = np.degrees(np.arctan2(enu[:4, 0].numpy(), enu[:4, 1].numpy())) % 360
+    assert np.allclose(azimuths, expected, atol=1e-9)
+    radii = np.hypot(true[:, 0], true[:, 1])
+    assert (np.diff(radii) > 0.1).all()
+    assert radii.max() <= 1.0
+    # The second panel has true ranges in metres.
+    assert np.allclose(np.sort(markers(figure, "x", 1)[:, 0]), TRUTH.norm(dim=-1).numpy(), rtol=1e-12)
+
+
+def test_arrows_lead_from_truth_to_estimate_only_where_they_differ() -> None:
+    located, enu = scene()
+
+    def arrows(figure: Figure) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+        return [
+            (text.xyann, text.xy)
+            for text in figure.axes[0].texts
+            if getattr(text, "arrowprops", None) and text.arrowprops["arrowstyle"] == "->"
+        ]
+
+    assert arrows(positions_figure(located)) == []
+    (arrow,) = arrows(positions_figure(located, enu))
+    tail, head = (math.hypot(*end) for end in arrow)
+    # 0.3 px less disparity puts the ship farther out than it is; nearer points move less than a marker.
+    assert head > tail
+
+
+@pytest.mark.parametrize("count", [1, 60])
+def test_one_point_and_many_points(tmp_path: Path, count: int) -> None:
+    rig = pinhole_rig()
+    points = torch.linspace(80, 6000, count, dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
+    left, right, _ = rig(points)
+    located = locate(rig, left, right, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
+    path = save_positions_picture(tmp_path / "map.png", located)
+    assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_nothing_to_draw_is_drawn_all_the_same(tmp_path: Path) -> None:
+    rig, marks = pinhole_rig(), tensor([5000.0, 1.0])
+    located = locate(rig, marks, marks, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
+    assert save_positions_picture(tmp_path / "map.png", located).stat().st_size > 10_000
+
+
+def test_bad_arguments(tmp_path: Path) -> None:
+    located, enu = scene()
+    with pytest.raises(InputError, match=r"truth: shape \(5, 3\)"):
+        positions_figure(located, enu[:2])
+    with pytest.raises(InputError, match=r"must end with \.png"):
+        save_positions_picture(tmp_path / "map.jpg", located)

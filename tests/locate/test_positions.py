@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from locate_rigs import pinhole_rig, real_rig, spread_points, tensor
+
+from kcal.errors import FileError, InputError
+from kcal.locate.export import to_csv, to_geojson, write_positions
+from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic
+from kcal.locate.positions import Located, Position, locate
+from kcal.locate.stereo import Status
+
+ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
+RIG = pinhole_rig()  # f b = 16 000 px m, centre (959.5, 539.5)
+
+
+def one(left: tuple[float, float], right: tuple[float, float], **options: float) -> Position:
+    return locate(RIG, tensor(left), tensor(right), origin=ORIGIN, heading_deg=0.0, **options).positions[0]
+
+
+def mixed() -> Located:
+    """A located pair, one of each failure that marks can cause, and a pair too far for a range."""
+    left = tensor([975.5, 539.5], [960.0, 500.0], [955.0, 500.0], [900.0, 500.0], [-5.0, 3.0], [math.nan, 3.0])
+    right = tensor([959.5, 539.5], [959.5, 500.0], [955.0, 500.0], [905.0, 500.0], [1.0, 3.0], [1.0, 3.0])
+    names = ["mast", "far", "parallel", "mismatch", "outside", "nothing"]
+    return locate(RIG, left, right, origin=ORIGIN, heading_deg=90.0, names=names)
+
+
+def test_end_to_end_with_real_lenses() -> None:
+    rig, truth = real_rig(), spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64))
+    left, right, _ = rig(truth)
+    located = locate(rig, left, right, origin=ORIGIN, heading_deg=200.0, pitch_deg=3.0, roll_deg=-2.0)
+    enu = truth @ enu_from_cam(200.0, 3.0, -2.0).T
+    assert located.count == 9
+    assert (located.enu - enu).norm(dim=-1).max() < 1e-6
+    geodetic = enu_to_geodetic(enu, ORIGIN)
+    for position, true_enu, (lat, lon, height) in zip(located.positions, enu, geodetic.tolist(), strict=True):
+        # 1e-11 degrees is a micrometre.
+        assert (position.lat, position.lon) == pytest.approx((lat, lon), abs=1e-11)
+        assert position.height == pytest.approx(height, abs=1e-6)
+        assert position.range_m == pytest.approx(float(true_enu.norm()), rel=1e-9)
+        assert position.range_low_m < position.range_m < position.range_high_m
+        assert position.azimuth_deg == pytest.approx(math.degrees(math.atan2(true_enu[0], true_enu[1])) % 360, abs=1e-9)
+        assert position.elevation_deg == pytest.approx(math.degrees(math.asin(true_enu[2] / true_enu.norm())), abs=1e-9)
+        assert position.reason == ""
+    assert [position.name for position in located.positions] == [str(i) for i in range(1, 10)]
+
+
+def test_a_point_ahead_of_a_rig_that_looks_east_is_east() -> None:
+    position = mixed().positions[0]
+    east, north, up = position.enu
+    # 16 px: 1000 m. The mark of the left camera is 16 px right of its centre: 10 m, and right of east is south.
+    assert (east, north, up) == pytest.approx((1000.0, -10.0, 0.0), abs=1e-6)
+    assert position.lon > ORIGIN.lon
+    assert position.lat < ORIGIN.lat
+    # The tangent plane is 8 cm above the ellipsoid at 1 km.
+    assert position.height == pytest.approx(40.078, abs=1e-3)
+
+
+def test_each_failure_says_why_and_carries_no_number_that_could_be_mistaken() -> None:
+    located = mixed()
+    by_name = {position.name: position for position in located.positions}
+    assert {name: position.status.name for name, position in by_name.items()} == {
+        "mast": "OK",
+        "far": "BEARING_ONLY",
+        "parallel": "PARALLEL",
+        "mismatch": "PARALLEL",
+        "outside": "OUTSIDE_IMAGE",
+        "nothing": "NOT_FINITE",
+    }
+    assert located.count == 1
+    for name, position in by_name.items():
+        if name != "mast":
+            assert position.reason
+            assert (position.lat, position.lon, position.height, position.enu, position.range_m) == (None,) * 5
+    assert torch.isnan(located.enu[1:]).all()
+    # 16 000 / (0.5 + 1.96 * 0.3 * sqrt 2) m, a little more along the slanted line of sight.
+    assert by_name["far"].range_low_m == pytest.approx(12_017, abs=10)
+    assert by_name["far"].range_high_m == math.inf
+    assert by_name["far"].azimuth_deg == pytest.approx(90 + math.degrees(0.5 / 1600), abs=1e-6)
+    assert "diverge by 0.179°" in by_name["mismatch"].reason
+    # No range explains marks that diverge: the bearing is all there is.
+    assert (by_name["mismatch"].range_low_m, by_name["mismatch"].range_high_m) == (None, None)
+    assert by_name["mismatch"].azimuth_deg is not None
+    assert by_name["nothing"].range_low_m is None
+    assert by_name["nothing"].azimuth_deg is None
+
+
+def test_a_match_that_cannot_be_right_is_called_doubtful() -> None:
+    # 12 px of vertical disparity on a level rig, half of it in each image.
+    position = one((975.5, 539.5), (959.5, 551.5))
+    assert position.status == Status.OK
+    assert position.reprojection_px == pytest.approx((6.0, 6.0), abs=0.01)
+    assert "doubtful" in position.reason
+    assert one((975.5, 539.5), (959.5, 540.0)).reason == ""
+
+
+def test_pixel_sigma_widens_the_interval() -> None:
+    fine, coarse = one((975.5, 539.5), (959.5, 539.5), pixel_sigma=0.1), one((975.5, 539.5), (959.5, 539.5))
+    assert coarse.range_low_m < fine.range_low_m < fine.range_m < fine.range_high_m < coarse.range_high_m
+    assert one((975.5, 539.5), (959.5, 539.5), pixel_sigma=4.0).status == Status.BEARING_ONLY
+
+
+def test_bad_input_is_refused() -> None:
+    marks = tensor([975.5, 539.5])
+    for arguments, message in (
+        ((marks[0], marks[0]), "shape"),
+        ((marks[:0], marks[:0]), "at least one"),
+        ((marks, tensor([1.0, 2.0], [3.0, 4.0])), "same shape"),
+        (([[1.0, 2.0]], marks), "tensor"),
+    ):
+        with pytest.raises(InputError, match=message):
+            locate(RIG, *arguments, origin=ORIGIN, heading_deg=0.0)
+    with pytest.raises(InputError, match="names"):
+        locate(RIG, marks, marks, origin=ORIGIN, heading_deg=0.0, names=["a", "b"])
+    with pytest.raises(InputError, match="heading"):
+        locate(RIG, marks, marks, origin=ORIGIN, heading_deg=math.nan)
+
+
+def test_cameras_stand_and_look_where_they_should() -> None:
+    left, right = mixed().cameras
+    assert left.enu == (0.0, 0.0, 0.0)
+    assert left.geodetic == (ORIGIN.lat, ORIGIN.lon, ORIGIN.height)
+    # Looking east, the right camera is 10 m to the south.
+    assert right.enu == pytest.approx((0.0, -10.0, 0.0), abs=1e-12)
+    half = math.degrees(math.atan(960 / 1600))
+    assert left.azimuths_deg == pytest.approx((90 - half, 90 + half), abs=1e-9)
+
+
+def test_geojson_follows_rfc_7946(tmp_path: Path) -> None:
+    located = mixed()
+    path = write_positions(tmp_path / "points.geojson", located)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    assert content == to_geojson(located)
+    # Section 4: no other coordinate system, hence no "crs"; section 3.3: these members and no others.
+    assert set(content) == {"type", "features"}
+    assert content["type"] == "FeatureCollection"
+    for feature in content["features"]:
+        assert set(feature) == {"type", "geometry", "properties"}
+        assert feature["type"] == "Feature"
+        if feature["geometry"] is not None:
+            assert feature["geometry"]["type"] == "Point"
+            longitude, latitude, _ = feature["geometry"]["coordinates"]
+            # Section 3.1.1: longitude first.
+            assert longitude == pytest.approx(151.2, abs=0.1)
+            assert latitude == pytest.approx(-33.9, abs=0.1)
+    cameras, points = content["features"][:2], content["features"][2:]
+    assert [camera["properties"]["name"] for camera in cameras] == ["left camera", "right camera"]
+    assert cameras[0]["geometry"]["coordinates"] == [151.2, -33.9, 40.0]
+    assert "not included" in cameras[0]["properties"]["range_interval"]
+    assert [point["geometry"] is None for point in points] == [False, True, True, True, True, True]
+    mast, far = points[0]["properties"], points[1]["properties"]
+    position = located.positions[0]
+    assert points[0]["geometry"]["coordinates"] == [position.lon, position.lat, position.height]
+    assert (mast["name"], mast["status"], mast["range_m"]) == ("mast", "ok", position.range_m)
+    assert (mast["east_m"], mast["north_m"], mast["up_m"]) == position.enu
+    assert (far["status"], far["range_high_m"], far["range_high_infinite"]) == ("bearing_only", None, True)
+    assert far["reason"]
+
+
+def test_csv_keeps_every_digit(tmp_path: Path) -> None:
+    located = mixed()
+    path = write_positions(tmp_path / "points.csv", located)
+    assert path.read_text(encoding="utf-8") == to_csv(located)
+    rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
+    assert [row["name"] for row in rows] == [position.name for position in located.positions]
+    position = located.positions[0]
+    for column, value in (
+        ("lat", position.lat),
+        ("lon", position.lon),
+        ("height_ellipsoidal_m", position.height),
+        ("east_m", position.enu[0]),
+        ("range_low_m", position.range_low_m),
+        ("reprojection_right_px", position.reprojection_px[1]),
+    ):
+        assert float(rows[0][column]) == value
+    assert (rows[1]["status"], rows[1]["lat"], rows[1]["range_high_m"]) == ("bearing_only", "", "inf")
+
+
+def test_unknown_formats_and_places_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"\.geojson, \.json, \.csv"):
+        write_positions(tmp_path / "points.shp", mixed())
+    with pytest.raises(FileError, match="does not exist"):
+        write_positions(tmp_path / "no" / "points.csv", mixed())
