@@ -1,0 +1,326 @@
+"""Solving a rig: where the right camera stands from the left, by boards that both have seen."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.covariance import spread
+from kcal.calibrate.init import homographies, poses_from_homographies
+from kcal.calibrate.pairs import Pair
+from kcal.calibrate.poses import unflip
+from kcal.calibrate.problem import BoardProblem, BoardState
+from kcal.corners.observations import Observations
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.pose import nearest_rotation
+from kcal.lens.rig import StereoRig
+from kcal.solve.lm import LMOptions, minimise
+from kcal.solve.result import State, Status
+
+_MINIMUM_CORNERS = 6
+# A camera that leaves its own boards this far off (pixels) is not the camera that took them.
+_FOREIGN_RMS = 5.0
+# A pair this many times worse than the median pair, and worse than the floor in pixels, is left out: roughly aligned,
+# and after the joint solve.
+_ROUGH = (10.0, 10.0)
+_FINE = (5.0, 1.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RigOptions:
+    """Options of `calibrate_rig`.
+
+    Args:
+        refine_cameras: solve for intrinsics and lenses again, jointly with the rig, starting from the given cameras.
+        board_warp: estimate how the board bends.
+        solver: options of the Levenberg-Marquardt solver.
+    """
+
+    refine_cameras: bool = False
+    board_warp: bool = False
+    solver: LMOptions = dataclasses.field(default_factory=LMOptions)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RigCalibrationResult:
+    """A solved rig and what it rests on.
+
+    Args:
+        rig: the rig, in the left camera's frame.
+        rms: sqrt(mean ‖r‖²) over the corners of both cameras, pixels.
+        rms_left: of the left camera alone.
+        rms_right: of the right camera alone.
+        pairs: the pairs used.
+        per_pair_rms: (P,) over both cameras.
+        flipped: pairs in which the right camera's corners had been read from the other end; they were turned.
+        excluded: pairs left out, with the reason.
+        sigma_rotation: (3,) radians, about the left camera's x (pitch), y (yaw) and z (roll).
+        sigma_translation: (3,) metres.
+        pixels: (P, 2, N, 2) corners as used, turned where flipped; NaN where not seen.
+        status: why the solver stopped.
+        warnings: sentences about what the user should doubt.
+    """
+
+    rig: StereoRig
+    rms: float
+    rms_left: float
+    rms_right: float
+    pairs: tuple[Pair, ...]
+    per_pair_rms: Tensor
+    flipped: tuple[Pair, ...]
+    excluded: tuple[tuple[Pair, str], ...]
+    sigma_rotation: Tensor
+    sigma_translation: Tensor
+    pixels: Tensor
+    status: Status
+    warnings: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Poses:
+    rotation: Tensor
+    translation: Tensor
+
+    def after(self, other: _Poses) -> _Poses:
+        """This motion applied after another."""
+        return _Poses(
+            self.rotation @ other.rotation,
+            (self.rotation @ other.translation[..., None])[..., 0] + self.translation,
+        )
+
+    def inverse(self) -> _Poses:
+        back = self.rotation.transpose(-1, -2)
+        return _Poses(back, -(back @ self.translation[..., None])[..., 0])
+
+    def __getitem__(self, index: int) -> _Poses:
+        return _Poses(self.rotation[index], self.translation[index])
+
+
+def calibrate_rig(
+    left: Camera,
+    right: Camera,
+    left_observations: Observations,
+    right_observations: Observations,
+    pairs: Sequence[Pair],
+    options: RigOptions | None = None,
+) -> RigCalibrationResult:
+    """Find the pose of the right camera in the left one's frame.
+
+    Each camera's board poses are found alone; every pair then proposes a relative pose, in the corner order as read
+    and with the right image's order turned by 180°. The proposal that the other pairs agree with best settles which
+    pairs were read from the other end and which do not belong. All remaining pairs are refined jointly: one board pose
+    a pair, one relative pose, the sum of squares over both images.
+
+    Args:
+        left: the left camera, calibrated.
+        right: the right camera, calibrated.
+        left_observations: views of the left camera.
+        right_observations: views of the right camera.
+        pairs: names of views taken at the same moment (see `kcal.calibrate.pairs`).
+        options: see `RigOptions`.
+
+    Raises:
+        InputError: boards or image sizes that differ, cameras that do not fit their observations.
+        DegenerateError: no pair is left.
+    """
+    options = options or RigOptions()
+    pixels, names = _pixels(left, right, left_observations, right_observations, pairs)
+    board = left_observations.board.points
+    cameras = (left, right)
+    views, alone = zip(*(_alone(board, pixels[:, c], cameras[c], options.solver) for c in (0, 1)), strict=True)
+    _check_fit(board, pixels, cameras, alone, options.solver)
+
+    relative, turned, error = _consensus(board, pixels, cameras, views[0], views[1])
+    pixels[turned, 1] = pixels[turned, 1].flip(-2)
+    flipped = [names[i] for i in turned.nonzero()[:, 0].tolist()]
+    excluded: list[tuple[Pair, str]] = []
+    keep = ~_outliers(error, *_ROUGH)
+    for i in (~keep).nonzero()[:, 0].tolist():
+        excluded.append((names[i], f"its board is {float(error[i]):.0f} px away from where the other pairs put it"))
+
+    start = BoardState(
+        parameters=tuple(camera.parameters_vector.detach() for camera in cameras),
+        warp=torch.zeros(2, dtype=torch.float64),
+        cam_from_first_rotation=relative.rotation[None],
+        cam_from_first_translation=relative.translation[None],
+        first_from_board_rotation=views[0].rotation,
+        first_from_board_translation=views[0].translation,
+    ).pack()
+    free = [_free(camera) if options.refine_cameras else [] for camera in cameras]
+    models = [camera.model for camera in cameras]
+    while True:
+        if not bool(keep.any()):
+            raise DegenerateError("no pair is left: do the views of a pair show the same board at the same moment?")
+        *shared, rotation, translation = start
+        problem = BoardProblem(board, pixels[keep], models, free, free_warp=options.board_warp)
+        result = minimise(problem, (*shared, rotation[keep], translation[keep]), options.solver)
+        rms = _pair_rms(problem, result.state, pixels[keep])
+        worse = _outliers(rms, *_FINE)
+        if not bool(worse.any()):
+            break
+        kept = keep.nonzero()[:, 0]
+        for i in worse.nonzero()[:, 0].tolist():
+            reason = f"RMS {float(rms[i]):.2f} px against {float(rms.median()):.2f} px typically"
+            excluded.append((names[int(kept[i])], reason))
+        keep[kept[worse]] = False
+    used = [names[i] for i in keep.nonzero()[:, 0].tolist()]
+    return _result(problem, problem.tidy(result.state), Status(int(result.status)), cameras, pixels[keep], used,
+                   [pair for pair in flipped if pair in used], excluded)  # fmt: skip
+
+
+def _free(camera: Camera) -> list[int]:
+    return [i for i, name in enumerate(camera.names) if name != "skew"]
+
+
+def _outliers(error: Tensor, times: float, floor: float) -> Tensor:
+    return error > max(times * float(error.median()), floor)
+
+
+def _pixels(
+    left: Camera, right: Camera, left_seen: Observations, right_seen: Observations, pairs: Sequence[Pair]
+) -> tuple[Tensor, list[Pair]]:
+    if left_seen.board != right_seen.board:
+        raise InputError(f"the cameras saw different boards: {left_seen.board} and {right_seen.board}")
+    for word, camera, seen in (("left", left, left_seen), ("right", right, right_seen)):
+        if camera.size != tuple(seen.image_size):
+            raise InputError(
+                f"the {word} camera has images of {camera.size[0]}x{camera.size[1]}, its observations of "
+                f"{seen.image_size[0]}x{seen.image_size[1]}: are the files mixed up?"
+            )
+    if not pairs:
+        raise InputError("no pair of views")
+    lefts = left_seen.subset([pair[0] for pair in pairs]).pixels()
+    rights = right_seen.subset([pair[1] for pair in pairs]).pixels()
+    pixels = torch.stack([lefts, rights], 1)
+    seen_corners = torch.isfinite(pixels).all(-1).sum(-1)
+    for pair, counts in zip(pairs, seen_corners.tolist(), strict=True):
+        if min(counts) < _MINIMUM_CORNERS:
+            raise InputError(f"pair {pair[0]}, {pair[1]}: at least {_MINIMUM_CORNERS} corners are needed in each view")
+    return pixels, list(pairs)
+
+
+def _alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions) -> tuple[_Poses, float]:
+    """Board poses from one camera alone, both tilts tried, and the median RMS of its views."""
+    normalized, valid = camera.normalize(pixels)
+    # Unseen corners are NaN and thereby not valid.
+    normalized = torch.where(valid[..., None], normalized, torch.nan)
+    if int(valid.sum(-1).min()) < _MINIMUM_CORNERS:
+        return _Poses(torch.empty(0), torch.empty(0)), math.inf
+    homography = homographies(board, normalized)
+    pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
+    rotation, translation = poses_from_homographies(homography, pinhole)
+    nothing = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
+    parameters = camera.parameters_vector.detach()
+    state: State = (parameters, torch.zeros(2, dtype=torch.float64), *nothing, rotation, translation)
+    state, _ = unflip(board, pixels[:, None], [camera.model], state, solver)
+    problem = BoardProblem(board, pixels[:, None], [camera.model], [()])
+    rms = float(_pair_rms(problem, state, pixels[:, None]).median())
+    return _Poses(state[-2], state[-1]), rms if math.isfinite(rms) else math.inf
+
+
+def _check_fit(
+    board: Tensor, pixels: Tensor, cameras: tuple[Camera, Camera], alone: tuple[float, ...], solver: LMOptions
+) -> None:
+    """Refuse cameras that do not fit their observations, or that fit each other's clearly better."""
+    for c, word in enumerate(("left", "right")):
+        if not alone[c] <= _FOREIGN_RMS:
+            raise InputError(
+                f"the {word} observations do not fit the {word} camera (RMS {alone[c]:.1f} px): are cameras or "
+                "observations swapped?"
+            )
+    if cameras[0].size == cameras[1].size:
+        swapped = [_alone(board, pixels[:, c], cameras[1 - c], solver)[1] for c in (0, 1)]
+        if all(other < 0.9 * own for other, own in zip(swapped, alone, strict=True)):
+            raise InputError(
+                f"the left observations fit the right camera better (RMS {swapped[0]:.2f} against {alone[0]:.2f} px), "
+                "and the right ones the left camera: the cameras are swapped"
+            )
+
+
+def _pair_rms(problem: BoardProblem, state: State, pixels: Tensor) -> Tensor:
+    residuals = problem.residuals(state)
+    count = torch.isfinite(pixels).all(-1).sum((-2, -1))
+    return torch.sqrt((residuals**2).sum(-1) / count)
+
+
+def _consensus(
+    board: Tensor, pixels: Tensor, cameras: tuple[Camera, Camera], left: _Poses, right: _Poses
+) -> tuple[_Poses, Tensor, Tensor]:
+    """The relative pose that most pairs agree with, which pairs are turned under it, and each pair's error (px)."""
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+    turn = _Poses(half_turn, board.amin(0) + board.amax(0))
+    proposals = [right[i].after(left[i].inverse()) for i in range(len(pixels))]
+    proposals += [right[i].after(turn).after(left[i].inverse()) for i in range(len(pixels))]
+    as_read, other_end = pixels[:, 1], pixels[:, 1].flip(-2)
+    points_left = board @ left.rotation.transpose(-1, -2) + left.translation[:, None]
+    best: tuple[float, _Poses, Tensor, Tensor] | None = None
+    for proposal in proposals:
+        projected, valid = cameras[1].project(points_left @ proposal.rotation.T + proposal.translation)
+        projected = torch.where(valid[..., None], projected, torch.inf)
+        errors = torch.stack([_distance(projected, as_read), _distance(projected, other_end)])
+        # A turned order must be clearly better, or a single pair could not tell.
+        turned = errors[1] < 0.2 * errors[0]
+        error = torch.where(turned, errors[1], errors[0])
+        score = float(error.median())
+        if best is None or score < best[0]:
+            best = (score, proposal, turned, error)
+    assert best is not None
+    return best[1:]
+
+
+def _distance(projected: Tensor, observed: Tensor) -> Tensor:
+    """Root mean square distance (P,) over the corners that were seen."""
+    return torch.sqrt(torch.nanmean(((projected - observed) ** 2).sum(-1), -1))
+
+
+def _result(
+    problem: BoardProblem,
+    state: State,
+    status: Status,
+    cameras: tuple[Camera, Camera],
+    pixels: Tensor,
+    used: list[Pair],
+    flipped: list[Pair],
+    excluded: list[tuple[Pair, str]],
+) -> RigCalibrationResult:
+    s = problem.unpack(state)
+    solved = [
+        Camera(parameters, size=camera.size, model=camera.model)
+        for parameters, camera in zip(s.parameters, cameras, strict=True)
+    ]
+    rig = StereoRig(
+        solved[0], solved[1], nearest_rotation(s.cam_from_first_rotation[0]), s.cam_from_first_translation[0]
+    )
+    squared = problem.residuals(state).unflatten(-1, (2, 2, -1)).pow(2).sum(-2)
+    seen = torch.isfinite(pixels).all(-1)
+    each = torch.sqrt(squared.sum((0, 2)) / seen.sum((0, 2)))
+    uncertainty = spread(problem.linearise(state), problem.residual_count, problem.shared_size + 6 * len(pixels))
+    pose = uncertainty.sigma[sum(len(f) for f in problem.free) :][:6]
+    warnings = []
+    if len(used) < 3:
+        warnings.append(f"{len(used)} pair(s) only: a wrong one could not be noticed; 5 or more are good")
+    if status not in (Status.CONVERGED, Status.EXACT):
+        warnings.append(f"the solver {status.message}")
+    rms = float(torch.sqrt(squared.sum() / seen.sum()))
+    if rms > 1.0:
+        warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
+    return RigCalibrationResult(
+        rig=rig,
+        rms=rms,
+        rms_left=float(each[0]),
+        rms_right=float(each[1]),
+        pairs=tuple(used),
+        per_pair_rms=_pair_rms(problem, state, pixels),
+        flipped=tuple(flipped),
+        excluded=tuple(excluded),
+        sigma_rotation=pose[:3],
+        sigma_translation=pose[3:],
+        pixels=pixels,
+        status=status,
+        warnings=tuple(warnings),
+    )
