@@ -84,7 +84,8 @@ def locate(
         if picture is not None:
             save_positions_picture(picture, located)
             advance(picture.name)
-    out.print(_table(located))
+    for line in _table(located):
+        out.print(line, markup=False)
     for position in located.positions:
         if position.reason:
             out.print(f"* {position.name}: {position.reason}", markup=False)
@@ -95,37 +96,32 @@ def locate(
         raise DegenerateError(f"{points}: none of the {len(located.positions)} pairs could be located; see the table")
 
 
-def _table(located: Located) -> object:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("name")
-    for column in ("lat °", "lon °", "height m", "range m", "interval m"):
-        table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("status", no_wrap=True)
-    for position in located.positions:
-        status = position.status.name.lower().replace("_", " ")
-        table.add_row(
-            escape(position.name),
-            *_numbers(position),
-            status + (" *" if position.reason else ""),
-        )
-    return table
+def _table(located: Located) -> list[str]:
+    """Aligned lines as wide as they need: a table fitted to the 80 columns of a pipe would cut names and digits."""
+    rows = [["name", "lat °", "lon °", "height m", "range m", "interval m", "status"]]
+    rows += [_row(position) for position in located.positions]
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    lines = []
+    for name, *numbers, status in rows:
+        cells = [name.ljust(widths[0])]
+        cells += [number.rjust(width) for number, width in zip(numbers, widths[1:-1], strict=True)]
+        lines.append("  ".join([*cells, status]))
+    return lines
 
 
-def _numbers(position: Position) -> tuple[str, str, str, str, str]:
+def _row(position: Position) -> list[str]:
     low, high = position.range_low_m, position.range_high_m
+    numbers = ["", "", "", ""]
+    if position.lat is not None and position.lon is not None and position.height is not None:
+        numbers = [
+            f"{position.lat:.7f}",
+            f"{position.lon:.7f}",
+            f"{position.height:.1f}",
+            _metres(position.range_m or 0),
+        ]
     interval = "" if low is None or high is None else f"{_metres(low)} – {_metres(high)}"
-    if position.lat is None or position.lon is None or position.height is None or position.range_m is None:
-        return "", "", "", "", interval
-    return (
-        f"{position.lat:.7f}",
-        f"{position.lon:.7f}",
-        f"{position.height:.1f}",
-        _metres(position.range_m),
-        interval,
-    )
+    status = position.status.name.lower().replace("_", " ")
+    return [position.name, *numbers, interval, f"{status} *" if position.reason else status]
 
 
 def _metres(value: float) -> str:

@@ -137,7 +137,9 @@ def locate(
         >>> round(position.range_m, 3), round(position.lat, 6), round(position.range_high_m, 1)
         (1000.0, 19.079034, 1054.8)
     """
-    pixels_left = as_points("pixels_left", pixels_left, 2)
+    device = rig.right_from_left_rotation.device
+    pixels_left = as_points("pixels_left", pixels_left, 2).to(device)
+    pixels_right = as_points("pixels_right", pixels_right, 2).to(device)
     if pixels_left.ndim != 2:
         raise InputError(f"pixels_left: shape (N, 2) is needed, got {tuple(pixels_left.shape)}")
     if len(pixels_left) == 0:

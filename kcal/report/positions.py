@@ -180,7 +180,7 @@ def _draw_plan(axes: Axes, located: Located, true_enu: Array | None, shown: list
     if true_enu is not None:
         axes.plot([], [], "x", color=_TRUE, markeredgewidth=1.6, label="true (arrow to estimated)")
     if len(shown) <= _NAMED:
-        _draw_names(axes, located, shown, scale)
+        _draw_names(axes, located, shown, scale, float(sweep[-1]))
     box = np.concatenate(extent)
     (left, bottom), (right, top) = box.min(0) - 0.05, box.max(0) + 0.05
     axes.set(xlim=(left - 0.04, right + 0.08), ylim=(bottom, top), aspect="equal", anchor="C")
@@ -226,8 +226,8 @@ def _draw_truth(axes: Axes, position: Position, true: Array, scale: _RangeScale)
             )  # fmt: skip
 
 
-def _draw_names(axes: Axes, located: Located, shown: list[int], scale: _RangeScale) -> None:
-    """Each name beside its point, on the side with more room."""
+def _draw_names(axes: Axes, located: Located, shown: list[int], scale: _RangeScale, labels_deg: float) -> None:
+    """Each name beside its point, on the side without other points and without the labels of the arcs."""
     anchors = []
     for i in shown:
         position = located.positions[i]
@@ -238,7 +238,9 @@ def _draw_names(axes: Axes, located: Located, shown: list[int], scale: _RangeSca
     for i, anchor in zip(shown, anchors, strict=True):
         others = [other - anchor for other in anchors if other is not anchor]
         crowded = any(0 < other[0] < 0.2 and abs(other[1]) < 0.03 for other in others)
-        side = -1 if crowded else 1
+        from_labels = (labels_deg - (located.positions[i].azimuth_deg or 0.0) + 180) % 360 - 180
+        labelled = 0 < from_labels < 15 and math.cos(math.radians(labels_deg)) > 0
+        side = -1 if crowded or labelled else 1
         axes.annotate(
             located.positions[i].name, _xy(anchor), (8 * side, 0), textcoords="offset points", fontsize=9, zorder=9,
             ha="left" if side > 0 else "right", va="center", path_effects=_HALO,

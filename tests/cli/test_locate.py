@@ -24,7 +24,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     save_rig(StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])), tmp_path / "rig.json")
     (tmp_path / "points.csv").write_text(HEADER + "[b]mast,975.5,539.5,959.5,539.5\nlost,-40,5,1,5\n")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("COLUMNS", "60")
     return tmp_path
 
 
@@ -44,8 +44,8 @@ def test_writes_files_and_a_table(
     assert run(monkeypatch, "rig.json", "points.csv", *origin, "--heading", "-90", *outputs) == 0
     printed = capsys.readouterr().out
     line = next(line for line in printed.splitlines() if line.startswith("[b]mast"))
-    # 1 km west (0.01081 degrees) and 10 m north (9.0e-5); a straight line west bends 5 cm north of the parallel.
-    assert line.split()[1:5] == ["-33.8999094", "151.1891880", "10.1", "1000"]
+    # 1 km west (0.0108116 degrees) and 10 m north (9.0e-5); a straight line west bends 5 cm north of the parallel.
+    assert line.split()[1:5] == ["-33.8999094", "151.1891884", "10.1", "1000"]
     assert "lost: a mark lies outside its image" in printed
     assert "calibration errors are not included" in printed
     features = json.loads((folder / "out.geojson").read_text())["features"]
