@@ -33,9 +33,8 @@ Progress = Callable[[str], None]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Minimum:
-    """One end of the ladder: the state, the solver's result for it, and the trials spent in all."""
+    """The end of a ladder: the solver's result, and the trial steps spent on the way."""
 
-    state: State
     result: Result
     iterations: int
 
@@ -115,6 +114,11 @@ def _starts(kept: list[State], cold: State, small: LensModel, large: LensModel, 
     return starts
 
 
+def free_parameters(model: LensModel) -> list[int]:
+    """Indices of all parameters but the skew."""
+    return [i for i, name in enumerate(parameter_names(model)) if name != "skew"]
+
+
 def climb(
     board_points: Tensor,
     pixels: Tensor,
@@ -149,7 +153,7 @@ def climb(
     for large in models[1:]:
         largest = float(observed_radius(board_points, pixels, kept[0])) ** 2
         starts = _starts(kept, (embed(cold[0], models[0], large), *cold[1:]), small, large, largest)
-        free = [_free(large)]
+        free = [free_parameters(large)]
         scouts = BoardProblem(board_points, pixels, [large], free, free_warp=free_warp, batch=(len(starts),))
         scouting = dataclasses.replace(options, max_iterations=min(_SCOUT_ITERATIONS, options.max_iterations))
         found = minimise(scouts, stack(starts), scouting)
@@ -166,16 +170,11 @@ def climb(
         small = large
         progress(str(large))
     if result is None:
-        problem = BoardProblem(board_points, pixels, [small], [_free(small)], free_warp=free_warp)
+        problem = BoardProblem(board_points, pixels, [small], [free_parameters(small)], free_warp=free_warp)
         result = minimise(problem, first, options)
         spent += int(result.iterations)
         progress(str(small))
-    return Minimum(state=result.state, result=result, iterations=spent)
-
-
-def _free(model: LensModel) -> list[int]:
-    """Indices of all parameters but the skew."""
-    return [i for i, name in enumerate(parameter_names(model)) if name != "skew"]
+    return Minimum(result=result, iterations=spent)
 
 
 def _regular(board_points: Tensor, pixels: Tensor, state: State, model: LensModel) -> bool:

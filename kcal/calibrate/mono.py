@@ -9,16 +9,16 @@ from torch import Tensor
 
 from kcal.calibrate.covariance import Spread, spread
 from kcal.calibrate.init import homographies, intrinsics_candidates, poses_from_homographies, radial_start
-from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
+from kcal.calibrate.ladder import Progress, climb, free_parameters, steps_to
 from kcal.calibrate.poses import unflip
 from kcal.calibrate.problem import BoardProblem
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
-from kcal.lens.projection import INTRINSICS, parameter_names
+from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import LMOptions, minimise
-from kcal.solve.result import State, Status
+from kcal.solve.result import Result, State, Status
 
 _MINIMUM_VIEWS = 3
 _MINIMUM_CORNERS = 6
@@ -125,23 +125,21 @@ def calibrate_camera(
 
     solver = options.solver
     ladder = steps_to(model)
-    first, cold = _first(board, pixels, observations.image_size, ladder[0], options)
+    first, cold, spent = _first(board, pixels, observations.image_size, ladder[0], options)
     progress(f"start ({ladder[0]})")
     seen = pixels[:, None]
     minimum = climb(board, seen, first, cold, ladder, solver, free_warp=options.board_warp, progress=progress)
 
+    spent += minimum.iterations
+
     # Poses once more, under the final lens.
-    state, flipped = unflip(board, seen, [model], minimum.state, solver)
-    problem = BoardProblem(board, seen, [model], [_free(model)], free_warp=options.board_warp)
+    result = minimum.result
+    state, flipped = unflip(board, seen, [model], result.state, solver)
+    problem = BoardProblem(board, seen, [model], [free_parameters(model)], free_warp=options.board_warp)
     if flipped:
         result = minimise(problem, state, solver)
-        minimum = Minimum(state=result.state, result=result, iterations=minimum.iterations + int(result.iterations))
-    state = problem.tidy(minimum.state)
-    return _result(observations, problem, state, minimum, model)
-
-
-def _free(model: LensModel) -> list[int]:
-    return [i for i, name in enumerate(parameter_names(model)) if name != "skew"]
+        spent += int(result.iterations)
+    return _result(observations, problem, result, spent, model)
 
 
 def _check(observations: Observations, pixels: Tensor, model: LensModel, warp: bool) -> None:
@@ -166,9 +164,10 @@ def _check(observations: Observations, pixels: Tensor, model: LensModel, warp: b
 
 def _first(
     board: Tensor, pixels: Tensor, size: tuple[int, int], model: LensModel, options: CalibrationOptions
-) -> tuple[State, State]:
-    """The first model's solution and a start without distortion, from the closed forms."""
+) -> tuple[State, State, int]:
+    """The first model's solution, a start without distortion, both from the closed forms, and the trials spent."""
     homography = homographies(board, pixels)
+    spent = 0
     best: tuple[float, State, State] | None = None
     for intrinsics in intrinsics_candidates(homography, size):
         rotation, translation = poses_from_homographies(homography, intrinsics)
@@ -185,14 +184,16 @@ def _first(
             rotation,
             translation,
         )
-        problem = BoardProblem(board, pixels[:, None], [model], [_free(model)], free_warp=options.board_warp)
+        problem = BoardProblem(board, pixels[:, None], [model], [free_parameters(model)], free_warp=options.board_warp)
         cold: State = (zero, *rest)
         for start in ((lens, *rest), cold):
             result = minimise(problem, start, options.solver)
+            spent += int(result.iterations)
             if result.status != Status.BAD_START:
                 break
         state, _ = unflip(board, pixels[:, None], [model], result.state, options.solver)
         result = minimise(problem, state, options.solver)
+        spent += int(result.iterations)
         cost = float(result.cost)
         if cost == cost and (best is None or cost < best[0]):
             best = (cost, result.state, cold)
@@ -200,7 +201,7 @@ def _first(
             break
     if best is None:
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
-    return best[1], best[2]
+    return best[1], best[2], spent
 
 
 def _rms(cost: float, pixels: Tensor) -> float:
@@ -208,8 +209,9 @@ def _rms(cost: float, pixels: Tensor) -> float:
 
 
 def _result(
-    observations: Observations, problem: BoardProblem, state: State, minimum: Minimum, model: LensModel
+    observations: Observations, problem: BoardProblem, solved: Result, spent: int, model: LensModel
 ) -> CameraCalibrationResult:
+    state = problem.tidy(solved.state)
     s = problem.unpack(state)
     pixels = observations.pixels()
     camera = Camera(s.parameters[0], size=observations.image_size, model=model)
@@ -222,7 +224,7 @@ def _result(
     uncertainty = spread(problem.linearise(state), problem.residual_count, count)
     names = [name for name in camera.names if name != "skew"]
     _check_focal(uncertainty, s.parameters[0])
-    status = Status(int(minimum.result.status))
+    status = Status(int(solved.status))
     return CameraCalibrationResult(
         camera=camera,
         rms=rms,
@@ -235,7 +237,7 @@ def _result(
             name: float(sigma) if bool(known) else None for name, sigma, known in zip(names, *uncertainty, strict=False)
         },
         status=status,
-        iterations=minimum.iterations,
+        iterations=spent,
         warnings=tuple(_warnings(observations, camera, rms, per_view, uncertainty, names, status)),
     )
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from kcal.calibrate.align import MINIMUM_CORNERS, check_fit, consensus, pair_rms, pose_alone
 from kcal.calibrate.covariance import spread
-from kcal.calibrate.init import homographies, poses_from_homographies
+from kcal.calibrate.ladder import free_parameters
 from kcal.calibrate.pairs import Pair
-from kcal.calibrate.poses import unflip
 from kcal.calibrate.problem import BoardProblem, BoardState
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
@@ -22,9 +21,6 @@ from kcal.lens.rig import StereoRig
 from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import State, Status
 
-_MINIMUM_CORNERS = 6
-# A camera that leaves its own boards this far off (pixels) is not the camera that took them.
-_FOREIGN_RMS = 5.0
 # A pair this many times worse than the median pair, and worse than the floor in pixels, is left out: roughly aligned,
 # and after the joint solve.
 _ROUGH = (10.0, 10.0)
@@ -81,26 +77,6 @@ class RigCalibrationResult:
     warnings: tuple[str, ...]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Poses:
-    rotation: Tensor
-    translation: Tensor
-
-    def after(self, other: _Poses) -> _Poses:
-        """This motion applied after another."""
-        return _Poses(
-            self.rotation @ other.rotation,
-            (self.rotation @ other.translation[..., None])[..., 0] + self.translation,
-        )
-
-    def inverse(self) -> _Poses:
-        back = self.rotation.transpose(-1, -2)
-        return _Poses(back, -(back @ self.translation[..., None])[..., 0])
-
-    def __getitem__(self, index: int) -> _Poses:
-        return _Poses(self.rotation[index], self.translation[index])
-
-
 def calibrate_rig(
     left: Camera,
     right: Camera,
@@ -132,10 +108,10 @@ def calibrate_rig(
     pixels, names = _pixels(left, right, left_observations, right_observations, pairs)
     board = left_observations.board.points
     cameras = (left, right)
-    views, alone = zip(*(_alone(board, pixels[:, c], cameras[c], options.solver) for c in (0, 1)), strict=True)
-    _check_fit(board, pixels, cameras, alone, options.solver)
+    views, alone = zip(*(pose_alone(board, pixels[:, c], cameras[c], options.solver) for c in (0, 1)), strict=True)
+    check_fit(board, pixels, cameras, alone, options.solver)
 
-    relative, turned, error = _consensus(board, pixels, cameras, views[0], views[1])
+    relative, turned, error = consensus(board, pixels, cameras, views[0], views[1])
     pixels[turned, 1] = pixels[turned, 1].flip(-2)
     flipped = [names[i] for i in turned.nonzero()[:, 0].tolist()]
     excluded: list[tuple[Pair, str]] = []
@@ -151,7 +127,7 @@ def calibrate_rig(
         first_from_board_rotation=views[0].rotation,
         first_from_board_translation=views[0].translation,
     ).pack()
-    free = [_free(camera) if options.refine_cameras else [] for camera in cameras]
+    free = [free_parameters(camera.model) if options.refine_cameras else [] for camera in cameras]
     models = [camera.model for camera in cameras]
     while True:
         if not bool(keep.any()):
@@ -159,7 +135,7 @@ def calibrate_rig(
         *shared, rotation, translation = start
         problem = BoardProblem(board, pixels[keep], models, free, free_warp=options.board_warp)
         result = minimise(problem, (*shared, rotation[keep], translation[keep]), options.solver)
-        rms = _pair_rms(problem, result.state, pixels[keep])
+        rms = pair_rms(problem, result.state, pixels[keep])
         worse = _outliers(rms, *_FINE)
         if not bool(worse.any()):
             break
@@ -171,10 +147,6 @@ def calibrate_rig(
     used = [names[i] for i in keep.nonzero()[:, 0].tolist()]
     return _result(problem, problem.tidy(result.state), Status(int(result.status)), cameras, pixels[keep], used,
                    [pair for pair in flipped if pair in used], excluded)  # fmt: skip
-
-
-def _free(camera: Camera) -> list[int]:
-    return [i for i, name in enumerate(camera.names) if name != "skew"]
 
 
 def _outliers(error: Tensor, times: float, floor: float) -> Tensor:
@@ -199,83 +171,9 @@ def _pixels(
     pixels = torch.stack([lefts, rights], 1)
     seen_corners = torch.isfinite(pixels).all(-1).sum(-1)
     for pair, counts in zip(pairs, seen_corners.tolist(), strict=True):
-        if min(counts) < _MINIMUM_CORNERS:
-            raise InputError(f"pair {pair[0]}, {pair[1]}: at least {_MINIMUM_CORNERS} corners are needed in each view")
+        if min(counts) < MINIMUM_CORNERS:
+            raise InputError(f"pair {pair[0]}, {pair[1]}: at least {MINIMUM_CORNERS} corners are needed in each view")
     return pixels, list(pairs)
-
-
-def _alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions) -> tuple[_Poses, float]:
-    """Board poses from one camera alone, both tilts tried, and the median RMS of its views."""
-    normalized, valid = camera.normalize(pixels)
-    # Unseen corners are NaN and thereby not valid.
-    normalized = torch.where(valid[..., None], normalized, torch.nan)
-    if int(valid.sum(-1).min()) < _MINIMUM_CORNERS:
-        return _Poses(torch.empty(0), torch.empty(0)), math.inf
-    homography = homographies(board, normalized)
-    pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    rotation, translation = poses_from_homographies(homography, pinhole)
-    nothing = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
-    parameters = camera.parameters_vector.detach()
-    state: State = (parameters, torch.zeros(2, dtype=torch.float64), *nothing, rotation, translation)
-    state, _ = unflip(board, pixels[:, None], [camera.model], state, solver)
-    problem = BoardProblem(board, pixels[:, None], [camera.model], [()])
-    rms = float(_pair_rms(problem, state, pixels[:, None]).median())
-    return _Poses(state[-2], state[-1]), rms if math.isfinite(rms) else math.inf
-
-
-def _check_fit(
-    board: Tensor, pixels: Tensor, cameras: tuple[Camera, Camera], alone: tuple[float, ...], solver: LMOptions
-) -> None:
-    """Refuse cameras that do not fit their observations, or that fit each other's clearly better."""
-    for c, word in enumerate(("left", "right")):
-        if not alone[c] <= _FOREIGN_RMS:
-            raise InputError(
-                f"the {word} observations do not fit the {word} camera (RMS {alone[c]:.1f} px): are cameras or "
-                "observations swapped?"
-            )
-    if cameras[0].size == cameras[1].size:
-        swapped = [_alone(board, pixels[:, c], cameras[1 - c], solver)[1] for c in (0, 1)]
-        if all(other < 0.9 * own for other, own in zip(swapped, alone, strict=True)):
-            raise InputError(
-                f"the left observations fit the right camera better (RMS {swapped[0]:.2f} against {alone[0]:.2f} px), "
-                "and the right ones the left camera: the cameras are swapped"
-            )
-
-
-def _pair_rms(problem: BoardProblem, state: State, pixels: Tensor) -> Tensor:
-    residuals = problem.residuals(state)
-    count = torch.isfinite(pixels).all(-1).sum((-2, -1))
-    return torch.sqrt((residuals**2).sum(-1) / count)
-
-
-def _consensus(
-    board: Tensor, pixels: Tensor, cameras: tuple[Camera, Camera], left: _Poses, right: _Poses
-) -> tuple[_Poses, Tensor, Tensor]:
-    """The relative pose that most pairs agree with, which pairs are turned under it, and each pair's error (px)."""
-    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
-    turn = _Poses(half_turn, board.amin(0) + board.amax(0))
-    proposals = [right[i].after(left[i].inverse()) for i in range(len(pixels))]
-    proposals += [right[i].after(turn).after(left[i].inverse()) for i in range(len(pixels))]
-    as_read, other_end = pixels[:, 1], pixels[:, 1].flip(-2)
-    points_left = board @ left.rotation.transpose(-1, -2) + left.translation[:, None]
-    best: tuple[float, _Poses, Tensor, Tensor] | None = None
-    for proposal in proposals:
-        projected, valid = cameras[1].project(points_left @ proposal.rotation.T + proposal.translation)
-        projected = torch.where(valid[..., None], projected, torch.inf)
-        errors = torch.stack([_distance(projected, as_read), _distance(projected, other_end)])
-        # A turned order must be clearly better, or a single pair could not tell.
-        turned = errors[1] < 0.2 * errors[0]
-        error = torch.where(turned, errors[1], errors[0])
-        score = float(error.median())
-        if best is None or score < best[0]:
-            best = (score, proposal, turned, error)
-    assert best is not None
-    return best[1:]
-
-
-def _distance(projected: Tensor, observed: Tensor) -> Tensor:
-    """Root mean square distance (P,) over the corners that were seen."""
-    return torch.sqrt(torch.nanmean(((projected - observed) ** 2).sum(-1), -1))
 
 
 def _result(
@@ -315,7 +213,7 @@ def _result(
         rms_left=float(each[0]),
         rms_right=float(each[1]),
         pairs=tuple(used),
-        per_pair_rms=_pair_rms(problem, state, pixels),
+        per_pair_rms=pair_rms(problem, state, pixels),
         flipped=tuple(flipped),
         excluded=tuple(excluded),
         sigma_rotation=pose[:3],

@@ -10,9 +10,11 @@ from rich.markup import escape
 
 import kcal
 from kcal.cli.board import board
+from kcal.cli.calibrate import calibrate
 from kcal.cli.console import err
 from kcal.cli.detect import detect
 from kcal.cli.locate import locate
+from kcal.cli.rig import rig
 from kcal.errors import KcalError
 
 app = typer.Typer(
@@ -42,6 +44,8 @@ def _root(
 
 app.command("board")(board)
 app.command("detect")(detect)
+app.command("calibrate")(calibrate)
+app.command("rig")(rig)
 app.command("locate")(locate)
 
 

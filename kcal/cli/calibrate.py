@@ -1,0 +1,118 @@
+"""`kcal calibrate`: an observations file to a camera file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from kcal.calibrate.mono import CameraCalibrationResult
+    from kcal.corners.observations import Observations
+    from kcal.io.camera_file import CameraFile
+
+
+def calibrate(
+    observations: Annotated[Path, typer.Argument(help="Observations file from `kcal detect`.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Camera file to write.")],
+    model: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="Lens model: pinhole, opencv4, opencv5, opencv8, opencv12, opencv14, ext16 ... ext24."
+        ),
+    ] = "opencv5",
+    board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
+    name: Annotated[str, typer.Option(help="Name of the camera; the observations' file name if not given.")] = "",
+    picture: Annotated[Path | None, typer.Option(help="A .png file: coverage, residuals and views.")] = None,
+) -> None:
+    """Calibrate one camera: intrinsics, lens and error bars.
+
+    Minimises the reprojection error of all corners over all parameters. Rich lens models are reached through the
+    models nested in them, so that more coefficients never end with a larger RMS. A small RMS is not yet accuracy:
+    look at the σ of the parameters, and prefer the smaller model where they are large.
+
+    **Examples**
+
+    `kcal calibrate left.obs.json -o left.camera.json`
+
+    `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --board-warp --picture left.png`
+    """
+    from kcal.cli.console import err, out, steps
+    from kcal.files import check_writable
+    from kcal.lens.model import LensModel
+
+    check_writable(output)
+    if picture is not None:
+        from kcal.report.figures import check_picture_format
+
+        check_picture_format(picture)
+        check_writable(picture)
+    lens = LensModel.named(model)
+
+    from kcal.calibrate.ladder import steps_to
+    from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
+    from kcal.corners.observations import Observations
+
+    seen = Observations.load(observations)
+    with steps("calibrating", 1 + max(1, len(steps_to(lens)) - 1)) as advance:
+        result = calibrate_camera(seen, CalibrationOptions(model=lens, board_warp=board_warp), advance)
+    file = record(result, seen, name or observations.name.split(".")[0], observations.name)
+    file.save(output)
+    if picture is not None:
+        from kcal.report.calibration import save_calibration_picture
+
+        save_calibration_picture(picture, seen, result)
+
+    width, height = seen.image_size
+    corners = int((result.residuals[..., 0] == result.residuals[..., 0]).sum())
+    out.print(f"{len(seen.views)} views, {corners} corners, {width}x{height} px, model {lens}")
+    out.print(f"RMS [bold]{result.rms:.4f} px[/]; {result.status.message} ({result.iterations} steps)")
+    out.print(_table(result))
+    if result.board_warp is not None:
+        x, y = (1e3 * result.board_warp).tolist()
+        out.print(f"board warp: {x:+.3f} mm along its rows, {y:+.3f} mm along its columns")
+    for text in result.warnings:
+        err.print("[yellow]warning:[/]", text, markup=True)
+    for path in (output, picture):
+        if path is not None:
+            out.print(f"wrote {path}", markup=False)
+
+
+def record(result: CameraCalibrationResult, seen: Observations, name: str, source: str) -> CameraFile:
+    """The camera file of a result."""
+    from kcal.io.camera_file import BoardRecord, CameraCalibration, camera_to_file, provenance
+
+    warp = result.board_warp
+    return camera_to_file(
+        result.camera,
+        name=name,
+        standard_deviations=result.sigma,
+        calibration=CameraCalibration(
+            rms=result.rms,
+            views=len(seen.views),
+            points=int((result.residuals[..., 0] == result.residuals[..., 0]).sum()),
+            per_view_rms=dict(zip(seen.names, result.per_view_rms.tolist(), strict=True)),
+            board=BoardRecord(columns=seen.board.columns, rows=seen.board.rows, square=seen.board.square),
+            board_warp=None if warp is None else (float(warp[0]), float(warp[1])),
+            stop_reason=result.status.message,
+            iterations=result.iterations,
+            observations=source,
+            **provenance(),
+        ),
+    )
+
+
+def _table(result: CameraCalibrationResult) -> object:
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column("± σ", justify="right", no_wrap=True)
+    values = dict(zip(result.camera.names, result.camera.parameters_vector.tolist(), strict=True))
+    for name, sigma in result.sigma.items():
+        digits = 3 if name in ("fx", "fy", "cx", "cy") else 6
+        spread = "not determined" if sigma is None else f"{sigma:.{digits}f}"
+        table.add_row(name, f"{values[name]:.{digits}f}", spread)
+    return table
