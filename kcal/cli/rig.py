@@ -73,9 +73,8 @@ def rig(
         advance("done")
     rig_record(result, None if refine_cameras else cameras).save(output)
 
-    out.print(
-        f"{len(result.pairs)} of {len(matched)} pairs used, {names_unpaired(names, matched)} views without partner"
-    )
+    alone = len(names[0]) + len(names[1]) - 2 * len(matched)
+    out.print(f"{len(result.pairs)} of {len(matched)} pairs used, {alone} views without partner")
     out.print(
         f"RMS [bold]{result.rms:.4f} px[/] (left {result.rms_left:.4f}, right {result.rms_right:.4f}); "
         f"{result.status.message}"
