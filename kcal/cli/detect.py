@@ -61,7 +61,7 @@ def detect(
 
     paths = expand_images(images)
     with steps("detecting", len(paths)) as advance:
-        observations = detect_images(paths, board, refine.value, progress=advance)
+        observations = detect_images(paths, board, refine.value, progress=lambda name: advance(escape(name)))
     observations.save(output)
 
     width, height = observations.image_size

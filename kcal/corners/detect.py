@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.grid import grid_trouble, local_side
+from kcal.corners.grid import MIN_SHARPNESS, grid_trouble, local_side, sharpness
 from kcal.corners.images import Grey, decode_grey, read_bytes, to_8bit, unique_names
 from kcal.corners.observations import Failure, Observations, Pixel, View
 from kcal.corners.order import canonical_order
@@ -84,6 +84,8 @@ def detect_board(image: Grey, board: Board, refine: Refinement = "saddle") -> De
         return Detection(None, reason)
     if refine != "none":
         pixels = _climb(image, pixels, board, factor)
+    if sharpness(image, pixels, board.columns, board.rows) < MIN_SHARPNESS:
+        return Detection(None, "too blurred: edges are nearly as wide as the squares; focus, hold still or come closer")
     side = local_side(pixels, board.columns, board.rows)
     refined = refine_corners(image, pixels, side, refine)
     good = int((refined.status == Status.GOOD).sum())
@@ -178,12 +180,12 @@ def _search(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor | None, 
     return None, 1.0, reason
 
 
-def _find_classic(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
+def _find_classic(image: Grey, board: Board) -> Tensor | None:
     found, corners = cv2.findChessboardCorners(image, (board.columns, board.rows), flags=_CLASSIC)
     return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
 
 
-def _find_sector(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
+def _find_sector(image: Grey, board: Board) -> Tensor | None:
     found, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=_SECTOR)
     return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
 

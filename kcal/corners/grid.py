@@ -11,8 +11,10 @@ from kcal.checks import as_points
 from kcal.errors import InputError
 
 MAX_BEND = 0.25  # of a square: how far a corner may lie from its neighbours' homography; a wrong grid is off by 1
+MAX_RATIO = 1.7  # of one square's side to the next along a row: perspective needs a board 3 squares away for this
 MIN_ALTERNATING = 0.9  # share of neighbouring squares that differ as they must; glare may spoil a few
 GOES_ON = 0.75  # of the contrast across a corner: an outer corner of the board's edge has half, one more row all
+MIN_SHARPNESS = 0.58  # see `sharpness`: a blur of 0.22 of the square's side
 MIN_SIDE = 5.0  # pixels: below this, blur decides where the corner seems to be
 
 
@@ -68,24 +70,39 @@ def cell_levels(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, ro
 def first_square_dark(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> tuple[bool, float]:
     """Whether the square diagonally outside corner 0 is dark, and the share of neighbouring squares that agree.
 
-    Colours alternate, so that square has the colour of the first one inside; comparing only neighbours makes uneven
-    light harmless.
+    Colours alternate, so that square has the colour of the first one inside.
     """
-    levels = cell_levels(image, pixels, columns, rows)
-    i, j = torch.meshgrid(torch.arange(rows - 1), torch.arange(columns - 1), indexing="ij")
-    sign = 1.0 - 2.0 * ((i + j) % 2)
-    across = (levels[:, 1:] - levels[:, :-1]) * sign[:, :-1]
-    down = (levels[1:] - levels[:-1]) * sign[:-1]
-    differences = torch.cat([across.reshape(-1), down.reshape(-1)])
+    differences = _alternating(cell_levels(image, pixels, columns, rows))
     lighter = float((differences > 0).double().mean())
     return lighter > 0.5, max(lighter, float((differences < 0).double().mean()))
+
+
+def sharpness(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> float:
+    """How square the squares still are: 1 if their colour reaches their edges, 0.5 if blur has made them waves.
+
+    The median over the squares between the corners of the contrast a quarter of a square inside their corners, over
+    that in their middle. A Gaussian blur of 0.2 of the square's side gives 0.64, one of 0.25 gives 0.54; from there on
+    a corner leans towards whatever lies beyond its own four squares, by tenths of a pixel at the board's border.
+    """
+    grid = as_grid(pixels, columns, rows)
+    p, q, r, s = grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
+    middle = _levels(image, (p + q + r + s) / 4)
+    near = torch.stack(
+        [
+            _levels(image, (9 * a + 3 * (b + c) + d) / 16)
+            for a, b, c, d in ((p, q, r, s), (q, p, s, r), (r, s, p, q), (s, r, q, p))
+        ]
+    ).mean(0)
+    contrast = _alternating(middle).median()
+    return float(_alternating(near).median() / torch.where(contrast == 0, 1e-9, contrast))
 
 
 def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> str | None:
     """Why a detected grid cannot be the board, or None.
 
     Every square must turn the same way, every block of up to 3 x 3 corners must fit a homography (by least squares;
-    one homography for the whole board would refuse wide lenses), and dark and light must alternate.
+    one homography for the whole board would refuse wide lenses), sides must change slowly along rows and columns (a
+    homography would explain a skipped row), dark and light must alternate, and must not go on outside.
     """
     grid = as_grid(pixels, columns, rows)
     if not bool(torch.isfinite(grid).all()):
@@ -96,7 +113,7 @@ def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, r
     areas = _corner_areas(grid)
     if not (bool((areas > 0).all()) or bool((areas < 0).all())):
         return "the grid found is folded: not the board"
-    if float(_bend(grid)) > MAX_BEND:
+    if float(_bend(grid)) > MAX_BEND or float(_ratio(grid)) > MAX_RATIO:
         return "the grid found is uneven: not the board, or another number of corners"
     if first_square_dark(image, pixels, columns, rows)[1] < MIN_ALTERNATING:
         return "the squares of the grid found do not alternate between dark and light"
@@ -115,6 +132,16 @@ def goes_on(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: 
     grid = as_grid(pixels, columns, rows)
     sides = (grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0))
     return any(_goes_on_above(image, side) for side in sides if len(side) >= 3)
+
+
+def _alternating(levels: Tensor) -> Tensor:
+    """How much lighter light squares are than dark neighbours, if the first is dark: uneven light hardly matters."""
+    rows, columns = levels.shape
+    i, j = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    sign = 1.0 - 2.0 * ((i + j) % 2)
+    across = (levels[:, 1:] - levels[:, :-1]) * sign[:, :-1]
+    down = (levels[1:] - levels[:-1]) * sign[:-1]
+    return torch.cat([across.reshape(-1), down.reshape(-1)])
 
 
 def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
@@ -152,6 +179,15 @@ def _corner_areas(grid: Tensor) -> Tensor:
         return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
     return torch.stack([cross(q - p, s - p), cross(r - q, p - q), cross(s - r, q - r), cross(p - s, r - s)])
+
+
+def _ratio(grid: Tensor) -> Tensor:
+    """The largest ratio of two successive sides along a row or a column."""
+    ratios = [torch.ones(1, dtype=torch.float64)]
+    for dim in (0, 1):
+        side = torch.linalg.vector_norm(grid.diff(dim=dim), dim=-1).log()
+        ratios.append(side.diff(dim=dim).abs().exp().reshape(-1))
+    return torch.cat(ratios).max()
 
 
 def _bend(grid: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ import os
 import re
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -151,7 +152,7 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
     deepest = max((len(part) for part in parts), default=1)
     names = [path.name for path in paths]
     for depth in range(2, deepest + 1):
-        twice = {name for name in names if names.count(name) > 1}
+        twice = {name for name, count in Counter(names).items() if count > 1}
         if not twice:
             break
         names = ["/".join(part[-depth:]) if name in twice else name for name, part in zip(names, parts, strict=True)]

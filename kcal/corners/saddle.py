@@ -24,6 +24,7 @@ REPEATS = 6
 MAX_MOVE = 2.0  # pixels from the start
 SQUARE_SHARE = 0.35  # of the smallest square side: the disc never reaches further
 MOVE_SHARE = 0.3  # of the smallest square side: a corner never moves further
+MIN_FIT = 0.85  # share of the grey levels' variance that the quadratic must explain; 0.98 to 0.999 on real corners
 STILL = 0.02  # pixels: a last step below this has converged
 
 _HALF = 12  # of the patch: 0.5 rounding + MAX_MOVE + RADIUS + 1 bilinear + 3 sigma of blur, rounded up
@@ -35,7 +36,7 @@ class Status(IntEnum):
     GOOD = 0
     MISSING = 1  # the start was NaN
     OUTSIDE = 2  # the disc and its blur leave the image
-    NO_SADDLE = 3  # the grey levels form a hill, a hollow or an edge
+    NO_SADDLE = 3  # the grey levels form a hill, a hollow or an edge, or fit no quadratic: something covers the corner
     MOVED = 4  # further from its start than it may
     RESTLESS = 5  # still moving after the last repeat
 
@@ -83,7 +84,7 @@ def saddle(image: Tensor, pixels: Tensor, side: Tensor | float) -> Refined:
     # Patches and all that follows have shape (corners of all images, ...).
     patches = _blurred_patches(image.reshape(-1, height, width), base.reshape(-1, base.shape[-2], 2), scale)
     offset = (start - base).reshape(-1, 2)
-    offsets, inverse = _disc(image.device)
+    offsets, design, inverse = _disc(image.device)
     flat_scale, flat_limit = scale.reshape(-1, 1), limit.reshape(-1, 1)
 
     where, step = offset, torch.zeros_like(offset)
@@ -91,6 +92,7 @@ def saddle(image: Tensor, pixels: Tensor, side: Tensor | float) -> Refined:
     for _ in range(REPEATS):
         samples = _bilinear(patches, where[:, None] + flat_scale[:, None] * offsets)
         step, is_saddle = _stationary(samples @ inverse.T)
+        is_saddle = is_saddle & _fits(samples, samples @ inverse.T @ design.T)
         step = step * flat_scale
         # A bounded step, and a centre whose disc stays on the patch; both bounds are out of reach of a good corner.
         step = step * (RADIUS / 2 * flat_scale / _length(step)).clamp(max=1.0)
@@ -152,14 +154,14 @@ def _check(image: Tensor, pixels: Tensor, side: Tensor | float) -> tuple[Tensor,
     return image, pixels, sides
 
 
-def _disc(device: torch.device) -> tuple[Tensor, Tensor]:
-    """Sample offsets (K, 2) on the disc, and the (6, K) pseudo-inverse that fits 1, x, y, x², xy, y² to samples."""
+def _disc(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Sample offsets (K, 2) on the disc, 1, x, y, x², xy, y² there (K, 6), and the (6, K) pseudo-inverse of these."""
     axis = torch.arange(-int(RADIUS), int(RADIUS) + 1, dtype=torch.float64, device=device)
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     keep = x**2 + y**2 <= RADIUS**2
     x, y = x[keep], y[keep]
     design = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
-    return torch.stack([x, y], -1), torch.linalg.solve(design.T @ design, design.T)
+    return torch.stack([x, y], -1), design, torch.linalg.solve(design.T @ design, design.T)
 
 
 def _blurred_patches(image: Tensor, base: Tensor, scale: Tensor) -> Tensor:
@@ -192,6 +194,12 @@ def _stationary(quadratic: Tensor) -> tuple[Tensor, Tensor]:
     safe = torch.where(is_saddle, determinant, 1.0)
     step = torch.stack([(xy * gy - 2 * yy * gx) / safe, (xy * gx - 2 * xx * gy) / safe], -1)
     return torch.where(is_saddle[:, None], step, 0.0), is_saddle
+
+
+def _fits(samples: Tensor, quadratic: Tensor) -> Tensor:
+    """Whether the quadratic explains the samples (M, K), (M,) bool."""
+    samples, quadratic = samples.detach(), quadratic.detach()
+    return (samples - quadratic).square().sum(-1) <= (1 - MIN_FIT) * samples.var(-1, correction=0) * samples.shape[-1]
 
 
 def _length(vector: Tensor) -> Tensor:
