@@ -84,8 +84,8 @@ def undistort(
 ) -> tuple[Tensor, Tensor]:
     """Undo the distortion, or say that it cannot be undone.
 
-    Newton's method with the 2x2 Jacobian, each point on its own: a step that does not lower the residual is halved,
-    and no iterate leaves the valid disc. The last two steps stay in the autograd graph: at a solution, a Newton step
+    Newton's method with the 2x2 Jacobian, each point on its own: a step that does not lower the residual, or that
+    leaves the valid disc, is halved. The last two steps stay in the autograd graph: at a solution, a Newton step
     has the exact implicit derivative by the point and by the coefficients, and two of them the second one too.
 
     Args:
@@ -143,10 +143,6 @@ def _newton_step(
 def _newton(
     target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel, limit: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    def inside(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        shrink = torch.clamp(limit / torch.hypot(x, y).clamp_min(1e-300), max=1.0)
-        return x * shrink, y * shrink
-
     def evaluate(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         lens = distort_components(x, y, coefficients, model)
         a, b, d, e = lens.point
@@ -167,9 +163,10 @@ def _newton(
     for _ in range(_ITERATIONS):
         if not torch.compiler.is_compiling() and bool((error <= tolerance).all()):
             break
-        trial_x, trial_y = inside(x - fraction * step_x, y - fraction * step_y)
+        trial_x, trial_y = x - fraction * step_x, y - fraction * step_y
         next_x, next_y, next_error = evaluate(trial_x, trial_y)
-        better = next_error < error
+        # Refused, not moved to the rim: there, beside a fold, a point can get stuck.
+        better = (next_error < error) & (torch.hypot(trial_x, trial_y) < limit)
         x, y = torch.where(better, trial_x, x), torch.where(better, trial_y, y)
         step_x, step_y = torch.where(better, next_x, step_x), torch.where(better, next_y, step_y)
         error = torch.where(better, next_error, error)
