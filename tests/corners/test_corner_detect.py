@@ -9,6 +9,7 @@ from board_render import homography, render
 
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, detect_images
+from kcal.corners.images import read_grey
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 
@@ -82,12 +83,21 @@ def test_nothing_there():
 
 
 def test_a_part_of_the_board_is_not_the_board():
-    image, _ = scene(BOARD, (640, 480), 45, supersample=3)
+    H = homography(BOARD, (640, 480), 25, (0.2, 0.1), 0.1)
+    image, _ = render(BOARD, (640, 480), H, supersample=2)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     assert cv2.findChessboardCorners(image, (8, 6), flags=flags)[0]  # OpenCV is content with a part
     found = detect_board(image, Board(columns=8, rows=6, square=0.025))
     assert found.pixels is None
     assert found.reason.startswith("the squares go on beyond 8x6")
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(8, 6), (7, 6), (5, 5)])
+def test_a_part_of_a_real_board_is_not_the_board(stereo, columns, rows):
+    part = Board(columns=columns, rows=rows, square=0.025)
+    found = [detect_board(read_grey(path), part) for path in stereo[::3]]
+    assert all(one.pixels is None for one in found)
+    assert sum("go on beyond" in one.reason or "uneven" in one.reason for one in found) >= 3
 
 
 @pytest.mark.parametrize(("dx", "dy", "radius"), [(3, 2, 5), (4, 0, 6), (5, 5, 8), (0, 0, 9)])
