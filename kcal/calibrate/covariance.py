@@ -11,6 +11,8 @@ from kcal.solve.schur import SchurLinearisation
 
 # Eigenvalues of the scaled information below this share of the largest are rounding, not information.
 _RANK_TOLERANCE = 1e-13
+# A parameter whose square has this share in a lost direction is lost with it.
+_LOST_SHARE = 1e-2
 
 
 class Spread(NamedTuple):
@@ -36,11 +38,11 @@ def spread(linear: SchurLinearisation, residual_count: int, parameter_count: int
     """
     information, scale = linear.information()
     eigenvalues, vectors = torch.linalg.eigh(information)
-    kept = eigenvalues > _RANK_TOLERANCE * eigenvalues[-1]
-    inverse = torch.where(kept, 1.0 / torch.where(kept, eigenvalues, 1.0), 0.0)
-    variance = (vectors**2 * inverse).sum(-1)
-    # A parameter with a part in a lost direction is not determined, however small the rest of its variance is.
-    determined = (vectors[:, ~kept] ** 2).sum(-1) < 1e-6
+    floor = _RANK_TOLERANCE * eigenvalues[-1]
+    lost = (vectors[:, eigenvalues <= floor] ** 2).sum(-1)
+    # What rounding hides is at least as uncertain as the floor says.
+    variance = (vectors**2 / eigenvalues.clamp_min(floor)).sum(-1)
     noise = 2.0 * linear.cost / max(residual_count - parameter_count, 1)
     sigma = torch.sqrt(variance * noise) * scale
+    determined = lost < _LOST_SHARE
     return Spread(torch.where(determined, sigma, torch.inf), determined)

@@ -5,6 +5,9 @@ either can be the lower. So each step solves from several starts side by side, i
 a start without distortion, and starts whose numerator and denominator nearly cancel at a chosen radius. A minimum of
 the smaller model, carried over unchanged, is always among the candidates, so that a richer model never ends above the
 one nested in it.
+
+Some minima buy a little cost with a fold or a pole just beyond the outermost corner. One inside the observed radius is
+no lens and is never chosen; one elsewhere in the image is chosen only where the gain is significant.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem import BoardProblem
+from kcal.lens.camera import Camera
 from kcal.lens.inverse import valid_radius
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
@@ -26,6 +30,9 @@ from kcal.solve.result import Result, State
 # Trial steps given to each start of a batch; the best one is then taken to convergence.
 _SCOUT_ITERATIONS = 150
 _KEPT = 4
+# How much χ² a lens that folds inside the image must gain on one that does not: 20 is far beyond chance for the few
+# parameters that a step of the ladder adds.
+_FOLD_PRICE = 20.0
 # Where near-cancelling starts put their bump, as a fraction of the largest observed r².
 _BUMPS = (0.1, 0.25, 0.5)
 Progress = Callable[[str], None]
@@ -122,6 +129,7 @@ def free_parameters(model: LensModel) -> list[int]:
 def climb(
     board_points: Tensor,
     pixels: Tensor,
+    size: tuple[int, int],
     first: State,
     cold: State,
     models: Sequence[LensModel],
@@ -135,6 +143,7 @@ def climb(
     Args:
         board_points: (N, 3).
         pixels: (V, 1, N, 2).
+        size: (width, height) of the image.
         first: a solution of `models[0]`.
         cold: a state of `models[0]` without distortion.
         models: each nested in the next.
@@ -159,10 +168,12 @@ def climb(
         found = minimise(scouts, stack(starts), scouting)
         spent += int(found.iterations.max())
         problem = BoardProblem(board_points, pixels, [large], free, free_warp=free_warp)
-        kept = _distinct(board_points, pixels, found, starts[0], problem, large)
+        kept = _distinct(board_points, pixels, size, found, starts[0], problem, large)
         result = minimise(problem, kept[0], options)
         spent += int(result.iterations)
-        if _regular(board_points, pixels, result.state, large):
+        if _trouble(board_points, pixels, size, result.state, large) <= _trouble(
+            board_points, pixels, size, kept[0], large
+        ):
             kept[0] = result.state
         else:
             # The last steps left the lens: keep the state before them.
@@ -177,25 +188,37 @@ def climb(
     return Minimum(result=result, iterations=spent)
 
 
-def _regular(board_points: Tensor, pixels: Tensor, state: State, model: LensModel) -> bool:
+def _trouble(board_points: Tensor, pixels: Tensor, size: tuple[int, int], state: State, model: LensModel) -> float:
+    """0 for a lens that is regular in the whole image, 1 if it folds outside the observed radius, infinity inside."""
     radius = valid_radius(state[0][len(INTRINSICS) :], model)
-    return bool(radius > observed_radius(board_points, pixels, state))
+    if not bool(radius > observed_radius(board_points, pixels, state)):
+        return math.inf
+    return 0.0 if bool(Camera(state[0], size=size, model=model).covers_image()) else 1.0
 
 
 def _distinct(
-    board_points: Tensor, pixels: Tensor, found: Result, carried: State, problem: BoardProblem, model: LensModel
+    board_points: Tensor,
+    pixels: Tensor,
+    size: tuple[int, int],
+    found: Result,
+    carried: State,
+    problem: BoardProblem,
+    model: LensModel,
 ) -> list[State]:
-    """The lowest few minima that are lenses, best first; the carried-over state leads if none is as good."""
+    """The best few minima that are lenses, best first; the carried-over state leads if none is as good."""
+    # In units of the noise variance, estimated from the best fit there is.
     limit = float(problem.cost(carried))
-    kept: list[State] = []
+    lowest = min(limit, float(torch.nan_to_num(found.cost, nan=math.inf).min()))
+    price = _FOLD_PRICE * max(lowest, 1e-300) / problem.residual_count
+    ranked = [(limit + price * _trouble(board_points, pixels, size, carried, model), limit, carried)]
     costs: list[float] = []
     for i in torch.argsort(torch.nan_to_num(found.cost, nan=torch.inf)).tolist():
         cost, state = float(found.cost[i]), pick(found.state, i)
-        if not math.isfinite(cost) or len(kept) == _KEPT:
-            break
-        if any(abs(cost - other) <= 1e-7 * other for other in costs):
+        if not math.isfinite(cost) or any(abs(cost - other) <= 1e-7 * other for other in costs):
             continue
-        if _regular(board_points, pixels, state, model):
-            kept.append(state)
-            costs.append(cost)
-    return kept if costs and costs[0] <= limit else [carried, *kept][:_KEPT]
+        costs.append(cost)
+        ranked.append((cost + price * _trouble(board_points, pixels, size, state, model), cost, state))
+    # A richer model must not end above the one nested in it, whatever the price says.
+    ranked = [entry for entry in ranked if math.isfinite(entry[0])]
+    ranked.sort(key=lambda entry: (entry[1] > limit, entry[0]))
+    return [state for _, _, state in ranked[:_KEPT]] or [carried]

@@ -128,7 +128,17 @@ def calibrate_camera(
     first, cold, spent = _first(board, pixels, observations.image_size, ladder[0], options)
     progress(f"start ({ladder[0]})")
     seen = pixels[:, None]
-    minimum = climb(board, seen, first, cold, ladder, solver, free_warp=options.board_warp, progress=progress)
+    minimum = climb(
+        board,
+        seen,
+        observations.image_size,
+        first,
+        cold,
+        ladder,
+        solver,
+        free_warp=options.board_warp,
+        progress=progress,
+    )
 
     spent += minimum.iterations
 
@@ -274,11 +284,8 @@ def _warnings(
     lost = [name for name, known in zip(names, uncertainty.determined.tolist(), strict=False) if not known]
     if lost:
         found.append(f"the views do not determine {', '.join(lost)}: choose a smaller model or add views")
-    width, height = camera.size
-    u, v = torch.linspace(0, width - 1, 33).double(), torch.linspace(0, height - 1, 25).double()
-    grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
-    _, valid = camera.unproject(grid)
-    if not bool(valid.all()):
+    if not bool(camera.covers_image()):
+        _, valid = camera.unproject(camera.grid(33, 25))
         share = 100.0 * float((~valid).double().mean())
         found.append(f"the lens model folds inside the image: {share:.0f} % of it gives no ray")
     return found

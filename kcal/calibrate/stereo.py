@@ -108,6 +108,7 @@ def calibrate_rig(
     pixels, names = _pixels(left, right, left_observations, right_observations, pairs)
     board = left_observations.board.points
     cameras = (left, right)
+    lost = _drop_rayless(pixels, cameras, names)
     views, alone = zip(*(pose_alone(board, pixels[:, c], cameras[c], options.solver) for c in (0, 1)), strict=True)
     check_fit(board, pixels, cameras, alone, options.solver)
 
@@ -145,8 +146,32 @@ def calibrate_rig(
             excluded.append((names[int(kept[i])], reason))
         keep[kept[worse]] = False
     used = [names[i] for i in keep.nonzero()[:, 0].tolist()]
-    return _result(problem, problem.tidy(result.state), Status(int(result.status)), cameras, pixels[keep], used,
-                   [pair for pair in flipped if pair in used], excluded)  # fmt: skip
+    solved = _result(problem, problem.tidy(result.state), Status(int(result.status)), cameras, pixels[keep], used)
+    return dataclasses.replace(
+        solved,
+        flipped=tuple(pair for pair in flipped if pair in used),
+        excluded=tuple(excluded),
+        warnings=(*lost, *solved.warnings),
+    )
+
+
+def _drop_rayless(pixels: Tensor, cameras: tuple[Camera, Camera], names: list[Pair]) -> list[str]:
+    """Turn corners at which a lens model has no ray into unseen ones, in place; returns warnings."""
+    warnings = []
+    for c, word in enumerate(("left", "right")):
+        _, valid = cameras[c].normalize(pixels[:, c])
+        seen = torch.isfinite(pixels[:, c]).all(-1)
+        if not bool((seen & ~valid).any()):
+            continue
+        few = ((seen & valid).sum(-1) < MINIMUM_CORNERS).nonzero()[:, 0].tolist()
+        if few:
+            raise InputError(
+                f"{names[few[0]][c]}: the {word} camera's lens model has no ray at most of its corners: it folds inside "
+                "the image; calibrate with views nearer the image's border or with a smaller model"
+            )
+        warnings.append(f"{int((seen & ~valid).sum())} corners left out where the {word} lens model has no ray")
+        pixels[:, c] = torch.where(valid[..., None], pixels[:, c], torch.nan)
+    return warnings
 
 
 def _outliers(error: Tensor, times: float, floor: float) -> Tensor:
@@ -183,8 +208,6 @@ def _result(
     cameras: tuple[Camera, Camera],
     pixels: Tensor,
     used: list[Pair],
-    flipped: list[Pair],
-    excluded: list[tuple[Pair, str]],
 ) -> RigCalibrationResult:
     s = problem.unpack(state)
     solved = [
@@ -214,8 +237,8 @@ def _result(
         rms_right=float(each[1]),
         pairs=tuple(used),
         per_pair_rms=pair_rms(problem, state, pixels),
-        flipped=tuple(flipped),
-        excluded=tuple(excluded),
+        flipped=(),
+        excluded=(),
         sigma_rotation=pose[:3],
         sigma_translation=pose[3:],
         pixels=pixels,

@@ -173,6 +173,21 @@ class Camera(nn.Module):
         u, v = pixels.unbind(-1)
         return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
 
+    def grid(self, columns: int, rows: int) -> Tensor:
+        """Pixels (rows, columns, 2) spread evenly over the image, its outermost pixels included."""
+        width, height = self.size
+        kind, place = torch.float64, self.parameters_vector.device
+        u = torch.linspace(0, width - 1, columns, dtype=kind, device=place)
+        v = torch.linspace(0, height - 1, rows, dtype=kind, device=place)
+        return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+
+    def covers_image(self) -> Tensor:
+        """(...) whether every pixel of the image has a ray, judged along its border."""
+        grid = self.grid(17, 13)
+        border = torch.cat([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
+        _, valid = self.unproject(border)
+        return valid.all(-1)
+
     def forward(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
         """The same as `project`."""
         return self.project(points_cam)

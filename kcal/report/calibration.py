@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -68,10 +67,10 @@ def _coverage(axes: Axes, observations: Observations, result: CameraCalibrationR
         width=0.0015,
     )
     axes.scatter(where[:, 0], where[:, 1], c=view, cmap="turbo", s=4, linewidths=0)
-    u, v = torch.linspace(0, width - 1, 97).double(), torch.linspace(0, height - 1, 73).double()
-    valid = result.camera.unproject(torch.stack(torch.meshgrid(u, v, indexing="xy"), -1))[1].numpy()
+    grid = result.camera.grid(97, 73)
+    valid = result.camera.unproject(grid)[1].numpy()
     if not valid.all():
-        axes.contourf(u.numpy(), v.numpy(), ~valid, levels=[0.5, 1.5], colors=[_WARN], alpha=0.25)
+        axes.contourf(*grid.unbind(-1), ~valid, levels=[0.5, 1.5], colors=[_WARN], alpha=0.25)
         axes.text(0.02, 0.02, "shaded: no valid ray", transform=axes.transAxes, color=_WARN, fontsize=9)
     axes.set_xlim(-0.03 * width, 1.03 * width)
     axes.set_ylim(1.03 * height, -0.03 * height)
