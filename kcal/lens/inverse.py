@@ -59,7 +59,8 @@ def valid_radius(coefficients: Tensor, model: LensModel | str) -> Tensor:
     for _ in range(11):
         count = good(radii)
         radii = radii.expand(*count.shape[:-1], -1, -1)
-        low = torch.gather(radii, -2, (count - 1)[..., None, :])
+        # A lens that is irregular on the axis itself (a tilt beyond 90°, say) has no valid disc: radius zero.
+        low = torch.gather(radii, -2, (count - 1).clamp(min=0)[..., None, :])
         high = torch.gather(radii, -2, count.clamp(max=radii.shape[-2] - 1)[..., None, :])
         radii = low + (high - low) * torch.linspace(0, 1, 33, dtype=kind, device=place)[:, None]
     return low[..., 0, :].amin(-1)
