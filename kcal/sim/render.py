@@ -6,6 +6,7 @@ averaged over the pixel's area. Then come blur (in linear light), vignetting, no
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -18,7 +19,7 @@ from kcal.sim.board import BoardLike, BoardPose, area_colours, board_points, che
 from kcal.sim.window import Window, grow, invert_window, pixel_axes
 
 _FAR = 1e9  # squares: nothing is painted there
-_SAMPLES = 4  # boxes along each side of a pixel that an edge crosses
+_REACH = 0.625  # pixels from a pixel's centre to where its outermost samples end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +31,8 @@ class RenderOptions:
         white: of the white squares and the margin.
         background: mean level around the board; it varies slowly by a fifth.
         margin: width of the white margin in squares.
-        blur: sigma of the optics' Gaussian in pixels, on top of the averaging over the pixel's area.
+        blur: sigma of the optics' Gaussian in pixels, on top of the averaging over the pixel's area; below 0.13 it is
+            0.13.
         noise: sigma of the sensor's noise in grey levels.
         vignetting: share of light lost in the image's corners.
 
@@ -70,8 +72,8 @@ def render_board(
     for their true pixels. A board that reaches beyond the image, or beyond what the lens can image, is drawn as far
     as it is seen; `project_board` says which corners are.
 
-    An edge is placed to better than 0.001 px: the lens is inverted every 8 px and interpolated by cubics, and the
-    pattern is integrated in 4 x 4 boxes per pixel, each an exact integral.
+    The lens is inverted every 8 px and interpolated by cubics; edges are integrated in closed form over quarters of a
+    pixel, so that a straight edge lies within 1e-9 px, and corners measured 0.001 px, of where they should.
 
     Args:
         camera: a single camera.
@@ -96,56 +98,83 @@ def render_board(
         (torch.Size([240, 320]), 40, 215)
     """
     options = options or RenderOptions()
+    if options.noise > 0 and generator is None:
+        raise InputError("render_board: noise needs a torch.Generator; give one or set noise to 0")
+    image = render_light(camera, cam_from_board, board, options)
+    if options.noise > 0:
+        image += options.noise * torch.randn(image.shape, dtype=torch.float64, generator=generator)
+    return image.round_().clamp_(0, 255).to(torch.uint8)
+
+
+@torch.no_grad()
+def render_light(
+    camera: Camera, cam_from_board: tuple[Tensor, Tensor], board: BoardLike, options: RenderOptions | None = None
+) -> Tensor:
+    """The image as it falls on the sensor, before noise and rounding: (height, width) float64 grey levels.
+
+    Arguments and errors are those of `render_board`.
+
+    Example:
+        >>> from kcal.sim.board import BoardSize
+        >>> camera = Camera.build(focal=(400, 400), center=(159.5, 119.5), size=(320, 240))
+        >>> pose = BoardPose(torch.eye(3), torch.tensor([-0.2, -0.125, 1.0]))
+        >>> light = render_light(camera, pose, BoardSize(9, 6, 0.05), RenderOptions(vignetting=0))
+        >>> [round(value, 6) for value in light[60, 78:82].tolist()]  # an edge half way between columns 79 and 80
+        [44.244125, 84.751421, 170.248754, 210.755908]
+    """
+    options = options or RenderOptions()
     if camera.parameters_vector.ndim != 1:
         raise InputError("render_board: a single camera is needed, got a batch")
     check_board(board)
     pose = check_pose(cam_from_board)
-    if options.noise > 0 and generator is None:
-        raise InputError("render_board: noise needs a torch.Generator; give one or set noise to 0")
-    with torch.no_grad():
-        radius = math.ceil(4 * options.blur)
-        width, height = camera.size
-        image = _background(Window(0, 0, width, height), camera.size, options)
-        paper = _paper_window(camera, pose, board, options.margin, radius)
-        if paper.width > 0 and paper.height > 0:
-            # What is just outside the window is blurred into it.
-            light = _light(camera, pose, board, grow(paper, radius), options)
-            rows, columns = slice(paper.top, paper.top + paper.height), slice(paper.left, paper.left + paper.width)
-            image[rows, columns] = _blur(light, options.blur, radius)
-        x, y = pixel_axes(Window(0, 0, width, height))
-        x, y = x - (width - 1) / 2, y - (height - 1) / 2
-        image *= 1 - options.vignetting * (x**2 + y[:, None] ** 2) / (x[-1] ** 2 + y[-1] ** 2)
-        if options.noise > 0:
-            image += options.noise * torch.randn(image.shape, dtype=torch.float64, generator=generator)
-        return image.round_().clamp_(0, 255).to(torch.uint8)
+    radius = math.ceil(4 * options.blur)
+    width, height = camera.size
+    image = _background(Window(0, 0, width, height), camera.size, options)
+    paper = _paper_window(camera, pose, board, options.margin, radius)
+    if paper.width > 0 and paper.height > 0:
+        # What is just outside the window is blurred into it.
+        light = _light(camera, pose, board, grow(paper, radius), options)
+        rows, columns = slice(paper.top, paper.top + paper.height), slice(paper.left, paper.left + paper.width)
+        image[rows, columns] = _blur(light, options.blur, radius)
+    x, y = pixel_axes(Window(0, 0, width, height))
+    x, y = x - (width - 1) / 2, y - (height - 1) / 2
+    image *= 1 - options.vignetting * (x**2 + y[:, None] ** 2) / (x[-1] ** 2 + y[-1] ** 2)
+    return image
 
 
 def _light(camera: Camera, pose: BoardPose, board: BoardLike, window: Window, options: RenderOptions) -> Tensor:
-    """Grey levels of a window, averaged over each pixel's area, before optics and sensor."""
+    """The scene in grey levels, before the optics: (2 height, 2 width), four samples in each pixel of a window.
+
+    Along x and y, a sample is the average over half a pixel, and of two such averages a quarter of a pixel apart: what
+    sampling folds back is then too little to move a corner.
+    """
     around = _background(window, camera.size, options)
     grown_a, grown_b = _board_coordinates(camera, pose, board, grow(window, 1))
     a, b = grown_a[1:-1, 1:-1], grown_b[1:-1, 1:-1]
     tiny = torch.tensor(1e-6, dtype=torch.float64)
-    light = _paint(a, b, tiny, tiny, board, options, around).reshape(-1)
+    light = _paint(a, b, tiny, tiny, board, options, around)
+    light = light.repeat_interleave(2, 0).repeat_interleave(2, 1)
 
     # Board squares per pixel, along x and y. Every edge of the pattern and of the paper lies at a whole number.
     a_x, a_y, b_x, b_y = *_slopes(grown_a), *_slopes(grown_b)
-    edge_a = (a - a.round()).abs() <= 0.5 * (a_x.abs() + a_y.abs())
-    edge_b = (b - b.round()).abs() <= 0.5 * (b_x.abs() + b_y.abs())
+    edge_a = (a - a.round()).abs() <= _REACH * (a_x.abs() + a_y.abs())
+    edge_b = (b - b.round()).abs() <= _REACH * (b_x.abs() + b_y.abs())
     outside = 1.5 + options.margin
     near = (a > -outside) & (a < board.columns - 1 + outside) & (b > -outside) & (b < board.rows - 1 + outside)
-    index = ((edge_a | edge_b) & near).reshape(-1).nonzero()[:, 0]
-    a, b, a_x, a_y, b_x, b_y, around = (value.reshape(-1)[index] for value in (a, b, a_x, a_y, b_x, b_y, around))
-    # Boxes with the variance of a small square along the board's axes: exact for aligned edges, never off centre.
-    width_a = torch.hypot(a_x, a_y).clamp_min(1e-9) / _SAMPLES
-    width_b = torch.hypot(b_x, b_y).clamp_min(1e-9) / _SAMPLES
-    offsets = [(i + 0.5) / _SAMPLES - 0.5 for i in range(_SAMPLES)]
-    mixed = torch.zeros_like(a)
-    for dx in offsets:
-        for dy in offsets:
-            mixed += _paint(a + a_x * dx + a_y * dy, b + b_x * dx + b_y * dy, width_a, width_b, board, options, around)
-    light[index] = mixed / _SAMPLES**2
-    return light.reshape(window.height, window.width)
+    rows, columns = ((edge_a | edge_b) & near).nonzero(as_tuple=True)
+    a, b, a_x, a_y, b_x, b_y, around = (value[rows, columns] for value in (a, b, a_x, a_y, b_x, b_y, around))
+    # Boxes with the variance of a square of a quarter pixel along the board's axes: exact for straight edges along the
+    # pixels, and never off centre.
+    width_a = 0.25 * torch.hypot(a_x, a_y).clamp_min(1e-9)
+    width_b = 0.25 * torch.hypot(b_x, b_y).clamp_min(1e-9)
+    for i, j in itertools.product((0, 1), repeat=2):
+        mixed = torch.zeros_like(a)
+        for m, n in itertools.product((-1, 0, 1), repeat=2):
+            dx, dy = 0.5 * j - 0.25 + 0.25 * m, 0.5 * i - 0.25 + 0.25 * n
+            sample = _paint(a + a_x * dx + a_y * dy, b + b_x * dx + b_y * dy, width_a, width_b, board, options, around)
+            mixed.add_(sample, alpha=(2 - abs(m)) * (2 - abs(n)) / 16)
+        light[2 * rows + i, 2 * columns + j] = mixed
+    return light
 
 
 def _slopes(grown: Tensor) -> tuple[Tensor, Tensor]:
@@ -209,17 +238,19 @@ def _background(window: Window, size: tuple[int, int], options: RenderOptions) -
 
 
 def _blur(light: Tensor, sigma: float, radius: int) -> Tensor:
-    """Gaussian blur; the result is smaller by `radius` on every side."""
-    if radius == 0:
-        return light
-    offset = torch.arange(-radius, radius + 1, dtype=torch.float64)
-    kernel = torch.exp(-0.5 * (offset / sigma) ** 2)
-    weights = (kernel / kernel.sum()).tolist()
-    rows, columns = light.shape[0] - 2 * radius, light.shape[1] - 2 * radius
-    vertical = torch.zeros((rows, light.shape[1]), dtype=torch.float64)
-    result = torch.zeros((rows, columns), dtype=torch.float64)
+    """Optics and pixel area: from four samples a pixel to pixels, `radius` of them fewer on every side."""
+    # In half pixels. The samples are a little wider than the half pixels that make up a pixel's area.
+    variance = max((2 * sigma) ** 2 - 0.0625, 1e-4)
+    reach = 2 * radius
+    offset = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    gaussian = torch.exp(-0.5 * offset**2 / variance)
+    both = torch.nn.functional.pad(gaussian, (0, 1)) + torch.nn.functional.pad(gaussian, (1, 0))
+    weights = (both / both.sum()).tolist()
+    rows, columns = (size - len(weights) + 2 for size in light.shape)
+    vertical = torch.zeros((rows // 2, light.shape[1]), dtype=torch.float64)
+    result = torch.zeros((rows // 2, columns // 2), dtype=torch.float64)
     for i, weight in enumerate(weights):
-        vertical.add_(light[i : i + rows], alpha=weight)
+        vertical.add_(light[i : i + rows : 2], alpha=weight)
     for i, weight in enumerate(weights):
-        result.add_(vertical[:, i : i + columns], alpha=weight)
+        result.add_(vertical[:, i : i + columns : 2], alpha=weight)
     return result
