@@ -1,3 +1,84 @@
-"""kcal: camera calibration and long-range stereo localisation for PyTorch."""
+"""kcal: camera calibration and long-range stereo localisation for PyTorch.
+
+The names below are loaded when they are first used, so that `import kcal` and `kcal --help` do not wait for torch.
+Everything else is found in its folder, for example `kcal.locate.positions.locate`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
+    from kcal.calibrate.stereo import RigOptions, calibrate_rig
+    from kcal.corners.board import Board
+    from kcal.corners.detect import detect_images
+    from kcal.corners.observations import Observations
+    from kcal.errors import KcalError
+    from kcal.io.camera_file import load_camera, save_camera
+    from kcal.io.rig_file import load_rig, save_rig
+    from kcal.lens.camera import Camera
+    from kcal.lens.model import LensModel
+    from kcal.lens.rig import StereoRig
+    from kcal.locate.geodesy import Origin
+    from kcal.locate.stereo import Triangulate
+    from kcal.solve.lm import LevenbergMarquardt, LMOptions
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Board",
+    "CalibrationOptions",
+    "Camera",
+    "KcalError",
+    "LMOptions",
+    "LensModel",
+    "LevenbergMarquardt",
+    "Observations",
+    "Origin",
+    "RigOptions",
+    "StereoRig",
+    "Triangulate",
+    "calibrate_camera",
+    "calibrate_rig",
+    "detect_images",
+    "load_camera",
+    "load_rig",
+    "save_camera",
+    "save_rig",
+]
+
+_HOME = {
+    "Board": "kcal.corners.board",
+    "CalibrationOptions": "kcal.calibrate.mono",
+    "Camera": "kcal.lens.camera",
+    "KcalError": "kcal.errors",
+    "LMOptions": "kcal.solve.lm",
+    "LensModel": "kcal.lens.model",
+    "LevenbergMarquardt": "kcal.solve.lm",
+    "Observations": "kcal.corners.observations",
+    "Origin": "kcal.locate.geodesy",
+    "RigOptions": "kcal.calibrate.stereo",
+    "StereoRig": "kcal.lens.rig",
+    "Triangulate": "kcal.locate.stereo",
+    "calibrate_camera": "kcal.calibrate.mono",
+    "calibrate_rig": "kcal.calibrate.stereo",
+    "detect_images": "kcal.corners.detect",
+    "load_camera": "kcal.io.camera_file",
+    "load_rig": "kcal.io.rig_file",
+    "save_camera": "kcal.io.camera_file",
+    "save_rig": "kcal.io.rig_file",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'kcal' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
