@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple, get_args
 
@@ -186,7 +187,12 @@ def _find_classic(image: Grey, board: Board) -> Tensor | None:
 
 
 def _find_sector(image: Grey, board: Board) -> Tensor | None:
-    found, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=_SECTOR)
+    # It draws from OpenCV's random numbers, whose state is a thread's own: in a new thread the same image gives the
+    # same corners, whatever was called before, and the caller's state is left alone.
+    with ThreadPoolExecutor(1) as fresh:
+        found, corners = fresh.submit(
+            cv2.findChessboardCornersSB, image, (board.columns, board.rows), flags=_SECTOR
+        ).result()
     return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
 
 

@@ -52,6 +52,12 @@ class Observations(NativeFile):
         refinement: how corners were made sub-pixel.
         views: the views in which the board was found.
         failures: the images that gave none.
+
+    Example:
+        >>> view = View(name="a.png", pixels=((0.0, 0.0), (9.0, 0.0), (0.0, 9.0), None))
+        >>> seen = Observations(board=Board(columns=2, rows=2, square=0.1), image_size=(10, 10), views=(view,))
+        >>> tuple(seen.pixels().shape), bool(seen.pixels()[0, 3].isnan().all())
+        ((1, 4, 2), True)
     """
 
     KIND: ClassVar[str] = "observations"
