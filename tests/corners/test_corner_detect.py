@@ -95,9 +95,9 @@ def test_a_part_of_the_board_is_not_the_board():
 @pytest.mark.parametrize(("columns", "rows"), [(8, 6), (7, 6), (5, 5)])
 def test_a_part_of_a_real_board_is_not_the_board(stereo, columns, rows):
     part = Board(columns=columns, rows=rows, square=0.025)
-    found = [detect_board(read_grey(path), part) for path in stereo[::3]]
+    found = [detect_board(read_grey(path), part) for path in stereo[::6]]
     assert all(one.pixels is None for one in found)
-    assert sum("go on beyond" in one.reason or "uneven" in one.reason for one in found) >= 3
+    assert sum("go on beyond" in one.reason or "uneven" in one.reason for one in found) >= 2
 
 
 @pytest.mark.parametrize(("dx", "dy", "radius"), [(3, 2, 5), (4, 0, 6), (5, 5, 8), (0, 0, 9)])
@@ -229,7 +229,7 @@ def test_real_calibration_reaches_the_known_residual(stereo):
 def test_detection_does_not_depend_on_what_was_called_before(stereo):
     # With 3x3 the second detector finds some part of the board, and which one depends on OpenCV's random numbers.
     part = Board(columns=3, rows=3, square=0.025)
-    images = [read_grey(path) for path in stereo[::2]]
+    images = [read_grey(path) for path in stereo[::5]]
 
     def corners(seed):
         cv2.setRNGSeed(seed)
