@@ -1,0 +1,48 @@
+# make demo   the whole chain on a simulated site; results in demo-output/
+# make test   linters, type check and all tests
+# make check  linters and type check only
+#
+# Each needs Python 3.11 or newer and nothing else; PYTHON=python3.12 make demo chooses another one.
+# Tests that need real data skip unless KCAL_DATA names the folder that holds them.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+OUT := demo-output
+
+# One thread a process: the matrices are small, and tests run two processes.
+export OMP_NUM_THREADS := 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := demo
+.PHONY: demo test check clean
+
+demo: $(VENV)/.installed
+	$(BIN)/kcal demo --output $(OUT)
+	@echo "results: $(CURDIR)/$(OUT)"
+
+check: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: check
+	$(BIN)/python -m pytest -n 2
+
+clean:
+	rm -rf $(VENV) $(OUT)
+
+# The stamps make installation happen once, and again when what is to be installed changes.
+$(VENV)/.python: | Makefile
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "$(PYTHON) is older than Python 3.11; set PYTHON to a newer one"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	touch $@
+
+$(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.python pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@ $(VENV)/.installed

@@ -1,0 +1,24 @@
+"""What all tests share: where real data lie, and repeatable property tests."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+# The same examples each time: a failure belongs to the change that is tested. Time is not what is tested.
+hypothesis.settings.register_profile("kcal", derandomize=True, deadline=None, print_blob=True)
+hypothesis.settings.load_profile("kcal")
+
+
+@pytest.fixture(scope="session")
+def kcal_data() -> Path:
+    """The folder of real data, named by KCAL_DATA; tests that need it skip without it."""
+    folder = os.environ.get("KCAL_DATA")
+    if not folder:
+        pytest.skip("KCAL_DATA is not set: it names the folder with the real images and corners")
+    path = Path(folder)
+    assert path.is_dir(), f"KCAL_DATA={folder} is no folder"
+    return path

@@ -1,0 +1,59 @@
+"""The README's Python runs, and its commands exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from kcal.cli.main import app
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def test_python_block() -> None:
+    (source,) = blocks("python")
+    scope: dict = {}
+    exec(compile(source, "README.md", "exec"), scope)
+    # Without noise the target comes back, 2004 m away in the direction that the README gave it.
+    torch.testing.assert_close(scope["found"].points, scope["target"], rtol=1e-8, atol=0)
+    position = scope["located"].positions[0]
+    assert position.range_m == pytest.approx(float(torch.linalg.vector_norm(scope["target"])), rel=1e-8)
+    assert position.range_low_m < position.range_m < position.range_high_m
+
+
+COMMANDS = [
+    line.split("#")[0].split() for text in blocks("sh") for line in text.splitlines() if line.startswith("kcal ")
+]
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=[" ".join(words[:3]) for words in COMMANDS])
+def test_commands_and_options_exist(words: list[str]) -> None:
+    # A terminal of 200 columns keeps option names whole.
+    help_text = CliRunner().invoke(app, [words[1], "--help"], env={"COLUMNS": "200", "NO_COLOR": "1"}).stdout
+    assert help_text
+    for word in words:
+        if word.startswith("-"):
+            assert re.search(rf"(?<![\w-]){re.escape(word)}(?![\w-])", help_text), word
+
+
+def test_make_targets_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = re.findall(r"^make (\w+)", "\n".join(blocks("sh")), re.MULTILINE)
+    assert targets == ["demo", "test"]
+    for target in targets:
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+
+
+def test_linked_files_exist() -> None:
+    links = re.findall(r"\]\(([^)#:]+)\)", README)
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
