@@ -12,6 +12,7 @@ import kcal
 from kcal.cli.board import board
 from kcal.cli.calibrate import calibrate
 from kcal.cli.console import err
+from kcal.cli.demo import demo
 from kcal.cli.detect import detect
 from kcal.cli.locate import locate
 from kcal.cli.rig import rig
@@ -42,6 +43,7 @@ def _root(
     pass
 
 
+app.command("demo")(demo)
 app.command("board")(board)
 app.command("detect")(detect)
 app.command("calibrate")(calibrate)

@@ -1,0 +1,324 @@
+"""`kcal demo`: the whole chain, on a simulated site or on a folder of real stereo pairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    import torch
+
+    from kcal.calibrate.mono import CameraCalibrationResult
+    from kcal.corners.board import Board
+    from kcal.corners.observations import Observations
+    from kcal.locate.geodesy import Origin
+    from kcal.locate.positions import Located
+    from kcal.sim.scene import DemoScene
+
+_SIDES = ("left", "right")
+
+
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results; made if missing.")] = Path(
+        "kcal-demo"
+    ),
+    seed: Annotated[int, typer.Option(help="Of the simulated site: poses, noise and marks.", min=0)] = 0,
+    images: Annotated[
+        Path | None, typer.Option(help="A folder of real pairs: left01.jpg with right01.jpg, or left/ and right/.")
+    ] = None,
+    size: Annotated[str, typer.Option("--board", metavar="CxR", help="With --images: inner corners.")] = "9x6",
+    square: Annotated[
+        str, typer.Option("--square", metavar="LENGTH", help="With --images: side of a square.")
+    ] = "25mm",
+    origin: Annotated[
+        str, typer.Option(metavar="LAT,LON,HEIGHT", help="With --images: where the left camera stands.")
+    ] = "0,0,0",
+    heading: Annotated[float, typer.Option(metavar="DEG", help="With --images: azimuth of the left camera.")] = 0.0,
+) -> None:
+    """Run the main job from images to positions, and show what came out against the truth.
+
+    Without images it renders a site: two cameras 10 m apart, boards seen through distorting lenses with blur and
+    noise, and targets from 100 m to 5 km. The pictures go through the same detection, calibration, rig and location as
+    anyone's would; the truth is used at the end, for the comparison.
+
+    **Examples**
+
+    `kcal demo`
+
+    `kcal demo --images calibration/ --board 9x6 --square 25mm -o results`
+    """
+    from kcal.errors import FileError
+
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{output}: cannot make this folder: {error.strerror}") from error
+    if images is None:
+        _simulated(output, seed)
+    else:
+        from kcal.corners.board import Board
+        from kcal.locate.geodesy import Origin
+
+        _real(output, images, Board.parse(size, square), Origin.parse(origin), heading)
+
+
+def _simulated(output: Path, seed: int) -> None:
+    from kcal.cli.console import out
+    from kcal.corners.board import Board
+    from kcal.io.rig_file import load_rig
+    from kcal.locate.export import write_positions
+    from kcal.locate.geodesy import Origin
+    from kcal.locate.positions import locate
+    from kcal.report.positions import save_positions_picture
+    from kcal.sim.scene import DemoScene
+
+    scene = DemoScene(seed=seed)
+    out.print(
+        f"A simulated site: two cameras {float(scene.rig.baseline):.3f} m apart, {scene.near_views} close views each, "
+        f"{scene.pair_views} views of a large board together, {len(scene.targets.names)} targets."
+    )
+    files = _render(scene, output / "images")
+    boards = {
+        kind: Board(columns=size.columns, rows=size.rows, square=size.square)
+        for kind, size in (("near", scene.near_board), ("pair", scene.pair_board))
+    }
+    seen = {key: _detect(paths, boards[key[1]], output / f"{key[0]}.{key[1]}.obs.json") for key, paths in files.items()}
+    for side in _SIDES:
+        _calibrate(seen[side, "near"], side, output)
+    _solve_rig(seen["left", "pair"], seen["right", "pair"], output)
+
+    marks, targets = scene.target_marks, scene.targets
+    _write_marks(output / "points.csv", targets.names, marks.left, marks.right)
+    place = Origin(lat=scene.lat, lon=scene.lon, height=scene.height)
+    located = locate(
+        load_rig(output / "rig.json"),
+        marks.left,
+        marks.right,
+        origin=place,
+        heading_deg=scene.heading_deg,
+        pitch_deg=scene.pitch_deg,
+        roll_deg=scene.roll_deg,
+        pixel_sigma=scene.mark_sigma,
+        names=targets.names,
+    )
+    write_positions(output / "points.geojson", located)
+    write_positions(output / "positions.csv", located)
+    save_positions_picture(output / "map.png", located, targets.enu)
+    _print_truth(located, targets.enu)
+    out.print(
+        f"Marks have {scene.mark_sigma:g} px of noise in each image. The interval covers that alone; the calibration's "
+        "own error comes on top of it."
+    )
+    _print_results(
+        output,
+        f"kcal locate {output}/rig.json {output}/points.csv --origin {scene.lat},{scene.lon},{scene.height:g} "
+        f"--heading {scene.heading_deg:g} --pitch {scene.pitch_deg:g} --roll {scene.roll_deg:g} "
+        f"--pixel-sigma {scene.mark_sigma:g} -o again.geojson",
+    )
+
+
+def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: float) -> None:
+    import torch
+
+    from kcal.cli.console import err, out
+    from kcal.io.rig_file import load_rig
+    from kcal.locate.export import write_positions
+    from kcal.locate.positions import locate
+    from kcal.report.positions import save_positions_picture
+
+    seen = {side: _detect(_side_images(folder, side), board, output / f"{side}.obs.json") for side in _SIDES}
+    for side in _SIDES:
+        _calibrate(seen[side], side, output)
+    pairs, pixels = _solve_rig(seen["left"], seen["right"], output)
+
+    # Two opposite corners of each board, whose distance is known.
+    ends = [0, board.corners - 1]
+    marks = pixels[:, :, ends]
+    names = [f"{Path(left).stem} {word}" for left, _ in pairs for word in ("first", "last")]
+    left, right = marks[:, 0].reshape(-1, 2), marks[:, 1].reshape(-1, 2)
+    both = torch.isfinite(left).all(-1) & torch.isfinite(right).all(-1)
+    chosen = [name for name, ok in zip(names, both.tolist(), strict=True) if ok]
+    _write_marks(output / "points.csv", chosen, left[both], right[both])
+    located = locate(
+        load_rig(output / "rig.json"), left[both], right[both], origin=origin, heading_deg=heading, names=chosen
+    )
+    write_positions(output / "points.geojson", located)
+    write_positions(output / "positions.csv", located)
+    save_positions_picture(output / "map.png", located)
+    _print_diagonals(located, board)
+    if origin == type(origin)(lat=0.0, lon=0.0, height=0.0):
+        err.print("[yellow]note:[/] no --origin was given: positions are placed at latitude 0, longitude 0")
+    _print_results(
+        output,
+        f"kcal locate {output}/rig.json {output}/points.csv --origin={origin.lat},{origin.lon},{origin.height:g} "
+        f"--heading {heading:g} -o again.geojson",
+    )
+    out.print(f"Figures for comparison: {len(pairs)} pairs, boards of {board}.", highlight=False)
+
+
+def _render(scene: DemoScene, folder: Path) -> dict[tuple[str, str], list[Path]]:
+    """Write the site's images; returns the files by camera and kind."""
+    from kcal.cli.console import steps
+    from kcal.io.images import write_png
+    from kcal.sim.scene import render_demo
+
+    files: dict[tuple[str, str], list[Path]] = {}
+    with steps("rendering", scene.images) as advance:
+        for view in render_demo(scene, advance):
+            place = folder / f"{view.camera}-{view.kind}"
+            place.mkdir(parents=True, exist_ok=True)
+            path = write_png(place / f"{view.name}.png", view.image.numpy())
+            files.setdefault((view.camera, view.kind), []).append(path)
+    return files
+
+
+def _side_images(folder: Path, side: str) -> list[Path]:
+    """Images of one camera: the subfolder of that name, or the files whose name begins with it."""
+    from kcal.corners.images import expand_images
+    from kcal.errors import FileError
+
+    if (folder / side).is_dir():
+        return expand_images([str(folder / side)])
+    found = [path for path in expand_images([str(folder)]) if path.name.lower().startswith(side)]
+    if not found:
+        raise FileError(f"{folder}: no folder {side}/ and no image whose name begins with {side!r}")
+    return found
+
+
+def _detect(paths: list[Path], board: Board, target: Path) -> Observations:
+    from rich.markup import escape
+
+    from kcal.cli.console import err, out, steps
+    from kcal.corners.detect import detect_images
+
+    with steps("detecting", len(paths)) as advance:
+        observations = detect_images(paths, board, progress=advance)
+    observations.save(target)
+    out.print(f"{target.name}: board found in {len(observations.views)} of {len(paths)} images", markup=False)
+    for failure in observations.failures:
+        err.print(f"  [yellow]failed[/] {escape(failure.name)}: {escape(failure.reason)}")
+    return observations
+
+
+def _calibrate(seen: Observations, side: str, output: Path) -> CameraCalibrationResult:
+    from kcal.calibrate.mono import calibrate_camera
+    from kcal.cli.calibrate import record
+    from kcal.cli.console import err, out, steps
+    from kcal.report.calibration import save_calibration_picture
+
+    with steps(f"calibrating {side}", 2) as advance:
+        result = calibrate_camera(seen, progress=advance)
+    record(result, seen, side, f"{side}.obs.json").save(output / f"{side}.camera.json")
+    save_calibration_picture(output / f"{side}.png", seen, result)
+    fx, sigma = float(result.camera.focal[0]), result.sigma["fx"]
+    out.print(f"{side} camera: RMS {result.rms:.4f} px, fx {fx:.2f} ± {sigma:.2f} px, model {result.camera.model}")
+    for text in result.warnings:
+        err.print(f"  [yellow]warning:[/] {text}")
+    return result
+
+
+def _solve_rig(
+    left: Observations, right: Observations, output: Path
+) -> tuple[tuple[tuple[str, str], ...], torch.Tensor]:
+    """Solve the rig of the two camera files in `output`; returns the pairs used and their corners."""
+    from kcal.calibrate.pairs import pair_by_name
+    from kcal.calibrate.stereo import calibrate_rig
+    from kcal.cli.console import err, out
+    from kcal.cli.rig import rig_record
+    from kcal.io.camera_file import CameraFile
+    from kcal.locate.check import triangulated_sides
+
+    files = CameraFile.load(output / "left.camera.json"), CameraFile.load(output / "right.camera.json")
+    pairs = pair_by_name(left.names, right.names)
+    result = calibrate_rig(files[0].camera(), files[1].camera(), left, right, pairs)
+    rig_record(result, files).save(output / "rig.json")
+    sides = triangulated_sides(result.rig, left.board.columns, left.board.rows, result.pixels)
+    out.print(
+        f"rig: {len(result.pairs)} of {len(pairs)} pairs, RMS {result.rms:.4f} px, baseline "
+        f"{float(result.rig.baseline):.5f} m; squares {1e3 * sides.mean:.3f} ± {1e3 * sides.spread:.3f} mm, "
+        f"true {1e3 * left.board.square:g} mm"
+    )
+    for pair, reason in result.excluded:
+        err.print("  [yellow]left out:[/]", f"{pair[0]}, {pair[1]}: {reason}")
+    for text in (*(f"turned by 180°: {a}, {b}" for a, b in result.flipped), *result.warnings):
+        err.print(f"  [yellow]warning:[/] {text}")
+    return result.pairs, result.pixels
+
+
+def _write_marks(path: Path, names: tuple[str, ...] | list[str], left: torch.Tensor, right: torch.Tensor) -> None:
+    from kcal.files import write_atomic
+
+    lines = ["name,left_u,left_v,right_u,right_v"]
+    for name, a, b in zip(names, left.tolist(), right.tolist(), strict=True):
+        lines.append(",".join([name, *(repr(value) for value in (*a, *b))]))
+    write_atomic(path, "\n".join(lines) + "\n")
+
+
+def _print_truth(located: Located, truth: torch.Tensor) -> None:
+    from rich.table import Table
+
+    from kcal.cli.console import out
+
+    table = Table(box=None, pad_edge=False, header_style="bold", title="True against estimated positions")
+    table.add_column("target", no_wrap=True)
+    for column in ("true range m", "estimated m", "95 % interval m", "range error m", "%", "across m"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for position, true in zip(located.positions, truth, strict=True):
+        distance = float(true.norm())
+        if position.enu is None or position.range_m is None:
+            table.add_row(position.name, f"{distance:.1f}", "-", "-", "-", "-", position.reason)
+            continue
+        error = true.new_tensor(position.enu) - true
+        along = float(error @ true) / distance
+        across = float((error - along * true / distance).norm())
+        low, high = position.range_low_m or 0.0, position.range_high_m or 0.0
+        table.add_row(
+            position.name,
+            f"{distance:.1f}",
+            f"{position.range_m:.1f}",
+            f"{low:.1f} – {high:.1f}",
+            f"{along:+.2f}",
+            f"{100 * along / distance:+.2f}",
+            f"{across:.2f}",
+        )
+    out.print(table)
+
+
+def _print_diagonals(located: Located, board: Board) -> None:
+    """The board's diagonal, known and triangulated, of every pair of which both ends were located."""
+    import math
+
+    from rich.table import Table
+
+    from kcal.cli.console import out
+
+    true = board.square * math.hypot(board.columns - 1, board.rows - 1)
+    table = Table(box=None, pad_edge=False, header_style="bold", title="The board's diagonal, true against estimated")
+    for column in ("pair", "range m", "true mm", "estimated mm", "error mm"):
+        table.add_column(column, justify="left" if column == "pair" else "right", no_wrap=True)
+    ends = {position.name: position for position in located.positions if position.enu is not None}
+    for name in sorted({name.rsplit(" ", 1)[0] for name in ends}):
+        first, last = ends.get(f"{name} first"), ends.get(f"{name} last")
+        if first is None or last is None or first.enu is None or last.enu is None:
+            continue
+        length = math.dist(first.enu, last.enu)
+        error = 1e3 * (length - true)
+        table.add_row(name, f"{first.range_m:.3f}", f"{1e3 * true:.2f}", f"{1e3 * length:.2f}", f"{error:+.2f}")
+    out.print(table)
+
+
+def _print_results(output: Path, again: str) -> None:
+    from kcal.cli.console import out
+
+    out.print(f"\nResults are in {output.resolve()}:", markup=False)
+    for name, what in (
+        ("map.png", "the map"),
+        ("points.geojson", "positions for a GIS"),
+        ("positions.csv", "the same as a table"),
+        ("left.png, right.png", "coverage and residuals of each camera"),
+        ("rig.json", "the rig; left.camera.json and right.camera.json are its cameras"),
+    ):
+        out.print(f"  {name:22s} {what}", markup=False)
+    out.print(f"Locate again by hand:\n  {again}", markup=False)
