@@ -15,6 +15,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +101,11 @@ def _projection() -> list[str]:
     for count in (4, 5, 8, 12, 14):
         theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, lens[:count])[0][:, 0]
         camera = Camera.build(
-            focal=(1600, 1590), center=(957, 541), size=(1920, 1080), coefficients=lens[:count], model=f"opencv{count}"
+            focal=(1600, 1590),
+            center=(957, 541),
+            size=(1920, 1080),
+            coefficients=lens[:count].tolist(),
+            model=f"opencv{count}",
         )
         ours, valid = camera.project(torch.from_numpy(points))
         difference = np.abs(ours.numpy() - theirs)[valid.numpy()].max()
@@ -123,8 +128,8 @@ def _calibration(seen: dict[str, Observations], repeats: int) -> list[str]:
     for side, observations in seen.items():
         for model in FLAGS:
             ours, theirs, times = _in_turn(
-                lambda o=observations, m=model: calibrate_camera(o, CalibrationOptions(model=m)),
-                lambda o=observations, m=model: _opencv(o, m),
+                partial(calibrate_camera, observations, CalibrationOptions(model=model)),
+                partial(_opencv, observations, model),
                 repeats,
             )
             ratios = [a / b for a, b in zip(*times, strict=True)]
@@ -164,7 +169,7 @@ def _points(observations: Observations) -> tuple[list[Any], list[Any]]:
 def _opencv(observations: Observations, model: str) -> Any:
     boards, pixels = _points(observations)
     size = observations.image_size
-    return cv2.calibrateCamera(boards, pixels, size, None, None, flags=FLAGS[model], criteria=CRITERIA)  # type: ignore[call-overload]
+    return cv2.calibrateCamera(boards, pixels, size, None, None, flags=FLAGS[model], criteria=CRITERIA)
 
 
 def _rig(seen: dict[str, Observations], repeats: int) -> list[str]:
@@ -180,12 +185,12 @@ def _rig(seen: dict[str, Observations], repeats: int) -> list[str]:
         ]
     )
     left, right = seen["left"], seen["right"]
-    cameras = [calibrate_camera(o).camera for o in (left, right)]
+    cameras = (calibrate_camera(left).camera, calibrate_camera(right).camera)
     pairs = pair_by_name(left.names, right.names)
     for word, refine in (("fixed", False), ("refined jointly", True)):
         ours, theirs, times = _in_turn(
-            lambda r=refine: calibrate_rig(*cameras, left, right, pairs, RigOptions(refine_cameras=r)),
-            lambda r=refine: _opencv_stereo(left, right, cameras, r),
+            partial(calibrate_rig, *cameras, left, right, pairs, RigOptions(refine_cameras=refine)),
+            partial(_opencv_stereo, left, right, cameras, refine),
             repeats,
         )
         side = triangulated_sides(ours.rig, BOARD.columns, BOARD.rows, ours.pixels)
@@ -201,7 +206,9 @@ def _rig(seen: dict[str, Observations], repeats: int) -> list[str]:
     return [*lines, *_show([""])]
 
 
-def _opencv_stereo(left: Observations, right: Observations, cameras: list[Camera], refine: bool) -> tuple[float, ...]:
+def _opencv_stereo(
+    left: Observations, right: Observations, cameras: tuple[Camera, Camera], refine: bool
+) -> tuple[float, ...]:
     boards, a = _points(left)
     b = _points(right)[1]
     start = [array.numpy().copy() for camera in cameras for array in (camera.matrix, camera.coefficients)]

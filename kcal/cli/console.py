@@ -7,7 +7,9 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
 
 T = TypeVar("T")
 
@@ -23,6 +25,7 @@ def _progress() -> Progress:
         TimeElapsedColumn(),
         console=err,
         transient=True,
+        disable=not err.is_terminal,
     )
 
 
@@ -39,6 +42,11 @@ def steps(description: str, total: int) -> Iterator[Callable[[str], None]]:
         task = progress.add_task(description, total=total)
 
         def advance(text: str) -> None:
-            progress.update(task, advance=1, description=f"{description}: {text}")
+            progress.update(task, advance=1, description=f"{description}: {escape(text)}")
 
         yield advance
+
+
+def show(table: Table) -> None:
+    """Print a table as wide as it needs: a name cut to fit the 80 columns of a pipe would be lost."""
+    out.print(table, width=out.measure(table, options=out.options.update(max_width=10_000)).maximum)

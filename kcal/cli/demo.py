@@ -259,7 +259,7 @@ def _write_marks(path: Path, names: tuple[str, ...] | list[str], left: torch.Ten
 def _print_truth(located: Located, truth: torch.Tensor) -> None:
     from rich.table import Table
 
-    from kcal.cli.console import out
+    from kcal.cli.console import show
 
     table = Table(box=None, pad_edge=False, header_style="bold", title="True against estimated positions")
     table.add_column("target", no_wrap=True)
@@ -283,7 +283,7 @@ def _print_truth(located: Located, truth: torch.Tensor) -> None:
             f"{100 * along / distance:+.2f}",
             f"{across:.2f}",
         )
-    out.print(table)
+    show(table)
 
 
 def _print_diagonals(located: Located, board: Board) -> None:
@@ -292,7 +292,7 @@ def _print_diagonals(located: Located, board: Board) -> None:
 
     from rich.table import Table
 
-    from kcal.cli.console import out
+    from kcal.cli.console import show
 
     true = board.square * math.hypot(board.columns - 1, board.rows - 1)
     table = Table(box=None, pad_edge=False, header_style="bold", title="The board's diagonal, true against estimated")
@@ -306,7 +306,7 @@ def _print_diagonals(located: Located, board: Board) -> None:
         length = math.dist(first.enu, last.enu)
         error = 1e3 * (length - true)
         table.add_row(name, f"{first.range_m:.3f}", f"{1e3 * true:.2f}", f"{1e3 * length:.2f}", f"{error:+.2f}")
-    out.print(table)
+    show(table)
 
 
 def _print_results(output: Path, again: str) -> None:
