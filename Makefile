@@ -26,8 +26,9 @@ check: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The folder kcal is there for the examples in its docstrings.
 test: check
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 kcal tests
 
 clean:
 	rm -rf $(VENV) $(OUT)
