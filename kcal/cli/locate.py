@@ -54,7 +54,8 @@ def locate(
     from kcal.locate.geodesy import Origin
     from kcal.locate.marks import read_marks
     from kcal.locate.positions import locate as locate_pairs
-    from kcal.report.positions import check_picture_format, save_positions_picture
+    from kcal.report.figures import check_picture_format
+    from kcal.report.positions import save_positions_picture
 
     outputs = output or []
     for path in outputs:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,21 +9,21 @@ from pathlib import Path
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.files import write_atomic
 from kcal.locate.positions import Located, Position
 from kcal.locate.stereo import Status
+from kcal.report.figures import new_figure, save_png
 
 Array = NDArray[np.float64]
 
 _LEFT, _RIGHT, _POINT, _TRUE, _FAINT, _UNSURE = "#2b6cb0", "#dd7a1f", "#111827", "#c02a6b", "#9aa3af", "#8a5a00"
 # The arcs of the paper's figure first, then rounder fillers where there is room.
 _ARCS = [250, 1000, 5000, 100, 500, 2500, *(k * 10.0**e for e in (0, 1, 4, 5) for k in (1, 2.5, 5)), 10.0**6]
+_PERCENT = (-1.0, -0.3, -0.1, -0.03, -0.01, -0.003, 0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 _NAMED = 40
 _HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
@@ -51,11 +50,10 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
         raise InputError(f"truth: shape ({len(located.positions)}, 3) is needed, got {true_enu.shape}")
     shown = [i for i, position in enumerate(located.positions) if position.range_low_m is not None]
     scale = _RangeScale(located, true_enu)
-    figure = Figure(figsize=(13.0, 7.4), dpi=130, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(13.0, 7.4)
     plan, ranges = figure.subplots(1, 2, width_ratios=[1.45, 1.0])
     _draw_plan(plan, located, true_enu, shown, scale)
-    _draw_ranges(ranges, located, true_enu, shown, scale)
+    _draw_ranges(ranges, located, true_enu, shown)
     figure.suptitle(
         f"{located.count} of {len(located.positions)} points located from "
         f"{located.origin.lat:.6f}°, {located.origin.lon:.6f}°, heading {located.heading_deg:g}°",
@@ -75,16 +73,7 @@ def save_positions_picture(path: str | Path, located: Located, truth: Tensor | N
         InputError: a suffix other than .png, or a truth of the wrong shape.
         FileError: the file cannot be written.
     """
-    check_picture_format(path)
-    data = io.BytesIO()
-    positions_figure(located, truth).savefig(data, format="png")
-    return write_atomic(path, data.getvalue())
-
-
-def check_picture_format(path: str | Path) -> None:
-    """Raise `InputError` unless `path` ends with .png."""
-    if Path(path).suffix.lower() != ".png":
-        raise InputError(f"{path}: the picture is a PNG; the file name must end with .png")
+    return save_png(path, positions_figure(located, truth))
 
 
 class _RangeScale:
@@ -247,30 +236,40 @@ def _draw_names(axes: Axes, located: Located, shown: list[int], scale: _RangeSca
         )  # fmt: skip
 
 
-def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: list[int], scale: _RangeScale) -> None:
-    axes.set_title("Range and its 95 % interval", fontsize=10.5, color="#374151")
+def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: list[int]) -> None:
+    """Intervals and truths relative to the estimate: on a scale of ranges, 1 % would not be seen."""
+    axes.set_title("95 % interval of the range, relative to the estimate", fontsize=10.5, color="#374151")
     order = sorted(shown, key=lambda i: located.positions[i].range_m or located.positions[i].range_low_m or 0.0)
-    left = max(scale.nearest / 2, scale.rim / 1e5)
-    right = scale.rim * 1.15
-    for row, i in enumerate(order):
+    spans = [_relative(located.positions[i], None if true_enu is None else true_enu[i]) for i in order]
+    finite = [abs(value) for span in spans for value in span if value is not None and math.isfinite(value)]
+    limit = min(max([0.02, *finite]) * 1.3, 2.0)
+    for row, (i, (low, high, true)) in enumerate(zip(order, spans, strict=True)):
         position = located.positions[i]
-        low, high = position.range_low_m, position.range_high_m
-        if low is None or high is None:
-            continue
         colour = _POINT if position.status == Status.OK else _UNSURE
-        low = min(max(low, left), right)
-        axes.plot([low, min(high, right)], [row, row], color=colour, linewidth=4, alpha=0.4, solid_capstyle="butt")
-        if high > right:
-            axes.plot(right, row, ">", color=colour, markersize=7, clip_on=False)
+        ends = max(low, -limit), min(high, limit)
+        axes.plot(ends, [row, row], color=colour, linewidth=5, alpha=0.4, solid_capstyle="butt")
+        if high > limit:
+            axes.plot(limit, row, ">", color=colour, markersize=7, clip_on=False)
         if position.range_m is not None:
-            axes.plot(position.range_m, row, "o", color=_POINT, markerfacecolor="white", markersize=6, zorder=3)
-        if true_enu is not None and np.isfinite(true_enu[i]).all():
-            axes.plot(np.linalg.norm(true_enu[i]), row, "x", color=_TRUE, markersize=7, markeredgewidth=1.6, zorder=4)
-    ticks = [arc for arc in scale.arcs() if left <= arc <= right]
-    axes.set_xscale("log")
-    axes.set(xlim=(left, right), ylim=(len(order) - 0.3, -0.7))
-    axes.set_xticks(ticks, [_length(tick) for tick in ticks], fontsize=9)
+            axes.plot(0.0, row, "o", color=_POINT, markerfacecolor="white", markersize=6, zorder=3)
+        if true is not None:
+            beyond = abs(true) > limit
+            axes.plot(
+                math.copysign(min(abs(true), limit), true),
+                row,
+                (">" if true > 0 else "<") if beyond else "x",
+                color=_TRUE,
+                markersize=7,
+                markeredgewidth=1.6,
+                zorder=4,
+                clip_on=False,
+            )
+    # Linear up to 1 %, logarithmic beyond: 100 m and 5 km differ by a factor of fifty.
+    axes.set_xscale("symlog", linthresh=0.01, linscale=1.0)
+    ticks = [tick for tick in _PERCENT if abs(tick) < limit]
+    axes.set_xticks(ticks, [f"{100 * tick:+g} %" if tick else "0" for tick in ticks], fontsize=9)
     axes.set_xticks([], minor=True)
+    axes.set(xlim=(-limit, limit), ylim=(len(order) - 0.3, -0.7))
     names = [f"{located.positions[i].name}  {_estimate(located.positions[i])}" for i in order]
     axes.set_yticks(range(len(order)) if len(order) <= _NAMED else [])
     if len(order) <= _NAMED:
@@ -279,6 +278,15 @@ def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: li
     axes.set_axisbelow(True)
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(axis="y", length=0)
+
+
+def _relative(position: Position, true: Array | None) -> tuple[float, float, float | None]:
+    """Lower end, upper end and truth as fractions of the estimate, or of the nearest range where there is none."""
+    base = position.range_m or position.range_low_m or 1.0
+    low = base if position.range_low_m is None else position.range_low_m
+    high = base if position.range_high_m is None else position.range_high_m
+    known = true is not None and bool(np.isfinite(true).all())
+    return low / base - 1.0, high / base - 1.0, float(np.linalg.norm(true)) / base - 1.0 if known else None  # type: ignore[arg-type]
 
 
 def _estimate(position: Position) -> str:
