@@ -96,7 +96,8 @@ class NativeFile(pydantic.BaseModel):
         except pydantic.ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
-            raise FileError(f"{source}: bad {kind} file: {where}: {first['msg'].removeprefix('Value error, ')}") from error
+            what = first["msg"].removeprefix("Value error, ")
+            raise FileError(f"{source}: bad {kind} file: {where}: {what}") from error
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
