@@ -1,0 +1,222 @@
+"""The main job from images to positions, through the command line as a user types it."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import kcal.sim.scene
+from kcal.cli.main import main
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.io.camera_file import CameraFile
+from kcal.io.images import write_png
+from kcal.io.rig_file import RigFile
+from kcal.lens.pose import rotation_from_vector
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+    """Run `kcal` with arguments in an empty folder; returns exit code, output and error text."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["kcal", *map(str, arguments)])
+        capsys.readouterr()
+        code: object = 0
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code
+        text = capsys.readouterr()
+        return int(code or 0), text.out, text.err  # type: ignore[call-overload]
+
+    return call
+
+
+def refused(answer: tuple[int, str, str], *words: str) -> None:
+    """One line on the error stream that holds the words, and an exit code that is not 0."""
+    code, _, error = answer
+    lines = [line for line in error.splitlines() if line.strip()]
+    assert code == 1
+    assert len(lines) == 1, error
+    assert lines[0].startswith("error: ")
+    for word in words:
+        assert word in lines[0]
+
+
+class TestRealImages:
+    def test_from_images_to_positions(self, run: Run, kcal_data: Path, tmp_path: Path) -> None:
+        folder = kcal_data / "opencv_stereo"
+        for side in ("left", "right"):
+            code, text, error = run(
+                "detect", folder / f"{side}*.jpg", "--board", "9x6", "--square", "25mm", "-o", f"{side}.obs.json"
+            )
+            assert (code, error) == (0, "")
+            assert "board found in 13 of 13 images" in text
+            code, text, error = run(
+                "calibrate", f"{side}.obs.json", "-o", f"{side}.camera.json", "--picture", f"{side}.png"
+            )
+            assert (code, error) == (0, "")
+            assert (tmp_path / f"{side}.png").stat().st_size > 10_000
+        files = [CameraFile.load(f"{side}.camera.json") for side in ("left", "right")]
+        # The peers' best refiner ends at 0.158 and 0.156 px, cornerSubPix at 0.195 and 0.207.
+        assert [file.calibration.rms < 0.17 for file in files if file.calibration] == [True, True]
+        code, text, error = run(
+            "rig", "left.camera.json", "right.camera.json", "--pairs", "left.obs.json", "right.obs.json", "-o", "r.json"
+        )
+        assert (code, error) == (0, "")
+        assert "13 of 13 pairs used" in text
+        rig = RigFile.load("r.json")
+        assert rig.calibration is not None
+        # stereoCalibrate finds 3.345 squares of 25 mm with less accurate corners.
+        assert math.isclose(rig.calibration.baseline_m, 3.345 * 0.025, rel_tol=0.01)
+
+        # The board's first and last corner of one pair, whose distance is known.
+        left, right = (Observations.load(f"{side}.obs.json").views[0].pixels for side in ("left", "right"))
+        lines = ["name,left_u,left_v,right_u,right_v"]
+        for name, i in (("first", 0), ("last", 53)):
+            lines.append(",".join([name, *map(repr, (*(left[i] or ()), *(right[i] or ())))]))
+        Path("points.csv").write_text("\n".join(lines))
+        code, text, error = run(
+            *("locate", "r.json", "points.csv", "--origin", "-33.9,151.2,10", "--heading", "250"),
+            *("-o", "p.geojson", "-o", "p.csv", "--picture", "map.png"),
+        )
+        assert (code, error) == (0, "")
+        rows = list(csv.DictReader(Path("p.csv").read_text().splitlines()))
+        ends = [[float(row[f"{axis}_m"]) for axis in ("east", "north", "up")] for row in rows]
+        assert math.isclose(math.dist(*ends), 0.025 * math.hypot(8, 5), rel_tol=5e-3)
+        features = json.loads(Path("p.geojson").read_text())["features"]
+        longitude, latitude, _ = features[0]["geometry"]["coordinates"]
+        assert math.isclose(latitude, -33.9, abs_tol=1e-4)
+        assert math.isclose(longitude, 151.2, abs_tol=1e-4)
+
+    def test_demo_on_a_folder_of_pairs(self, run: Run, kcal_data: Path) -> None:
+        code, text, error = run("demo", "--images", kcal_data / "opencv_stereo", "-o", "out")
+        assert code == 0
+        assert "no --origin was given" in error
+        assert "13 of 13 pairs" in text
+        for name in ("map.png", "points.geojson", "positions.csv", "left.png", "right.png", "rig.json", "points.csv"):
+            assert Path("out", name).stat().st_size > 100
+
+
+class TestDemo:
+    def test_simulated_site(self, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+        # A third of the images, so that the test takes seconds.
+        small = functools.partial(kcal.sim.scene.DemoScene, near_views=8, pair_views=4)
+        monkeypatch.setattr(kcal.sim.scene, "DemoScene", small)
+        code, text, _ = run("demo", "-o", "out", "--seed", "3")
+        assert code == 0
+        assert "True against estimated positions" in text
+        scene = small(seed=3)
+        text = Path("out", "positions.csv").read_text()
+        rows = {row["name"]: row for row in csv.DictReader(text.splitlines())}
+        for name, true in zip(scene.targets.names, scene.targets.enu.tolist(), strict=True):
+            distance = math.hypot(*true)
+            estimate = float(rows[name]["range_m"])
+            # Marks of 0.1 px leave 4.4 % at 5 km and less before; five sigma of that and of the few views.
+            assert abs(estimate / distance - 1) < 0.004 + 0.22 * distance / 5000
+        for name in ("map.png", "points.geojson", "left.png", "right.png"):
+            assert Path("out", name).stat().st_size > 1000
+
+    def test_output_that_is_a_file(self, run: Run) -> None:
+        Path("taken").write_text("mine")
+        refused(run("demo", "-o", "taken"), "taken", "folder")
+        assert Path("taken").read_text() == "mine"
+
+
+def observations(count: int, *, tilt: float, size: tuple[int, int] = (640, 480)) -> Observations:
+    """Views of a board through a pinhole camera with 0.1 px of noise, each turned by `tilt` radians another way."""
+    board = Board(columns=7, rows=6, square=0.05)
+    generator = np.random.default_rng(5)
+    views = []
+    for i in range(count):
+        angle = tilt * math.cos(2.0 * i)
+        other = tilt * math.sin(2.0 * i)
+        cosine, sine = math.cos(angle), math.sin(angle)
+        turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+        turn = turn @ np.array(
+            [[1, 0, 0], [0, math.cos(other), -math.sin(other)], [0, math.sin(other), math.cos(other)]]
+        )
+        points = board.points.numpy() @ turn.T + [-0.15, -0.12, 0.7 + 0.02 * i]
+        pixels = 700 * points[:, :2] / points[:, 2:] + [319.5, 239.5] + generator.normal(0, 0.1, (42, 2))
+        views.append(View(name=f"{i}.png", pixels=tuple((float(u), float(v)) for u, v in pixels)))
+    return Observations(board=board, image_size=size, views=tuple(views))
+
+
+class TestBadInput:
+    def test_empty_folder(self, run: Run) -> None:
+        Path("empty").mkdir()
+        refused(run("detect", "empty", "--board", "9x6", "--square", "25mm", "-o", "a.obs.json"), "empty")
+        assert not Path("a.obs.json").exists()
+
+    def test_no_board_in_any_image(self, run: Run) -> None:
+        grey = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
+        write_png("a.png", grey)
+        refused(run("detect", "a.png", "--board", "9x6", "--square", "25mm", "-o", "a.obs.json"), "a.png", "no board")
+        assert not Path("a.obs.json").exists()
+
+    def test_length_without_unit(self, run: Run) -> None:
+        refused(run("detect", "a.png", "--board", "9x6", "--square", "25", "-o", "a.obs.json"), "unit", "25mm")
+
+    def test_one_view(self, run: Run) -> None:
+        observations(1, tilt=0.5).save("one.obs.json")
+        refused(run("calibrate", "one.obs.json", "-o", "c.json"), "1 view", "at least 3")
+        assert not Path("c.json").exists()
+
+    def test_all_views_parallel_to_the_image(self, run: Run) -> None:
+        observations(8, tilt=0.0).save("flat.obs.json")
+        refused(run("calibrate", "flat.obs.json", "-o", "c.json"), "focal length", "tilted")
+        assert not Path("c.json").exists()
+
+    def test_two_image_sizes(self, run: Run) -> None:
+        generator = np.random.default_rng(0)
+        for name, shape in (("a.png", (240, 320)), ("b.png", (480, 640))):
+            write_png(name, generator.integers(0, 255, shape, dtype=np.uint8))
+        answer = run("detect", "a.png", "b.png", "--board", "9x6", "--square", "25mm", "-o", "a.obs.json")
+        refused(answer, "320x240", "640x480")
+
+    def test_a_rig_file_where_a_camera_file_belongs(self, run: Run) -> None:
+        Path("rig.json").write_text('{"kcal": "rig", "version": 1}')
+        observations(4, tilt=0.5).save("a.obs.json")
+        answer = run("rig", "rig.json", "rig.json", "--pairs", "a.obs.json", "a.obs.json", "-o", "out.json")
+        refused(answer, "rig.json", "rig file", "camera file is needed")
+        assert not Path("out.json").exists()
+
+    def test_a_camera_file_where_observations_belong(self, run: Run) -> None:
+        Path("camera.json").write_text('{"kcal": "camera", "version": 1}')
+        refused(run("calibrate", "camera.json", "-o", "c.json"), "camera file", "observations file is needed")
+
+    def test_output_in_a_folder_that_does_not_exist(self, run: Run) -> None:
+        observations(5, tilt=0.5).save("a.obs.json")
+        refused(run("calibrate", "a.obs.json", "-o", "nowhere/c.json"), "nowhere", "does not exist")
+
+    def test_unknown_model(self, run: Run) -> None:
+        observations(5, tilt=0.5).save("a.obs.json")
+        refused(run("calibrate", "a.obs.json", "-o", "c.json", "--model", "opencv15"), "opencv15", "opencv14")
+
+    def test_an_old_file_survives_a_failure(self, run: Run) -> None:
+        Path("c.json").write_text("precious")
+        observations(1, tilt=0.5).save("one.obs.json")
+        assert run("calibrate", "one.obs.json", "-o", "c.json")[0] == 1
+        assert Path("c.json").read_text() == "precious"
+        assert sorted(path.name for path in Path().iterdir()) == ["c.json", "one.obs.json"]
+
+
+@pytest.mark.parametrize("command", ["demo", "board", "detect", "calibrate", "rig", "locate"])
+def test_help_has_examples(run: Run, command: str) -> None:
+    code, text, _ = run(command, "--help")
+    assert code == 0
+    assert "Examples" in text
+    assert f"kcal {command}" in text
