@@ -144,11 +144,7 @@ def observations(count: int, *, tilt: float, size: tuple[int, int] = (640, 480))
     for i in range(count):
         angle = tilt * math.cos(2.0 * i)
         other = tilt * math.sin(2.0 * i)
-        cosine, sine = math.cos(angle), math.sin(angle)
-        turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-        turn = turn @ np.array(
-            [[1, 0, 0], [0, math.cos(other), -math.sin(other)], [0, math.sin(other), math.cos(other)]]
-        )
+        turn = rotation_from_vector(torch.tensor([other, angle, 0.0], dtype=torch.float64)).numpy()
         points = board.points.numpy() @ turn.T + [-0.15, -0.12, 0.7 + 0.02 * i]
         pixels = 700 * points[:, :2] / points[:, 2:] + [319.5, 239.5] + generator.normal(0, 0.1, (42, 2))
         views.append(View(name=f"{i}.png", pixels=tuple((float(u), float(v)) for u, v in pixels)))
