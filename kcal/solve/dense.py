@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from kcal.errors import InputError
 from kcal.solve.result import State
 
 
@@ -45,15 +46,23 @@ class DenseProblem:
 
     def cost(self, state: State) -> Tensor:
         """See `Problem.cost`."""
-        residuals = self._value(state[0], *self._data)
-        self.residual_count = residuals.shape[-1]
+        residuals = self._residuals(state)
         return 0.5 * (residuals * residuals).sum(-1)
 
     def linearise(self, state: State) -> DenseLinearisation:
         """See `Problem.linearise`."""
+        return DenseLinearisation(self._residuals(state), self._jacobian(state[0], *self._data))
+
+    def _residuals(self, state: State) -> Tensor:
         residuals = self._value(state[0], *self._data)
+        if residuals.ndim != len(self.batch) + 1 or residuals.dtype != torch.float64:
+            shape = tuple(residuals.shape[len(self.batch) :])
+            raise InputError(
+                f"residual function: a float64 vector (R,) is needed for each element, got {residuals.dtype} of shape "
+                f"{shape}"
+            )
         self.residual_count = residuals.shape[-1]
-        return DenseLinearisation(residuals, self._jacobian(state[0], *self._data))
+        return residuals
 
     def retract(self, state: State, step: State) -> State:
         """Plain addition."""

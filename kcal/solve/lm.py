@@ -19,6 +19,7 @@ from kcal.solve.result import Result, State, Status
 Callback = Callable[[int, Tensor], bool | None]
 
 _LOWEST_DAMPING, _HIGHEST_DAMPING = 1e-14, 1e10
+_LITTLE_DAMPING = 1e-3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,7 +98,7 @@ def minimise(
         iterations = iterations + running
 
         # A tiny prediction means a minimum only where little damping shaped the step.
-        flat = running & solved & (predicted <= options.tolerance * cost) & (damping <= 1e-3)
+        flat = running & solved & (predicted <= options.tolerance * cost) & (damping <= _LITTLE_DAMPING)
         shrink = torch.clamp(1.0 - (2.0 * gain - 1.0) ** 3, min=1.0 / 10.0)
         damping = torch.where(accept, damping * shrink, torch.where(running, damping * growth, damping))
         damping = damping.clamp(min=_LOWEST_DAMPING)
@@ -109,7 +110,13 @@ def minimise(
         status = torch.where(flat, int(Status.CONVERGED), status)
         status = torch.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
         stalled = (status == 0) & ~accept & (damping > _HIGHEST_DAMPING)
-        status = torch.where(stalled, int(Status.STALLED), status)
+        if bool(stalled.any()):
+            # Where the residual stays large and curved, steps need damping even at the minimum and end in rounding:
+            # whether it is one is told by the step that would be free of damping.
+            _, free = linear.step(torch.full_like(damping, _LITTLE_DAMPING))
+            at_minimum = stalled & (free <= options.tolerance * cost)
+            status = torch.where(at_minimum, int(Status.CONVERGED), status)
+            status = torch.where(stalled & ~at_minimum, int(Status.STALLED), status)
         if callback is not None and callback(trial, cost):
             status = torch.where(status == 0, int(Status.INTERRUPTED), status)
         if bool((accept & (status == 0)).any()):
@@ -150,8 +157,12 @@ class LevenbergMarquardt(nn.Module):
             A `Result` with `x` (..., P) and a status for each element.
 
         Raises:
-            InputError: a start that is not float64 or not finite, or data whose leading shape differs.
+            InputError: a start or residuals that are not float64 vectors, a start that is not finite, or data whose
+                leading shape differs.
         """
+        if not isinstance(start, Tensor) or start.ndim == 0 or start.numel() == 0:
+            shape = tuple(start.shape) if isinstance(start, Tensor) else type(start).__name__
+            raise InputError(f"LevenbergMarquardt: the start must be a tensor (..., P) with values, got {shape}")
         if start.dtype != torch.float64:
             raise InputError(f"LevenbergMarquardt: the start must be float64, got {start.dtype}; use .double()")
         require_finite("LevenbergMarquardt start", start)
