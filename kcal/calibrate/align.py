@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.init import homographies, poses_from_homographies
-from kcal.calibrate.poses import unflip
+from kcal.calibrate.poses import refine_poses, unflip
 from kcal.calibrate.problem import BoardProblem
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -19,6 +19,8 @@ from kcal.solve.result import State
 MINIMUM_CORNERS = 6
 # A camera that leaves its own boards this far off (pixels) is not the camera that took them.
 _FOREIGN_RMS = 5.0
+# A turned order of corners is believed only if it leaves less than this share of the error.
+_TURNED = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +59,11 @@ def pose_alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions)
     nothing = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
     parameters = camera.parameters_vector.detach()
     state: State = (parameters, torch.zeros(2, dtype=torch.float64), *nothing, rotation, translation)
-    state, _ = unflip(board, pixels[:, None], [camera.model], state, solver)
+    view = pixels[:, None]
+    state, _ = refine_poses(board, view, [camera.model], state, solver)
+    state, flipped = unflip(board, view, [camera.model], state)
+    if flipped:
+        state, _ = refine_poses(board, view, [camera.model], state, solver)
     problem = BoardProblem(board, pixels[:, None], [camera.model], [()])
     rms = float(pair_rms(problem, state, pixels[:, None]).median())
     return Poses(state[-2], state[-1]), rms if math.isfinite(rms) else math.inf
@@ -100,15 +106,17 @@ def consensus(
     as_read, other_end = pixels[:, 1], pixels[:, 1].flip(-2)
     points_left = board @ left.rotation.transpose(-1, -2) + left.translation[:, None]
     best: tuple[float, Poses, Tensor, Tensor] | None = None
-    for proposal in proposals:
+    for number, proposal in enumerate(proposals):
         projected, valid = cameras[1].project(points_left @ proposal.rotation.T + proposal.translation)
         projected = torch.where(valid[..., None], projected, torch.inf)
         errors = torch.stack([_distance(projected, as_read), _distance(projected, other_end)])
-        # A turned order must be clearly better, or a single pair could not tell.
-        turned = errors[1] < 0.2 * errors[0]
+        turned = errors[1] < _TURNED * errors[0]
         error = torch.where(turned, errors[1], errors[0])
-        score = float(error.median())
-        if best is None or score < best[0]:
+        # At least two pairs must agree, or every proposal would be right about its own pair.
+        rank = min(len(error), max(2, (len(error) + 1) // 2))
+        score = float(error.sort().values[rank - 1])
+        # One pair, or boards that hardly moved, fit a turned proposal as well: then the order is as read.
+        if best is None or score < (_TURNED if number >= len(pixels) else 1.0) * best[0]:
             best = (score, proposal, turned, error)
     assert best is not None
     return best[1:]

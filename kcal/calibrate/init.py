@@ -28,6 +28,28 @@ def homographies(board_points: Tensor, pixels: Tensor) -> Tensor:
     return result
 
 
+def spread_out(board_points: Tensor, pixels: Tensor) -> Tensor:
+    """Whether the corners seen in each view determine a homography: not all, nor all but one, on one line.
+
+    The equations of the direct linear transform from the board to itself have then rank eight.
+
+    Args:
+        board_points: (N, 3), z = 0.
+        pixels: (V, N, 2), NaN where not seen.
+
+    Returns:
+        (V,) bool.
+    """
+    low, high = board_points[:, :2].amin(0), board_points[:, :2].amax(0)
+    x, y = ((2.0 * board_points[:, :2] - low - high) / (high - low)).unbind(-1)
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    upper = torch.stack([x, y, one, zero, zero, zero, -x * x, -x * y, -x], -1)
+    lower = torch.stack([zero, zero, zero, x, y, one, -x * y, -y * y, -y], -1)
+    seen = torch.isfinite(pixels).all(-1).to(pixels.dtype)[..., None]
+    values = torch.linalg.svdvals(torch.cat([seen * upper, seen * lower], -2))
+    return values[..., 7] > 1e-9 * values[..., 0]
+
+
 def _rows(h: Tensor) -> tuple[Tensor, Tensor]:
     """Zhang's two constraints on the image of the absolute conic, from the first two columns of H (V, 3, 3)."""
 

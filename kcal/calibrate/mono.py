@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.covariance import Spread, spread
-from kcal.calibrate.init import homographies, intrinsics_candidates, poses_from_homographies, radial_start
+from kcal.calibrate.init import (
+    homographies,
+    intrinsics_candidates,
+    poses_from_homographies,
+    radial_start,
+    spread_out,
+)
 from kcal.calibrate.ladder import Progress, climb, free_parameters, steps_to
 from kcal.calibrate.poses import unflip
 from kcal.calibrate.problem import BoardProblem
@@ -22,6 +28,8 @@ from kcal.solve.result import Result, State, Status
 
 _MINIMUM_VIEWS = 3
 _MINIMUM_CORNERS = 6
+# RMS distance in pixels of a view's corners from the line that fits them best, below which they show no plane.
+_MINIMUM_WIDTH = 0.5
 # A focal length known to worse than this is not a calibration: 5 % of range at every distance.
 _MAX_FOCAL_SIGMA = 0.05
 # A first fit worse than this many pixels is retried from other focal lengths.
@@ -144,7 +152,7 @@ def calibrate_camera(
 
     # Poses once more, under the final lens.
     result = minimum.result
-    state, flipped = unflip(board, seen, [model], result.state, solver)
+    state, flipped = unflip(board, seen, [model], result.state)
     problem = BoardProblem(board, seen, [model], [free_parameters(model)], free_warp=options.board_warp)
     if flipped:
         result = minimise(problem, state, solver)
@@ -164,6 +172,19 @@ def _check(observations: Observations, pixels: Tensor, model: LensModel, warp: b
         raise InputError(
             f"view {observations.names[poor[0]]!r} has {int(seen[poor[0]])} corners; at least {_MINIMUM_CORNERS} are "
             "needed: remove the view"
+        )
+    on_line = (~spread_out(observations.board.points, pixels)).nonzero()[:, 0].tolist()
+    if on_line:
+        raise InputError(
+            f"view {observations.names[on_line[0]]!r}: all its corners, or all but one, lie on one line: that leaves "
+            "the board's pose open; remove the view"
+        )
+    centred = torch.nan_to_num(pixels - pixels.nanmean(1, keepdim=True))
+    width = torch.linalg.svdvals(centred)[:, 1] / seen.sqrt()
+    thin = (width < _MINIMUM_WIDTH).nonzero()[:, 0].tolist()
+    if thin:
+        raise InputError(
+            f"view {observations.names[thin[0]]!r}: its corners coincide or the board is seen edge-on; remove the view"
         )
     unknowns = 4 + model.size + 2 * warp + 6 * len(pixels)
     if 2 * int(seen.sum()) <= unknowns:
@@ -201,9 +222,10 @@ def _first(
             spent += int(result.iterations)
             if result.status != Status.BAD_START:
                 break
-        state, _ = unflip(board, pixels[:, None], [model], result.state, options.solver)
-        result = minimise(problem, state, options.solver)
-        spent += int(result.iterations)
+        state, flipped = unflip(board, pixels[:, None], [model], result.state)
+        if flipped:
+            result = minimise(problem, state, options.solver)
+            spent += int(result.iterations)
         cost = float(result.cost)
         if cost == cost and (best is None or cost < best[0]):
             best = (cost, result.state, cold)
@@ -258,7 +280,7 @@ def _check_focal(uncertainty: Spread, parameters: Tensor) -> None:
         known = "not at all" if worst == float("inf") else f"only to ±{100 * worst:.1f} %"
         raise DegenerateError(
             f"the views determine the focal length {known}: they are parallel to the image or too much alike; add "
-            "views with the board tilted by 30 to 45 degrees in different directions"
+            "views with the board tilted by 30 to 45 degrees in different directions, or choose a smaller model"
         )
 
 

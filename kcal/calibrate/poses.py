@@ -11,6 +11,9 @@ from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import State
 
+# Enough to tell which of two tilts fits; what is chosen is refined with everything else afterwards.
+_ROUGH = LMOptions(max_iterations=20, tolerance=1e-4)
+
 
 def refine_poses(
     board_points: Tensor, pixels: Tensor, models: list[LensModel], state: State, options: LMOptions
@@ -36,22 +39,27 @@ def refine_poses(
     return (*shared, rotation[:, 0], translation[:, 0]), result.cost
 
 
-def unflip(
-    board_points: Tensor, pixels: Tensor, models: list[LensModel], state: State, options: LMOptions
-) -> tuple[State, list[int]]:
+def unflip(board_points: Tensor, pixels: Tensor, models: list[LensModel], state: State) -> tuple[State, list[int]]:
     """Replace every board pose whose twin with the opposite tilt fits better (see `flipped_poses`).
 
     A view far away or nearly face-on has two poses of almost equal cost, and a solver that starts at the wrong one
     stays there: measured on 200 and more views, one or two such views raise the RMS of a whole calibration by up to
     a quarter.
 
+    Args:
+        board_points: (N, 3).
+        pixels: (V, C, N, 2).
+        models: one lens model a camera.
+        state: with board poses that are already refined.
+
     Returns:
-        the state with the better poses, and the indices of the views that changed.
+        the state with the better poses, roughly refined, and the indices of the views that changed.
     """
-    now, cost_now = refine_poses(board_points, pixels, models, state, options)
-    twin, cost_twin = refine_poses(board_points, pixels, models, flipped_poses(board_points, state), options)
-    better = cost_twin < 0.999 * cost_now
-    *shared, rotation, translation = now
+    problem = BoardProblem(board_points, pixels, models, [() for _ in models])
+    cost = 0.5 * (problem.residuals(state) ** 2).sum(-1)
+    twin, cost_twin = refine_poses(board_points, pixels, models, flipped_poses(board_points, state), _ROUGH)
+    better = cost_twin < 0.999 * cost
+    *shared, rotation, translation = state
     rotation = torch.where(better[:, None, None], twin[-2], rotation)
     translation = torch.where(better[:, None], twin[-1], translation)
     return (*shared, rotation, translation), better.nonzero()[:, 0].tolist()

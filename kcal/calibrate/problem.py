@@ -167,7 +167,9 @@ class BoardProblem(SchurProblem):
                 normal = s.first_from_board_rotation[..., 2]
                 along = torch.einsum("...vkun,...vk->...vun", by_first, normal)
                 shared[..., self._warp_slot, c, :, :] = along[..., None, :, :] * self._shape[:, None]
-            rows[..., -1, c, :, :] = projected.pixels - self._target[..., c, :, :]
+            # As in `residuals`, so that a start that is no projection is told from one that is.
+            bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
+            rows[..., -1, c, :, :] = projected.pixels - self._target[..., c, :, :] + bad
         if not self._all_seen:
             rows = torch.where(self._seen[..., None, :, None, :], rows, 0.0)
         return rows.flatten(-3)

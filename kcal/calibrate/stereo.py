@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcal.calibrate.align import MINIMUM_CORNERS, check_fit, consensus, pair_rms, pose_alone
 from kcal.calibrate.covariance import spread
+from kcal.calibrate.init import spread_out
 from kcal.calibrate.ladder import free_parameters
 from kcal.calibrate.pairs import Pair
 from kcal.calibrate.problem import BoardProblem, BoardState
@@ -55,8 +56,8 @@ class RigCalibrationResult:
         per_pair_rms: (P,) over both cameras.
         flipped: pairs in which the right camera's corners had been read from the other end; they were turned.
         excluded: pairs left out, with the reason.
-        sigma_rotation: (3,) radians, about the left camera's x (pitch), y (yaw) and z (roll).
-        sigma_translation: (3,) metres.
+        sigma_rotation: (3,) radians, of right_from_left about the right camera's x (pitch), y (yaw) and z (roll).
+        sigma_translation: (3,) metres, of right_from_left along the right camera's axes.
         pixels: (P, 2, N, 2) corners as used, turned where flipped; NaN where not seen.
         status: why the solver stopped.
         warnings: sentences about what the user should doubt.
@@ -103,6 +104,25 @@ def calibrate_rig(
     Raises:
         InputError: boards or image sizes that differ, cameras that do not fit their observations.
         DegenerateError: no pair is left.
+
+    Example:
+        >>> from kcal.corners.board import Board
+        >>> from kcal.corners.observations import View
+        >>> from kcal.lens.pose import rotation_from_vector
+        >>> board = Board(columns=7, rows=6, square=0.05)
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
+        >>> truth = StereoRig(camera, camera, torch.eye(3), torch.tensor([-0.2, 0.0, 0.0]))
+        >>> tilts = torch.tensor([[0.4, 0, 0], [-0.4, 0.1, 0], [0, 0.4, 0.2]], dtype=torch.float64)
+        >>> sides = ([], [])
+        >>> for i, rotation in enumerate(rotation_from_vector(tilts)):
+        ...     points = board.points @ rotation.T + torch.tensor([-0.1, -0.1, 1.0], dtype=torch.float64)
+        ...     for views, pixels in zip(sides, truth(points)[:2]):
+        ...         views.append(View(name=f"{i}.png", pixels=pixels.tolist()))
+        >>> left, right = (Observations(board=board, image_size=(640, 480), views=views) for views in sides)
+        >>> pairs = [(name, name) for name in left.names]
+        >>> result = calibrate_rig(camera, camera, left, right, pairs)
+        >>> [round(value, 6) + 0.0 for value in result.rig.right_from_left_translation.tolist()]
+        [-0.2, 0.0, 0.0]
     """
     options = options or RigOptions()
     pixels, names = _pixels(left, right, left_observations, right_observations, pairs)
@@ -166,8 +186,8 @@ def _drop_rayless(pixels: Tensor, cameras: tuple[Camera, Camera], names: list[Pa
         few = ((seen & valid).sum(-1) < MINIMUM_CORNERS).nonzero()[:, 0].tolist()
         if few:
             raise InputError(
-                f"{names[few[0]][c]}: the {word} camera's lens model has no ray at most of its corners: it folds inside "
-                "the image; calibrate with views nearer the image's border or with a smaller model"
+                f"{names[few[0]][c]}: the {word} camera's lens model has no ray at most of its corners: it folds "
+                "inside the image; calibrate with views nearer the image's border or with a smaller model"
             )
         warnings.append(f"{int((seen & ~valid).sum())} corners left out where the {word} lens model has no ray")
         pixels[:, c] = torch.where(valid[..., None], pixels[:, c], torch.nan)
@@ -198,6 +218,10 @@ def _pixels(
     for pair, counts in zip(pairs, seen_corners.tolist(), strict=True):
         if min(counts) < MINIMUM_CORNERS:
             raise InputError(f"pair {pair[0]}, {pair[1]}: at least {MINIMUM_CORNERS} corners are needed in each view")
+    board = left_seen.board.points
+    for c in (0, 1):
+        for i in (~spread_out(board, pixels[:, c])).nonzero()[:, 0].tolist():
+            raise InputError(f"{pairs[i][c]}: all its corners, or all but one, lie on one line; leave the pair out")
     return pixels, list(pairs)
 
 
