@@ -40,7 +40,7 @@ def calibrate(
 
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --board-warp --picture left.png`
     """
-    from kcal.cli.console import err, out, show, steps
+    from kcal.cli.console import err, out, steps
     from kcal.files import check_writable
     from kcal.lens.model import LensModel
 
@@ -70,7 +70,7 @@ def calibrate(
     corners = int((result.residuals[..., 0] == result.residuals[..., 0]).sum())
     out.print(f"{len(seen.views)} views, {corners} corners, {width}x{height} px, model {lens}")
     out.print(f"RMS [bold]{result.rms:.4f} px[/]; {result.status.message} ({result.iterations} steps)")
-    show(_table(result))
+    out.print(_table(result))
     if result.board_warp is not None:
         x, y = (1e3 * result.board_warp).tolist()
         out.print(f"board warp: {x:+.3f} mm along its rows, {y:+.3f} mm along its columns")

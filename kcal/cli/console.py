@@ -9,12 +9,21 @@ from typing import TypeVar
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 T = TypeVar("T")
 
-out = Console(soft_wrap=True, highlight=False)
-err = Console(stderr=True, soft_wrap=True, highlight=False)
+# A table cut to fit the 80 columns of a pipe would lose names and digits.
+_PIPE_WIDTH = 200
+
+
+def _console(stderr: bool) -> Console:
+    console = Console(stderr=stderr, soft_wrap=True, highlight=False)
+    if not console.is_terminal:
+        console.width = _PIPE_WIDTH
+    return console
+
+
+out, err = _console(stderr=False), _console(stderr=True)
 
 
 def _progress() -> Progress:
@@ -45,8 +54,3 @@ def steps(description: str, total: int) -> Iterator[Callable[[str], None]]:
             progress.update(task, advance=1, description=f"{description}: {escape(text)}")
 
         yield advance
-
-
-def show(table: Table) -> None:
-    """Print a table as wide as it needs: a name cut to fit the 80 columns of a pipe would be lost."""
-    out.print(table, width=out.measure(table, options=out.options.update(max_width=10_000)).maximum)

@@ -122,7 +122,7 @@ def _simulated(output: Path, seed: int) -> None:
 def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: float) -> None:
     import torch
 
-    from kcal.cli.console import err, out
+    from kcal.cli.console import err
     from kcal.io.rig_file import load_rig
     from kcal.locate.export import write_positions
     from kcal.locate.positions import locate
@@ -155,7 +155,6 @@ def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: flo
         f"kcal locate {output}/rig.json {output}/points.csv --origin={origin.lat},{origin.lon},{origin.height:g} "
         f"--heading {heading:g} -o again.geojson",
     )
-    out.print(f"Figures for comparison: {len(pairs)} pairs, boards of {board}.", highlight=False)
 
 
 def _render(scene: DemoScene, folder: Path) -> dict[tuple[str, str], list[Path]]:
@@ -259,11 +258,16 @@ def _write_marks(path: Path, names: tuple[str, ...] | list[str], left: torch.Ten
 def _print_truth(located: Located, truth: torch.Tensor) -> None:
     from rich.table import Table
 
-    from kcal.cli.console import show
+    from kcal.cli.console import out
 
-    table = Table(box=None, pad_edge=False, header_style="bold", title="True against estimated positions")
+    table = Table(
+        box=None,
+        pad_edge=False,
+        header_style="bold",
+        title="True against estimated positions",
+    )
     table.add_column("target", no_wrap=True)
-    for column in ("true range m", "estimated m", "95 % interval m", "range error m", "%", "across m"):
+    for column in ("true m", "estimated m", "95 % interval m", "error m", "error %", "across m"):
         table.add_column(column, justify="right", no_wrap=True)
     for position, true in zip(located.positions, truth, strict=True):
         distance = float(true.norm())
@@ -283,7 +287,7 @@ def _print_truth(located: Located, truth: torch.Tensor) -> None:
             f"{100 * along / distance:+.2f}",
             f"{across:.2f}",
         )
-    show(table)
+    out.print(table)
 
 
 def _print_diagonals(located: Located, board: Board) -> None:
@@ -292,7 +296,7 @@ def _print_diagonals(located: Located, board: Board) -> None:
 
     from rich.table import Table
 
-    from kcal.cli.console import show
+    from kcal.cli.console import out
 
     true = board.square * math.hypot(board.columns - 1, board.rows - 1)
     table = Table(box=None, pad_edge=False, header_style="bold", title="The board's diagonal, true against estimated")
@@ -306,7 +310,7 @@ def _print_diagonals(located: Located, board: Board) -> None:
         length = math.dist(first.enu, last.enu)
         error = 1e3 * (length - true)
         table.add_row(name, f"{first.range_m:.3f}", f"{1e3 * true:.2f}", f"{1e3 * length:.2f}", f"{error:+.2f}")
-    show(table)
+    out.print(table)
 
 
 def _print_results(output: Path, again: str) -> None:
