@@ -150,13 +150,14 @@ def calibrate_camera(
 
     spent += minimum.iterations
 
-    # Poses once more, under the final lens.
+    # The first model's poses were looked at; look once more under another lens.
     result = minimum.result
-    state, flipped = unflip(board, seen, [model], result.state)
     problem = BoardProblem(board, seen, [model], [free_parameters(model)], free_warp=options.board_warp)
-    if flipped:
-        result = minimise(problem, state, solver)
-        spent += int(result.iterations)
+    if len(ladder) > 1:
+        state, flipped = unflip(board, seen, [model], result.state)
+        if flipped:
+            result = minimise(problem, state, solver)
+            spent += int(result.iterations)
     return _result(observations, problem, result, spent, model)
 
 

@@ -12,7 +12,7 @@ from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import State
 
 # Enough to tell which of two tilts fits; what is chosen is refined with everything else afterwards.
-_ROUGH = LMOptions(max_iterations=20, tolerance=1e-4)
+_ROUGH = LMOptions(max_iterations=10, tolerance=1e-4)
 
 
 def refine_poses(
