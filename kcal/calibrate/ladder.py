@@ -28,7 +28,7 @@ from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import Result, State
 
 # Trial steps given to each start of a batch; the best one is then taken to convergence.
-_SCOUT_ITERATIONS = 150
+_SCOUT_STEPS = 150
 _KEPT = 4
 # How much χ² a lens that folds inside the image must gain on one that does not: 20 is far beyond chance for the few
 # parameters that a step of the ladder adds.
@@ -103,22 +103,40 @@ def pick(state: State, index: int) -> State:
     return tuple(tensor[index] for tensor in state)
 
 
-def observed_radius(board_points: Tensor, pixels: Tensor, state: State) -> Tensor:
-    """Largest undistorted radius (...) at which a corner was seen, for a single camera."""
-    *_, rotation, translation = state
-    points = board_points @ rotation.transpose(-1, -2) + translation[..., None, :]
-    radius = torch.linalg.vector_norm(points[..., :2] / points[..., 2:], dim=-1)
-    seen = torch.isfinite(pixels[:, 0]).all(-1)
-    return torch.where(seen, radius, 0.0).amax((-2, -1))
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Views:
+    """What a ladder is climbed on.
 
+    Args:
+        board_points: (N, 3) metres.
+        pixels: (V, 1, N, 2) of one camera, NaN where not seen.
+        size: (width, height) of the image.
+        free_warp: whether the board's warp is estimated.
+    """
 
-def _starts(kept: list[State], cold: State, small: LensModel, large: LensModel, largest: float) -> list[State]:
-    carried = [(embed(state[0], small, large), *state[1:]) for state in kept]
-    starts = [*carried, cold]
-    if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
-        base = carried[0]
-        starts += [(near_cancelling(base[0], large, largest, place), *base[1:]) for place in _BUMPS]
-    return starts
+    board_points: Tensor
+    pixels: Tensor
+    size: tuple[int, int]
+    free_warp: bool
+
+    def problem(self, model: LensModel, batch: tuple[int, ...] = ()) -> BoardProblem:
+        """The least-squares problem of one lens model."""
+        free = [free_parameters(model)]
+        return BoardProblem(self.board_points, self.pixels, [model], free, free_warp=self.free_warp, batch=batch)
+
+    def observed_radius(self, state: State) -> Tensor:
+        """Largest undistorted radius at which a corner was seen."""
+        *_, rotation, translation = state
+        points = self.board_points @ rotation.transpose(-1, -2) + translation[..., None, :]
+        radius = torch.linalg.vector_norm(points[..., :2] / points[..., 2:], dim=-1)
+        seen = torch.isfinite(self.pixels[:, 0]).all(-1)
+        return torch.where(seen, radius, 0.0).max()
+
+    def trouble(self, state: State, model: LensModel) -> float:
+        """0 for a lens that is regular in the whole image, 1 if it folds outside the observed radius, else infinity."""
+        if not bool(valid_radius(state[0][len(INTRINSICS) :], model) > self.observed_radius(state)):
+            return math.inf
+        return 0.0 if bool(Camera(state[0], size=self.size, model=model).covers_image()) else 1.0
 
 
 def free_parameters(model: LensModel) -> list[int]:
@@ -127,98 +145,66 @@ def free_parameters(model: LensModel) -> list[int]:
 
 
 def climb(
-    board_points: Tensor,
-    pixels: Tensor,
-    size: tuple[int, int],
-    first: State,
-    cold: State,
-    models: Sequence[LensModel],
-    options: LMOptions,
-    *,
-    free_warp: bool,
-    progress: Progress,
+    views: Views, first: State, cold: State, models: Sequence[LensModel], options: LMOptions, progress: Progress
 ) -> Minimum:
     """Solve a ladder of models for one camera.
 
     Args:
-        board_points: (N, 3).
-        pixels: (V, 1, N, 2).
-        size: (width, height) of the image.
+        views: the data.
         first: a solution of `models[0]`.
         cold: a state of `models[0]` without distortion.
         models: each nested in the next.
         options: of the final solves.
-        free_warp: whether the board's warp is estimated.
         progress: told the name of each finished model.
 
     Returns:
         The lowest minimum found for the last model. Among states that fold or meet a pole inside the radius that was
         observed none is chosen.
     """
-    kept = [first]
     small = models[0]
-    result: Result | None = None
-    spent = 0
+    result = minimise(views.problem(small), first, options)
+    kept, spent = [result.state], int(result.iterations)
     for large in models[1:]:
-        largest = float(observed_radius(board_points, pixels, kept[0])) ** 2
-        starts = _starts(kept, (embed(cold[0], models[0], large), *cold[1:]), small, large, largest)
-        free = [free_parameters(large)]
-        scouts = BoardProblem(board_points, pixels, [large], free, free_warp=free_warp, batch=(len(starts),))
-        scouting = dataclasses.replace(options, max_iterations=min(_SCOUT_ITERATIONS, options.max_iterations))
-        found = minimise(scouts, stack(starts), scouting)
-        spent += int(found.iterations.max())
-        problem = BoardProblem(board_points, pixels, [large], free, free_warp=free_warp)
-        kept = _distinct(board_points, pixels, size, found, starts[0], problem, large)
+        plain = (embed(cold[0], models[0], large), *cold[1:])
+        carried = [(embed(state[0], small, large), *state[1:]) for state in kept]
+        found = _scout(views, carried, plain, small, large, options)
+        kept = _rank(views, found, carried[0], large)
+        problem = views.problem(large)
         result = minimise(problem, kept[0], options)
-        spent += int(result.iterations)
-        if _trouble(board_points, pixels, size, result.state, large) <= _trouble(
-            board_points, pixels, size, kept[0], large
-        ):
-            kept[0] = result.state
-        else:
+        spent += int(found.iterations.max()) + int(result.iterations)
+        if views.trouble(result.state, large) > views.trouble(kept[0], large):
             # The last steps left the lens: keep the state before them.
             result = dataclasses.replace(result, state=kept[0], cost=problem.cost(kept[0]))
+        kept[0] = result.state
         small = large
         progress(str(large))
-    if result is None:
-        problem = BoardProblem(board_points, pixels, [small], [free_parameters(small)], free_warp=free_warp)
-        result = minimise(problem, first, options)
-        spent += int(result.iterations)
-        progress(str(small))
     return Minimum(result=result, iterations=spent)
 
 
-def _trouble(board_points: Tensor, pixels: Tensor, size: tuple[int, int], state: State, model: LensModel) -> float:
-    """0 for a lens that is regular in the whole image, 1 if it folds outside the observed radius, infinity inside."""
-    radius = valid_radius(state[0][len(INTRINSICS) :], model)
-    if not bool(radius > observed_radius(board_points, pixels, state)):
-        return math.inf
-    return 0.0 if bool(Camera(state[0], size=size, model=model).covers_image()) else 1.0
+def _scout(
+    views: Views, carried: list[State], plain: State, small: LensModel, large: LensModel, options: LMOptions
+) -> Result:
+    """Solve for `large` from all starts side by side, with a limited number of steps."""
+    starts = [*carried, plain]
+    if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
+        largest = float(views.observed_radius(carried[0])) ** 2
+        starts += [(near_cancelling(carried[0][0], large, largest, b), *carried[0][1:]) for b in _BUMPS]
+    limited = dataclasses.replace(options, max_iterations=min(_SCOUT_STEPS, options.max_iterations))
+    return minimise(views.problem(large, (len(starts),)), stack(starts), limited)
 
 
-def _distinct(
-    board_points: Tensor,
-    pixels: Tensor,
-    size: tuple[int, int],
-    found: Result,
-    carried: State,
-    problem: BoardProblem,
-    model: LensModel,
-) -> list[State]:
+def _rank(views: Views, found: Result, carried: State, model: LensModel) -> list[State]:
     """The best few minima that are lenses, best first; the carried-over state leads if none is as good."""
-    # In units of the noise variance, estimated from the best fit there is.
+    problem = views.problem(model)
     limit = float(problem.cost(carried))
-    lowest = min(limit, float(torch.nan_to_num(found.cost, nan=math.inf).min()))
-    price = _FOLD_PRICE * max(lowest, 1e-300) / problem.residual_count
-    ranked = [(limit + price * _trouble(board_points, pixels, size, carried, model), limit, carried)]
-    costs: list[float] = []
+    candidates = [(limit, carried)]
     for i in torch.argsort(torch.nan_to_num(found.cost, nan=torch.inf)).tolist():
-        cost, state = float(found.cost[i]), pick(found.state, i)
-        if not math.isfinite(cost) or any(abs(cost - other) <= 1e-7 * other for other in costs):
-            continue
-        costs.append(cost)
-        ranked.append((cost + price * _trouble(board_points, pixels, size, state, model), cost, state))
+        cost = float(found.cost[i])
+        if math.isfinite(cost) and not any(abs(cost - other) <= 1e-7 * other for other, _ in candidates[1:]):
+            candidates.append((cost, pick(found.state, i)))
+    # In units of the noise variance, estimated from the best fit there is.
+    price = _FOLD_PRICE * max(min(cost for cost, _ in candidates), 1e-300) / problem.residual_count
+    ranked = [(cost > limit, cost + price * views.trouble(state, model), state) for cost, state in candidates]
     # A richer model must not end above the one nested in it, whatever the price says.
-    ranked = [entry for entry in ranked if math.isfinite(entry[0])]
-    ranked.sort(key=lambda entry: (entry[1] > limit, entry[0]))
-    return [state for _, _, state in ranked[:_KEPT]] or [carried]
+    ranked = sorted((entry for entry in ranked if math.isfinite(entry[1])), key=lambda entry: entry[:2])
+    return [state for *_, state in ranked[:_KEPT]] or [carried]

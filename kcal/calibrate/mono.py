@@ -15,7 +15,7 @@ from kcal.calibrate.init import (
     radial_start,
     spread_out,
 )
-from kcal.calibrate.ladder import Progress, climb, free_parameters, steps_to
+from kcal.calibrate.ladder import Progress, Views, climb, free_parameters, steps_to
 from kcal.calibrate.poses import unflip
 from kcal.calibrate.problem import BoardProblem
 from kcal.corners.observations import Observations
@@ -136,23 +136,13 @@ def calibrate_camera(
     first, cold, spent = _first(board, pixels, observations.image_size, ladder[0], options)
     progress(f"start ({ladder[0]})")
     seen = pixels[:, None]
-    minimum = climb(
-        board,
-        seen,
-        observations.image_size,
-        first,
-        cold,
-        ladder,
-        solver,
-        free_warp=options.board_warp,
-        progress=progress,
-    )
-
+    views = Views(board_points=board, pixels=seen, size=observations.image_size, free_warp=options.board_warp)
+    minimum = climb(views, first, cold, ladder, solver, progress)
     spent += minimum.iterations
 
     # The first model's poses were looked at; look once more under another lens.
     result = minimum.result
-    problem = BoardProblem(board, seen, [model], [free_parameters(model)], free_warp=options.board_warp)
+    problem = views.problem(model)
     if len(ladder) > 1:
         state, flipped = unflip(board, seen, [model], result.state)
         if flipped:
