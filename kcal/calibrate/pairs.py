@@ -84,9 +84,9 @@ def read_pairs(path: str | Path, left: Sequence[str], right: Sequence[str]) -> l
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+        rows = list(csv.reader(io.StringIO(text)))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(f"{path}: cannot read: {error}") from error
-    rows = list(csv.reader(io.StringIO(text)))
     if not rows or [cell.strip() for cell in rows[0]] != ["left", "right"]:
         header = ",".join(rows[0]) if rows else "nothing"
         raise FileError(f"{path}: the header must be left,right; it is {header}")

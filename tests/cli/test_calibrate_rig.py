@@ -1,0 +1,320 @@
+"""`kcal calibrate` and `kcal rig` on simulated observations: what they write, and how they refuse."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from typer.testing import CliRunner
+
+from kcal.cli.main import app, main
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.io.camera_file import CameraFile
+from kcal.io.rig_file import RigFile
+from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import StereoRig
+
+BOARD = Board(columns=7, rows=6, square=0.05)
+SIZE = (640, 480)
+LEFT = Camera.build(focal=(500, 505), center=(325, 235), size=SIZE, coefficients=[-0.2, 0.05])
+RIGHT = Camera.build(focal=(560, 555), center=(310, 250), size=SIZE, coefficients=[-0.15, 0.03])
+TURN = rotation_from_vector(torch.tensor([0.02, 0.1, 0.01], dtype=torch.float64))
+RIG = StereoRig(LEFT, RIGHT, TURN, torch.tensor([-0.12, 0.005, 0.01], dtype=torch.float64))
+
+
+def observations(side: int, count: int, noise: float = 0.1) -> Observations:
+    """Boards tilted by half a radian about axes all round, seen by one camera."""
+    generator = torch.Generator().manual_seed(7 + side)
+    middle = BOARD.points.mean(0)
+    views = []
+    for i in range(count):
+        angle = 2.0 * math.pi * i / max(count, 5)
+        tilt = torch.tensor([0.5 * math.cos(angle), 0.5 * math.sin(angle), 0.1 * i], dtype=torch.float64)
+        rotation = rotation_from_vector(tilt)
+        centre = torch.tensor([0.05 * math.cos(2 * angle), 0.06 * math.sin(3 * angle), 0.75], dtype=torch.float64)
+        points = (BOARD.points - middle) @ rotation.T + centre
+        pixels: Tensor = RIG(points)[side]
+        pixels = pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+        views.append(View(name=f"{('left', 'right')[side]}{i:02}.png", pixels=tuple(map(tuple, pixels.tolist()))))
+    return Observations(board=BOARD, image_size=SIZE, views=tuple(views))
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    observations(0, 6).save(tmp_path / "left.obs.json")
+    observations(1, 6).save(tmp_path / "right.obs.json")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    return tmp_path
+
+
+@pytest.fixture
+def cameras(folder: Path) -> Path:
+    """The folder with both cameras calibrated in it."""
+    for word in ("left", "right"):
+        outcome = CliRunner().invoke(app, ["calibrate", f"{word}.obs.json", "-o", f"{word}.camera.json"])
+        assert outcome.exit_code == 0, outcome.output
+    return folder
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["kcal", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    code = stopped.value.code
+    return code if isinstance(code, int) else 0
+
+
+def refuse(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Run what must fail; the one line it says. Nothing may appear or change in the folder."""
+    before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    assert run(monkeypatch, *arguments) == 1
+    printed = capsys.readouterr()
+    assert printed.err.startswith("error: "), printed.err
+    assert len(printed.err.splitlines()) == 1, printed.err
+    assert "Traceback" not in printed.out + printed.err
+    assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
+    return printed.err
+
+
+PAIRS = ["--pairs", "left.obs.json", "right.obs.json"]
+
+
+class TestCalibrate:
+    def test_writes_a_camera_file(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        arguments = [
+            "left.obs.json",
+            "-o",
+            "left.camera.json",
+            "--model",
+            "opencv4",
+            "--name",
+            "mast",
+            "--picture",
+            "left.png",
+        ]
+        assert run(monkeypatch, "calibrate", *arguments) == 0
+        printed = capsys.readouterr()
+        assert "6 views, 252 corners, 640x480 px, model opencv4" in printed.out
+        assert "wrote left.camera.json" in printed.out
+        assert "wrote left.png" in printed.out
+        assert printed.err == ""
+        file = CameraFile.load(folder / "left.camera.json")
+        assert file.name == "mast"
+        assert file.calibration is not None
+        assert file.calibration.views == 6
+        assert file.calibration.points == 252
+        assert sorted(file.calibration.per_view_rms) == [f"left{i:02}.png" for i in range(6)]
+        assert f"RMS {file.calibration.rms:.4f} px" in printed.out
+        found = file.camera()
+        # Six views at 0.1 px: some tenths of a percent; the table shows what the file holds.
+        assert float(found.focal[0]) == pytest.approx(500, rel=0.01)
+        row = next(line.split() for line in printed.out.splitlines() if line.startswith("fx "))
+        assert row[1] == f"{float(found.focal[0]):.3f}"
+        assert (folder / "left.png").read_bytes().startswith(b"\x89PNG")
+
+    def test_board_warp_and_a_warning(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        content = json.loads((folder / "left.obs.json").read_text())
+        for i, pixel in enumerate(content["views"][2]["pixels"]):
+            content["views"][2]["pixels"][i] = [pixel[0] + 4 * (i % 2), pixel[1] - 3 * (i % 3)]
+        (folder / "bad.obs.json").write_text(json.dumps(content))
+        assert run(monkeypatch, "calibrate", "bad.obs.json", "-o", "bad.json", "--board-warp") == 0
+        printed = capsys.readouterr()
+        assert "mm along its rows" in printed.out
+        assert "warning: view left02.png: RMS" in printed.err
+        assert CameraFile.load(folder / "bad.json").name == "bad"
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["none.obs.json", "-o", "a.json"], "none.obs.json: cannot read: No such file"),
+            (["left.obs.json", "-o", "no/a.json"], "the folder no does not exist; make it first"),
+            (["left.obs.json", "-o", "."], "is a folder; give a file name"),
+            (["left.obs.json", "-o", "a.json", "--model", "opencv6"], "unknown lens model 'opencv6'; choose one of"),
+            (["left.obs.json", "-o", "a.json", "--picture", "a.jpg"], "end with .png"),
+            (["left.obs.json", "-o", "a.json", "--picture", "no/a.png"], "the folder no does not exist"),
+        ],
+    )
+    def test_refusals(
+        self,
+        folder: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+        arguments: list[str],
+        message: str,
+    ) -> None:
+        assert message in refuse(folder, monkeypatch, capsys, "calibrate", *arguments)
+
+    @pytest.mark.parametrize(
+        ("content", "message"),
+        [
+            ("", "not a JSON file"),
+            ("[1, 2]", "not a kcal file; a kcal observations file is needed here"),
+            ('{"kcal": "observations", "version": 9}', "version 9 of the observations format"),
+            ('{"kcal": "observations", "version": 1}', "bad observations file: board: "),
+        ],
+    )
+    def test_files_that_are_something_else(
+        self,
+        folder: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+        content: str,
+        message: str,
+    ) -> None:
+        (folder / "odd.json").write_text(content)
+        text = refuse(folder, monkeypatch, capsys, "calibrate", "odd.json", "-o", "a.json")
+        assert text.startswith("error: odd.json: ")
+        assert message in text
+
+    @pytest.mark.parametrize("count", [0, 1, 2])
+    def test_too_few_views(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], count: int
+    ) -> None:
+        observations(0, count).save(folder / "few.obs.json")
+        text = refuse(folder, monkeypatch, capsys, "calibrate", "few.obs.json", "-o", "a.json")
+        assert ("no view with a board" if count == 0 else f"{count} view(s) of the board: at least 3") in text
+
+    def test_an_old_file_survives_a_failure(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        (folder / "old.json").write_text("precious")
+        observations(0, 2).save(folder / "few.obs.json")
+        refuse(folder, monkeypatch, capsys, "calibrate", "few.obs.json", "-o", "old.json")
+
+    @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="the superuser may write anywhere")
+    def test_no_permission_is_told_before_any_work(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        (folder / "shut").mkdir(mode=0o500)
+        text = refuse(folder, monkeypatch, capsys, "calibrate", "left.obs.json", "-o", "shut/a.json")
+        assert "no permission to write here" in text
+
+    def test_output_is_checked_before_the_input_is_read(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """With both wrong, the output is named: no minute is spent on what cannot be written."""
+        assert "make it first" in refuse(folder, monkeypatch, capsys, "calibrate", "none.json", "-o", "no/a.json")
+        text = refuse(folder, monkeypatch, capsys, "rig", "none.json", "none.json", *PAIRS, "-o", "no/a.json")
+        assert "make it first" in text
+
+
+class TestRig:
+    def test_writes_a_rig_file(
+        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json") == 0
+        printed = capsys.readouterr()
+        assert "6 of 6 pairs used, 0 views without partner" in printed.out
+        assert "wrote rig.json" in printed.out
+        assert printed.err == ""
+        file = RigFile.load(cameras / "rig.json")
+        assert file.calibration is not None
+        assert file.calibration.pairs == 6
+        assert file.calibration.baseline_m == pytest.approx(float(RIG.baseline), rel=0.02)
+        assert f"baseline {file.calibration.baseline_m:.6f} m" in printed.out
+        assert "the board's are 50.0000 mm" in printed.out
+        side = float(next(line for line in printed.out.splitlines() if "triangulated" in line).split()[2])
+        assert side == pytest.approx(50.0, rel=2e-3)
+
+    def test_pairs_from_a_csv(
+        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        (cameras / "pairs.csv").write_text(
+            "left,right\n" + "".join(f"left{i:02}.png,right{i:02}.png\n" for i in (1, 3, 4))
+        )
+        arguments = ["left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json", "--match", "pairs.csv"]
+        assert run(monkeypatch, "rig", *arguments, "--refine-cameras", "--board-warp") == 0
+        assert "3 of 3 pairs used, 6 views without partner" in capsys.readouterr().out
+        (cameras / "pairs.csv").write_text("left,right\nleft01.png,right77.png\n")
+        (cameras / "rig.json").unlink()
+        text = refuse(cameras, monkeypatch, capsys, "rig", *arguments)
+        assert "pairs.csv: line 2: no view of the right camera is named 'right77.png'" in text
+
+    def test_turned_and_wrong_pairs_are_listed(
+        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        content = json.loads((cameras / "right.obs.json").read_text())
+        content["views"][1]["pixels"].reverse()
+        for pixel in content["views"][4]["pixels"]:
+            pixel[1] += 40.0
+        (cameras / "right.obs.json").write_text(json.dumps(content))
+        assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json") == 0
+        printed = capsys.readouterr()
+        assert "turned by 180°: left01.png, right01.png" in printed.out
+        assert "left out: left04.png, right04.png: " in printed.err
+        record = RigFile.load(cameras / "rig.json").calibration
+        assert record is not None
+        assert record.flipped == ("left01.png right01.png",)
+        assert [entry.name for entry in record.excluded] == ["left04.png right04.png"]
+        assert record.baseline_m == pytest.approx(float(RIG.baseline), rel=0.02)
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["left.obs.json", "right.camera.json", *PAIRS], "this is a kcal observations file; a kcal camera file"),
+            (
+                ["left.camera.json", "right.camera.json", "--pairs", "left.obs.json", "right.camera.json"],
+                "this is a kcal camera file; a kcal observations file is needed here",
+            ),
+            (["none.json", "right.camera.json", *PAIRS], "none.json: cannot read"),
+            (["right.camera.json", "left.camera.json", *PAIRS], "swapped"),
+            (["left.camera.json", "right.camera.json", "--pairs", "right.obs.json", "left.obs.json"], "swapped"),
+            (["left.camera.json", "right.camera.json", *PAIRS, "--match", "none.csv"], "none.csv: cannot read"),
+        ],
+    )
+    def test_refusals(
+        self,
+        cameras: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+        arguments: list[str],
+        message: str,
+    ) -> None:
+        assert message in refuse(cameras, monkeypatch, capsys, "rig", *arguments, "-o", "rig.json")
+
+    def test_a_rig_file_is_no_camera_file(
+        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json") == 0
+        capsys.readouterr()
+        text = refuse(cameras, monkeypatch, capsys, "rig", "rig.json", "right.camera.json", *PAIRS, "-o", "b.json")
+        assert "rig.json: this is a kcal rig file; a kcal camera file is needed here" in text
+
+    def test_views_that_cannot_be_paired(
+        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        content = json.loads((cameras / "right.obs.json").read_text())
+        for i, view in enumerate(content["views"]):
+            view["name"] = "abcdef"[i]
+        (cameras / "right.obs.json").write_text(json.dumps(content))
+        text = refuse(
+            cameras, monkeypatch, capsys, "rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "r.json"
+        )
+        assert "give a CSV of pairs" in text
+
+
+@pytest.mark.parametrize("command", ["calibrate", "rig"])
+def test_help_shows_examples(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    outcome = CliRunner().invoke(app, [command, "--help"])
+    assert outcome.exit_code == 0
+    assert "Examples" in outcome.output
+    assert outcome.output.count(f"kcal {command} left.") >= 2
+
+
+@pytest.mark.parametrize("arguments", [["calibrate"], ["calibrate", "a.json"], ["rig", "a.json", "b.json", "-o", "c"]])
+def test_missing_arguments_are_a_usage_error(arguments: list[str]) -> None:
+    assert CliRunner().invoke(app, arguments).exit_code == 2
