@@ -16,9 +16,17 @@ import pydantic
 from kcal.errors import FileError, InputError
 
 
-def check_writable(path: str | Path) -> Path:
-    """Raise `FileError` now if `path` could not be written later, before minutes of work are spent."""
+def check_writable(path: str | Path, *inputs: str | Path) -> Path:
+    """Raise `FileError` now if `path` could not be written later, before minutes of work are spent.
+
+    Args:
+        path: of the file to write.
+        inputs: files that are read; writing over one of them is refused.
+    """
     path = Path(path)
+    for other in inputs:
+        if path.exists() and Path(other).exists() and path.samefile(other):
+            raise FileError(f"{path}: this is an input; give the output another name")
     if path.is_dir():
         raise FileError(f"{path}: is a folder; give a file name")
     if not path.parent.is_dir():

@@ -40,10 +40,18 @@ Progress = Callable[[str], None]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Minimum:
-    """The end of a ladder: the solver's result, and the trial steps spent on the way."""
+    """The end of a ladder.
+
+    Args:
+        result: the solver's, for the last model.
+        iterations: trial steps spent on the way.
+        rivals: other ends for the last model as (cost, state): further minima, and the first model's solution. Where
+            one fits almost as well but lies far away, the data do not determine the model.
+    """
 
     result: Result
     iterations: int
+    rivals: tuple[tuple[float, State], ...] = ()
 
 
 def steps_to(model: LensModel) -> list[LensModel]:
@@ -178,7 +186,10 @@ def climb(
         kept[0] = result.state
         small = large
         progress(str(large))
-    return Minimum(result=result, iterations=spent)
+    last = views.problem(small)
+    others = [(embed(first[0], models[0], small), *first[1:]), *kept[1:]]
+    rivals = tuple((float(last.cost(state)), state) for state in others) if len(models) > 1 else ()
+    return Minimum(result=result, iterations=spent, rivals=rivals)
 
 
 def _scout(

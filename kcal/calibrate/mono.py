@@ -15,7 +15,7 @@ from kcal.calibrate.init import (
     radial_start,
     spread_out,
 )
-from kcal.calibrate.ladder import Progress, Views, climb, free_parameters, steps_to
+from kcal.calibrate.ladder import Minimum, Progress, Views, climb, free_parameters, steps_to
 from kcal.calibrate.poses import unflip
 from kcal.calibrate.problem import BoardProblem
 from kcal.corners.observations import Observations
@@ -32,6 +32,8 @@ _MINIMUM_CORNERS = 6
 _MINIMUM_WIDTH = 0.5
 # A focal length known to worse than this is not a calibration: 5 % of range at every distance.
 _MAX_FOCAL_SIGMA = 0.05
+# A rival that is worse by less χ² than this cannot be ruled out: the gain that chance gives 14 more parameters.
+_CLOSE_RIVAL = 25.0
 # A first fit worse than this many pixels is retried from other focal lengths.
 _SUSPICIOUS_RMS = 2.0
 
@@ -148,7 +150,9 @@ def calibrate_camera(
         if flipped:
             result = minimise(problem, state, solver)
             spent += int(result.iterations)
-    return _result(observations, problem, result, spent, model)
+    solved = _result(observations, problem, result, spent, model)
+    doubts = _rivals(solved, float(result.cost), problem.residual_count, minimum)
+    return dataclasses.replace(solved, warnings=(*solved.warnings, *doubts))
 
 
 def _check(observations: Observations, pixels: Tensor, model: LensModel, warp: bool) -> None:
@@ -273,6 +277,29 @@ def _check_focal(uncertainty: Spread, parameters: Tensor) -> None:
             f"the views determine the focal length {known}: they are parallel to the image or too much alike; add "
             "views with the board tilted by 30 to 45 degrees in different directions, or choose a smaller model"
         )
+
+
+def _rivals(solved: CameraCalibrationResult, cost: float, residual_count: int, minimum: Minimum) -> list[str]:
+    """A warning where another solution fits almost as well and is farther away than the error bars say."""
+    variance = max(2.0 * cost / residual_count, 1e-300)
+    here = dict(zip(solved.camera.names, solved.camera.parameters_vector.tolist(), strict=True))
+    for other, state in minimum.rivals:
+        if not 2.0 * (other - cost) / variance < _CLOSE_RIVAL:
+            continue
+        there = dict(zip(solved.camera.names, state[0].tolist(), strict=True))
+        apart = {
+            name: there[name] - here[name]
+            for name in ("fx", "fy", "cx", "cy")
+            if abs(there[name] - here[name]) > max(1.0, 4.0 * (solved.sigma[name] or 0.0))
+        }
+        if apart:
+            rms = (2.0 * variance * other / cost) ** 0.5
+            where = ", ".join(f"{name} {shift:+.1f} px" for name, shift in apart.items())
+            return [
+                f"another solution fits almost as well (RMS {rms:.4f} px) with {where}: do not trust this model's "
+                "parameters; choose a smaller model or add views"
+            ]
+    return []
 
 
 def _warnings(

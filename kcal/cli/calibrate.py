@@ -44,7 +44,7 @@ def calibrate(
     from kcal.files import check_writable
     from kcal.lens.model import LensModel
 
-    check_writable(output)
+    check_writable(output, observations)
     if picture is not None:
         from kcal.report.figures import check_picture_format
 

@@ -60,6 +60,7 @@ def detect(
     from kcal.corners.images import expand_images
 
     paths = expand_images(images)
+    check_writable(output, *paths)
     with steps("detecting", len(paths)) as advance:
         observations = detect_images(paths, board, refine.value, progress=lambda name: advance(escape(name)))
     observations.save(output)

@@ -60,7 +60,7 @@ def locate(
     outputs = output or []
     for path in outputs:
         check_format(path)
-        check_writable(path)
+        check_writable(path, rig, points)
     if picture is not None:
         check_picture_format(picture)
         check_writable(picture)

@@ -47,7 +47,7 @@ def rig(
     from kcal.cli.console import err, out, steps
     from kcal.files import check_writable
 
-    check_writable(output)
+    check_writable(output, left, right, *pairs, *([match] if match else []))
 
     import math
 

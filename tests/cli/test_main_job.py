@@ -198,6 +198,12 @@ class TestBadInput:
         observations(5, tilt=0.5).save("a.obs.json")
         refused(run("calibrate", "a.obs.json", "-o", "nowhere/c.json"), "nowhere", "does not exist")
 
+    def test_output_over_an_input(self, run: Run) -> None:
+        observations(5, tilt=0.5).save("a.obs.json")
+        before = Path("a.obs.json").read_bytes()
+        refused(run("calibrate", "a.obs.json", "-o", "a.obs.json"), "a.obs.json", "input")
+        assert Path("a.obs.json").read_bytes() == before
+
     def test_unknown_model(self, run: Run) -> None:
         observations(5, tilt=0.5).save("a.obs.json")
         refused(run("calibrate", "a.obs.json", "-o", "c.json", "--model", "opencv15"), "opencv15", "opencv14")
