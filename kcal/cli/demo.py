@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from kcal.cli.demo_tables import print_diagonals, print_results, print_truth
 
 if TYPE_CHECKING:
     import torch
@@ -14,7 +17,6 @@ if TYPE_CHECKING:
     from kcal.corners.board import Board
     from kcal.corners.observations import Observations
     from kcal.locate.geodesy import Origin
-    from kcal.locate.positions import Located
     from kcal.sim.scene import DemoScene
 
 _SIDES = ("left", "right")
@@ -91,27 +93,27 @@ def _simulated(output: Path, seed: int) -> None:
 
     marks, targets = scene.target_marks, scene.targets
     _write_marks(output / "points.csv", targets.names, marks.left, marks.right)
-    place = Origin(lat=scene.lat, lon=scene.lon, height=scene.height)
-    located = locate(
+    locate_marks = partial(
+        locate,
         load_rig(output / "rig.json"),
-        marks.left,
-        marks.right,
-        origin=place,
+        origin=Origin(lat=scene.lat, lon=scene.lon, height=scene.height),
         heading_deg=scene.heading_deg,
         pitch_deg=scene.pitch_deg,
         roll_deg=scene.roll_deg,
         pixel_sigma=scene.mark_sigma,
         names=targets.names,
     )
+    located = locate_marks(marks.left, marks.right)
+    exact = locate_marks(marks.true_left, marks.true_right)
     write_positions(output / "points.geojson", located)
     write_positions(output / "positions.csv", located)
     save_positions_picture(output / "map.png", located, targets.enu)
-    _print_truth(located, targets.enu)
+    print_truth(located, exact, targets.enu)
     out.print(
-        f"Marks have {scene.mark_sigma:g} px of noise in each image. The interval covers that alone; the calibration's "
-        "own error comes on top of it."
+        f"Marks have {scene.mark_sigma:g} px of noise in each image, and the interval covers that alone. The last "
+        "column is what the same rig gives for marks without noise: the calibration's own share of the error."
     )
-    _print_results(
+    print_results(
         output,
         f"kcal locate {output}/rig.json {output}/points.csv --origin {scene.lat},{scene.lon},{scene.height:g} "
         f"--heading {scene.heading_deg:g} --pitch {scene.pitch_deg:g} --roll {scene.roll_deg:g} "
@@ -147,10 +149,10 @@ def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: flo
     write_positions(output / "points.geojson", located)
     write_positions(output / "positions.csv", located)
     save_positions_picture(output / "map.png", located)
-    _print_diagonals(located, board)
+    print_diagonals(located, board)
     if origin == type(origin)(lat=0.0, lon=0.0, height=0.0):
         err.print("[yellow]note:[/] no --origin was given: positions are placed at latitude 0, longitude 0")
-    _print_results(
+    print_results(
         output,
         f"kcal locate {output}/rig.json {output}/points.csv --origin={origin.lat},{origin.lon},{origin.height:g} "
         f"--heading {heading:g} -o again.geojson",
@@ -253,76 +255,3 @@ def _write_marks(path: Path, names: tuple[str, ...] | list[str], left: torch.Ten
     for name, a, b in zip(names, left.tolist(), right.tolist(), strict=True):
         lines.append(",".join([name, *(repr(value) for value in (*a, *b))]))
     write_atomic(path, "\n".join(lines) + "\n")
-
-
-def _print_truth(located: Located, truth: torch.Tensor) -> None:
-    from rich.table import Table
-
-    from kcal.cli.console import out
-
-    table = Table(
-        box=None,
-        pad_edge=False,
-        header_style="bold",
-        title="True against estimated positions",
-    )
-    table.add_column("target", no_wrap=True)
-    for column in ("true m", "estimated m", "95 % interval m", "error m", "error %", "across m"):
-        table.add_column(column, justify="right", no_wrap=True)
-    for position, true in zip(located.positions, truth, strict=True):
-        distance = float(true.norm())
-        if position.enu is None or position.range_m is None:
-            table.add_row(position.name, f"{distance:.1f}", "-", "-", "-", "-", position.reason)
-            continue
-        error = true.new_tensor(position.enu) - true
-        along = float(error @ true) / distance
-        across = float((error - along * true / distance).norm())
-        low, high = position.range_low_m or 0.0, position.range_high_m or 0.0
-        table.add_row(
-            position.name,
-            f"{distance:.1f}",
-            f"{position.range_m:.1f}",
-            f"{low:.1f} – {high:.1f}",
-            f"{along:+.2f}",
-            f"{100 * along / distance:+.2f}",
-            f"{across:.2f}",
-        )
-    out.print(table)
-
-
-def _print_diagonals(located: Located, board: Board) -> None:
-    """The board's diagonal, known and triangulated, of every pair of which both ends were located."""
-    import math
-
-    from rich.table import Table
-
-    from kcal.cli.console import out
-
-    true = board.square * math.hypot(board.columns - 1, board.rows - 1)
-    table = Table(box=None, pad_edge=False, header_style="bold", title="The board's diagonal, true against estimated")
-    for column in ("pair", "range m", "true mm", "estimated mm", "error mm"):
-        table.add_column(column, justify="left" if column == "pair" else "right", no_wrap=True)
-    ends = {position.name: position for position in located.positions if position.enu is not None}
-    for name in sorted({name.rsplit(" ", 1)[0] for name in ends}):
-        first, last = ends.get(f"{name} first"), ends.get(f"{name} last")
-        if first is None or last is None or first.enu is None or last.enu is None:
-            continue
-        length = math.dist(first.enu, last.enu)
-        error = 1e3 * (length - true)
-        table.add_row(name, f"{first.range_m:.3f}", f"{1e3 * true:.2f}", f"{1e3 * length:.2f}", f"{error:+.2f}")
-    out.print(table)
-
-
-def _print_results(output: Path, again: str) -> None:
-    from kcal.cli.console import out
-
-    out.print(f"\nResults are in {output.resolve()}:", markup=False)
-    for name, what in (
-        ("map.png", "the map"),
-        ("points.geojson", "positions for a GIS"),
-        ("positions.csv", "the same as a table"),
-        ("left.png, right.png", "coverage and residuals of each camera"),
-        ("rig.json", "the rig; left.camera.json and right.camera.json are its cameras"),
-    ):
-        out.print(f"  {name:22s} {what}", markup=False)
-    out.print(f"Locate again by hand:\n  {again}", markup=False)
