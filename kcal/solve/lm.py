@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from kcal.checks import require_finite
 from kcal.errors import InputError
 from kcal.solve.dense import DenseProblem
+from kcal.solve.implicit import attach_implicit_gradient
 from kcal.solve.problem import Problem
 from kcal.solve.result import Result, State, Status
 
@@ -134,8 +135,9 @@ class LevenbergMarquardt(nn.Module):
             differentiate.
         options: see `LMOptions`.
 
-    Convention: float64 only, because squared condition numbers leave float32 nothing. The result carries no
-    gradient.
+    Convention: float64 only, because squared condition numbers leave float32 nothing. Where data require gradients,
+    the solution `x` carries them: exact first derivatives by the implicit function theorem, at the price of one
+    Hessian. Elements that did not converge carry none.
 
     Example:
         >>> def rosenbrock(x):
@@ -173,7 +175,11 @@ class LevenbergMarquardt(nn.Module):
                     f"{tuple(start.shape[:-1])}"
                 )
         problem = DenseProblem(self.residual, start.shape[:-1], data)
-        return minimise(problem, (start.detach(),), self.options, callback)
+        result = minimise(problem, (start.detach(),), self.options, callback)
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in data):
+            x = attach_implicit_gradient(self.residual, result.x, result.converged, data)
+            result = dataclasses.replace(result, state=(x,))
+        return result
 
     def __call__(self, *args: Any, **kwargs: Any) -> Result:
         """See `forward`."""

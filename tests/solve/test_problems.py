@@ -270,14 +270,15 @@ class TestRefusals:
             LMOptions(**options)
 
 
-def test_start_and_data_are_left_as_they_were_and_no_gradient_is_kept() -> None:
+def test_start_and_data_are_left_as_they_were_and_only_the_solution_has_a_gradient() -> None:
     start = vector(500.0, 1e-4).requires_grad_()
     y = MISRA_Y.clone().requires_grad_()
     result = LevenbergMarquardt(decay)(start, MISRA_X, y)
     assert start.tolist() == [500.0, 1e-4]
     assert torch.equal(y, MISRA_Y)
-    assert not result.x.requires_grad
+    assert result.x.requires_grad
     assert not result.cost.requires_grad
+    assert torch.autograd.grad(result.x.sum(), start, allow_unused=True) == (None,)
 
 
 def test_every_status_has_a_sentence_of_its_own() -> None:
