@@ -19,9 +19,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.problem import BoardProblem
-from kcal.lens.camera import Camera
-from kcal.lens.inverse import valid_radius
+from kcal.calibrate.views import Views
+from kcal.calibrate.wide import wide_starts
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
 from kcal.solve.lm import LMOptions, minimise
@@ -30,6 +29,8 @@ from kcal.solve.result import Result, State
 # Trial steps given to each start of a batch; the best one is then taken to convergence.
 _SCOUT_STEPS = 150
 _KEPT = 4
+# Where the smaller model leaves more than this (pixels), the lens may be too wide for it.
+_SUSPICIOUS_RMS = 2.0
 # How much χ² a lens that folds inside the image must gain on one that does not: 20 is far beyond chance for the few
 # parameters that a step of the ladder adds.
 _FOLD_PRICE = 20.0
@@ -111,47 +112,6 @@ def pick(state: State, index: int) -> State:
     return tuple(tensor[index] for tensor in state)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Views:
-    """What a ladder is climbed on.
-
-    Args:
-        board_points: (N, 3) metres.
-        pixels: (V, 1, N, 2) of one camera, NaN where not seen.
-        size: (width, height) of the image.
-        free_warp: whether the board's warp is estimated.
-    """
-
-    board_points: Tensor
-    pixels: Tensor
-    size: tuple[int, int]
-    free_warp: bool
-
-    def problem(self, model: LensModel, batch: tuple[int, ...] = ()) -> BoardProblem:
-        """The least-squares problem of one lens model."""
-        free = [free_parameters(model)]
-        return BoardProblem(self.board_points, self.pixels, [model], free, free_warp=self.free_warp, batch=batch)
-
-    def observed_radius(self, state: State) -> Tensor:
-        """Largest undistorted radius at which a corner was seen."""
-        *_, rotation, translation = state
-        points = self.board_points @ rotation.transpose(-1, -2) + translation[..., None, :]
-        radius = torch.linalg.vector_norm(points[..., :2] / points[..., 2:], dim=-1)
-        seen = torch.isfinite(self.pixels[:, 0]).all(-1)
-        return torch.where(seen, radius, 0.0).max()
-
-    def trouble(self, state: State, model: LensModel) -> float:
-        """0 for a lens that is regular in the whole image, 1 if it folds outside the observed radius, else infinity."""
-        if not bool(valid_radius(state[0][len(INTRINSICS) :], model) > self.observed_radius(state)):
-            return math.inf
-        return 0.0 if bool(Camera(state[0], size=self.size, model=model).covers_image()) else 1.0
-
-
-def free_parameters(model: LensModel) -> list[int]:
-    """Indices of all parameters but the skew."""
-    return [i for i, name in enumerate(parameter_names(model)) if name != "skew"]
-
-
 def climb(
     views: Views, first: State, cold: State, models: Sequence[LensModel], options: LMOptions, progress: Progress
 ) -> Minimum:
@@ -198,6 +158,8 @@ def _scout(
     """Solve for `large` from all starts side by side, with a limited number of steps."""
     starts = [*carried, plain]
     if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
+        if views.rms(carried[0], large) > _SUSPICIOUS_RMS:
+            starts += wide_starts(views, large)
         largest = float(views.observed_radius(carried[0])) ** 2
         starts += [(near_cancelling(carried[0][0], large, largest, b), *carried[0][1:]) for b in _BUMPS]
     limited = dataclasses.replace(options, max_iterations=min(_SCOUT_STEPS, options.max_iterations))

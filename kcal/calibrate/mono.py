@@ -15,9 +15,10 @@ from kcal.calibrate.init import (
     radial_start,
     spread_out,
 )
-from kcal.calibrate.ladder import Minimum, Progress, Views, climb, free_parameters, steps_to
+from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
 from kcal.calibrate.poses import unflip
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.views import Views, free_parameters
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera

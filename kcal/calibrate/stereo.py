@@ -11,9 +11,9 @@ from torch import Tensor
 from kcal.calibrate.align import MINIMUM_CORNERS, check_fit, consensus, pair_rms, pose_alone
 from kcal.calibrate.covariance import spread
 from kcal.calibrate.init import spread_out
-from kcal.calibrate.ladder import free_parameters
 from kcal.calibrate.pairs import Pair
 from kcal.calibrate.problem import BoardProblem, BoardState
+from kcal.calibrate.views import free_parameters
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera

@@ -10,9 +10,9 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.ladder import free_parameters
 from kcal.calibrate.mono import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.problem import BoardProblem, warp_shape
+from kcal.calibrate.views import free_parameters
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions, minimise
