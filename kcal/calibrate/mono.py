@@ -18,6 +18,7 @@ from kcal.calibrate.init import (
 from kcal.calibrate.ladder import Progress, climb, free_parameters, steps_to
 from kcal.calibrate.poses import unflip
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.weights import whitening
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
@@ -43,11 +44,14 @@ class CalibrationOptions:
     Args:
         model: lens model, by name or as a `LensModel`.
         board_warp: estimate how the board bends (two more parameters).
+        weighted: let corners count by their covariances where all views have them (`kcal.calibrate.weights`);
+            False minimises the plain RMS, as OpenCV does.
         solver: options of the Levenberg-Marquardt solver.
     """
 
     model: LensModel | str = "opencv5"
     board_warp: bool = False
+    weighted: bool = True
     solver: LMOptions = dataclasses.field(default_factory=lambda: LMOptions(max_iterations=1000))
 
 
@@ -57,7 +61,8 @@ class CameraCalibrationResult:
 
     Args:
         camera: the camera.
-        rms: sqrt(mean ‖r‖²) over all corners, pixels (Eq. 5).
+        rms: sqrt(mean ‖r‖²) over all corners, pixels (Eq. 5), plain also where the corners were weighted.
+        weighted_rms: likewise of the weighted residuals that were minimised, None where all corners counted alike.
         per_view_rms: (V,) likewise for each view, in the order of the observations.
         residuals: (V, N, 2) projected minus observed, pixels; NaN where a corner was not seen.
         cam_from_board_rotation: (V, 3, 3).
@@ -71,6 +76,7 @@ class CameraCalibrationResult:
 
     camera: Camera
     rms: float
+    weighted_rms: float | None
     per_view_rms: Tensor
     residuals: Tensor
     cam_from_board_rotation: Tensor
@@ -158,6 +164,15 @@ def calibrate_camera(
         if flipped:
             result = minimise(problem, state, solver)
             spent += int(result.iterations)
+    covariances = observations.covariances()
+    if options.weighted and covariances is not None:
+        # The residuals of the plain solution tell how much there is beyond the corners' own noise.
+        weights = whitening(covariances, 2.0 * float(result.cost) / problem.residual_count)
+        problem = BoardProblem(
+            board, seen, [model], problem.free, free_warp=options.board_warp, whitening=weights[:, None]
+        )
+        result = minimise(problem, result.state, solver)
+        spent += int(result.iterations)
     return _result(observations, problem, result, spent, model)
 
 
@@ -248,7 +263,7 @@ def _result(
     s = problem.unpack(state)
     pixels = observations.pixels()
     camera = Camera(s.parameters[0], size=observations.image_size, model=model)
-    residuals = problem.residuals(state).unflatten(-1, (2, -1)).transpose(-1, -2)
+    residuals = problem.pixel_errors(state)[:, 0].transpose(-1, -2)
     seen = torch.isfinite(pixels).all(-1)
     squared = (residuals**2).sum(-1)
     per_view = torch.sqrt(squared.sum(-1) / seen.sum(-1))
@@ -261,6 +276,7 @@ def _result(
     return CameraCalibrationResult(
         camera=camera,
         rms=rms,
+        weighted_rms=float(torch.sqrt(2.0 * solved.cost / seen.sum())) if problem.whitened else None,
         per_view_rms=per_view,
         residuals=torch.where(seen[..., None], residuals, torch.nan),
         cam_from_board_rotation=s.first_from_board_rotation,

@@ -16,6 +16,7 @@ from kcal.files import check_writable
 class Refine(StrEnum):
     """Names of the refinements, for the command line."""
 
+    erf = "erf"
     saddle = "saddle"
     opencv = "opencv"
     skimage = "skimage"
@@ -37,8 +38,8 @@ def detect(
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write.")],
     refine: Annotated[
-        Refine, typer.Option("--refine", metavar="METHOD", help="saddle (most accurate), opencv, skimage or none.")
-    ] = Refine.saddle,
+        Refine, typer.Option("--refine", metavar="METHOD", help="erf (most accurate), saddle, opencv, skimage or none.")
+    ] = Refine.erf,
 ) -> None:
     """Find the board in the images of one camera.
 
