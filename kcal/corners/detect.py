@@ -169,6 +169,12 @@ def detect_images(
     return Observations(board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures))
 
 
+def limit_threads(count: int) -> None:
+    """Let OpenCV and torch use so many threads each in this process, for work that is spread over processes already."""
+    cv2.setNumThreads(count)
+    torch.set_num_threads(count)
+
+
 def view_of(found: Detection, name: str, image: str | None = None, sha256: str | None = None) -> View:
     """A detection as a view of an observations file.
 
