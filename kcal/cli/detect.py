@@ -31,7 +31,12 @@ def detect(
         ),
     ],
     size: Annotated[
-        str, typer.Option("--board", metavar="CxR", help="Inner corners, columns by rows: 9x6 has 10x7 squares.")
+        str,
+        typer.Option(
+            "--board",
+            metavar="CxR",
+            help="Inner corners, columns by rows: 9x6 has 10x7 squares; charuco:9x6[:DICTIONARY[:MARKER]].",
+        ),
     ],
     square: Annotated[
         str, typer.Option("--square", metavar="LENGTH", help="Side of a square with its unit: 25mm, 2.5cm, 1in.")
@@ -49,6 +54,8 @@ def detect(
     **Examples**
 
     `kcal detect left/ --board 9x6 --square 25mm -o left.obs.json`
+
+    `kcal detect left/ --board charuco:9x6:5x5_100:18mm --square 25mm -o left.obs.json`
 
     `kcal detect "shots/left*.png" --board 9x6 --square 25mm -o left.obs.json --refine opencv`
     """

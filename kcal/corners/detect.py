@@ -16,12 +16,13 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
+from kcal.corners.charuco import MIN_CORNERS, enough, find_charuco, free_side
 from kcal.corners.grid import MIN_SHARPNESS, grid_trouble, local_side, sharpness
 from kcal.corners.images import Grey, decode_grey, read_bytes, to_8bit, unique_names
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.order import canonical_order
 from kcal.corners.refine import Refinement, refine_corners
-from kcal.corners.saddle import Status
+from kcal.corners.saddle import Refined, Status
 from kcal.errors import FileError, InputError
 
 SEARCH_SIDES = (1200, 2400)  # pixels: the longer side of the image that is searched, small first
@@ -56,7 +57,7 @@ class Detection(NamedTuple):
 
 
 def detect_board(image: Grey, board: Board, refine: Refinement = "erf") -> Detection:
-    """Find the inner corners of a checkerboard.
+    """Find the inner corners of a checkerboard, or those of a ChArUco board that are seen.
 
     OpenCV's `findChessboardCorners` searches first; where it fails, `findChessboardCornersSB` (A. Duda and U. Frese,
     BMVC 2018). Images above 1200 px are searched small and refined upwards in steps of two. What was found must look
@@ -65,7 +66,7 @@ def detect_board(image: Grey, board: Board, refine: Refinement = "erf") -> Detec
 
     Args:
         image: (H, W) uint8 or uint16.
-        board: at least 3 inner corners each way, all of them in the image.
+        board: at least 3 inner corners each way, all of them in the image unless it is a ChArUco board.
         refine: see `kcal.corners.refine.refine_corners`.
 
     Returns:
@@ -90,6 +91,8 @@ def detect_board(image: Grey, board: Board, refine: Refinement = "erf") -> Detec
         raise InputError(f"board {board.columns}x{board.rows}: at least 3 inner corners each way can be detected")
     if refine not in get_args(Refinement):
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
+    if board.dictionary is not None:
+        return _detect_charuco(image, board, refine)
     pixels, factor, reason = _search(to_8bit(image), board)
     if pixels is None:
         return Detection(None, reason)
@@ -101,10 +104,26 @@ def detect_board(image: Grey, board: Board, refine: Refinement = "erf") -> Detec
     refined = refine_corners(image, pixels, side, refine, (board.columns, board.rows))
     good = int((refined.status == Status.GOOD).sum())
     if good < MIN_GOOD * board.corners:
-        counts = Counter(refined.status.tolist())
-        why = ", ".join(f"{counts[code]} {text}" for code, text in _REASONS.items() if counts[code])
-        return Detection(None, f"only {good} of {board.corners} corners are sharp enough to be refined ({why})")
+        return Detection(None, _too_few(refined, board.corners))
     return Detection(refined.pixels, covariance=refined.covariance)
+
+
+def _detect_charuco(image: Grey, board: Board, refine: Refinement) -> Detection:
+    pixels = find_charuco(to_8bit(image), board)
+    if pixels is None:
+        return Detection(None, f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on a line")
+    seen = torch.isfinite(pixels).all(-1)
+    refined = refine_corners(image, pixels, free_side(pixels, board), refine, (board.columns, board.rows))
+    if not enough(refined.pixels, board):
+        return Detection(None, _too_few(refined, int(seen.sum())))
+    return Detection(refined.pixels, covariance=refined.covariance)
+
+
+def _too_few(refined: Refined, found: int) -> str:
+    good = int((refined.status == Status.GOOD).sum())
+    counts = Counter(refined.status.tolist())
+    why = ", ".join(f"{counts[code]} {text}" for code, text in _REASONS.items() if counts[code])
+    return f"only {good} of {found} corners are sharp enough to be refined ({why})"
 
 
 def detect_images(
@@ -281,7 +300,7 @@ def _sizes_differ(files: list[Path], names: list[str]) -> str:
 
 def _hint(files: list[Path], board: Board) -> str:
     """The usual slip: squares were counted instead of inner corners."""
-    if min(board.columns, board.rows) < 4:
+    if min(board.columns, board.rows) < 4 or board.dictionary is not None:
         return ""
     fewer = Board(columns=board.columns - 1, rows=board.rows - 1, square=board.square)
     for file in files[:3]:

@@ -36,6 +36,7 @@ def local_side(pixels: Tensor, columns: int, rows: int) -> Tensor:
     """The distance in pixels from each corner to the nearest of its neighbours in the grid, (rows * columns,).
 
     This is what a refinement window must be measured by: a fixed one swallows the next corner of a distant board.
+    Neighbours that were not seen (NaN) do not count; a corner that has none gets infinity.
 
     Example:
         >>> corners = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [3.0, 4.0]])
@@ -46,10 +47,10 @@ def local_side(pixels: Tensor, columns: int, rows: int) -> Tensor:
     side = torch.full((rows, columns), float("inf"), dtype=torch.float64, device=grid.device)
     across = torch.linalg.vector_norm(grid[:, 1:] - grid[:, :-1], dim=-1)
     down = torch.linalg.vector_norm(grid[1:] - grid[:-1], dim=-1)
-    side[:, 1:] = torch.minimum(side[:, 1:], across)
-    side[:, :-1] = torch.minimum(side[:, :-1], across)
-    side[1:] = torch.minimum(side[1:], down)
-    side[:-1] = torch.minimum(side[:-1], down)
+    side[:, 1:] = torch.fmin(side[:, 1:], across)
+    side[:, :-1] = torch.fmin(side[:, :-1], across)
+    side[1:] = torch.fmin(side[1:], down)
+    side[:-1] = torch.fmin(side[:-1], down)
     return side.reshape(-1)
 
 
