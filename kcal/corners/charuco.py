@@ -36,7 +36,8 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
     if ids is None or len(ids) == 0:
         return None
     pixels = torch.full((board.corners, 2), float("nan"), dtype=torch.float64)
-    pixels[np.asarray(ids).reshape(-1).tolist()] = torch.from_numpy(np.asarray(corners, np.float64).reshape(-1, 2))
+    places = torch.from_numpy(np.asarray(ids, np.int64).reshape(-1))
+    pixels[places] = torch.from_numpy(np.asarray(corners, np.float64).reshape(-1, 2))
     return pixels if enough(pixels, board) else None
 
 
