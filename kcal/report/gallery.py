@@ -50,7 +50,7 @@ def gallery_figure(observations: Observations) -> Figure:
     if len(order) > _MOST:
         title += f" (the {_MOST} worst)"
     if observations.failures:
-        title += f"; {len(observations.failures)} images without a board"
+        title += f"; without a board: {len(observations.failures)}"
     figure.text(0.02, 1 - 0.3 / tall, title, fontsize=13, color=_INK, va="center")
     for row, text in enumerate(listed):
         figure.text(0.02, (foot - 0.15 - 0.22 * row) / tall, text[:130], fontsize=8, color=_WARN, va="center")
