@@ -128,7 +128,7 @@ def _calibration(seen: dict[str, Observations], repeats: int) -> list[str]:
     for side, observations in seen.items():
         for model in FLAGS:
             ours, theirs, times = _in_turn(
-                partial(calibrate_camera, observations, CalibrationOptions(model=model)),
+                partial(calibrate_camera, observations, CalibrationOptions(model=model, weighted=False)),
                 partial(_opencv, observations, model),
                 repeats,
             )

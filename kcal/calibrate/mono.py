@@ -7,7 +7,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from kcal.calibrate.covariance import Spread, spread
+from kcal.calibrate.covariance import spread
 from kcal.calibrate.init import (
     homographies,
     intrinsics_candidates,
@@ -15,10 +15,12 @@ from kcal.calibrate.init import (
     radial_start,
     spread_out,
 )
-from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
+from kcal.calibrate.ladder import Progress, climb, steps_to
 from kcal.calibrate.poses import unflip
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.verdict import check_focal, rival_warnings, warnings_of
 from kcal.calibrate.views import Views, free_parameters
+from kcal.calibrate.weights import whitening
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
@@ -31,10 +33,6 @@ _MINIMUM_VIEWS = 3
 _MINIMUM_CORNERS = 6
 # RMS distance in pixels of a view's corners from the line that fits them best, below which they show no plane.
 _MINIMUM_WIDTH = 0.5
-# A focal length known to worse than this is not a calibration: 5 % of range at every distance.
-_MAX_FOCAL_SIGMA = 0.05
-# A rival that is worse by less χ² than this cannot be ruled out: the gain that chance gives 14 more parameters.
-_CLOSE_RIVAL = 25.0
 # A first fit worse than this many pixels is retried from other focal lengths.
 _SUSPICIOUS_RMS = 2.0
 
@@ -46,11 +44,14 @@ class CalibrationOptions:
     Args:
         model: lens model, by name or as a `LensModel`.
         board_warp: estimate how the board bends (two more parameters).
+        weighted: let corners count by their covariances where all views have them (`kcal.calibrate.weights`);
+            False minimises the plain RMS, as OpenCV does.
         solver: options of the Levenberg-Marquardt solver.
     """
 
     model: LensModel | str = "opencv5"
     board_warp: bool = False
+    weighted: bool = True
     solver: LMOptions = dataclasses.field(default_factory=lambda: LMOptions(max_iterations=1000))
 
 
@@ -60,7 +61,8 @@ class CameraCalibrationResult:
 
     Args:
         camera: the camera.
-        rms: sqrt(mean ‖r‖²) over all corners, pixels (Eq. 5).
+        rms: sqrt(mean ‖r‖²) over all corners, pixels (Eq. 5), plain also where the corners were weighted.
+        weighted_rms: likewise of the weighted residuals that were minimised, None where all corners counted alike.
         per_view_rms: (V,) likewise for each view, in the order of the observations.
         residuals: (V, N, 2) projected minus observed, pixels; NaN where a corner was not seen.
         cam_from_board_rotation: (V, 3, 3).
@@ -74,6 +76,7 @@ class CameraCalibrationResult:
 
     camera: Camera
     rms: float
+    weighted_rms: float | None
     per_view_rms: Tensor
     residuals: Tensor
     cam_from_board_rotation: Tensor
@@ -151,8 +154,18 @@ def calibrate_camera(
         if flipped:
             result = minimise(problem, state, solver)
             spent += int(result.iterations)
+    plain_cost = float(result.cost)
+    covariances = observations.covariances()
+    if options.weighted and covariances is not None:
+        # The residuals of the plain solution tell how much there is beyond the corners' own noise.
+        weights = whitening(covariances, 2.0 * plain_cost / problem.residual_count)
+        problem = BoardProblem(
+            board, seen, [model], problem.free, free_warp=options.board_warp, whitening=weights[:, None]
+        )
+        result = minimise(problem, result.state, solver)
+        spent += int(result.iterations)
     solved = _result(observations, problem, result, spent, model)
-    doubts = _rivals(solved, float(result.cost), problem.residual_count, minimum)
+    doubts = rival_warnings(solved.camera, solved.sigma, minimum, plain_cost, problem.residual_count)
     return dataclasses.replace(solved, warnings=(*solved.warnings, *doubts))
 
 
@@ -243,7 +256,7 @@ def _result(
     s = problem.unpack(state)
     pixels = observations.pixels()
     camera = Camera(s.parameters[0], size=observations.image_size, model=model)
-    residuals = problem.residuals(state).unflatten(-1, (2, -1)).transpose(-1, -2)
+    residuals = problem.pixel_errors(state)[:, 0].transpose(-1, -2)
     seen = torch.isfinite(pixels).all(-1)
     squared = (residuals**2).sum(-1)
     per_view = torch.sqrt(squared.sum(-1) / seen.sum(-1))
@@ -251,11 +264,12 @@ def _result(
     count = problem.shared_size + 6 * len(pixels)
     uncertainty = spread(problem.linearise(state), problem.residual_count, count)
     names = [name for name in camera.names if name != "skew"]
-    _check_focal(uncertainty, s.parameters[0])
+    check_focal(uncertainty, s.parameters[0])
     status = Status(int(solved.status))
     return CameraCalibrationResult(
         camera=camera,
         rms=rms,
+        weighted_rms=float(torch.sqrt(2.0 * solved.cost / seen.sum())) if problem.whitened else None,
         per_view_rms=per_view,
         residuals=torch.where(seen[..., None], residuals, torch.nan),
         cam_from_board_rotation=s.first_from_board_rotation,
@@ -266,67 +280,5 @@ def _result(
         },
         status=status,
         iterations=spent,
-        warnings=tuple(_warnings(observations, camera, rms, per_view, uncertainty, names, status)),
+        warnings=tuple(warnings_of(observations, camera, rms, per_view, uncertainty, names, status)),
     )
-
-
-def _check_focal(uncertainty: Spread, parameters: Tensor) -> None:
-    worst = float((uncertainty.sigma[:2] / parameters[:2]).max())
-    if not worst <= _MAX_FOCAL_SIGMA:
-        known = "not at all" if worst == float("inf") else f"only to ±{100 * worst:.1f} %"
-        raise DegenerateError(
-            f"the views determine the focal length {known}: they are parallel to the image or too much alike; add "
-            "views with the board tilted by 30 to 45 degrees in different directions, or choose a smaller model"
-        )
-
-
-def _rivals(solved: CameraCalibrationResult, cost: float, residual_count: int, minimum: Minimum) -> list[str]:
-    """A warning where another solution fits almost as well and is farther away than the error bars say."""
-    variance = max(2.0 * cost / residual_count, 1e-300)
-    here = dict(zip(solved.camera.names, solved.camera.parameters_vector.tolist(), strict=True))
-    for other, state in minimum.rivals:
-        if not 2.0 * (other - cost) / variance < _CLOSE_RIVAL:
-            continue
-        there = dict(zip(solved.camera.names, state[0].tolist(), strict=True))
-        apart = {
-            name: there[name] - here[name]
-            for name in ("fx", "fy", "cx", "cy")
-            if abs(there[name] - here[name]) > max(1.0, 4.0 * (solved.sigma[name] or 0.0))
-        }
-        if apart:
-            rms = (2.0 * variance * other / cost) ** 0.5
-            where = ", ".join(f"{name} {shift:+.1f} px" for name, shift in apart.items())
-            return [
-                f"another solution fits almost as well (RMS {rms:.4f} px) with {where}: do not trust this model's "
-                "parameters; choose a smaller model or add views"
-            ]
-    return []
-
-
-def _warnings(
-    observations: Observations,
-    camera: Camera,
-    rms: float,
-    per_view: Tensor,
-    uncertainty: Spread,
-    names: list[str],
-    status: Status,
-) -> list[str]:
-    found = []
-    if status not in (Status.CONVERGED, Status.EXACT):
-        found.append(f"the solver {status.message}")
-    if rms > 1.0:
-        found.append(f"RMS {rms:.2f} px is high: corners, board or lens model do not fit each other")
-    typical = float(per_view.median())
-    for i in (per_view > max(3.0 * typical, 0.1)).nonzero()[:, 0].tolist():
-        found.append(
-            f"view {observations.names[i]}: RMS {float(per_view[i]):.2f} px against {typical:.2f} px typically"
-        )
-    lost = [name for name, known in zip(names, uncertainty.determined.tolist(), strict=False) if not known]
-    if lost:
-        found.append(f"the views do not determine {', '.join(lost)}: choose a smaller model or add views")
-    if not bool(camera.covers_image()):
-        _, valid = camera.unproject(camera.grid(33, 25))
-        share = 100.0 * float((~valid).double().mean())
-        found.append(f"the lens model folds inside the image: {share:.0f} % of it gives no ray")
-    return found

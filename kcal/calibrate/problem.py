@@ -72,6 +72,8 @@ class BoardProblem(SchurProblem):
         models: one lens model a camera.
         free: for each camera the indices of its free parameters.
         free_warp: whether the board's warp is estimated.
+        whitening: (..., V, C, N, 2, 2) by which each corner's residual is multiplied (`kcal.calibrate.weights`), or
+            None: all corners count alike.
         batch: leading shape of the states, () for one solve.
     """
 
@@ -85,6 +87,7 @@ class BoardProblem(SchurProblem):
         free: Sequence[Sequence[int]],
         *,
         free_warp: bool = False,
+        whitening: Tensor | None = None,
         batch: tuple[int, ...] = (),
     ) -> None:
         self.models = tuple(models)
@@ -96,6 +99,10 @@ class BoardProblem(SchurProblem):
         self._seen = torch.isfinite(pixels).all(-1)
         self._all_seen = bool(self._seen.all())
         self._target = torch.where(self._seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
+        self._whitening: Tensor | None = None
+        if whitening is not None:
+            seen = self._seen[..., None, None]
+            self._whitening = torch.where(seen, whitening, 0.0).movedim(-3, -1).contiguous()  # (..., V, C, 2, 2, N)
         self.residual_count = 2 * int(self._seen.sum((-3, -2, -1)).max())
         self._sizes = [len(INTRINSICS) + model.size for model in self.models]
         # Where each block of shared parameters stands in a step: cameras, poses of the further cameras, warp.
@@ -106,6 +113,11 @@ class BoardProblem(SchurProblem):
         self._pose_slots = slots[len(self.models) : -1]
         self._warp_slot = slots[-1]
         self.shared_size = ends[-1]
+
+    @property
+    def whitened(self) -> bool:
+        """Whether corners count by their own weights."""
+        return self._whitening is not None
 
     def unpack(self, state: State) -> BoardState:
         """The solver's tuple as named tensors."""
@@ -138,6 +150,13 @@ class BoardProblem(SchurProblem):
 
     def residuals(self, state: State) -> Tensor:
         """See `SchurProblem.residuals`; NaN where a seen corner lies behind a camera, beyond a pole or a fold."""
+        errors = self.pixel_errors(state)
+        if self._whitening is not None:
+            errors = torch.einsum("...uwn,...wn->...un", self._whitening, errors)
+        return errors.flatten(-3)
+
+    def pixel_errors(self, state: State) -> Tensor:
+        """Projected minus observed, (..., V, C, 2, N) pixels, not weighted; 0 where not seen."""
         out = []
         for c, _, points, parameters in self._views(self.unpack(state)):
             projected = project_components(points, parameters, self.models[c])
@@ -145,7 +164,7 @@ class BoardProblem(SchurProblem):
             seen = self._seen[..., c, None, :]
             bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
             out.append(torch.where(seen, error + bad, 0.0))
-        return torch.stack(out, -3).flatten(-3)
+        return torch.stack(out, -3)
 
     def rows(self, state: State) -> Tensor:
         """See `SchurProblem.rows`."""
@@ -172,6 +191,8 @@ class BoardProblem(SchurProblem):
             rows[..., -1, c, :, :] = projected.pixels - self._target[..., c, :, :] + bad
         if not self._all_seen:
             rows = torch.where(self._seen[..., None, :, None, :], rows, 0.0)
+        if self._whitening is not None:
+            rows = torch.einsum("...cuwn,...pcwn->...pcun", self._whitening, rows)
         return rows.flatten(-3)
 
     def retract(self, state: State, step: State) -> State:

@@ -14,7 +14,12 @@ from kcal.files import check_writable, write_atomic
 
 def board(
     size: Annotated[
-        str, typer.Option("--board", metavar="CxR", help="Inner corners, columns by rows: 9x6 has 10x7 squares.")
+        str,
+        typer.Option(
+            "--board",
+            metavar="CxR",
+            help="Inner corners, columns by rows: 9x6 has 10x7 squares; charuco:9x6[:DICTIONARY[:MARKER]].",
+        ),
     ],
     square: Annotated[
         str, typer.Option("--square", metavar="LENGTH", help="Side of a square with its unit: 25mm, 2.5cm, 1in.")
@@ -29,7 +34,7 @@ def board(
         ),
     ] = "auto",
 ) -> None:
-    """Draw a checkerboard to print at true scale.
+    """Draw a checkerboard or a ChArUco board to print at true scale.
 
     Print it at 100 % ("actual size"), measure the ruler below it, and glue it to something flat and stiff. Choose one
     odd and one even number (9x6, 7x6): then corners can be numbered alike however the board is held.
@@ -37,6 +42,8 @@ def board(
     **Examples**
 
     `kcal board --board 9x6 --square 25mm --page A4 -o board.pdf`
+
+    `kcal board --board charuco:9x6 --square 25mm --page A4 -o charuco.pdf`
 
     `kcal board --board 7x6 --square 50mm --page A2 -o board.svg`
     """

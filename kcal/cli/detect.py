@@ -9,13 +9,14 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from kcal.cli.console import out, steps
+from kcal.cli.console import err, out, steps
 from kcal.files import check_writable
 
 
 class Refine(StrEnum):
     """Names of the refinements, for the command line."""
 
+    erf = "erf"
     saddle = "saddle"
     opencv = "opencv"
     skimage = "skimage"
@@ -26,19 +27,30 @@ def detect(
     images: Annotated[
         list[str],
         typer.Argument(
-            metavar="IMAGES", help="Images of one camera: files, folders or quoted wildcards.", show_default=False
+            metavar="IMAGES",
+            help="Images of one camera: files, folders or quoted wildcards; or one video.",
+            show_default=False,
         ),
     ],
     size: Annotated[
-        str, typer.Option("--board", metavar="CxR", help="Inner corners, columns by rows: 9x6 has 10x7 squares.")
+        str,
+        typer.Option(
+            "--board",
+            metavar="CxR",
+            help="Inner corners, columns by rows: 9x6 has 10x7 squares; charuco:9x6[:DICTIONARY[:MARKER]].",
+        ),
     ],
     square: Annotated[
         str, typer.Option("--square", metavar="LENGTH", help="Side of a square with its unit: 25mm, 2.5cm, 1in.")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write.")],
     refine: Annotated[
-        Refine, typer.Option("--refine", metavar="METHOD", help="saddle (most accurate), opencv, skimage or none.")
-    ] = Refine.saddle,
+        Refine, typer.Option("--refine", metavar="METHOD", help="erf (most accurate), saddle, opencv, skimage or none.")
+    ] = Refine.erf,
+    gallery: Annotated[
+        Path | None, typer.Option(help="A .png file: the views with their corners, worst first.")
+    ] = None,
+    coverage: Annotated[Path | None, typer.Option(help="A .png file: where in the image corners were seen.")] = None,
 ) -> None:
     """Find the board in the images of one camera.
 
@@ -49,25 +61,59 @@ def detect(
 
     `kcal detect left/ --board 9x6 --square 25mm -o left.obs.json`
 
+    `kcal detect left/ --board charuco:9x6:5x5_100:18mm --square 25mm -o left.obs.json`
+
     `kcal detect "shots/left*.png" --board 9x6 --square 25mm -o left.obs.json --refine opencv`
     """
     from kcal.corners.board import Board
 
+    pictures = [path for path in (gallery, coverage) if path is not None]
+    if pictures:
+        from kcal.report.figures import check_picture_format
+
+        for path in pictures:
+            check_picture_format(path)
+            check_writable(path)
     check_writable(output)
     board = Board.parse(size, square)
 
     from kcal.corners.detect import detect_images
     from kcal.corners.images import expand_images
+    from kcal.corners.orientation import turned_images
+    from kcal.corners.video import SUFFIXES, detect_video
 
-    paths = expand_images(images)
-    check_writable(output, *paths)
-    with steps("detecting", len(paths)) as advance:
-        observations = detect_images(paths, board, refine.value, progress=lambda name: advance(escape(name)))
+    turned: list[Path] = []
+    if len(images) == 1 and Path(images[0]).suffix.lower() in SUFFIXES:
+        searched = 0
+
+        def count(_: str) -> None:
+            nonlocal searched
+            searched += 1
+
+        with err.status("searching the video"):
+            observations = detect_video(images[0], board, refine.value, progress=count)
+        source = f"of {searched} sharp frames (repeats left out)"
+    else:
+        paths = expand_images(images)
+        check_writable(output, *paths)
+        with steps("detecting", len(paths)) as advance:
+            observations = detect_images(paths, board, refine.value, progress=advance)
+        turned = turned_images([path for path in paths if path.is_file()])
+        source = f"of {len(paths)} images"
     observations.save(output)
+    if pictures:
+        from kcal.report.gallery import save_coverage, save_gallery
+
+        if gallery is not None:
+            save_gallery(gallery, observations)
+        if coverage is not None:
+            save_coverage(coverage, observations)
 
     width, height = observations.image_size
     found, unseen = len(observations.views), sum(view.pixels.count(None) for view in observations.views)
-    out.print(f"{escape(str(output))}: board found in {found} of {len(paths)} images of {width}x{height} px")
+    out.print(f"{escape(str(output))}: board found in {found} {source} of {width}x{height} px")
+    if turned:
+        out.print(f"note: {len(turned)} images ask to be turned (EXIF); kcal takes pixels as the sensor wrote them")
     if unseen:
         out.print(f"corners left out as uncertain: {unseen} of {found * board.corners}")
     for failure in observations.failures:

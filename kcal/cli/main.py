@@ -9,6 +9,7 @@ import typer
 from rich.markup import escape
 
 import kcal
+from kcal.cli.batch import batch
 from kcal.cli.board import board
 from kcal.cli.calibrate import calibrate
 from kcal.cli.console import err
@@ -47,6 +48,7 @@ app.command("demo")(demo)
 app.command("board")(board)
 app.command("detect")(detect)
 app.command("calibrate")(calibrate)
+app.command("batch")(batch)
 app.command("rig")(rig)
 app.command("locate")(locate)
 

@@ -16,12 +16,13 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
+from kcal.corners.charuco import MIN_CORNERS, enough, find_charuco, free_side
 from kcal.corners.grid import MIN_SHARPNESS, grid_trouble, local_side, sharpness
 from kcal.corners.images import Grey, decode_grey, read_bytes, to_8bit, unique_names
-from kcal.corners.observations import Failure, Observations, Pixel, View
+from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.order import canonical_order
 from kcal.corners.refine import Refinement, refine_corners
-from kcal.corners.saddle import Status
+from kcal.corners.saddle import Refined, Status
 from kcal.errors import FileError, InputError
 
 SEARCH_SIDES = (1200, 2400)  # pixels: the longer side of the image that is searched, small first
@@ -35,18 +36,28 @@ _REASONS = {
     Status.NO_SADDLE: "not a corner",
     Status.MOVED: "moved too far",
     Status.RESTLESS: "did not settle",
+    Status.SATURATED: "over- or underexposed",
+    Status.OCCLUDED: "covered or glaring",
+    Status.BLURRED: "too blurred",
 }
 
 
 class Detection(NamedTuple):
-    """A board in an image: `pixels` (corners, 2) float64 in the board's order, NaN where not seen, or None and why."""
+    """A board in an image.
+
+    Args:
+        pixels: (corners, 2) float64 in the board's order, NaN where not seen; None where there is no board.
+        reason: why there is none.
+        covariance: (corners, 2, 2) px², where the refinement tells.
+    """
 
     pixels: Tensor | None
     reason: str = ""
+    covariance: Tensor | None = None
 
 
-def detect_board(image: Grey, board: Board, refine: Refinement = "saddle") -> Detection:
-    """Find the inner corners of a checkerboard.
+def detect_board(image: Grey, board: Board, refine: Refinement = "erf") -> Detection:
+    """Find the inner corners of a checkerboard, or those of a ChArUco board that are seen.
 
     OpenCV's `findChessboardCorners` searches first; where it fails, `findChessboardCornersSB` (A. Duda and U. Frese,
     BMVC 2018). Images above 1200 px are searched small and refined upwards in steps of two. What was found must look
@@ -55,7 +66,7 @@ def detect_board(image: Grey, board: Board, refine: Refinement = "saddle") -> De
 
     Args:
         image: (H, W) uint8 or uint16.
-        board: at least 3 inner corners each way, all of them in the image.
+        board: at least 3 inner corners each way, all of them in the image unless it is a ChArUco board.
         refine: see `kcal.corners.refine.refine_corners`.
 
     Returns:
@@ -80,6 +91,8 @@ def detect_board(image: Grey, board: Board, refine: Refinement = "saddle") -> De
         raise InputError(f"board {board.columns}x{board.rows}: at least 3 inner corners each way can be detected")
     if refine not in get_args(Refinement):
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
+    if board.dictionary is not None:
+        return _detect_charuco(image, board, refine)
     pixels, factor, reason = _search(to_8bit(image), board)
     if pixels is None:
         return Detection(None, reason)
@@ -88,19 +101,35 @@ def detect_board(image: Grey, board: Board, refine: Refinement = "saddle") -> De
     if sharpness(image, pixels, board.columns, board.rows) < MIN_SHARPNESS:
         return Detection(None, "too blurred: edges are nearly as wide as the squares; focus, hold still or come closer")
     side = local_side(pixels, board.columns, board.rows)
-    refined = refine_corners(image, pixels, side, refine)
+    refined = refine_corners(image, pixels, side, refine, (board.columns, board.rows))
     good = int((refined.status == Status.GOOD).sum())
     if good < MIN_GOOD * board.corners:
-        counts = Counter(refined.status.tolist())
-        why = ", ".join(f"{counts[code]} {text}" for code, text in _REASONS.items() if counts[code])
-        return Detection(None, f"only {good} of {board.corners} corners are sharp enough to be refined ({why})")
-    return Detection(refined.pixels)
+        return Detection(None, _too_few(refined, board.corners))
+    return Detection(refined.pixels, covariance=refined.covariance)
+
+
+def _detect_charuco(image: Grey, board: Board, refine: Refinement) -> Detection:
+    pixels = find_charuco(to_8bit(image), board)
+    if pixels is None:
+        return Detection(None, f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on a line")
+    seen = torch.isfinite(pixels).all(-1)
+    refined = refine_corners(image, pixels, free_side(pixels, board), refine, (board.columns, board.rows))
+    if not enough(refined.pixels, board):
+        return Detection(None, _too_few(refined, int(seen.sum())))
+    return Detection(refined.pixels, covariance=refined.covariance)
+
+
+def _too_few(refined: Refined, found: int) -> str:
+    good = int((refined.status == Status.GOOD).sum())
+    counts = Counter(refined.status.tolist())
+    why = ", ".join(f"{counts[code]} {text}" for code, text in _REASONS.items() if counts[code])
+    return f"only {good} of {found} corners are sharp enough to be refined ({why})"
 
 
 def detect_images(
     paths: Sequence[str | Path],
     board: Board,
-    refine: Refinement = "saddle",
+    refine: Refinement = "erf",
     progress: Callable[[str], None] | None = None,
 ) -> Observations:
     """Find the board in the images of one camera.
@@ -150,13 +179,35 @@ def detect_images(
                 failures.append(Failure(name=name, reason=found.reason))
             else:
                 digest = hashlib.sha256(data).hexdigest()
-                views.append(View(name=name, pixels=_listed(found.pixels), image=str(file), sha256=digest))
+                views.append(view_of(found, name, image=str(file), sha256=digest))
         if progress is not None:
             progress(name)
     if size is None or not views:
         first = f"{failures[0].name}: {failures[0].reason}"
         raise InputError(f"no board in any of {len(files)} images ({first}){_hint(files, board)}")
     return Observations(board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures))
+
+
+def limit_threads(count: int) -> None:
+    """Let OpenCV and torch use so many threads each in this process, for work that is spread over processes already."""
+    cv2.setNumThreads(count)
+    torch.set_num_threads(count)
+
+
+def view_of(found: Detection, name: str, image: str | None = None, sha256: str | None = None) -> View:
+    """A detection as a view of an observations file.
+
+    Raises:
+        InputError: nothing was detected.
+    """
+    if found.pixels is None:
+        raise InputError(f"{name}: {found.reason}")
+    pixels = tuple(None if u != u else (u, v) for u, v in found.pixels.tolist())
+    spread = None
+    if found.covariance is not None:
+        packed = found.covariance.reshape(-1, 4)[:, [0, 1, 3]].tolist()
+        spread = tuple(None if uu != uu else (uu, uv, vv) for uu, uv, vv in packed)
+    return View(name=name, pixels=pixels, covariance=spread, image=image, sha256=sha256)
 
 
 def _search(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor | None, float, str]:
@@ -233,10 +284,6 @@ def _size(image: Grey) -> tuple[int, int]:
     return image.shape[1], image.shape[0]
 
 
-def _listed(pixels: Tensor) -> tuple[Pixel | None, ...]:
-    return tuple(None if u != u else (u, v) for u, v in pixels.tolist())
-
-
 def _sizes_differ(files: list[Path], names: list[str]) -> str:
     by_size: dict[tuple[int, int], list[str]] = {}
     for name, file in zip(names, files, strict=True):
@@ -253,7 +300,7 @@ def _sizes_differ(files: list[Path], names: list[str]) -> str:
 
 def _hint(files: list[Path], board: Board) -> str:
     """The usual slip: squares were counted instead of inner corners."""
-    if min(board.columns, board.rows) < 4:
+    if min(board.columns, board.rows) < 4 or board.dictionary is not None:
         return ""
     fewer = Board(columns=board.columns - 1, rows=board.rows - 1, square=board.square)
     for file in files[:3]:

@@ -13,6 +13,7 @@ from kcal.errors import InputError
 from kcal.files import NativeFile
 
 Pixel = tuple[float, float]
+Covariance = tuple[float, float, float]
 
 
 class View(pydantic.BaseModel):
@@ -22,6 +23,7 @@ class View(pydantic.BaseModel):
         name: unique name in the file, usually the image's file name; views of two cameras are paired by it.
         pixels: one (u, v) a board corner in the board's order, or None where a corner was not seen. Integer
             coordinates are centres of pixels.
+        covariance: one (uu, uv, vv) in px² a board corner, None where not seen; or None where it is not known.
         image: where the image was read from, relative or absolute.
         sha256: of the image file's bytes, so that a changed image is noticed.
     """
@@ -30,6 +32,7 @@ class View(pydantic.BaseModel):
 
     name: str = pydantic.Field(min_length=1)
     pixels: tuple[Pixel | None, ...]
+    covariance: tuple[Covariance | None, ...] | None = None
     image: str | None = None
     sha256: str | None = None
 
@@ -65,7 +68,7 @@ class Observations(NativeFile):
 
     board: Board
     image_size: tuple[pydantic.PositiveInt, pydantic.PositiveInt]
-    refinement: Literal["saddle", "opencv", "skimage", "none"] = "saddle"
+    refinement: Literal["erf", "saddle", "opencv", "skimage", "none"] = "erf"
     views: tuple[View, ...]
     failures: tuple[Failure, ...] = ()
 
@@ -78,6 +81,20 @@ class Observations(NativeFile):
         for view in self.views:
             if len(view.pixels) != self.board.corners:
                 raise ValueError(f"view {view.name!r} has {len(view.pixels)} corners, the board {self.board.corners}")
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _covariances(self) -> Observations:
+        for view in self.views:
+            if view.covariance is None:
+                continue
+            if len(view.covariance) != len(view.pixels):
+                raise ValueError(f"view {view.name!r} has {len(view.covariance)} covariances for its corners")
+            for pixel, spread in zip(view.pixels, view.covariance, strict=True):
+                if (pixel is None) != (spread is None):
+                    raise ValueError(f"view {view.name!r}: seen corners, and only these, have a covariance")
+                if spread is not None and not (spread[0] > 0 and spread[0] * spread[2] > spread[1] ** 2):
+                    raise ValueError(f"view {view.name!r}: the covariance {spread} is not positive definite")
         return self
 
     @property
@@ -98,6 +115,16 @@ class Observations(NativeFile):
             [[nowhere if pixel is None else pixel for pixel in view.pixels] for view in self.views],
             dtype=torch.float64,
         )
+
+    def covariances(self) -> Tensor | None:
+        """Covariances as (views, corners, 2, 2) px²; NaN where not seen, None unless all views have them."""
+        if not self.views or any(view.covariance is None for view in self.views):
+            return None
+        nothing = (float("nan"),) * 3
+        packed = torch.tensor(
+            [[spread or nothing for spread in view.covariance or ()] for view in self.views], dtype=torch.float64
+        )
+        return packed[..., [0, 1, 1, 2]].unflatten(-1, (2, 2))
 
     def subset(self, names: list[str]) -> Observations:
         """The same file with only the named views, in the order given."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 from kcal.corners.board import Board
+from kcal.corners.charuco import marker_cells
 from kcal.corners.drawing import Drawing, Rectangle, Text
 from kcal.errors import InputError
 
@@ -66,11 +68,32 @@ def board_sheet(board: Board, page: str = "auto") -> Sheet:
         for column in range(board.columns + 1)
         if (row + column) % 2 == 0
     )
+    if board.dictionary is not None:
+        squares += _markers(board, left, top)
     ruler, texts = _foot(board, page_wide, page_high)
     drawing = Drawing(
         width=page_wide, height=page_high, title=f"Board {board}", rectangles=squares + ruler, texts=texts
     )
     return Sheet(drawing, name, min(left, top) / square)
+
+
+def _markers(board: Board, left: float, top: float) -> tuple[Rectangle, ...]:
+    """The black cells of the markers in the light squares, each run along a row as one rectangle."""
+    assert board.marker is not None
+    square, side = board.square * 1000, board.marker * 1000
+    light = [(r, c) for r in range(board.rows + 1) for c in range(board.columns + 1) if (r + c) % 2 == 1]
+    shapes = []
+    for (row, column), cells in zip(light, marker_cells(board), strict=True):
+        cell = side / len(cells)
+        x, y = left + column * square + (square - side) / 2, top + row * square + (square - side) / 2
+        for i, line in enumerate(cells.tolist()):
+            begin = 0
+            for black, run in itertools.groupby(line):
+                length = len(list(run))
+                if black:
+                    shapes.append(Rectangle(x=x + begin * cell, y=y + i * cell, width=length * cell, height=cell))
+                begin += length
+    return tuple(shapes)
 
 
 def _page(board: Board, page: str, wide: float, high: float) -> tuple[str, tuple[float, float]]:
@@ -113,6 +136,9 @@ def _turned(board: Board, paper: tuple[float, float]) -> tuple[float, float] | N
 def _captions(board: Board) -> tuple[str, str]:
     turned = "" if board.unambiguous else " Looks the same turned by 180 degrees: not for stereo."
     size = f"{board.columns}x{board.rows} (inner corners), {board.square * 1000:g} mm squares."
+    if board.marker is not None:
+        markers = f"{board.dictionary}:{board.marker * 1000:g}mm"
+        size = f"charuco:{board.columns}x{board.rows}:{markers}, {board.square * 1000:g} mm squares."
     return "Print at 100 %; the ruler is 100 mm long.", f"kcal board {size}{turned}"
 
 

@@ -39,13 +39,25 @@ class Status(IntEnum):
     NO_SADDLE = 3  # the grey levels form a hill, a hollow or an edge, or fit no quadratic: something covers the corner
     MOVED = 4  # further from its start than it may
     RESTLESS = 5  # still moving after the last repeat
+    SATURATED = 6  # too many grey levels at the end of the scale
+    OCCLUDED = 7  # the grey levels are not those of four squares: something covers the corner
+    BLURRED = 8  # the edges are too wide for the squares
 
 
 class Refined(NamedTuple):
-    """Refined corners: `pixels` (..., N, 2) float64, NaN where `status` (..., N) int64 is not `Status.GOOD`."""
+    """Refined corners.
+
+    Args:
+        pixels: (..., N, 2) float64, NaN where `status` is not `Status.GOOD`.
+        status: (..., N) int64, see `Status`.
+        covariance: (..., N, 2, 2) px² of (u, v), NaN where not good; None from methods that do not tell.
+        blur: (..., N) px, sigma of the edges' Gaussian with the pixel's own area in it, NaN where not good; or None.
+    """
 
     pixels: Tensor
     status: Tensor
+    covariance: Tensor | None = None
+    blur: Tensor | None = None
 
 
 def saddle(image: Tensor, pixels: Tensor, side: Tensor | float) -> Refined:
@@ -74,7 +86,7 @@ def saddle(image: Tensor, pixels: Tensor, side: Tensor | float) -> Refined:
         >>> [round(value, 2) for value in found.pixels[0].tolist()], int(found.status[0])
         ([20.6, 19.3], 0)
     """
-    image, pixels, side = _check(image, pixels, side)
+    image, pixels, side = check_arguments(image, pixels, side)
     batch, (height, width) = pixels.shape[:-2], image.shape[-2:]
     seen = torch.isfinite(pixels).all(-1)
     start = torch.where(seen[..., None], pixels, 0.0)
@@ -132,7 +144,12 @@ class SaddleRefine(nn.Module):
         return saddle(image, pixels, side)
 
 
-def _check(image: Tensor, pixels: Tensor, side: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
+def check_arguments(image: Tensor, pixels: Tensor, side: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
+    """The arguments of `saddle`, positions and sides as float64 and sides of one shape with the corners.
+
+    Raises:
+        InputError: see `saddle`.
+    """
     if not isinstance(image, Tensor) or image.ndim < 2:
         raise InputError("image: a tensor of shape (..., H, W) is needed")
     if not (image.is_floating_point() or image.dtype == torch.uint8):
@@ -164,15 +181,24 @@ def _disc(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     return torch.stack([x, y], -1), design, torch.linalg.solve(design.T @ design, design.T)
 
 
-def _blurred_patches(image: Tensor, base: Tensor, scale: Tensor) -> Tensor:
-    """Cut (2 HALF + 1)² patches round `base` (B, N, 2) from (B, H, W) and blur each with its own sigma: (B N, P, P)."""
+def cut_patches(image: Tensor, base: Tensor, half: int) -> Tensor:
+    """Cut (2 half + 1)² grey levels round whole pixels `base` (B, N, 2) from (B, H, W): (B N, P, P) float64.
+
+    Outside the image its edge goes on.
+    """
     height, width = image.shape[-2:]
-    reach = torch.arange(-_HALF, _HALF + 1, device=image.device)
+    reach = torch.arange(-half, half + 1, device=image.device)
     columns = (base[..., 0].long()[..., None] + reach).clamp(0, width - 1)
     rows = (base[..., 1].long()[..., None] + reach).clamp(0, height - 1)
     index = rows[..., :, None] * width + columns[..., None, :]
     cut = image.reshape(len(image), -1).gather(1, index.reshape(len(image), -1)).to(torch.float64)
-    patches = cut.reshape(-1, 2 * _HALF + 1, 2 * _HALF + 1)
+    return cut.reshape(-1, 2 * half + 1, 2 * half + 1)
+
+
+def _blurred_patches(image: Tensor, base: Tensor, scale: Tensor) -> Tensor:
+    """Patches round `base` (B, N, 2) of (B, H, W), each blurred with its own sigma: (B N, P, P)."""
+    patches = cut_patches(image, base, _HALF)
+    reach = torch.arange(-_HALF, _HALF + 1, device=image.device)
     sigma = (BLUR * scale).reshape(-1, 1, 1)
     distance = (reach[:, None] - reach[None, :]).to(torch.float64)
     kernel = torch.exp(-0.5 * (distance / sigma) ** 2)

@@ -1,0 +1,83 @@
+"""What to think of a calibration: what is refused, and what the user should doubt."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from kcal.calibrate.covariance import Spread
+from kcal.calibrate.ladder import Minimum
+from kcal.corners.observations import Observations
+from kcal.errors import DegenerateError
+from kcal.lens.camera import Camera
+from kcal.solve.result import Status
+
+# A focal length known to worse than this is not a calibration: 5 % of range at every distance.
+_MAX_FOCAL_SIGMA = 0.05
+# A rival that is worse by less χ² than this cannot be ruled out: the gain that chance gives 14 more parameters.
+_CLOSE_RIVAL = 25.0
+
+
+def check_focal(uncertainty: Spread, parameters: Tensor) -> None:
+    """Raise `DegenerateError` where the focal length is hardly known: that is no calibration."""
+    worst = float((uncertainty.sigma[:2] / parameters[:2]).max())
+    if not worst <= _MAX_FOCAL_SIGMA:
+        known = "not at all" if worst == float("inf") else f"only to ±{100 * worst:.1f} %"
+        raise DegenerateError(
+            f"the views determine the focal length {known}: they are parallel to the image or too much alike; add "
+            "views with the board tilted by 30 to 45 degrees in different directions, or choose a smaller model"
+        )
+
+
+def rival_warnings(
+    camera: Camera, sigma: dict[str, float | None], minimum: Minimum, cost: float, residual_count: int
+) -> list[str]:
+    """A warning where another solution fits almost as well and is farther away than the error bars say."""
+    variance = max(2.0 * cost / residual_count, 1e-300)
+    here = dict(zip(camera.names, camera.parameters_vector.tolist(), strict=True))
+    for other, state in minimum.rivals:
+        if not 2.0 * (other - cost) / variance < _CLOSE_RIVAL:
+            continue
+        there = dict(zip(camera.names, state[0].tolist(), strict=True))
+        apart = {
+            name: there[name] - here[name]
+            for name in ("fx", "fy", "cx", "cy")
+            if abs(there[name] - here[name]) > max(1.0, 4.0 * (sigma[name] or 0.0))
+        }
+        if apart:
+            rms = (2.0 * variance * other / cost) ** 0.5
+            where = ", ".join(f"{name} {shift:+.1f} px" for name, shift in apart.items())
+            return [
+                f"another solution fits almost as well (RMS {rms:.4f} px) with {where}: do not trust this model's "
+                "parameters; choose a smaller model or add views"
+            ]
+    return []
+
+
+def warnings_of(
+    observations: Observations,
+    camera: Camera,
+    rms: float,
+    per_view: Tensor,
+    uncertainty: Spread,
+    names: list[str],
+    status: Status,
+) -> list[str]:
+    """Sentences about what the user should doubt."""
+    found = []
+    if status not in (Status.CONVERGED, Status.EXACT):
+        found.append(f"the solver {status.message}")
+    if rms > 1.0:
+        found.append(f"RMS {rms:.2f} px is high: corners, board or lens model do not fit each other")
+    typical = float(per_view.median())
+    for i in (per_view > max(3.0 * typical, 0.1)).nonzero()[:, 0].tolist():
+        found.append(
+            f"view {observations.names[i]}: RMS {float(per_view[i]):.2f} px against {typical:.2f} px typically"
+        )
+    lost = [name for name, known in zip(names, uncertainty.determined.tolist(), strict=False) if not known]
+    if lost:
+        found.append(f"the views do not determine {', '.join(lost)}: choose a smaller model or add views")
+    if not bool(camera.covers_image()):
+        _, valid = camera.unproject(camera.grid(33, 25))
+        share = 100.0 * float((~valid).double().mean())
+        found.append(f"the lens model folds inside the image: {share:.0f} % of it gives no ray")
+    return found

@@ -1,0 +1,111 @@
+"""`kcal batch`: many cameras at once, in parallel, begun again where it stopped."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kcal.cli.console import err, out, steps
+from kcal.cli.detect import Refine
+
+if TYPE_CHECKING:
+    from kcal.cli.batch_results import Row
+
+
+def batch(
+    cameras: Annotated[
+        Path,
+        typer.Argument(
+            help="A folder with a folder of images for each camera, or a CSV with the columns camera,images and, where "
+            "they differ, board,square,model.",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results; made if missing.")],
+    size: Annotated[
+        str | None, typer.Option("--board", metavar="CxR", help="Inner corners, columns by rows.", show_default=False)
+    ] = None,
+    square: Annotated[
+        str | None, typer.Option("--square", metavar="LENGTH", help="Side of a square: 25mm.", show_default=False)
+    ] = None,
+    model: Annotated[str, typer.Option(metavar="NAME", help="Lens model, see `kcal calibrate`.")] = "opencv5",
+    refine: Annotated[
+        Refine, typer.Option("--refine", metavar="METHOD", help="erf (most accurate), saddle, opencv, skimage or none.")
+    ] = Refine.erf,
+    board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how each board bends.")] = False,
+    workers: Annotated[
+        int, typer.Option(help="Processes on this machine; 0 for one a core.", min=0, show_default=False)
+    ] = 0,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="A Dask scheduler whose workers see the same files: tcp://host:8786."),
+    ] = None,
+    time_limit: Annotated[float, typer.Option(help="Seconds for one image or one calibration.", min=1)] = 300.0,
+) -> None:
+    """Calibrate many cameras: images in, observations, camera files and one table out.
+
+    Writes NAME.obs.json and NAME.camera.json for each camera, and summary.csv. What is finished is kept in a folder
+    .work, named by what it was made from: the same command continues an interrupted run, and does only what is new
+    when images, options or cameras were added. A camera or an image that fails is listed with its reason and does not
+    stop the others; the exit code is then 1. Dask workers should have one thread each (--nthreads 1).
+
+    **Examples**
+
+    `kcal batch cameras/ --board 9x6 --square 25mm -o results`
+
+    `kcal batch cameras.csv -o results --workers 4`
+
+    `kcal batch /shared/cameras --board 9x6 --square 25mm -o /shared/results --scheduler tcp://10.0.0.1:8786`
+    """
+    from kcal.cli.batch_jobs import BatchOptions, read_jobs
+    from kcal.cli.batch_results import Results, write_summary
+    from kcal.cli.batch_run import pool, run_tasks
+    from kcal.corners.board import Board
+    from kcal.errors import DegenerateError, InputError
+    from kcal.lens.model import LensModel
+
+    if (size is None) != (square is None):
+        raise InputError("--board and --square belong together: give both")
+    board = Board.parse(size, square) if size is not None and square is not None else None
+    LensModel.named(model)
+    jobs = read_jobs(cameras, board, model)
+    options = BatchOptions(refine=refine.value, board_warp=board_warp, time_limit=time_limit)
+    results = Results(output, jobs, options)
+    try:
+        with (
+            steps("images and cameras", results.total) as advance,
+            pool(workers or os.cpu_count() or 1, scheduler) as crew,
+        ):
+            run_tasks(results.tasks(advance), results.done, crew)
+    except KeyboardInterrupt:
+        err.print("interrupted; what is finished is kept: run the same command to continue")
+        raise typer.Exit(130) from None
+    rows = results.rows()
+    summary = write_summary(output / "summary.csv", rows)
+    _print(rows)
+    out.print(f"{results.reused} of {results.total} pieces of work were there already", markup=False)
+    out.print(f"wrote {summary}", markup=False)
+    failed = [row.camera for row in rows if row.error]
+    if failed:
+        raise DegenerateError(f"{len(failed)} of {len(rows)} cameras failed: {', '.join(failed[:5])}; see the table")
+
+
+def _print(rows: list[Row]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for title in ("camera", "views", "RMS px", "fx", "± σ", "cx", "cy", "model"):
+        table.add_column(title, no_wrap=True, justify="left" if title in ("camera", "model") else "right")
+    table.add_column("note")
+    for row in rows:
+        numbers = ["", "", "", "", ""]
+        if row.rms is not None:
+            spread = "" if row.sigma_fx is None else f"{row.sigma_fx:.3f}"
+            numbers = [f"{row.rms:.4f}", f"{row.fx:.3f}", spread, f"{row.cx:.3f}", f"{row.cy:.3f}"]
+        note = f"[red]failed:[/] {escape(row.error)}" if row.error else escape(row.warnings)
+        table.add_row(escape(row.camera), f"{row.views} of {row.images}", *numbers, row.model, note)
+    out.print(table)

@@ -1,0 +1,223 @@
+"""The work of `kcal batch` in pieces that are each done once: one image's corners, one camera's calibration.
+
+A piece is named by a hash of all it depends on (the image's bytes, the options, kcal's version), so that a finished one
+is found again whatever happened in between, and one whose input changed is not.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import faulthandler
+import hashlib
+import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import ClassVar
+
+import kcal
+from kcal.corners.board import Board
+from kcal.corners.detect import detect_board, view_of
+from kcal.corners.images import decode_grey, expand_images, read_bytes, unique_names
+from kcal.corners.observations import Covariance, Failure, Observations, Pixel, View
+from kcal.corners.refine import Refinement
+from kcal.errors import FileError, InputError, KcalError
+from kcal.files import NativeFile
+from kcal.io.camera_file import CameraFile
+
+_COLUMNS = ("camera", "images", "board", "square", "model")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BatchOptions:
+    """What is done to every camera.
+
+    Args:
+        refine: see `kcal.corners.refine.refine_corners`.
+        board_warp: estimate how each board bends.
+        time_limit: seconds for one image or one calibration.
+    """
+
+    refine: Refinement = "erf"
+    board_warp: bool = False
+    time_limit: float = 300.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CameraJob:
+    """One camera of a batch; `error` says why it cannot be begun."""
+
+    name: str
+    images: tuple[Path, ...] = ()
+    board: Board | None = None
+    model: str = "opencv5"
+    error: str = ""
+
+
+class Detected(NativeFile):
+    """The corners of one image, or the reason why there are none (file kind `detected`)."""
+
+    KIND: ClassVar[str] = "detected"
+    VERSION: ClassVar[int] = 1
+
+    size: tuple[int, int] | None = None
+    pixels: tuple[Pixel | None, ...] | None = None
+    covariance: tuple[Covariance | None, ...] | None = None
+    reason: str = ""
+
+
+class Calibrated(NativeFile):
+    """One camera's calibration, or the reason why there is none (file kind `calibrated`)."""
+
+    KIND: ClassVar[str] = "calibrated"
+    VERSION: ClassVar[int] = 1
+
+    camera: CameraFile | None = None
+    warnings: tuple[str, ...] = ()
+    error: str = ""
+
+
+def read_jobs(source: Path, board: Board | None, model: str) -> list[CameraJob]:
+    """The cameras that a folder of folders or a CSV table names.
+
+    In a folder, every folder with images is a camera. A table has the columns `camera` and `images` (a file, folder or
+    wildcard, relative to the table) and may have `board`, `square` and `model`, which go before the options.
+
+    Raises:
+        FileError: no such file or folder, no camera in it, or a table that cannot be read.
+        InputError: a camera without a board.
+    """
+    if source.is_dir():
+        rows = [
+            {"camera": folder.name, "images": str(folder)}
+            for folder in sorted(source.iterdir())
+            if folder.is_dir() and not folder.name.startswith(".")
+        ]
+        if not rows:
+            raise FileError(f"{source}: no folders in it; make one folder of images for each camera, or give a CSV")
+    else:
+        rows = _read_table(source)
+    names = [row["camera"] for row in rows]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{source}: two cameras are named {name!r}")
+        if not name or Path(name).name != name or name.startswith("."):
+            raise InputError(f"{source}: {name!r} cannot name a camera: it becomes a file name")
+    return [_job(source, row, board, model) for row in rows]
+
+
+def _job(source: Path, row: dict[str, str], board: Board | None, model: str) -> CameraJob:
+    name = row["camera"]
+    try:
+        if row.get("board") or row.get("square"):
+            board = Board.parse(row.get("board", ""), row.get("square", ""))
+        images = expand_images([source.parent / row["images"] if source.is_file() else row["images"]])
+    except KcalError as error:
+        return CameraJob(name=name, error=str(error))
+    if board is None:
+        raise InputError(f"camera {name!r}: no board; give --board and --square, or columns of these names")
+    return CameraJob(name=name, images=tuple(images), board=board, model=row.get("model") or model)
+
+
+def _read_table(path: Path) -> list[dict[str, str]]:
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from error
+    reader = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
+    header = reader.fieldnames or []
+    if not {"camera", "images"} <= set(header) <= set(_COLUMNS):
+        raise FileError(f"{path}: the first line must name the columns camera,images and may name board,square,model")
+    rows = []
+    for row in reader:
+        if None in row or None in row.values():
+            raise FileError(f"{path}: line {reader.line_num}: {len(header)} fields are needed")
+        rows.append({key: value.strip() for key, value in row.items()})
+    if not rows:
+        raise FileError(f"{path}: no camera under the header")
+    return rows
+
+
+def hash_of(*parts: object) -> str:
+    """A name for a piece of work from all that it depends on."""
+    text = repr((kcal.__version__, *parts))
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def detection_key(digest: str, board: Board, refine: str) -> str:
+    """The name of one image's detection; `digest` is the hash of the file's bytes."""
+    return hash_of("detected", digest, board.model_dump_json(), refine)
+
+
+def detect_image(path: str, board: Board, options: BatchOptions) -> Detected:
+    """Find the board in one image."""
+    with _time_limit(options.time_limit):
+        try:
+            image = decode_grey(read_bytes(path), path)
+        except FileError as error:
+            return Detected(reason=str(error).removeprefix(f"{path}: "))
+        found = detect_board(image, board, options.refine)
+        size = image.shape[1], image.shape[0]
+        if found.pixels is None:
+            return Detected(size=size, reason=found.reason)
+        view = view_of(found, Path(path).name)
+        return Detected(size=size, pixels=view.pixels, covariance=view.covariance)
+
+
+def observations_of(job: CameraJob, pieces: list[Detected], digests: list[str], refine: Refinement) -> Observations:
+    """One camera's observations from the pieces of its images.
+
+    Raises:
+        InputError: images of several sizes, or no board in any.
+    """
+    assert job.board is not None
+    names = unique_names(list(job.images))
+    sizes = [piece.size for piece in pieces if piece.size is not None]
+    different = sorted(set(sizes))
+    if len(different) > 1:
+        shown = ", ".join(f"{sizes.count(size)} of {size[0]}x{size[1]}" for size in different)
+        raise InputError(f"images of different sizes: {shown}; give the images of one camera at one resolution")
+    views, failures = [], []
+    for name, path, piece, digest in zip(names, job.images, pieces, digests, strict=True):
+        if piece.pixels is None:
+            failures.append(Failure(name=name, reason=piece.reason))
+            continue
+        views.append(View(name=name, pixels=piece.pixels, covariance=piece.covariance, image=str(path), sha256=digest))
+    if not views:
+        raise InputError(f"no board in any of {len(pieces)} images ({failures[0].name}: {failures[0].reason})")
+    return Observations(
+        board=job.board,
+        image_size=different[0],
+        refinement=refine,
+        views=tuple(views),
+        failures=tuple(failures),
+    )
+
+
+def calibrate_observations(seen: Observations, name: str, model: str, options: BatchOptions) -> Calibrated:
+    """Calibrate one camera."""
+    from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
+    from kcal.cli.calibrate import record
+
+    with _time_limit(options.time_limit):
+        try:
+            result = calibrate_camera(seen, CalibrationOptions(model=model, board_warp=options.board_warp))
+        except KcalError as error:
+            return Calibrated(error=str(error))
+        return Calibrated(camera=record(result, seen, name, f"{name}.obs.json"), warnings=result.warnings)
+
+
+@contextmanager
+def _time_limit(seconds: float) -> Iterator[None]:
+    """End this process if the work takes longer.
+
+    An endless loop inside a C++ library hears no Python signal; the watchdog is a thread of its own.
+    """
+    with open(os.devnull, "w") as nowhere:
+        faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()

@@ -1,0 +1,209 @@
+"""What a batch has finished: pieces on disk, found again by their keys, and the files and the table made from them."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from kcal.cli.batch_jobs import (
+    BatchOptions,
+    Calibrated,
+    CameraJob,
+    Detected,
+    calibrate_observations,
+    detect_image,
+    detection_key,
+    hash_of,
+    observations_of,
+)
+from kcal.cli.batch_run import Task, WorkerDiedError
+from kcal.corners.images import read_bytes
+from kcal.corners.observations import Observations
+from kcal.errors import FileError, KcalError
+from kcal.files import NativeFile, write_atomic
+
+Piece = TypeVar("Piece", bound=NativeFile)
+
+
+class Row(NamedTuple):
+    """One camera in the table; `failures` counts images without a board."""
+
+    camera: str
+    status: str
+    model: str
+    images: int
+    views: int
+    failures: int
+    width: int | None = None
+    height: int | None = None
+    rms: float | None = None
+    fx: float | None = None
+    fy: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    sigma_fx: float | None = None
+    warnings: str = ""
+    error: str = ""
+
+
+class Results:
+    """The state of a batch in a folder.
+
+    Args:
+        folder: made if missing.
+        jobs: the cameras.
+        options: what is done to each.
+
+    Raises:
+        FileError: the folder cannot be made.
+    """
+
+    def __init__(self, folder: Path, jobs: list[CameraJob], options: BatchOptions) -> None:
+        self.folder, self.jobs, self.options = folder, jobs, options
+        self.reused = 0
+        self.total = sum(len(job.images) + (not job.error) for job in jobs)
+        self._work = folder / ".work"
+        try:
+            self._work.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FileError(f"{folder}: cannot make this folder: {error.strerror}") from error
+        self._advance: Callable[[str], None] = lambda _: None
+        self._pieces: list[list[Detected | None]] = [[None] * len(job.images) for job in jobs]
+        self._digests: list[list[str]] = [[""] * len(job.images) for job in jobs]
+        self._views: dict[int, Observations] = {}
+        self._calibrated: dict[int, Calibrated] = {}
+
+    def tasks(self, advance: Callable[[str], None]) -> Iterator[Task]:
+        """What is left to do, image after image; `advance` is called after each piece of work."""
+        self._advance = advance
+        for number, job in enumerate(self.jobs):
+            for i, path in enumerate(job.images):
+                yield from self._image(number, i, path)
+
+    def _image(self, number: int, i: int, path: Path) -> Iterator[Task]:
+        board = self.jobs[number].board
+        assert board is not None
+        try:
+            digest = hashlib.sha256(read_bytes(path)).hexdigest()
+        except FileError as error:
+            yield from self._detected(number, i, Detected(reason=str(error).removeprefix(f"{path}: ")))
+            return
+        self._digests[number][i] = digest
+        key = detection_key(digest, board, self.options.refine)
+        kept = self._load(Detected, key)
+        if kept is not None:
+            yield from self._detected(number, i, kept)
+        else:
+            yield Task(("image", number, i, key), detect_image, (str(path), board, self.options))
+
+    def done(self, task: Task, outcome: Any) -> list[Task]:
+        """Keep what a task has given; returns the calibration that has become possible."""
+        kind, number, i, key = task.tag
+        if kind == "image":
+            if isinstance(outcome, Detected):
+                outcome.save(self._path(key))
+            else:
+                # Not kept: more memory or time may help.
+                outcome = Detected(reason=_reason(outcome))
+            return self._detected(number, i, outcome)
+        if isinstance(outcome, Calibrated):
+            outcome.save(self._path(key))
+        else:
+            outcome = Calibrated(error=_reason(outcome))
+        self._finish(number, outcome)
+        return []
+
+    def _detected(self, number: int, i: int, piece: Detected) -> list[Task]:
+        job = self.jobs[number]
+        self._pieces[number][i] = piece
+        self._advance(f"{job.name} {job.images[i].name}")
+        pieces = [piece for piece in self._pieces[number] if piece is not None]
+        if len(pieces) < len(job.images):
+            return []
+        try:
+            seen = observations_of(job, pieces, self._digests[number], self.options.refine)
+        except KcalError as error:
+            self._finish(number, Calibrated(error=str(error)))
+            return []
+        self._views[number] = seen
+        seen.save(self.folder / f"{job.name}.obs.json")
+        key = hash_of("calibrated", job.name, job.model, self.options.board_warp, seen.dump())
+        kept = self._load(Calibrated, key)
+        if kept is not None:
+            self._finish(number, kept)
+            return []
+        return [Task(("camera", number, 0, key), calibrate_observations, (seen, job.name, job.model, self.options))]
+
+    def _finish(self, number: int, result: Calibrated) -> None:
+        path = self.folder / f"{self.jobs[number].name}.camera.json"
+        self._calibrated[number] = result
+        if result.camera is not None:
+            result.camera.save(path)
+        else:
+            path.unlink(missing_ok=True)  # of an earlier run with other images: not this one's result
+        self._advance(self.jobs[number].name)
+
+    def rows(self) -> list[Row]:
+        """The table, in the order of the cameras."""
+        return [self._row(number, job) for number, job in enumerate(self.jobs)]
+
+    def _row(self, number: int, job: CameraJob) -> Row:
+        result = self._calibrated.get(number, Calibrated(error=job.error))
+        seen = self._views.get(number)
+        views = len(seen.views) if seen is not None else 0
+        camera = result.camera
+        row = Row(
+            camera=job.name,
+            status="failed" if camera is None else "ok",
+            model=job.model,
+            images=len(job.images),
+            views=views,
+            failures=len(job.images) - views,
+            width=seen.image_size[0] if seen is not None else None,
+            height=seen.image_size[1] if seen is not None else None,
+            warnings="; ".join(result.warnings),
+            error=result.error,
+        )
+        if camera is None or camera.calibration is None:
+            return row
+        return row._replace(
+            rms=camera.calibration.rms,
+            fx=camera.intrinsics.fx,
+            fy=camera.intrinsics.fy,
+            cx=camera.intrinsics.cx,
+            cy=camera.intrinsics.cy,
+            sigma_fx=(camera.standard_deviations or {}).get("fx"),
+        )
+
+    def _path(self, key: str) -> Path:
+        return self._work / f"{key}.json"
+
+    def _load(self, kind: type[Piece], key: str) -> Piece | None:
+        """A finished piece; one that cannot be read is done again."""
+        if not self._path(key).exists():
+            return None
+        try:
+            piece = kind.load(self._path(key))
+        except FileError:
+            return None
+        self.reused += 1
+        return piece
+
+
+def write_summary(path: Path, rows: list[Row]) -> Path:
+    """Write the table as CSV, atomically."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(Row._fields)
+    writer.writerows(["" if value is None else value for value in row] for row in rows)
+    return write_atomic(path, text.getvalue())
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, KcalError | WorkerDiedError):
+        return str(error)
+    return f"{type(error).__name__}: {error}"

@@ -1,0 +1,177 @@
+"""Many pieces of work on many processes, of which some may die: every piece comes back with a result or a reason."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from kcal.errors import FileError, InputError, KcalError
+
+_AHEAD = 3  # pieces handed out a worker: enough to keep it busy, few enough to hold in memory
+
+
+class Task(NamedTuple):
+    """A call to make somewhere; `tag` tells the caller which it was."""
+
+    tag: Any
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+
+
+class WorkerDiedError(KcalError):
+    """The process that did a piece of work ended: out of memory, beyond its time limit, or crashed."""
+
+
+# Called with a finished task and its result or exception; returns tasks that can now be done.
+Done = Callable[[Task, Any], Iterable[Task]]
+
+
+class Pool:
+    """Processes on this machine, started again when one of them dies, or a Dask scheduler's workers.
+
+    Args:
+        workers: processes, if there is no scheduler.
+        scheduler: address of a Dask scheduler, or None.
+
+    Raises:
+        InputError: a scheduler is given but `distributed` is not installed.
+        FileError: the scheduler does not answer.
+    """
+
+    def __init__(self, workers: int, scheduler: str | None = None) -> None:
+        self.workers = workers
+        self._client: Any = None
+        self._executor: Executor | None = None
+        if scheduler is not None:
+            self._client = _connect(scheduler)
+            self.workers = max(1, sum(self._client.nthreads().values()))
+
+    @property
+    def ahead(self) -> int:
+        """How many tasks to hand out at a time."""
+        return _AHEAD * self.workers
+
+    def submit(self, task: Task) -> Future[Any]:
+        """Hand out a task."""
+        if self._executor is None:
+            if self._client is not None:
+                # Pure tasks would be answered from Dask's memory by their arguments, whatever is in the files now.
+                self._executor = self._client.get_executor(pure=False)
+            else:
+                # Not forked: OpenCV's and torch's threads would be copied half.
+                context = multiprocessing.get_context("spawn")
+                self._executor = ProcessPoolExecutor(self.workers, mp_context=context, initializer=_begin)
+        return self._executor.submit(task.function, *task.arguments)
+
+    def restart(self) -> None:
+        """Forget the processes; the next task starts new ones."""
+        if isinstance(self._executor, ProcessPoolExecutor):
+            self._executor.shutdown(wait=False, cancel_futures=True)
+        elif self._executor is not None:
+            self._executor.shutdown(wait=False)
+        self._executor = None
+
+    def close(self) -> None:
+        """Let go of all workers."""
+        self.restart()
+        if self._client is not None:
+            self._client.close()
+
+
+@contextmanager
+def pool(workers: int, scheduler: str | None = None) -> Iterator[Pool]:
+    """A `Pool` that is closed at the end, also after an interruption."""
+    opened = Pool(workers, scheduler)
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+def run_tasks(tasks: Iterable[Task], done: Done, workers: Pool) -> None:
+    """Do all tasks and those that `done` adds; it is called in this process, once for each, in any order.
+
+    A task whose worker dies is tried once more, alone; if its worker dies again it is given up with
+    `WorkerDiedError`.
+    """
+    source = iter(tasks)
+    added: deque[Task] = deque()
+    pending: dict[Future[Any], Task] = {}
+    casualties: list[Task] = []
+    while True:
+        while len(pending) < workers.ahead and not casualties:
+            task = added.popleft() if added else next(source, None)
+            if task is None:
+                break
+            try:
+                pending[workers.submit(task)] = task
+            except BrokenExecutor:
+                casualties.append(task)
+        if not pending and not casualties:
+            return
+        finished, _ = wait(pending, return_when=FIRST_COMPLETED) if pending else (set(), None)
+        for future in finished:
+            task = pending.pop(future)
+            if isinstance(future.exception(), BrokenExecutor):
+                casualties.append(task)
+            else:
+                added.extend(done(task, _outcome(future)))
+        if casualties and not pending:
+            workers.restart()
+            for task in casualties:
+                outcome = _outcome(workers.submit(task))
+                if isinstance(outcome, WorkerDiedError):
+                    workers.restart()
+                added.extend(done(task, outcome))
+            casualties.clear()
+
+
+def _outcome(future: Future[Any]) -> Any:
+    """The result, or the exception instead of raising it."""
+    error = future.exception()
+    if error is None:
+        return future.result()
+    if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":
+        return WorkerDiedError("its process ended: out of memory, beyond the time limit (--time-limit), or crashed")
+    return error
+
+
+def _begin() -> None:
+    """In a new process: leave Ctrl-C to the parent, end when the parent is gone, use one thread."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _one_thread()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _one_thread() -> None:
+    """One thread a process: as many processes as cores share the work already."""
+    from kcal.corners.detect import limit_threads
+
+    limit_threads(1)
+
+
+def _connect(address: str) -> Any:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError('--scheduler needs Dask: pip install "kcal[dask]"') from None
+    try:
+        client = Client(address, timeout=15, set_as_default=False)
+        client.run(_one_thread)
+    except (OSError, ValueError) as error:
+        raise FileError(f"{address}: no Dask scheduler answers here: {error}") from error
+    return client

@@ -1,0 +1,166 @@
+"""Pictures of a detection: every view with its corners, worst first, and what of the image the board has covered."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from kcal.corners.images import read_grey, to_8bit
+from kcal.corners.observations import Observations, View
+from kcal.errors import FileError
+from kcal.report.figures import new_figure, save_png
+
+_INK, _FAINT, _ACCENT, _WARN = "#111827", "#9aa3af", "#2b6cb0", "#c02a6b"
+_MOST = 24  # views in a gallery
+_ACROSS = 4
+_THUMB = 480  # pixels of a view's longer side
+_CELLS = 8  # of the coverage map along the image's longer side
+
+
+def gallery_figure(observations: Observations) -> Figure:
+    """Draw the views with their corners: those with corners left out first, then by the corners' predicted error.
+
+    Corner 0 is a ring and the first row a line, so that a board read from its other end is seen at once. At most 24
+    views are shown; images that gave none are listed with their reasons.
+
+    Args:
+        observations: with the paths of their images; a view whose image is not there is drawn on grey.
+    """
+    order = sorted(range(len(observations.views)), key=lambda i: _badness(observations.views[i]), reverse=True)
+    shown = order[:_MOST]
+    across = max(1, min(_ACROSS, len(shown)))
+    down = max(1, math.ceil(len(shown) / across))
+    width, height = observations.image_size
+    listed = [f"{failure.name}: {failure.reason}" for failure in observations.failures[:10]]
+    foot = 0.22 * len(listed) + 0.15
+    tall = down * (3.6 * height / width + 0.32) + 0.7 + foot
+    figure = new_figure(3.6 * across + 0.3, tall, dpi=110)
+    grid = figure.add_gridspec(
+        down, across, left=0.02, right=0.98, top=1 - 0.7 / tall, bottom=foot / tall, hspace=0.16, wspace=0.04
+    )
+    for place, i in enumerate(shown):
+        _draw_view(figure.add_subplot(grid[place // across, place % across]), observations, observations.views[i])
+    title = f"{len(observations.views)} views, worst first"
+    if len(order) > _MOST:
+        title += f" (the {_MOST} worst)"
+    if observations.failures:
+        title += f"; without a board: {len(observations.failures)}"
+    figure.text(0.02, 1 - 0.3 / tall, title, fontsize=13, color=_INK, va="center")
+    for row, text in enumerate(listed):
+        figure.text(0.02, (foot - 0.15 - 0.22 * row) / tall, text[:130], fontsize=8, color=_WARN, va="center")
+    return figure
+
+
+def coverage_figure(observations: Observations) -> Figure:
+    """Draw where corners were seen, one colour a view (the paper's Fig. 1), over how often each part was reached.
+
+    Parts of the image that no corner reached are hatched: there the lens model extrapolates.
+    """
+    width, height = observations.image_size
+    pixels = observations.pixels().numpy()
+    seen = np.isfinite(pixels).all(-1)
+    columns = _CELLS if width >= height else max(1, round(_CELLS * width / height))
+    rows = _CELLS if height > width else max(1, round(_CELLS * height / width))
+    u, v = pixels[seen].T
+    views = np.broadcast_to(np.arange(len(pixels))[:, None], seen.shape)[seen]
+    cells = np.zeros((rows, columns))
+    for view in range(len(pixels)):
+        mine = views == view
+        once, _, _ = np.histogram2d(
+            v[mine], u[mine], bins=(rows, columns), range=((-0.5, height - 0.5), (-0.5, width - 0.5))
+        )
+        cells += once > 0
+    figure = new_figure(9.0, 9.0 * height / width * 0.86 + 1.2)
+    axes = figure.add_subplot()
+    figure.subplots_adjust(left=0.07, right=0.99, bottom=0.09, top=0.9)
+    axes.imshow(
+        cells, cmap="Greys", vmin=0, vmax=2.5 * max(cells.max(), 1), extent=(-0.5, width - 0.5, height - 0.5, -0.5)
+    )
+    for row, column in np.argwhere(cells == 0):
+        axes.add_patch(
+            Rectangle(
+                (column * width / columns - 0.5, row * height / rows - 0.5),
+                width / columns,
+                height / rows,
+                fill=False,
+                hatch="///",
+                edgecolor=_WARN,
+                linewidth=0,
+                alpha=0.6,
+            )
+        )
+    axes.scatter(u, v, c=views, cmap="turbo", s=7, linewidths=0)
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_xlabel("u, pixels")
+    axes.set_ylabel("v, pixels")
+    reached = 100.0 * float((cells > 0).mean())
+    axes.set_title(
+        f"{len(pixels)} views, {int(seen.sum())} corners; {reached:.0f} % of the image reached, hatched: not",
+        fontsize=11,
+        loc="left",
+    )
+    return figure
+
+
+def save_gallery(path: str | Path, observations: Observations) -> Path:
+    """Write the picture of `gallery_figure` as a PNG, atomically."""
+    return save_png(path, gallery_figure(observations))
+
+
+def save_coverage(path: str | Path, observations: Observations) -> Path:
+    """Write the picture of `coverage_figure` as a PNG, atomically."""
+    return save_png(path, coverage_figure(observations))
+
+
+def _badness(view: View) -> tuple[int, float]:
+    return view.pixels.count(None), _sigma(view) or 0.0
+
+
+def _sigma(view: View) -> float | None:
+    """Root mean square of the corners' predicted standard deviations, px."""
+    if view.covariance is None:
+        return None
+    traces = [0.5 * (spread[0] + spread[2]) for spread in view.covariance if spread is not None]
+    return math.sqrt(sum(traces) / len(traces)) if traces else None
+
+
+def _draw_view(axes: Axes, observations: Observations, view: View) -> None:
+    width, height = observations.image_size
+    whole = (-0.5, width - 0.5, height - 0.5, -0.5)
+    axes.imshow(_thumbnail(view, (width, height)), cmap="gray", vmin=0, vmax=255, extent=whole)
+    places = np.array([(math.nan, math.nan) if pixel is None else pixel for pixel in view.pixels])
+    first = places[: observations.board.columns]
+    axes.plot(first[:, 0], first[:, 1], color=_ACCENT, linewidth=1.2)
+    axes.scatter(places[:, 0], places[:, 1], s=9, color=_WARN, linewidths=0)
+    axes.scatter(places[:1, 0], places[:1, 1], s=60, facecolors="none", edgecolors=_ACCENT, linewidths=1.6)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    sigma, unseen = _sigma(view), view.pixels.count(None)
+    text = view.name if len(view.name) <= 34 else "…" + view.name[-33:]
+    text += f"  σ {sigma:.3f} px" if sigma is not None else ""
+    text += f"  {unseen} left out" if unseen else ""
+    axes.set_title(text, fontsize=8.5, loc="left", pad=3, color=_WARN if unseen else _INK)
+
+
+def _thumbnail(view: View, size: tuple[int, int]) -> npt.NDArray[np.uint8]:
+    """The view's image, every so many pixels, or grey where the file is not there any more."""
+    grey = np.full((2, 2), 200, np.uint8)
+    if view.image is None:
+        return grey
+    try:
+        image = to_8bit(read_grey(view.image))
+    except FileError:
+        return grey
+    if (image.shape[1], image.shape[0]) != size:
+        return grey
+    step = max(1, max(image.shape) // _THUMB)
+    return image[step // 2 :: step, step // 2 :: step]

@@ -1,0 +1,286 @@
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import Future
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from kcal.cli.batch_jobs import BatchOptions, detect_image, read_jobs
+from kcal.cli.batch_results import Results
+from kcal.cli.batch_run import Pool, Task, WorkerDiedError, pool, run_tasks
+from kcal.cli.main import app
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations
+from kcal.errors import FileError, InputError, KcalError
+from kcal.io.camera_file import CameraFile
+from kcal.lens.camera import Camera
+from kcal.sim.board import BoardSize
+from kcal.sim.poses import sample_board_poses
+from kcal.sim.render import RenderOptions, render_board
+
+BOARD = Board(columns=6, rows=5, square=0.02)
+WHAT = ("--board", "6x5", "--square", "20mm")
+
+
+def kcal(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def images():
+    """Four views each of two cameras, as PNG bytes."""
+    cameras = {}
+    for seed, name in enumerate(("east", "west")):
+        camera = Camera.build(focal=(300 + 20 * seed,) * 2, center=(159.5, 119.5), size=(320, 240))
+        size = BoardSize(BOARD.columns, BOARD.rows, BOARD.square)
+        generator = torch.Generator().manual_seed(seed)
+        poses = sample_board_poses(camera, size, 4, generator, fill=(0.5, 0.8))
+        shots = [render_board(camera, pose, size, RenderOptions(), generator).numpy() for pose in poses]
+        cameras[name] = [cv2.imencode(".png", shot)[1].tobytes() for shot in shots]
+    return cameras
+
+
+@pytest.fixture
+def folder(images, tmp_path):
+    cameras = tmp_path / "cameras"
+    for name, shots in images.items():
+        (cameras / name).mkdir(parents=True)
+        for i, shot in enumerate(shots):
+            (cameras / name / f"{i}.png").write_bytes(shot)
+    return cameras
+
+
+class Here:
+    """A pool that works in this process."""
+
+    ahead = 2
+
+    def __init__(self):
+        self.tasks = []
+
+    def submit(self, task):
+        self.tasks.append(task)
+        future = Future()
+        try:
+            future.set_result(task.function(*task.arguments))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def run(folder, output, options=None, board=BOARD, model="opencv5"):
+    """A batch in this process: its rows, and how many pieces were done anew."""
+    results = Results(output, read_jobs(folder, board, model), options or BatchOptions())
+    here = Here()
+    run_tasks(results.tasks(lambda _: None), results.done, here)
+    return results.rows(), len(here.tasks)
+
+
+class TestResults:
+    def test_is_what_detect_and_calibrate_give(self, folder, tmp_path):
+        rows, done = run(folder, tmp_path / "out")
+        assert [(row.camera, row.status, row.views) for row in rows] == [("east", "ok", 4), ("west", "ok", 4)]
+        assert done == 10
+        for name in ("east", "west"):
+            single = tmp_path / f"{name}.obs.json"
+            assert kcal("detect", folder / name, *WHAT, "-o", single).exit_code == 0
+            assert kcal("calibrate", single, "-o", tmp_path / f"{name}.camera.json").exit_code == 0
+            seen = Observations.load(tmp_path / "out" / f"{name}.obs.json")
+            assert seen == Observations.load(single)
+            ours = CameraFile.load(tmp_path / "out" / f"{name}.camera.json")
+            other = CameraFile.load(tmp_path / f"{name}.camera.json")
+            assert ours.intrinsics == other.intrinsics
+            assert ours.standard_deviations == other.standard_deviations
+        assert rows[0].rms == pytest.approx(0.02, abs=0.02)
+        assert rows[0].fx == pytest.approx(300, rel=0.01)
+
+    def test_nothing_is_done_twice(self, folder, tmp_path):
+        first, _ = run(folder, tmp_path / "out")
+        assert run(folder, tmp_path / "out") == (first, 0)
+
+    def test_only_what_changed_is_done_again(self, folder, images, tmp_path):
+        first, _ = run(folder, tmp_path / "out")
+        (folder / "east" / "0.png").unlink()
+        rows, done = run(folder, tmp_path / "out")
+        assert done == 1  # east's calibration
+        assert rows[0].views == 3
+        assert rows[1] == first[1]
+        (folder / "east" / "0.png").write_bytes(images["east"][0])
+        assert run(folder, tmp_path / "out") == (first, 0)
+        # A renamed image needs no detection, but its view has another name.
+        (folder / "west" / "3.png").rename(folder / "west" / "9.png")
+        assert run(folder, tmp_path / "out")[1] == 1
+
+    def test_options_are_part_of_the_key(self, folder, tmp_path):
+        run(folder, tmp_path / "out")
+        assert run(folder, tmp_path / "out", BatchOptions(refine="saddle"))[1] == 10
+        assert run(folder, tmp_path / "out", model="opencv4")[1] == 2
+        assert run(folder, tmp_path / "out", BatchOptions(board_warp=True))[1] == 2
+        assert run(folder, tmp_path / "out", BatchOptions(time_limit=99))[1] == 0
+
+    def test_a_damaged_piece_is_done_again(self, folder, tmp_path):
+        first, _ = run(folder, tmp_path / "out")
+        piece = min((tmp_path / "out" / ".work").iterdir())
+        piece.write_text(piece.read_text()[:40])
+        assert run(folder, tmp_path / "out") == (first, 1)
+
+    def test_failures_stay_with_their_camera(self, folder, tmp_path):
+        (folder / "east" / "bad.png").write_bytes(b"no image")
+        (folder / "broken").mkdir()
+        (folder / "broken" / "a.png").write_bytes(b"")
+        (folder / "empty").mkdir()
+        (folder / "few").mkdir()
+        (folder / "few" / "a.png").write_bytes((folder / "west" / "0.png").read_bytes())
+        rows, _ = run(folder, tmp_path / "out")
+        by_name = {row.camera: row for row in rows}
+        assert [row.status for row in rows] == ["failed", "ok", "failed", "failed", "ok"]
+        assert (by_name["east"].views, by_name["east"].failures) == (4, 1)
+        assert "the file is empty" in by_name["broken"].error
+        assert "no image in this folder" in by_name["empty"].error
+        assert "at least 3" in by_name["few"].error
+        assert not (tmp_path / "out" / "few.camera.json").exists()
+
+    def test_an_unexpected_error_is_listed_and_not_kept(self, folder, tmp_path, monkeypatch):
+        monkeypatch.setattr("kcal.cli.batch_jobs.detect_board", lambda *_: 1 / 0)
+        rows, _ = run(folder, tmp_path / "out")
+        assert "ZeroDivisionError: division by zero" in rows[0].error
+        monkeypatch.undo()
+        rows, done = run(folder, tmp_path / "out")
+        assert (rows[0].status, done) == ("ok", 10)
+
+    def test_a_camera_that_fails_later_leaves_no_old_file(self, folder, tmp_path):
+        run(folder, tmp_path / "out")
+        for i in range(2):
+            (folder / "east" / f"{i}.png").unlink()
+        assert run(folder, tmp_path / "out")[0][0].status == "failed"
+        assert not (tmp_path / "out" / "east.camera.json").exists()
+
+
+class TestJobs:
+    def test_table(self, folder, tmp_path):
+        table = folder / "cameras.csv"
+        table.write_text(
+            "camera,images,board,square,model\n"
+            "a,east,6x5,20mm,\n"
+            "b,west/*.png,,,opencv4\n"
+            "c,nowhere/*.png,,,\n"
+        )  # fmt: skip
+        jobs = read_jobs(table, Board(columns=6, rows=5, square=0.1), "opencv8")
+        assert [job.name for job in jobs] == ["a", "b", "c"]
+        assert [job.model for job in jobs[:2]] == ["opencv8", "opencv4"]
+        assert [job.board.square for job in jobs[:2]] == [0.02, 0.1]
+        assert [len(job.images) for job in jobs] == [4, 4, 0]
+        assert "no such file" in jobs[2].error or "no file matches" in jobs[2].error
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("name,images\na,east\n", "must name the columns"),
+            ("camera,images,colour\na,east,red\n", "must name the columns"),
+            ("camera,images\n", "no camera"),
+            ("camera,images\na,east,\n", "line 2: 2 fields"),
+            ("camera,images\na,east\na,west\n", "two cameras"),
+            ("camera,images\n../a,east\n", "cannot name a camera"),
+        ],
+    )
+    def test_bad_tables(self, folder, text, message):
+        (folder / "t.csv").write_text(text)
+        with pytest.raises(KcalError, match=message):
+            read_jobs(folder / "t.csv", BOARD, "opencv5")
+
+    def test_no_board_and_no_folders(self, folder):
+        with pytest.raises(InputError, match="no board"):
+            read_jobs(folder, None, "opencv5")
+        with pytest.raises(FileError, match="no folders"):
+            read_jobs(folder / "east", BOARD, "opencv5")
+        with pytest.raises(FileError, match="cannot read"):
+            read_jobs(folder / "none.csv", BOARD, "opencv5")
+
+
+def test_every_piece_comes_back_when_workers_die(folder):
+    # os._exit stands for a crash in a C++ library; the last one goes beyond its time limit.
+    slow = detect_image, (str(folder / "east" / "0.png"), BOARD, BatchOptions(time_limit=1e-3))
+    tasks = [Task(0, os.getpid, ()), Task(1, os._exit, (3,)), Task(2, abs, (-7,)), Task(3, *slow)]
+    found = {}
+
+    def done(task, outcome):
+        found[task.tag] = outcome
+        return [Task(4, divmod, (7, 0))] if task.tag == 2 else []
+
+    with pool(1) as workers:
+        run_tasks(tasks, done, workers)
+    assert found[0] != os.getpid()
+    assert found[2] == 7
+    assert isinstance(found[1], WorkerDiedError)
+    assert isinstance(found[3], WorkerDiedError)
+    assert "--time-limit" in str(found[3])
+    assert isinstance(found[4], ZeroDivisionError)
+
+
+def test_a_killed_run_continues_and_gives_the_same_table(folder, tmp_path):
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    script = Path(__file__).parents[2] / "scripts" / "calibrate_batch.py"
+    command = [sys.executable, str(script), str(folder), *WHAT, "--workers", "1", "-o"]
+    running = subprocess.Popen([*command, str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while len(list(out.glob(".work/*.json"))) < 3 and running.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.002)
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+    before = {path: path.stat().st_mtime_ns for path in out.glob(".work/*.json")}
+    assert len(before) >= 3
+
+    assert not (out / "summary.csv").exists()
+    again = subprocess.run([*command, str(out)], capture_output=True, text=True)
+    assert again.returncode == 0, again.stderr
+    assert f"{len(before)} of 10 pieces of work were there already" in again.stdout
+    for path, stamp in before.items():
+        assert path.stat().st_mtime_ns == stamp
+    run(folder, whole)
+    rows = list(csv.DictReader((out / "summary.csv").open()))
+    expected, _ = run(folder, whole)
+    assert [{key: "" if value is None else str(value) for key, value in row._asdict().items()} for row in expected] == (
+        rows
+    )
+
+
+def test_command_line(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(Pool, "submit", lambda _, task: Here().submit(task))
+    (folder / "empty").mkdir()
+    result = kcal("batch", folder, *WHAT, "-o", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "1 of 3 cameras failed: empty" in str(result.exception)
+    assert "4 of 4" in result.output
+    with (tmp_path / "out" / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == ["ok", "failed", "ok"]
+    (folder / "empty").rmdir()
+    assert kcal("batch", folder, *WHAT, "-o", tmp_path / "out").exit_code == 0
+    assert "give both" in str(kcal("batch", folder, "--board", "6x5", "-o", tmp_path / "out").exception)
+    assert "model" in str(kcal("batch", folder, *WHAT, "--model", "best", "-o", tmp_path / "out").exception)
+    assert not (tmp_path / "none").exists()
+
+
+def test_dask(folder, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        result = kcal("batch", folder, *WHAT, "-o", tmp_path / "out", "--scheduler", cluster.scheduler_address)
+    assert result.exit_code == 0, result.exception
+    expected, _ = run(folder, tmp_path / "whole")
+    rows = list(csv.DictReader((tmp_path / "out" / "summary.csv").open()))
+    assert [row["rms"] for row in rows] == [str(row.rms) for row in expected]
+
+
+def test_no_scheduler(tmp_path, folder):
+    pytest.importorskip("distributed")
+    with pytest.raises(FileError, match="no Dask scheduler"):
+        Pool(1, "not-an-address")
