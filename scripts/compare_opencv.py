@@ -160,10 +160,14 @@ def _in_turn(first: Callable[[], Any], second: Callable[[], Any], repeats: int) 
     return results[0], results[1], times
 
 
-def _points(observations: Observations) -> tuple[list[Any], list[Any]]:
-    pixels = observations.pixels().numpy().astype(np.float32)
-    board = observations.board.points.numpy().astype(np.float32)
-    return [board] * len(pixels), list(pixels)
+def _points(observations: Observations, also: Observations | None = None) -> tuple[list[Any], list[Any]]:
+    """Board points and pixels of each view as OpenCV wants them: only the corners seen (in both views, for pairs)."""
+    pixels = observations.pixels()
+    seen = torch.isfinite(pixels).all(-1)
+    if also is not None:
+        seen = seen & torch.isfinite(also.pixels()).all(-1)
+    board = observations.board.points.float()
+    return [board[s].numpy() for s in seen], [p[s].float().numpy() for p, s in zip(pixels, seen, strict=True)]
 
 
 def _opencv(observations: Observations, model: str) -> Any:
@@ -209,20 +213,24 @@ def _rig(seen: dict[str, Observations], repeats: int) -> list[str]:
 def _opencv_stereo(
     left: Observations, right: Observations, cameras: tuple[Camera, Camera], refine: bool
 ) -> tuple[float, ...]:
-    boards, a = _points(left)
-    b = _points(right)[1]
+    boards, a = _points(left, right)
+    b = _points(right, left)[1]
     start = [array.numpy().copy() for camera in cameras for array in (camera.matrix, camera.coefficients)]
     flags = cv2.CALIB_USE_INTRINSIC_GUESS if refine else cv2.CALIB_FIX_INTRINSIC
     solved = cv2.stereoCalibrate(boards, a, b, *start, left.image_size, flags=flags, criteria=CRITERIA)  # type: ignore[call-overload]
     rms, K1, D1, K2, D2, R, T = solved[:7]
     P1, P2 = np.eye(3, 4), np.hstack([R, T])
     sides = []
-    for p, q in zip(a, b, strict=True):
+    place = left.board.points.float().numpy()
+    for points, p, q in zip(boards, a, b, strict=True):
         u, v = cv2.undistortPoints(p, K1, D1)[:, 0], cv2.undistortPoints(q, K2, D2)[:, 0]
         homogeneous = cv2.triangulatePoints(P1, P2, u.T.astype(float), v.T.astype(float))
-        grid = (homogeneous[:3] / homogeneous[3]).T.reshape(BOARD.rows, BOARD.columns, 3)
+        every_corner = np.full((BOARD.corners, 3), np.nan)
+        every_corner[(place[:, None] == points).all(-1).any(1)] = (homogeneous[:3] / homogeneous[3]).T
+        grid = every_corner.reshape(BOARD.rows, BOARD.columns, 3)
         for step in (np.diff(grid, axis=0), np.diff(grid, axis=1)):
-            sides.append(np.linalg.norm(step, axis=-1).ravel())
+            side = np.linalg.norm(step, axis=-1).ravel()
+            sides.append(side[np.isfinite(side)])
     every = np.concatenate(sides)
     return rms, float(np.linalg.norm(T)), float(every.mean()), float(every.std(ddof=1))
 
