@@ -24,7 +24,7 @@ from kcal.calibrate.wide import wide_starts
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
 from kcal.solve.lm import LMOptions, minimise
-from kcal.solve.result import Result, State
+from kcal.solve.result import Result, State, Status
 
 # Trial steps given to each start of a batch; the best one is then taken to convergence.
 _SCOUT_STEPS = 150
@@ -34,6 +34,10 @@ _SUSPICIOUS_RMS = 2.0
 # How much χ² a lens that folds inside the image must gain on one that does not: 20 is far beyond chance for the few
 # parameters that a step of the ladder adds.
 _FOLD_PRICE = 20.0
+# Trial steps between two looks at a lens that is about to fold.
+_STRETCH = 12
+# How far beyond the outermost corner a lens must be regular.
+_MARGIN = 1.02
 # Where near-cancelling starts put their bump, as a fraction of the largest observed r².
 _BUMPS = (0.1, 0.25, 0.5)
 Progress = Callable[[str], None]
@@ -137,12 +141,8 @@ def climb(
         carried = [(embed(state[0], small, large), *state[1:]) for state in kept]
         found = _scout(views, carried, plain, small, large, options)
         kept = _rank(views, found, carried[0], large)
-        problem = views.problem(large)
-        result = minimise(problem, kept[0], options)
+        result = _finish(views, kept[0], large, options)
         spent += int(found.iterations.max()) + int(result.iterations)
-        if views.trouble(result.state, large) > views.trouble(kept[0], large):
-            # The last steps left the lens: keep the state before them.
-            result = dataclasses.replace(result, state=kept[0], cost=problem.cost(kept[0]))
         kept[0] = result.state
         small = large
         progress(str(large))
@@ -150,6 +150,25 @@ def climb(
     others = [(embed(first[0], models[0], small), *first[1:]), *kept[1:]]
     rivals = tuple((float(last.cost(state)), state) for state in others) if len(models) > 1 else ()
     return Minimum(result=result, iterations=spent, rivals=rivals)
+
+
+def _finish(views: Views, start: State, model: LensModel, options: LMOptions) -> Result:
+    """Solve to convergence, or until the lens would fold in a part of the image where it did not at the start."""
+    limit = views.trouble(start, model)
+    problem = views.problem(model, radius=_MARGIN * float(views.observed_radius(start)))
+    result = minimise(problem, start, options)
+    if views.trouble(result.state, model) <= limit:
+        return result
+    # Go again in short stretches, and stop before the one that folds the lens.
+    best = dataclasses.replace(result, state=start, cost=problem.cost(start))
+    for _ in range(options.max_iterations // _STRETCH):
+        result = minimise(problem, best.state, dataclasses.replace(options, max_iterations=_STRETCH))
+        if views.trouble(result.state, model) > limit:
+            break
+        best = result
+        if best.status != Status.ITERATION_LIMIT:
+            return best
+    return dataclasses.replace(best, status=torch.full_like(best.status, int(Status.AT_BOUND)))
 
 
 def _scout(

@@ -74,6 +74,8 @@ class BoardProblem(SchurProblem):
         free_warp: whether the board's warp is estimated.
         whitening: (..., V, C, N, 2, 2) by which each corner's residual is multiplied (`kcal.calibrate.weights`), or
             None: all corners count alike.
+        guard: (3, K) points in front of the camera at which every camera's lens must be regular, whether a corner was
+            seen there or not; None: only at seen corners. States that break this have no cost.
         batch: leading shape of the states, () for one solve.
     """
 
@@ -88,12 +90,14 @@ class BoardProblem(SchurProblem):
         *,
         free_warp: bool = False,
         whitening: Tensor | None = None,
+        guard: Tensor | None = None,
         batch: tuple[int, ...] = (),
     ) -> None:
         self.models = tuple(models)
         self.free = tuple(tuple(indices) for indices in free)
         self.free_warp = free_warp
         self.batch = batch
+        self._guard = guard
         self._board = board_points.T.contiguous()
         self._shape = warp_shape(board_points)
         self._seen = torch.isfinite(pixels).all(-1)
@@ -163,7 +167,11 @@ class BoardProblem(SchurProblem):
             error = projected.pixels - self._target[..., c, :, :]
             seen = self._seen[..., c, None, :]
             bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
-            out.append(torch.where(seen, error + bad, 0.0))
+            error = torch.where(seen, error + bad, 0.0)
+            if self._guard is not None:
+                kept = project_components(self._guard, parameters[..., 0, :], self.models[c]).regular.all(-1)
+                error = torch.where(kept[..., None, None, None], error, torch.nan)
+            out.append(error)
         return torch.stack(out, -3)
 
     def rows(self, state: State) -> Tensor:

@@ -32,10 +32,17 @@ class Views:
     size: tuple[int, int]
     free_warp: bool
 
-    def problem(self, model: LensModel, batch: tuple[int, ...] = ()) -> BoardProblem:
-        """The least-squares problem of one lens model."""
-        free = [free_parameters(model)]
-        return BoardProblem(self.board_points, self.pixels, [model], free, free_warp=self.free_warp, batch=batch)
+    def problem(self, model: LensModel, batch: tuple[int, ...] = (), radius: float | None = None) -> BoardProblem:
+        """The least-squares problem of one lens model, which must be regular up to `radius` on the plane z = 1."""
+        return BoardProblem(
+            self.board_points,
+            self.pixels,
+            [model],
+            [free_parameters(model)],
+            free_warp=self.free_warp,
+            guard=None if radius is None else _disc(radius),
+            batch=batch,
+        )
 
     def rms(self, state: State, model: LensModel) -> float:
         """Root mean square distance (pixels) between corners and their projections."""
@@ -55,6 +62,14 @@ class Views:
         if not bool(valid_radius(state[0][len(INTRINSICS) :], model) > self.observed_radius(state)):
             return math.inf
         return 0.0 if bool(Camera(state[0], size=self.size, model=model).covers_image()) else 1.0
+
+
+def _disc(radius: float) -> Tensor:
+    """Points (3, K) on the plane z = 1, closer together than a pole or fold of a rational lens is wide."""
+    r = torch.linspace(0.0, radius, 49, dtype=torch.float64)[1:]
+    turn = torch.linspace(0.0, 2.0 * math.pi, 13, dtype=torch.float64)[:-1]
+    x, y = torch.outer(r, torch.cos(turn)).flatten(), torch.outer(r, torch.sin(turn)).flatten()
+    return torch.stack([x, y, torch.ones_like(x)])
 
 
 def free_parameters(model: LensModel) -> list[int]:

@@ -16,7 +16,8 @@ class Status(enum.IntEnum):
 
     `CONVERGED`: no step can lower the cost by more than the tolerance. `EXACT`: the residual is zero to rounding.
     `ITERATION_LIMIT`: still improving. `STALLED`: a lower cost was predicted but no step, however short, gave one.
-    `BAD_START`: the cost at the start is not finite. `INTERRUPTED`: the caller's callback asked to stop.
+    `BAD_START`: the cost at the start is not finite. `INTERRUPTED`: the caller's callback asked to stop. `AT_BOUND`:
+    the caller held the solution back, because lower costs lie where the problem makes no sense.
     """
 
     RUNNING = 0
@@ -26,6 +27,7 @@ class Status(enum.IntEnum):
     STALLED = 4
     BAD_START = 5
     INTERRUPTED = 6
+    AT_BOUND = 7
 
     @property
     def message(self) -> str:
@@ -40,6 +42,7 @@ _MESSAGES = {
     Status.ITERATION_LIMIT: "stopped at the iteration limit while still improving",
     Status.STALLED: "stalled: no step lowers the cost although one was predicted",
     Status.BAD_START: "the cost at the start is not finite",
+    Status.AT_BOUND: "stopped at a bound: lower costs lie beyond what is allowed",
     Status.INTERRUPTED: "interrupted; this is the best state so far",
 }
 
