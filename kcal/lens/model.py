@@ -39,6 +39,9 @@ class LensModel:
         tangential: whether p1, p2 are present.
         prism: highest power of r² in the thin-prism terms, 0 to 4, for x and y each.
         tilt: whether the tilted-sensor angles are present.
+        fisheye: whether the numerator's series acts on the angle from the axis instead of its tangent
+            (Kannala-Brandt): r_D = θ (1 + k1 θ² + k2 θ⁴ + ...). It has no other terms, and its coefficients are
+            called k1, k2, k3, ... in this order, as in `cv2.fisheye`.
 
     Example:
         >>> LensModel(numerator=3, tangential=True).names
@@ -52,12 +55,15 @@ class LensModel:
     tangential: bool = False
     prism: int = 0
     tilt: bool = False
+    fisheye: bool = False
 
     def __post_init__(self) -> None:
         for name, limit in (("numerator", 7), ("denominator", 7), ("prism", 4)):
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= limit:
                 raise InputError(f"lens model: {name} must be a whole number from 0 to {limit}, got {value!r}")
+        if self.fisheye and (self.denominator or self.tangential or self.prism or self.tilt):
+            raise InputError("lens model: a fisheye has a numerator only")
 
     @classmethod
     def named(cls, name: str | LensModel) -> LensModel:
@@ -75,6 +81,8 @@ class LensModel:
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """Coefficient names in storage order: OpenCV's 14 first, higher orders after them."""
+        if self.fisheye:
+            return tuple(f"k{order}" for order in range(1, self.numerator + 1))
         present = {name for name, (term, order) in _RADIAL.items() if order <= getattr(self, term)}
         present |= {name for name, (_, order) in _PRISM.items() if order <= self.prism}
         present |= {"p1", "p2"} if self.tangential else set()
@@ -85,6 +93,11 @@ class LensModel:
     def size(self) -> int:
         """How many coefficients the model has."""
         return len(self.names)
+
+    @property
+    def radial(self) -> bool:
+        """Whether the lens is symmetric about its axis, so that whatever limits it is a circle."""
+        return not (self.tangential or self.prism or self.tilt)
 
     @functools.cached_property
     def numerator_index(self) -> tuple[int, ...]:
@@ -104,15 +117,18 @@ class LensModel:
         return tuple(place[0, j] for j in orders), tuple(place[1, j] for j in orders)
 
     def _radial_index(self, term: str) -> tuple[int, ...]:
+        if self.fisheye:
+            return tuple(range(getattr(self, term)))
         place = {order: name for name, (kind, order) in _RADIAL.items() if kind == term}
         return tuple(self.names.index(place[order]) for order in range(1, getattr(self, term) + 1))
 
     def contains(self, other: LensModel) -> bool:
         """Whether every lens of `other` is also a lens of this model."""
-        return set(other.names) <= set(self.names)
+        return self.fisheye == other.fisheye and set(other.names) <= set(self.names)
 
     def __str__(self) -> str:
-        return next((name for name, model in PRESETS.items() if model == self), f"({', '.join(self.names)})")
+        kind = "fisheye " if self.fisheye else ""
+        return next((name for name, model in PRESETS.items() if model == self), f"{kind}({', '.join(self.names)})")
 
 
 PRESETS: dict[str, LensModel] = {
@@ -128,4 +144,5 @@ PRESETS: dict[str, LensModel] = {
     "ext20b": LensModel(numerator=6, denominator=6, tangential=True, prism=2, tilt=True),
     "ext22": LensModel(numerator=6, denominator=6, tangential=True, prism=3, tilt=True),
     "ext24": LensModel(numerator=7, denominator=7, tangential=True, prism=3, tilt=True),
+    "fisheye4": LensModel(numerator=4, fisheye=True),
 }
