@@ -162,8 +162,10 @@ class Undistort(nn.Module):
 
     def _state(self) -> Tensor:
         """All that the maps depend on, to notice when it changes."""
-        cameras = (self.camera, self.new_camera)
-        return torch.cat([part.detach().flatten() for c in cameras for part in (c.parameters_vector, c.valid_radius)])
+        parts = [
+            part for camera in (self.camera, self.new_camera) for part in (*camera.parameters(), *camera.buffers())
+        ]
+        return torch.cat([part.detach().flatten().to(torch.float64) for part in parts])
 
     def _maps(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         cameras = (self.camera, self.new_camera)
@@ -171,7 +173,8 @@ class Undistort(nn.Module):
         compiling = torch.compiler.is_compiling()
         if live or (compiling and self.grid_x.dtype != precision):
             return self._grid(precision)
-        # What is compiled or exported is a snapshot: a comparison of values would break its graph.
+        # What is compiled or exported is a snapshot: a comparison of values would break its graph. Here it costs some
+        # microseconds, and a stale map would be a wrong image.
         if not compiling and (self.grid_x.dtype != precision or not torch.equal(self._made_for, self._state())):
             self.grid_x, self.grid_y, self.mask = self._grid(precision)
             self._made_for = self._state()
@@ -198,15 +201,15 @@ def _source_positions(camera: Camera, new_camera: Camera) -> tuple[Tensor, Tenso
     width, height = new_camera.size
     if min(width, height, *camera.size) < 2:
         raise InputError(f"images of {camera.size} and {new_camera.size}: at least 2 pixels each way are needed")
+    shapes = [tuple(c.parameters_vector.shape[:-1]) for c in (camera, new_camera)]
     try:
-        torch.broadcast_shapes(camera.valid_radius.shape, new_camera.valid_radius.shape)
+        torch.broadcast_shapes(*shapes)
     except RuntimeError as error:
-        shapes = tuple(camera.valid_radius.shape), tuple(new_camera.valid_radius.shape)
         raise InputError(f"batches of {shapes[0]} cameras and {shapes[1]} new cameras do not fit") from error
     bands = []
     for pixels in new_camera.grid(width, height).flatten(0, 1).split(_BAND):
-        normalized, valid = new_camera.normalize(pixels)
-        source, seen = source_pixels(camera, normalized)
+        rays, valid = new_camera.unproject(pixels)
+        source, seen = source_pixels(camera, rays)
         bands.append((source, seen & valid))
     source, mask = torch.cat([band[0] for band in bands], -2), torch.cat([band[1] for band in bands], -1)
     source = torch.where(mask[..., None], source, NOWHERE)

@@ -19,14 +19,16 @@ from kcal.lens.camera import Camera
 SLACK = 1e-6
 _SAMPLES = 129
 _RIM = 1440
+# Rays farther from the axis count for neither rectangle: a pinhole's plane has no place for them.
+_WIDEST = math.radians(89.0)
 
 
-def source_pixels(camera: Camera, normalized: Tensor) -> tuple[Tensor, Tensor]:
-    """Where a lens put directions, and whether the image has a value there.
+def source_pixels(camera: Camera, points_cam: Tensor) -> tuple[Tensor, Tensor]:
+    """Where a lens put points, and whether the image has a value there.
 
     Args:
         camera: the camera that took the image.
-        normalized: (..., N, 2) undistorted coordinates on the plane z = 1.
+        points_cam: (..., N, 3), rays for example.
 
     Returns:
         pixels (..., N, 2) and seen (..., N): before the lens folds, and between the centres of the outer pixels, so
@@ -34,12 +36,11 @@ def source_pixels(camera: Camera, normalized: Tensor) -> tuple[Tensor, Tensor]:
 
     Example:
         >>> camera = Camera.build(focal=(100, 100), center=(50, 40), size=(101, 81), model="pinhole")
-        >>> pixels, seen = source_pixels(camera, torch.tensor([[0.25, 0.0], [0.5, 0.375], [0.51, 0.0]]))
+        >>> pixels, seen = source_pixels(camera, torch.tensor([[1.0, 0.0, 4.0], [4.0, 3.0, 8.0], [51.0, 0.0, 100.0]]))
         >>> pixels[0].tolist(), seen.tolist()
         ([75.0, 40.0], [True, True, False])
     """
-    points = torch.cat([normalized, torch.ones_like(normalized[..., :1])], -1)
-    pixels, valid = camera.project(points)
+    pixels, valid = camera.project(points_cam)
     last = torch.tensor(camera.size, dtype=pixels.dtype, device=pixels.device) - 1
     near = ((pixels >= -SLACK) & (pixels <= last + SLACK)).all(-1)
     # On the bounds themselves clamp passes the gradient on.
@@ -56,11 +57,13 @@ def new_pinhole(camera: Camera, alpha: float = 0.0, size: tuple[int, int] | None
     image's border are narrowed down, and alpha 0 is checked at every border pixel of the new image.
 
     A part of the image where the lens model folds, or has no preimage, counts for neither rectangle. With a very wide
-    lens the outer one is huge, and the middle of an image with alpha 1 small: a pinhole cannot show 180°.
+    lens the outer one is huge, and the middle of an image with alpha 1 small: a pinhole cannot show 180°. For such a
+    lens, a fisheye above all, choose the new focal length yourself: `Camera.build(..., model="pinhole")`.
 
     Args:
         camera: one camera or a batch.
-        alpha: 0: every pixel of the new image is valid; 1: every pixel of the source that has a ray is kept.
+        alpha: 0: every pixel of the new image is valid; 1: every pixel of the source that has a ray, less than 89°
+            from the axis, is kept.
         size: (width, height) of the new image, the camera's own if not given.
 
     Returns:
@@ -131,9 +134,10 @@ def _extremes(camera: Camera, outermost: bool) -> Tensor:
     for _ in range(3):
         along = start[..., None] + (end - start)[..., None] * step
         pixels = _border(torch.zeros_like(last), last, along)
-        normalized, valid = camera.normalize(pixels.flatten(-3, -2))
-        normalized, valid = normalized.unflatten(-2, (4, _SAMPLES)), valid.unflatten(-1, (4, _SAMPLES))
-        reach = torch.cat([normalized[..., :2, :, 0], normalized[..., 2:, :, 1]], -2) * sign[:, None]
+        rays, valid = camera.unproject(pixels.flatten(-3, -2))
+        rays, valid = rays.unflatten(-2, (4, _SAMPLES)), valid.unflatten(-1, (4, _SAMPLES))
+        valid = valid & (rays[..., 2] > math.cos(_WIDEST))
+        reach = torch.cat([rays[..., :2, :, 0], rays[..., 2:, :, 1]], -2) / rays[..., 2] * sign[:, None]
         best, index = torch.where(valid, reach, -math.inf).max(-1)
         value = best * sign
         along = along.expand(reach.shape)
@@ -147,15 +151,16 @@ def _inner(camera: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     vector = camera.parameters_vector
     shape = torch.tensor(size, dtype=vector.dtype, device=vector.device) - 1
     # A side without rays lies beyond the fold: there the rectangle of the image's shape in the valid disc ends it.
-    disc = camera.valid_radius[..., None] * shape / torch.linalg.vector_norm(shape)
+    disc = torch.linalg.vector_norm(_rim(camera), dim=-1).amin(-1, keepdim=True) * shape / shape.norm()
     sides = _extremes(camera, outermost=False)
     low = torch.where(sides[..., 0::2].isfinite(), sides[..., 0::2], -disc)
     high = torch.where(sides[..., 1::2].isfinite(), sides[..., 1::2], disc)
 
     middle = (torch.tensor(camera.size, dtype=vector.dtype, device=vector.device) - 1) / 2
-    centre, valid = camera.normalize(middle[None])
-    centre = centre[..., 0, :]
-    if not bool((valid[..., 0] & (centre > low).all(-1) & (centre < high).all(-1)).all()):
+    rays, valid = camera.unproject(middle[None])
+    ray, valid = rays[..., 0, :], valid[..., 0]
+    centre = ray[..., :2] / ray[..., 2:]
+    if not bool((valid & (ray[..., 2] > 0) & (centre > low).all(-1) & (centre < high).all(-1)).all()):
         raise DegenerateError("the image's centre has no valid ray; check the camera, or build the new one by hand")
 
     columns, rows = (torch.linspace(0, 1, n, dtype=vector.dtype, device=vector.device) for n in size)
@@ -165,9 +170,9 @@ def _inner(camera: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     def clear(scale: Tensor) -> Tensor:
         """Whether all pixels along the border have a source when the rectangle shrinks towards the centre."""
         border = _border(*_towards(centre, low, high, scale), along)
-        return source_pixels(camera, border.flatten(-3, -2))[1].all(-1)
+        return source_pixels(camera, _points(border.flatten(-3, -2)))[1].all(-1)
 
-    good, bad = torch.zeros_like(camera.valid_radius), torch.ones_like(camera.valid_radius)
+    good, bad = torch.zeros_like(centre[..., 0]), torch.ones_like(centre[..., 0])
     good = torch.where(clear(bad), bad, good)
     while bool((bad - good > 1e-9).any()):
         trial = (good + bad) / 2
@@ -184,14 +189,30 @@ def _towards(centre: Tensor, low: Tensor, high: Tensor, scale: Tensor) -> tuple[
 
 def _outer(camera: Camera) -> tuple[Tensor, Tensor]:
     """The rectangle round every source pixel that has a ray."""
-    vector = camera.parameters_vector
     sides = _extremes(camera, outermost=True)
     low, high = sides[..., 0::2], sides[..., 1::2]
     # Where the fold crosses the image, the valid region ends on its rim instead of on the image's border.
-    turn = torch.arange(_RIM, dtype=vector.dtype, device=vector.device) * (2 * math.pi / _RIM)
-    circle = torch.stack([torch.cos(turn), torch.sin(turn)], -1)
-    rim = circle * (camera.valid_radius[..., None, None] * (1 - 1e-9))
-    _, seen = source_pixels(camera, rim)
+    rim = _rim(camera)
+    _, seen = source_pixels(camera, _points(rim))
     low = torch.minimum(low, torch.where(seen[..., None], rim, math.inf).amin(-2))
     high = torch.maximum(high, torch.where(seen[..., None], rim, -math.inf).amax(-2))
     return low, high
+
+
+def _rim(camera: Camera) -> Tensor:
+    """The last valid points of the plane z = 1 along 1440 directions from the axis, (..., 1440, 2)."""
+    vector = camera.parameters_vector
+    turn = torch.arange(_RIM, dtype=vector.dtype, device=vector.device) * (2 * math.pi / _RIM)
+    circle = torch.stack([torch.cos(turn), torch.sin(turn)], -1)
+    low, high = torch.zeros_like(turn), torch.full_like(turn, _WIDEST)
+    # Halved until neither angle can be told from the other.
+    for _ in range(52):
+        middle = (low + high) / 2
+        _, valid = camera.project(_points(circle * torch.tan(middle)[..., None]))
+        low, high = torch.where(valid, middle, low), torch.where(valid, high, middle)
+    return circle * torch.tan(low)[..., None]
+
+
+def _points(normalized: Tensor) -> Tensor:
+    """Points (..., 3) on the plane z = 1."""
+    return torch.cat([normalized, torch.ones_like(normalized[..., :1])], -1)

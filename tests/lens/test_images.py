@@ -276,7 +276,7 @@ class TestMask:
     def test_needs_all_four_neighbours(self) -> None:
         camera = build(100, (11, 9), [], "pinhole")
         pixels = torch.tensor([[0.0, 0.0], [10.0, 8.0], [-1e-3, 4.0], [5.0, 8.001], [10.0 + 1e-8, 4.0]], dtype=F64)
-        found, seen = source_pixels(camera, (pixels - camera.center) / camera.focal)
+        found, seen = source_pixels(camera, camera.unproject(pixels)[0])
         assert seen.tolist() == [True, True, False, False, True]
         assert found[-1].tolist() == [10.0, 4.0]
 
