@@ -75,7 +75,7 @@ def project_components(
     offset = len(INTRINSICS)
     lens_wanted = [i - offset for i in wanted or () if i >= offset]
     lens = distort_components(x, y, parameters[..., offset:], model, lens_wanted)
-    fx, fy, cx, cy, skew = unbind_last(parameters[..., :offset])
+    fx, fy, _, _, skew = unbind_last(parameters[..., :offset])
     pixels = torch.stack(to_pixels(lens.x, lens.y, parameters), -2)
     regular = lens.positive & (lens.determinant > 0)
     if not model.fisheye:
