@@ -123,6 +123,15 @@ class TestFold:
         r = math.sqrt(3.0)
         assert FOLDING.inside(600 * torch.tensor([[r - 0.2 * r**3, 0.0]], dtype=F64) + FOLDING.center).all()
 
+    def test_new_pixels_without_a_ray_are_masked(self) -> None:
+        """The other way round: the new camera's corners have no preimage, and must not show the optical axis."""
+        folding = Camera.build(focal=(75, 75), center=(240, 135), size=(480, 270), coefficients=[-0.2])
+        wide = new_pinhole(folding, alpha=1)
+        _, valid = folding.unproject(folding.grid(480, 270).flatten(0, 1))
+        mask = undistort_maps(wide, folding).mask
+        assert 0.05 < mask.mean() < 0.9
+        assert np.array_equal(mask, valid.unflatten(0, (270, 480)).numpy())
+
     def test_alpha(self) -> None:
         """None of this camera's four sides has a ray; both rectangles end on the fold's circle."""
         radius = math.sqrt(1 / 0.6)
