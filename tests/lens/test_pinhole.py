@@ -125,12 +125,12 @@ class TestFold:
 
     def test_new_pixels_without_a_ray_are_masked(self) -> None:
         """The other way round: the new camera's corners have no preimage, and must not show the optical axis."""
-        folding = Camera.build(focal=(75, 75), center=(240, 135), size=(480, 270), coefficients=[-0.2])
+        folding = Camera.build(focal=(25, 25), center=(80, 45), size=(160, 90), coefficients=[-0.2])
         wide = new_pinhole(folding, alpha=1)
-        _, valid = folding.unproject(folding.grid(480, 270).flatten(0, 1))
+        _, valid = folding.unproject(folding.grid(160, 90).flatten(0, 1))
         mask = undistort_maps(wide, folding).mask
         assert 0.05 < mask.mean() < 0.9
-        assert np.array_equal(mask, valid.unflatten(0, (270, 480)).numpy())
+        assert np.array_equal(mask, valid.unflatten(0, (90, 160)).numpy())
 
     def test_alpha(self) -> None:
         """None of this camera's four sides has a ray; both rectangles end on the fold's circle."""
