@@ -48,7 +48,7 @@ class Distorted(NamedTuple):
     def determinant(self) -> Tensor:
         """Of the derivative by the point: positive before the lens folds."""
         a, b, d, e = self.point
-        return a * e - b * d
+        return torch.addcmul(a * e, b, d, value=-1.0)
 
 
 def unbind_last(values: Tensor) -> tuple[Tensor, ...]:
@@ -129,12 +129,13 @@ def distort_components(
         p1x, p1y, p2x, p2y = p1 * x, p1 * y, p2 * x, p2 * y
         # p1 s + 2 y (p1 y + p2 x) is p1 (s + 2 y²) + 2 p2 x y, and likewise for x.
         shear = 2.0 * (p1y + p2x)
-        u, v = u + p2 * s + x * shear, v + p1 * s + y * shear
+        u = torch.addcmul(torch.addcmul(u, p2, s), x, shear)
+        v = torch.addcmul(torch.addcmul(v, p1, s), y, shear)
         if slopes:
             a, b, d, e = point
             # By the product rule: shear + 2 p2 x + 2 p2 x and so on.
             turn = 2.0 * (p2y + p1x)
-            a, e = a + shear + 4.0 * p2x, e + shear + 4.0 * p1y
+            a, e = torch.add(a + shear, p2x, alpha=4.0), torch.add(e + shear, p1y, alpha=4.0)
             point = (a, b + turn, d + turn, e)
 
     columns = _columns(x, y, s, xx, xy, yy, g, inverse, model, wanted)

@@ -18,7 +18,7 @@ from kcal.lens.eager import finite_or, in_chunks, is_differentiated, known_true,
 from kcal.lens.hard import solve_hard
 from kcal.lens.model import LensModel
 from kcal.lens.region import Region, in_region, valid_radius, valid_region
-from kcal.lens.start import fit_start, start_from
+from kcal.lens.start import fit_start, start_from, without_tilt
 
 __all__ = ["Inverse", "prepare_inverse", "undistort", "undistort_components", "valid_radius"]
 
@@ -27,8 +27,9 @@ TOLERANCE = 1e-13
 # Plain steps before a point counts as hard, and damped steps where all points take the same number.
 _PLAIN = 6
 _FIXED = 8
-# Below this residual one more step of a method that squares errors is the last.
-_CLOSE = 1e-7
+# A Jacobian taken below the first residual is good enough to be kept: each step gains some four digits with it, so
+# that below the second residual one more step reaches rounding.
+_CLOSE, _LAST = 1e-4, 1e-11
 
 
 class Inverse(NamedTuple):
@@ -110,11 +111,16 @@ def undistort_components(
     return x, y, valid
 
 
-def _newton_step(lens: Distorted, target_x: Tensor, target_y: Tensor) -> tuple[Tensor, Tensor]:
+def _inverse_jacobian(lens: Distorted) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     a, b, d, e = lens.point
-    inverse = lens.determinant.reciprocal()
+    scale = lens.determinant.reciprocal()
+    return e * scale, b * scale, d * scale, a * scale
+
+
+def _newton_step(lens: Distorted, target_x: Tensor, target_y: Tensor) -> tuple[Tensor, Tensor]:
+    e, b, d, a = _inverse_jacobian(lens)
     error_x, error_y = lens.x - target_x, lens.y - target_y
-    return (e * error_x - b * error_y) * inverse, (a * error_y - d * error_x) * inverse
+    return e * error_x - b * error_y, a * error_y - d * error_x
 
 
 def _squared_error(lens: Distorted, target_x: Tensor, target_y: Tensor) -> Tensor:
@@ -123,29 +129,44 @@ def _squared_error(lens: Distorted, target_x: Tensor, target_y: Tensor) -> Tenso
 
 
 def _squared_tolerance(target_x: Tensor, target_y: Tensor) -> Tensor:
-    return TOLERANCE**2 * (1.0 + target_x * target_x + target_y * target_y)
+    return torch.addcmul(torch.addcmul(target_x.new_ones(()), target_x, target_x), target_y, target_y) * TOLERANCE**2
 
 
 def _solve_eagerly(
     target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel, ready: Inverse
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Plain Newton for all, and the safeguarded solver for those that it does not bring home."""
-    x, y = start_from(target_x, target_y, coefficients, model, ready.start)
-    lens = distort_components(x, y, coefficients, model)
+    goal_x, goal_y, own, rest = without_tilt(target_x, target_y, coefficients, model)
+    x, y = start_from(goal_x, goal_y, rest, ready.start)
+    lens = distort_components(x, y, own, rest)
+    close = last = False
     for _ in range(_PLAIN):
-        close = known_true(_squared_error(lens, target_x, target_y) <= _CLOSE**2)
-        step_x, step_y = _newton_step(lens, target_x, target_y)
-        x, y = x - step_x, y - step_y
-        # After the last step only the residual is needed.
-        lens = distort_components(x, y, coefficients, model, slopes=not close)
+        error_x, error_y = lens.x - goal_x, lens.y - goal_y
+        error = torch.addcmul(error_x * error_x, error_y, error_y)
         if close:
+            last = known_true(error <= _LAST**2)
+        else:
+            e, b, d, a = _inverse_jacobian(lens)
+            close = known_true(error <= _CLOSE**2)
+        x = torch.addcmul(torch.addcmul(x, b, error_y), e, error_x, value=-1.0)
+        y = torch.addcmul(torch.addcmul(y, d, error_x), a, error_y, value=-1.0)
+        if last:
             break
-    tolerance = _squared_tolerance(target_x, target_y)
-    valid = (_squared_error(lens, target_x, target_y) <= tolerance) & lens.positive
-    valid = valid & in_region(x, y, coefficients, model, ready.region)
+        lens = distort_components(x, y, own, rest, slopes=not close)
+    x, y, valid, tolerance = _judge(x, y, target_x, target_y, coefficients, model, ready)
     if known_true(valid):
         return x, y, valid
     return solve_hard(x, y, valid, target_x, target_y, tolerance, coefficients, model, ready.region)
+
+
+def _judge(
+    x: Tensor, y: Tensor, target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel, ready: Inverse
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Whether x, y are mapped to the target by the whole lens and lie in its region; and the tolerance."""
+    lens = distort_components(x, y, coefficients, model, slopes=False)
+    tolerance = _squared_tolerance(target_x, target_y)
+    arrived = (_squared_error(lens, target_x, target_y) <= tolerance) & lens.positive
+    return x, y, arrived & in_region(x, y, coefficients, model, ready.region), tolerance
 
 
 def _solve_in_fixed_steps(
@@ -154,22 +175,23 @@ def _solve_in_fixed_steps(
     """The same steps for every point: one that does not lower the residual, or leaves the lens, is halved."""
     # Nothing outside the circle around the polygon is asked; `in_region` has the last word.
     limit = (ready.region.corners**2).sum(-1).amax(-1)[..., None]
-    tolerance = _squared_tolerance(target_x, target_y)
-    x, y = start_from(target_x, target_y, coefficients, model, ready.start)
+    goal_x, goal_y, own, rest = without_tilt(target_x, target_y, coefficients, model)
+    x, y = start_from(goal_x, goal_y, rest, ready.start)
     # The axis is always regular; a start outside is no better.
     lost = ~(x * x + y * y < limit)
     x, y = torch.where(lost, 0.0, x), torch.where(lost, 0.0, y)
-    lens = distort_components(x, y, coefficients, model)
-    error = _squared_error(lens, target_x, target_y)
-    step_x, step_y = _newton_step(lens, target_x, target_y)
+    lens = distort_components(x, y, own, rest)
+    error = _squared_error(lens, goal_x, goal_y)
+    step_x, step_y = _newton_step(lens, goal_x, goal_y)
     for _ in range(_FIXED):
         trial_x, trial_y = x - step_x, y - step_y
-        lens = distort_components(trial_x, trial_y, coefficients, model)
-        trial_error = _squared_error(lens, target_x, target_y)
+        lens = distort_components(trial_x, trial_y, own, rest)
+        trial_error = _squared_error(lens, goal_x, goal_y)
         inside = (trial_x * trial_x + trial_y * trial_y < limit) & lens.positive & (lens.determinant > 0)
         better = (trial_error < error) & inside
-        next_x, next_y = _newton_step(lens, target_x, target_y)
+        next_x, next_y = _newton_step(lens, goal_x, goal_y)
         x, y = torch.where(better, trial_x, x), torch.where(better, trial_y, y)
         error = torch.where(better, trial_error, error)
         step_x, step_y = torch.where(better, next_x, 0.5 * step_x), torch.where(better, next_y, 0.5 * step_y)
-    return x, y, (error <= tolerance) & in_region(x, y, coefficients, model, ready.region)
+    x, y, valid, _ = _judge(x, y, target_x, target_y, coefficients, model, ready)
+    return x, y, valid

@@ -8,6 +8,8 @@ for ordinary lenses; what tangential and prism terms add is left to Newton, and 
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 from torch import Tensor
 
@@ -64,9 +66,10 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = DE
     return torch.cat([torch.where(usable[..., None], largest, 1.0), fitted], -1)
 
 
-def start_from(x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel, start: Tensor) -> tuple[Tensor, Tensor]:
-    """A first guess of the undistorted coordinates for distorted ones (..., N)."""
-    x, y = _untilt(x, y, coefficients, model)
+def start_from(x: Tensor, y: Tensor, model: LensModel, start: Tensor) -> tuple[Tensor, Tensor]:
+    """A first guess of the undistorted coordinates for distorted ones (..., N) whose tilt is undone."""
+    if not (model.numerator or model.denominator):
+        return x, y
     largest, constant, *rest = unbind_last(start)
     square = torch.addcmul(x * x, y, y)
     variable = 2.0 * torch.sqrt(torch.clamp(1.0 - square / largest, min=0.0)) - 1.0
@@ -75,14 +78,18 @@ def start_from(x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel, sta
     return x * ratio, y * ratio
 
 
-def _untilt(x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:
-    """Undo the tilt homography in closed form."""
+def without_tilt(
+    x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel
+) -> tuple[Tensor, Tensor, Tensor, LensModel]:
+    """Undo the tilt of distorted coordinates (..., N) in closed form: x, y, and the lens that remains."""
     if not model.tilt:
-        return x, y
+        return x, y, coefficients, model
+    rest = dataclasses.replace(model, tilt=False)
     c = unbind_last(coefficients)
     tau_x, tau_y = c[model.names.index("tau_x")], c[model.names.index("tau_y")]
     cos_x, sin_x, cos_y, sin_y = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
     a, b = cos_x - sin_y * x, (cos_y * sin_x) * x
     d, e = -sin_y * (sin_x + y), cos_y * (1.0 + sin_x * y)
     scale = (cos_y * cos_x) * (a * e - b * d).reciprocal()
-    return (e * x - b * y) * scale, (a * y - d * x) * scale
+    kept = [model.names.index(name) for name in rest.names]
+    return (e * x - b * y) * scale, (a * y - d * x) * scale, coefficients[..., kept], rest
