@@ -53,7 +53,7 @@ class Camera(nn.Module):
     parameters_vector: Tensor
     free_mask: Tensor
     valid_radius: Tensor
-    valid_corners: Tensor
+    valid_edge: Tensor
     inverse_start: Tensor
 
     def __init__(self, parameters: Tensor, *, size: tuple[int, int], model: LensModel | str = "opencv5") -> None:
@@ -164,7 +164,7 @@ class Camera(nn.Module):
     @property
     def valid_region(self) -> Region:
         """Where the lens is valid, on the plane z = 1 (for a fisheye, on the plane of angles)."""
-        return Region(self.valid_radius, self.valid_corners)
+        return Region(self.valid_radius, self.valid_edge)
 
     def valid_polygon(self) -> Tensor:
         """The part of the image whose pixels have a ray, as a polygon (V, 2) of pixels; clockwise as one sees it.
@@ -186,7 +186,7 @@ class Camera(nn.Module):
             corners = values.new_tensor([[-0.5, -0.5], [width, -0.5], [-0.5, height], [width, height]])
             x, y = from_pixels(corners[:, 0], corners[:, 1], values)
             region, start = prepare_inverse(values[..., 5:], self.model, torch.hypot(x, y).amax(-1))
-        return {"valid_radius": region.radius, "valid_corners": region.corners, "inverse_start": start}
+        return {"valid_radius": region.radius, "valid_edge": region.edge, "inverse_start": start}
 
     def update_valid_region(self) -> None:
         """Measure the valid region again; call it after changing parameters in place."""

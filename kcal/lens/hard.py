@@ -53,8 +53,8 @@ def solve_hard(
     )
     lenses = coefficients.expand(*lead, model.size).reshape(cameras, model.size)
     radius = region.radius.expand(lead).reshape(cameras)
-    corners = region.corners.expand(*lead, DIRECTIONS, 2).reshape(cameras, DIRECTIONS, 2)
-    sample_x, sample_y, image_x, image_y = _samples(lenses, model, corners)
+    edges = region.edge.expand(*lead, -1).reshape(cameras, -1)
+    sample_x, sample_y, image_x, image_y = _samples(lenses, model, Region(radius, edges))
 
     camera, place = (~valid).nonzero(as_tuple=True)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -62,7 +62,7 @@ def solve_hard(
         goal_x, goal_y, enough = target_x[c, n], target_y[c, n], tolerance[c, n]
         nearest = ((image_x[c] - goal_x[:, None]) ** 2 + (image_y[c] - goal_y[:, None]) ** 2).argmin(-1)
         own = lenses[c] if cameras > 1 else lenses[0]
-        here = Region(radius[c], corners[c]) if cameras > 1 else Region(radius[0], corners[0])
+        here = Region(radius[c], edges[c]) if cameras > 1 else Region(radius[0], edges[0])
         # One lens a point where there are several: points then have a dimension of their own, of length one.
         tail = (-1, 1) if cameras > 1 else (-1,)
         args = (goal_x.reshape(tail), goal_y.reshape(tail), enough.reshape(tail), own, model, here)
@@ -74,13 +74,13 @@ def solve_hard(
     return x, y, valid
 
 
-def _samples(lenses: Tensor, model: LensModel, corners: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _samples(lenses: Tensor, model: LensModel, region: Region) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points of each region on rings like its edge, axis included, and where they are mapped: (cameras, 1025) each."""
     rings = torch.arange(1, _RINGS + 1, dtype=torch.float64, device=lenses.device) / (_RINGS + 0.5)
-    points = (rings[:, None, None] * corners[:, None]).flatten(1, 2)
+    points = (rings[:, None, None] * region.outline(DIRECTIONS)[:, None]).flatten(1, 2)
     points = torch.cat([torch.zeros_like(points[:, :1]), points], 1)
     x, y = points.unbind(-1)
-    lens = distort_components(x, y, lenses, model, slopes=True)
+    lens = distort_components(x, y, lenses, model)
     regular = lens.positive & (lens.determinant > 0)
     # Far enough never to be the nearest, and still finite when squared.
     image_x, image_y = (

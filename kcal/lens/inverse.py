@@ -2,7 +2,7 @@
 
 Most points need three steps from the start of `kcal.lens.start`. The few that do not arrive, near a fold or without a
 preimage at all, go to `kcal.lens.hard`. Where Python may not look at values (compile, export, vmap) all points take
-the same number of damped steps, and what has not arrived by then is flagged.
+the same number of steps, and what has not arrived by then is flagged.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ __all__ = ["Inverse", "prepare_inverse", "undistort", "undistort_components", "v
 
 # Residual in normalized coordinates: 1e-13 is 2e-10 px at f = 2000 px, just above rounding.
 TOLERANCE = 1e-13
-# Plain steps before a point counts as hard, and damped steps where all points take the same number.
-_PLAIN = 6
-_FIXED = 8
+# Steps before a point counts as hard, and steps where all points take the same number.
+_MOST = 6
+_FIXED = 6
 # A Jacobian taken below the first residual is good enough to be kept: each step gains some four digits with it, so
 # that below the second residual one more step reaches rounding.
 _CLOSE, _LAST = 1e-4, 1e-11
@@ -103,9 +103,7 @@ def undistort_components(
             x, y = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0)
     if is_differentiated(target_x, target_y, coefficients):
         for _ in range(2):
-            lens = distort_components(x, y, coefficients, model)
-            step_x, step_y = _newton_step(lens, target_x, target_y)
-            x, y = x - step_x, y - step_y
+            x, y = _newton_step(x, y, target_x, target_y, coefficients, model)
             if not all_valid:
                 x, y = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0)
     return x, y, valid
@@ -117,10 +115,13 @@ def _inverse_jacobian(lens: Distorted) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return e * scale, b * scale, d * scale, a * scale
 
 
-def _newton_step(lens: Distorted, target_x: Tensor, target_y: Tensor) -> tuple[Tensor, Tensor]:
+def _newton_step(
+    x: Tensor, y: Tensor, target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel
+) -> tuple[Tensor, Tensor]:
+    lens = distort_components(x, y, coefficients, model)
     e, b, d, a = _inverse_jacobian(lens)
     error_x, error_y = lens.x - target_x, lens.y - target_y
-    return e * error_x - b * error_y, a * error_y - d * error_x
+    return x - (e * error_x - b * error_y), y - (a * error_y - d * error_x)
 
 
 def _squared_error(lens: Distorted, target_x: Tensor, target_y: Tensor) -> Tensor:
@@ -140,7 +141,7 @@ def _solve_eagerly(
     x, y = start_from(goal_x, goal_y, rest, ready.start)
     lens = distort_components(x, y, own, rest)
     close = last = False
-    for _ in range(_PLAIN):
+    for _ in range(_MOST):
         error_x, error_y = lens.x - goal_x, lens.y - goal_y
         error = torch.addcmul(error_x * error_x, error_y, error_y)
         if close:
@@ -153,45 +154,23 @@ def _solve_eagerly(
         if last:
             break
         lens = distort_components(x, y, own, rest, slopes=not close)
-    x, y, valid, tolerance = _judge(x, y, target_x, target_y, coefficients, model, ready)
+    lens = distort_components(x, y, coefficients, model, slopes=False)
+    tolerance = _squared_tolerance(target_x, target_y)
+    valid = (_squared_error(lens, target_x, target_y) <= tolerance) & lens.positive
+    valid = valid & in_region(x, y, coefficients, model, ready.region)
     if known_true(valid):
         return x, y, valid
     return solve_hard(x, y, valid, target_x, target_y, tolerance, coefficients, model, ready.region)
 
 
-def _judge(
-    x: Tensor, y: Tensor, target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel, ready: Inverse
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Whether x, y are mapped to the target by the whole lens and lie in its region; and the tolerance."""
-    lens = distort_components(x, y, coefficients, model, slopes=False)
-    tolerance = _squared_tolerance(target_x, target_y)
-    arrived = (_squared_error(lens, target_x, target_y) <= tolerance) & lens.positive
-    return x, y, arrived & in_region(x, y, coefficients, model, ready.region), tolerance
-
-
 def _solve_in_fixed_steps(
     target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel, ready: Inverse
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The same steps for every point: one that does not lower the residual, or leaves the lens, is halved."""
-    # Nothing outside the circle around the polygon is asked; `in_region` has the last word.
-    limit = (ready.region.corners**2).sum(-1).amax(-1)[..., None]
+    """The same steps for every point. What strays, beside a fold or without a preimage, fails the last check."""
     goal_x, goal_y, own, rest = without_tilt(target_x, target_y, coefficients, model)
     x, y = start_from(goal_x, goal_y, rest, ready.start)
-    # The axis is always regular; a start outside is no better.
-    lost = ~(x * x + y * y < limit)
-    x, y = torch.where(lost, 0.0, x), torch.where(lost, 0.0, y)
-    lens = distort_components(x, y, own, rest)
-    error = _squared_error(lens, goal_x, goal_y)
-    step_x, step_y = _newton_step(lens, goal_x, goal_y)
     for _ in range(_FIXED):
-        trial_x, trial_y = x - step_x, y - step_y
-        lens = distort_components(trial_x, trial_y, own, rest)
-        trial_error = _squared_error(lens, goal_x, goal_y)
-        inside = (trial_x * trial_x + trial_y * trial_y < limit) & lens.positive & (lens.determinant > 0)
-        better = (trial_error < error) & inside
-        next_x, next_y = _newton_step(lens, goal_x, goal_y)
-        x, y = torch.where(better, trial_x, x), torch.where(better, trial_y, y)
-        error = torch.where(better, trial_error, error)
-        step_x, step_y = torch.where(better, next_x, 0.5 * step_x), torch.where(better, next_y, 0.5 * step_y)
-    x, y, valid, _ = _judge(x, y, target_x, target_y, coefficients, model, ready)
-    return x, y, valid
+        x, y = _newton_step(x, y, goal_x, goal_y, own, rest)
+    lens = distort_components(x, y, coefficients, model, slopes=not model.radial)
+    valid = (_squared_error(lens, target_x, target_y) <= _squared_tolerance(target_x, target_y)) & lens.positive
+    return x, y, valid & in_region(x, y, coefficients, model, ready.region, lens)

@@ -8,7 +8,7 @@ from torch import Tensor
 from kcal.lens.distortion import distort_components
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS, to_pixels
-from kcal.lens.region import Region, directions
+from kcal.lens.region import Region
 
 _COUNT = 256
 # A little inside the edge: at a pole the edge itself is mapped to infinity.
@@ -17,9 +17,8 @@ _INSIDE = 1.0 - 1e-6
 
 def image_outline(parameters: Tensor, model: LensModel, region: Region, size: tuple[int, int]) -> Tensor:
     """The part of the image (width, height) that the region is mapped to: a polygon (V, 2) of pixels."""
-    x, y = directions(_COUNT, parameters)
-    reach = torch.maximum(region.radius, 1.0 / region.fraction(x, y)) * _INSIDE
-    lens = distort_components(x * reach, y * reach, parameters[len(INTRINSICS) :], model, slopes=False)
+    x, y = (region.outline(_COUNT) * _INSIDE).unbind(-1)
+    lens = distort_components(x, y, parameters[len(INTRINSICS) :], model, slopes=False)
     polygon = torch.stack(to_pixels(lens.x, lens.y, parameters), -1)
     return clip_to_image(polygon, size) if bool(region.radius > 0) else polygon[:0]
 

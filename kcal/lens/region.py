@@ -7,7 +7,8 @@ edge of a region once around the origin is one-to-one inside; where the edge doe
 inside which a pixel has several preimages), the region is pulled in until it does.
 
 For a lens without tangential, prism and tilt terms the region is a disc. For others it is the union of the largest
-disc about the axis and the regular part of the polygon through the 64 places.
+disc about the axis and the regular part of what a short Fourier series encloses: the reciprocal of the limit as a
+function of the direction, rounded up so that it stays inside the 64 places.
 """
 
 from __future__ import annotations
@@ -18,16 +19,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.distortion import check_coefficients, distort_components
+from kcal.lens.distortion import Distorted, check_coefficients, distort_components, unbind_last
 from kcal.lens.eager import known_true
 from kcal.lens.model import LensModel
 from kcal.lens.plane import largest_radius
 
-_QUARTER = 16
-DIRECTIONS = 4 * _QUARTER
+DIRECTIONS = 64
+_HARMONICS = 6
 # How far beyond the smallest disc the region may reach, or how far inside it must stay, until it is one-to-one.
 _CAPS = (math.inf, 8.0, 4.0, 2.5, 1.7, 1.3, 1.15, 1.05, 1.0, 0.8, 0.6, 0.4, 0.2)
-
 # The limit is smooth along the directions: within this fraction of the smallest one no fold hides between two of them.
 _SURE = 0.95
 
@@ -37,11 +37,12 @@ class Region(NamedTuple):
 
     Attributes:
         radius: (...) of the largest disc about the axis inside the region.
-        corners: (..., 64, 2) of the polygon, clockwise as seen in the image, beginning on the x axis.
+        edge: (..., 13) Fourier series of the reciprocal distance of the edge: constant, then cosine and sine of the
+            direction's first, second, ... multiple.
     """
 
     radius: Tensor
-    corners: Tensor
+    edge: Tensor
 
     def covers(self, x: Tensor, y: Tensor, fraction: float = 1.0) -> Tensor:
         """Whether points (..., N) lie in the disc, or in a fraction of it."""
@@ -49,33 +50,49 @@ class Region(NamedTuple):
         return torch.addcmul(x * x, y, y) < radius * radius
 
     def fraction(self, x: Tensor, y: Tensor) -> Tensor:
-        """How far out points (..., N) lie, as a fraction of the way to the polygon's edge.
+        """How far out points (..., N) lie, as a fraction of the way to the edge that the series describes."""
+        distance = torch.sqrt(torch.addcmul(x * x, y, y))
+        scale = torch.clamp(distance, min=1e-300).reciprocal()
+        return distance * _fourier(self.edge, x * scale, y * scale)
 
-        Directions are told by y / (|x| + |y|), a stand-in for the angle that needs no trigonometry. The corners are
-        evenly spaced in it, and along an edge the reciprocal of |x| + |y| is linear in it.
-        """
-        length = x.abs() + y.abs()
-        slope = y / torch.clamp(length, min=1e-300)
-        turn = torch.where(x < 0, 2.0 - slope, torch.where(slope < 0, slope + 4.0, slope)) * _QUARTER
-        index = torch.clamp(turn.floor(), 0, DIRECTIONS - 1)
-        weight = turn - index
-        near = torch.nan_to_num(index).to(torch.int64)
-        reciprocal = self.corners.abs().sum(-1).reciprocal()
-        reciprocal = torch.cat([reciprocal, reciprocal[..., :1]], -1)
-        shape = torch.broadcast_shapes(near.shape[:-1], reciprocal.shape[:-1])
-        table = reciprocal.expand(*shape, DIRECTIONS + 1)
-        near = near.expand(*shape, near.shape[-1])
-        low, high = torch.gather(table, -1, near), torch.gather(table, -1, near + 1)
-        return length * (low + weight * (high - low))
+    def outline(self, count: int) -> Tensor:
+        """Points (..., count, 2) on the edge of the region, clockwise as seen in the image, the first on the x axis."""
+        unit_x, unit_y = directions(count, self.edge)
+        reciprocal = _fourier(self.edge, unit_x, unit_y)
+        reach = torch.maximum(self.radius[..., None], reciprocal.reciprocal())
+        return torch.stack([reach * unit_x, reach * unit_y], -1)
+
+
+def _fourier(edge: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+    """The series at directions given by their cosine and sine."""
+    constant, *rest = unbind_last(edge)
+    double = 2.0 * cosine
+    value = torch.addcmul(torch.addcmul(constant, rest[0], cosine), rest[1], sine)
+    c, c_before, s, s_before = cosine, torch.ones_like(cosine), sine, torch.zeros_like(sine)
+    for k in range(1, _HARMONICS):
+        c, c_before, s, s_before = double * c - c_before, c, double * s - s_before, s
+        value = torch.addcmul(torch.addcmul(value, rest[2 * k], c), rest[2 * k + 1], s)
+    return value
+
+
+def _fit_edge(limits: Tensor) -> Tensor:
+    """The series (..., 13) that stays within limits (..., 64) at every one of the directions."""
+    angle = torch.arange(DIRECTIONS, dtype=torch.float64, device=limits.device) * (2 * math.pi / DIRECTIONS)
+    waves = [f(k * angle) for k in range(1, _HARMONICS + 1) for f in (torch.cos, torch.sin)]
+    basis = torch.stack([torch.ones_like(angle), *waves], -1)
+    weights = basis * (2.0 / DIRECTIONS)
+    weights[:, 0] *= 0.5
+    # A lens that is irregular on the axis reaches nowhere; 1e100 stands for the reciprocal of zero.
+    wanted = limits.clamp(min=1e-100).reciprocal()
+    series = wanted @ weights
+    raise_by = (wanted - series @ basis.T).amax(-1).clamp(min=0.0)
+    return torch.cat([series[..., :1] + raise_by[..., None], series[..., 1:]], -1)
 
 
 def directions(count: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vectors (count,) around the origin, evenly spaced in y / (|x| + |y|) as `Region.fraction` wants them."""
-    turn = torch.arange(count, dtype=torch.float64, device=like.device) * (4.0 / count)
-    y = torch.where(turn <= 1.0, turn, torch.where(turn <= 3.0, 2.0 - turn, turn - 4.0))
-    x = torch.where(turn <= 2.0, 1.0 - turn, turn - 3.0)
-    length = torch.sqrt(x * x + y * y)
-    return x / length, y / length
+    """Cosine and sine (count,) of directions spread evenly, beginning on the x axis."""
+    angle = torch.arange(count, dtype=torch.float64, device=like.device) * (2 * math.pi / count)
+    return torch.cos(angle), torch.sin(angle)
 
 
 @torch.no_grad()
@@ -129,43 +146,58 @@ def valid_region(coefficients: Tensor, model: LensModel | str) -> Region:
     Example:
         >>> k = torch.tensor([-1.0 / 12.0, 0.0, 0.0, 0.0], dtype=torch.float64)
         >>> region = valid_region(k, "opencv4")  # x - x³/12 turns back at x = 2
-        >>> round(float(region.radius), 12), [round(float(c), 12) for c in region.corners[0]]
+        >>> round(float(region.radius), 12), [round(float(c), 12) for c in region.outline(4)[0]]
         (2.0, [2.0, 0.0])
     """
     model = LensModel.named(model)
     coefficients = check_coefficients(coefficients, model)
-    unit_x, unit_y = directions(DIRECTIONS, coefficients)
     if model.radial:
-        radius = first_limits(coefficients, model, 1)[..., 0]
-        limits = radius[..., None].expand(*radius.shape, DIRECTIONS)
-        return Region(radius, torch.stack([limits * unit_x, limits * unit_y], -1))
+        limits = first_limits(coefficients, model, 1)
+        return Region(limits[..., 0], _fit_edge(limits.expand(*limits.shape[:-1], DIRECTIONS)))
     limits = first_limits(coefficients, model, DIRECTIONS)
     smallest = limits.amin(-1, keepdim=True)
     caps = torch.tensor(_CAPS, dtype=torch.float64, device=limits.device)[:, None]
     # No limit times a radius of zero would be NaN.
     capped = torch.minimum(limits[..., None, :], torch.nan_to_num(caps * smallest[..., None, :], nan=0.0, posinf=1e9))
-    lens = distort_components(
-        (capped * unit_x).flatten(-2), (capped * unit_y).flatten(-2), coefficients, model, slopes=False
-    )
+    candidates = Region(capped.amin(-1), _fit_edge(capped))
+    outline = candidates.outline(DIRECTIONS).flatten(-3, -2)
+    lens = distort_components(outline[..., 0], outline[..., 1], coefficients, model, slopes=False)
     fits = _winds_once(lens.x.unflatten(-1, (-1, DIRECTIONS)), lens.y.unflatten(-1, (-1, DIRECTIONS)))
     # The first cap that fits; close to the axis every regular lens is linear, so the last one stands for it.
-    first = (fits.to(torch.int64).cumsum(-1) == 0).sum(-1).clamp(max=len(_CAPS) - 1)
-    chosen = torch.gather(capped, -2, first[..., None, None].expand(*first.shape, 1, DIRECTIONS))[..., 0, :]
-    return Region(chosen.amin(-1), torch.stack([chosen * unit_x, chosen * unit_y], -1))
+    first = (fits.to(torch.int64).cumsum(-1) == 0).sum(-1).clamp(max=len(_CAPS) - 1)[..., None]
+    radius = torch.gather(candidates.radius, -1, first)[..., 0]
+    edge = torch.gather(candidates.edge, -2, first[..., None].expand(*first.shape, candidates.edge.shape[-1]))
+    return Region(radius, edge[..., 0, :])
 
 
-def in_region(x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel, region: Region) -> Tensor:
+def in_region(
+    x: Tensor,
+    y: Tensor,
+    coefficients: Tensor,
+    model: LensModel,
+    region: Region,
+    lens: Distorted | None = None,
+) -> Tensor:
     """Whether points (..., N) of the plane lie in the valid region.
 
     Near the edge of a lens that is not symmetric the Jacobian itself is asked, so that a fold in between two of the
     64 directions does not go unseen.
+
+    Args:
+        x: (..., N).
+        y: likewise.
+        coefficients: (..., P).
+        model: the lens model.
+        region: of the lens.
+        lens: the lens evaluated there with its slopes, if that is at hand.
     """
     if model.radial:
         return region.covers(x, y)
     sure = region.covers(x, y, _SURE)
     if known_true(sure):
         return sure
-    lens = distort_components(x, y, coefficients, model)
+    if lens is None:
+        lens = distort_components(x, y, coefficients, model)
     near = region.covers(x, y) | (region.fraction(x, y) < 1.0)
     return sure | (near & lens.positive & (lens.determinant > 0))
 

@@ -8,8 +8,6 @@ for ordinary lenses; what tangential and prism terms add is left to Newton, and 
 
 from __future__ import annotations
 
-import dataclasses
-
 import torch
 from torch import Tensor
 
@@ -84,12 +82,15 @@ def without_tilt(
     """Undo the tilt of distorted coordinates (..., N) in closed form: x, y, and the lens that remains."""
     if not model.tilt:
         return x, y, coefficients, model
-    rest = dataclasses.replace(model, tilt=False)
     c = unbind_last(coefficients)
     tau_x, tau_y = c[model.names.index("tau_x")], c[model.names.index("tau_y")]
     cos_x, sin_x, cos_y, sin_y = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
     a, b = cos_x - sin_y * x, (cos_y * sin_x) * x
     d, e = -sin_y * (sin_x + y), cos_y * (1.0 + sin_x * y)
     scale = (cos_y * cos_x) * (a * e - b * d).reciprocal()
-    kept = [model.names.index(name) for name in rest.names]
-    return (e * x - b * y) * scale, (a * y - d * x) * scale, coefficients[..., kept], rest
+    return (
+        (e * x - b * y) * scale,
+        (a * y - d * x) * scale,
+        coefficients[..., list(model.untilted_index)],
+        model.untilted,
+    )
