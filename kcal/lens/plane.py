@@ -5,8 +5,9 @@ angle θ from the optical axis lies at distance θ from the origin, in the same 
 
     (x, y) = θ / ρ · (X, Y),  ρ = √(X² + Y²),  θ = atan2(ρ, Z)
 
-so that points beside the camera and behind it have a place too (Kannala and Brandt, 2006). Near the axis θ / ρ is
-taken from its series, which is exact to rounding and has derivatives of every order.
+so that points beside the camera and behind it have a place too (Kannala and Brandt, 2006). θ / ρ comes from halving the
+angle four times, tan(θ/2) = ρ / (R + Z) and tan(φ/2) = tan φ / (1 + √(1 + tan² φ)), and a series for what is left:
+exact to rounding, smooth on the axis, and made of operations that every runtime has in float64.
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ from torch import Tensor
 
 from kcal.lens.model import LensModel
 
-# Where t = ρ² / Z² or θ² is below this, nine terms of a series are exact to rounding.
+_HALVINGS = 4
+# arctan t / t by powers of t², for t up to tan(180° / 16) = 0.199.
+_ARCTAN = [(-1.0) ** n / (2 * n + 1) for n in range(12)]
+# Where t = ρ² / Z² or θ² is below this, few terms of a series are exact to rounding.
 _NEAR = 0.01
-_ARCTAN = [(-1.0) ** n / (2 * n + 1) for n in range(9)]
-# (d/dt) of the above times two: 2 n / (2 n + 1), for the derivative of θ / ρ by ρ.
+# 2 d/dt of arctan's series: the derivative of θ / ρ by ρ, near the axis.
 _ARCTAN_SLOPE = [(-1.0) ** n * 2 * n / (2 * n + 1) for n in range(1, 10)]
 _SINC = [(-1.0) ** n / math.factorial(2 * n + 1) for n in range(7)]
 _COS = [(-1.0) ** n / math.factorial(2 * n) for n in range(7)]
@@ -33,24 +36,21 @@ def largest_radius(model: LensModel) -> float:
 
 
 def _series(coefficients: list[float], t: Tensor) -> Tensor:
-    value = torch.full_like(t, coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
-        value = value * t + coefficient
+    # As a tensor: ONNX would write plain numbers as float32.
+    *rest, value = torch.tensor(coefficients, dtype=t.dtype, device=t.device).unbind()
+    for coefficient in reversed(rest):
+        value = torch.addcmul(coefficient, value, t)
     return value
 
 
-def _angle_over_distance(X: Tensor, Y: Tensor, Z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """θ / ρ, and what its derivative needs: ρ² (1 where near), where the series holds, and its t and Z there."""
+def _angle_over_distance(X: Tensor, Y: Tensor, Z: Tensor) -> Tensor:
+    """θ / ρ."""
     square = X * X + Y * Y
-    near = (square < _NEAR * Z * Z) & (Z > 0)
-    # The branch that is not taken gets harmless numbers, so that its gradient is not NaN.
-    depth = torch.where(near, Z, 1.0)
-    t = torch.where(near, square / (depth * depth), 0.0)
-    far_square = torch.where(near, 1.0, square)
-    rho = torch.sqrt(far_square)
-    ratio = torch.where(near, _series(_ARCTAN, t) / depth, torch.atan2(rho, Z) / rho)
-    slope_near = _series(_ARCTAN_SLOPE, t) / (depth * depth * depth)
-    return ratio, far_square, near, slope_near
+    # tan(angle) / ρ of the half angle, the quarter, ...
+    ratio = (torch.sqrt(square + Z * Z) + Z).reciprocal()
+    for _ in range(_HALVINGS - 1):
+        ratio = ratio / (1.0 + torch.sqrt(1.0 + square * ratio * ratio))
+    return 2.0**_HALVINGS * ratio * _series(_ARCTAN, square * ratio * ratio)
 
 
 def plane_from_points(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:
@@ -66,7 +66,7 @@ def plane_from_points(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
     if not model.fisheye:
         inverse = Z.reciprocal()
         return X * inverse, Y * inverse
-    ratio = _angle_over_distance(X, Y, Z)[0]
+    ratio = _angle_over_distance(X, Y, Z)
     return ratio * X, ratio * Y
 
 
@@ -76,9 +76,14 @@ def plane_with_slopes(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
         inverse = Z.reciprocal()
         x, y = X * inverse, Y * inverse
         return x, y, inverse, torch.zeros_like(x), inverse, -x * inverse, -y * inverse
-    ratio, far_square, near, slope_near = _angle_over_distance(X, Y, Z)
-    by_distance = (X * X + Y * Y + Z * Z).reciprocal()
-    h = torch.where(near, slope_near, (Z * by_distance - ratio) / far_square)
+    ratio = _angle_over_distance(X, Y, Z)
+    square = X * X + Y * Y
+    by_distance = (square + Z * Z).reciprocal()
+    # h is the derivative of θ / ρ by ρ, over ρ; near the axis its difference would cancel.
+    near = (square < _NEAR * Z * Z) & (Z > 0)
+    depth = torch.where(near, Z, 1.0)
+    series = _series(_ARCTAN_SLOPE, torch.where(near, square / (depth * depth), 0.0)) / (depth * depth * depth)
+    h = torch.where(near, series, (Z * by_distance - ratio) / torch.where(near, 1.0, square))
     cross = X * Y * h
     return (
         ratio * X, ratio * Y, ratio + X * X * h, cross, ratio + Y * Y * h, -X * by_distance, -Y * by_distance,
