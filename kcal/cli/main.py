@@ -17,6 +17,7 @@ from kcal.cli.demo import demo
 from kcal.cli.detect import detect
 from kcal.cli.locate import locate
 from kcal.cli.rig import rig
+from kcal.cli.undistort import undistort
 from kcal.errors import KcalError
 
 app = typer.Typer(
@@ -51,6 +52,7 @@ app.command("calibrate")(calibrate)
 app.command("batch")(batch)
 app.command("rig")(rig)
 app.command("locate")(locate)
+app.command("undistort")(undistort)
 
 
 def main() -> None:

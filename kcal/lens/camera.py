@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Self
 
@@ -11,9 +12,14 @@ from torch import Tensor, nn
 
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
-from kcal.lens.inverse import undistort, valid_radius
+from kcal.lens.distortion import distort_components
+from kcal.lens.eager import finite_or, in_chunks, is_differentiated, known_true
+from kcal.lens.inverse import Inverse, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
-from kcal.lens.projection import INTRINSICS, parameter_names, project_components
+from kcal.lens.outline import area, image_outline
+from kcal.lens.plane import plane_from_points, rays_from_plane
+from kcal.lens.projection import INTRINSICS, from_pixels, parameter_names, to_pixels
+from kcal.lens.region import Region, in_region
 
 
 class Camera(nn.Module):
@@ -21,8 +27,9 @@ class Camera(nn.Module):
 
     Convention: camera frame x right, y down, z forward; pixel (0, 0) is the centre of the first pixel; metres.
     Geometry is float64 whatever `.half()`, `.float()` or the inputs are: lower precision is promoted. Parameters do
-    not require gradients until asked (`camera.requires_grad_(True)`), so that training a network around a camera
-    leaves its calibration alone.
+    not require gradients until asked (`camera.free("fx", "k1")`), so that training a network around a camera leaves its
+    calibration alone. Where the lens is valid is measured when the camera is made and when a state is loaded; after
+    changing parameters in any other way, call `update_valid_region()`.
 
     Args:
         parameters: (..., 5 + P): fx, fy, cx, cy, skew, then the lens coefficients in the order of `model.names`.
@@ -44,7 +51,10 @@ class Camera(nn.Module):
     """
 
     parameters_vector: Tensor
+    free_mask: Tensor
     valid_radius: Tensor
+    valid_edge: Tensor
+    inverse_start: Tensor
 
     def __init__(self, parameters: Tensor, *, size: tuple[int, int], model: LensModel | str = "opencv5") -> None:
         super().__init__()
@@ -57,7 +67,11 @@ class Camera(nn.Module):
         if min(self.size) < 1:
             raise InputError(f"image size {self.size}: width and height must be positive")
         self.parameters_vector = nn.Parameter(parameters.detach().clone(), requires_grad=False)
-        self.register_buffer("valid_radius", valid_radius(parameters[..., 5:].detach(), self.model))
+        everything = torch.ones(5 + self.model.size, dtype=torch.bool, device=parameters.device)
+        self.register_buffer("free_mask", everything)
+        # Follow from the parameters, so they are no part of the state that is saved.
+        for name, value in self._measure().items():
+            self.register_buffer(name, value, persistent=False)
 
     @classmethod
     def build(
@@ -85,24 +99,59 @@ class Camera(nn.Module):
         return parameter_names(self.model)
 
     @property
+    def values(self) -> Tensor:
+        """(..., 5 + P) the parameters, with gradients only to those that are free."""
+        return torch.where(self.free_mask, self.parameters_vector, self.parameters_vector.detach())
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """Names of the parameters that receive gradients; empty while the camera is frozen."""
+        if not self.parameters_vector.requires_grad:
+            return ()
+        return tuple(name for name, free in zip(self.names, self.free_mask.tolist(), strict=True) if free)
+
+    def free(self, *names: str) -> Self:
+        """Let gradients reach these parameters and no others; without names, all but skew.
+
+        The choice is part of the state (`free_mask`). The frozen parameters get a gradient of exactly zero; weight
+        decay in an optimizer would still move them. `requires_grad_(False)` freezes the camera again.
+
+        Raises:
+            InputError: a name that the camera does not have.
+
+        Example:
+            >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480)).free("fx", "k1")
+            >>> camera.project(torch.tensor([[1.0, 1.0, 4.0]]))[0].sum().backward()
+            >>> [name for name, g in zip(camera.names, camera.parameters_vector.grad) if g != 0]
+            ['fx', 'k1']
+        """
+        unknown = [name for name in names if name not in self.names]
+        if unknown:
+            raise InputError(f"parameter {unknown[0]!r}: the camera has {', '.join(self.names)}")
+        chosen = names or tuple(name for name in self.names if name != "skew")
+        with torch.no_grad():
+            self.free_mask.copy_(torch.tensor([name in chosen for name in self.names]))
+        return self.requires_grad_(True)
+
+    @property
     def focal(self) -> Tensor:
         """(..., 2) focal lengths fx, fy in pixels."""
-        return self.parameters_vector[..., 0:2]
+        return self.values[..., 0:2]
 
     @property
     def center(self) -> Tensor:
         """(..., 2) principal point cx, cy in pixels."""
-        return self.parameters_vector[..., 2:4]
+        return self.values[..., 2:4]
 
     @property
     def coefficients(self) -> Tensor:
         """(..., P) lens coefficients in the order of `model.names`."""
-        return self.parameters_vector[..., len(INTRINSICS) :]
+        return self.values[..., len(INTRINSICS) :]
 
     @property
     def matrix(self) -> Tensor:
         """(..., 3, 3) intrinsic matrix A of Eq. 3."""
-        fx, fy, cx, cy, skew = self.parameters_vector[..., :5].unbind(-1)
+        fx, fy, cx, cy, skew = self.values[..., :5].unbind(-1)
         zero, one = torch.zeros_like(fx), torch.ones_like(fx)
         return torch.stack([fx, skew, cx, zero, fy, cy, zero, zero, one], -1).unflatten(-1, (3, 3))
 
@@ -112,9 +161,37 @@ class Camera(nn.Module):
         text = repr((self.size, self.model.names, self.parameters_vector.detach().flatten().tolist()))
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
-    def update_valid_radius(self) -> None:
+    @property
+    def valid_region(self) -> Region:
+        """Where the lens is valid, on the plane z = 1 (for a fisheye, on the plane of angles)."""
+        return Region(self.valid_radius, self.valid_edge)
+
+    def valid_polygon(self) -> Tensor:
+        """The part of the image whose pixels have a ray, as a polygon (V, 2) of pixels; clockwise as one sees it.
+
+        The whole image of an ordinary camera: its four corners, half a pixel beyond the outermost pixel centres.
+        Where the lens folds inside the image, the fold's outline at 256 directions; empty if no pixel has a ray.
+
+        Raises:
+            InputError: a batch of cameras.
+        """
+        if self.parameters_vector.ndim != 1:
+            raise InputError(f"one camera has one polygon, this is a batch of {tuple(self.valid_radius.shape)}")
+        return image_outline(self.parameters_vector.detach(), self.model, self.valid_region, self.size)
+
+    def _measure(self) -> dict[str, Tensor]:
+        with torch.no_grad():
+            values = self.parameters_vector.detach()
+            width, height = self.size
+            corners = values.new_tensor([[-0.5, -0.5], [width, -0.5], [-0.5, height], [width, height]])
+            x, y = from_pixels(corners[:, 0], corners[:, 1], values)
+            region, start = prepare_inverse(values[..., 5:], self.model, torch.hypot(x, y).amax(-1))
+        return {"valid_radius": region.radius, "valid_edge": region.edge, "inverse_start": start}
+
+    def update_valid_region(self) -> None:
         """Measure the valid region again; call it after changing parameters in place."""
-        self.valid_radius = valid_radius(self.coefficients.detach(), self.model)
+        for name, value in self._measure().items():
+            setattr(self, name, value)
 
     def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
         """Map points to pixels.
@@ -123,33 +200,65 @@ class Camera(nn.Module):
             points_cam: (..., N, 3) in the camera frame.
 
         Returns:
-            pixels (..., N, 2) and valid (..., N): in front of the camera, finite, and before the lens model folds.
-            Whether the pixel lies inside the image is another question (`inside`). Pixels that are not valid hold
-            the principal point.
+            pixels (..., N, 2) and valid (..., N): in front of the camera (for a fisheye: within its monotone angle),
+            finite, and before the lens model folds. Whether the pixel lies inside the image is another question
+            (`inside`). Pixels that are not valid hold the principal point.
         """
         points = as_points("points_cam", points_cam, 3)
-        x, y, z = points.unbind(-1)
-        radius = self.valid_radius[..., None]
-        with torch.no_grad():
-            valid = torch.isfinite(points).all(-1) & (z > 0)
-            valid = valid & (torch.hypot(x, y) < radius * z)
-        keep = valid[..., None]
-        axis = torch.tensor([0.0, 0.0, 1.0], dtype=points.dtype, device=points.device)
-        safe = torch.where(keep, points, axis).transpose(-1, -2)
-        pixels = project_components(safe, self.parameters_vector, self.model).pixels.transpose(-1, -2)
-        return torch.where(keep, pixels, self.center[..., None, :]), valid.expand(pixels.shape[:-1])
+        values = self.values
+        coefficients, center = values[..., 5:], values[..., None, 2:4]
+
+        def one(points: Tensor) -> tuple[Tensor, Tensor]:
+            X, Y, Z = points.unbind(-1)
+            with torch.no_grad():
+                valid = self._sees(X, Y, Z, coefficients)
+                all_valid = known_true(valid)
+            if not all_valid:
+                # The axis is a harmless stand-in: no NaN in values or gradients.
+                X, Y, Z = torch.where(valid, X, 0.0), torch.where(valid, Y, 0.0), torch.where(valid, Z, 1.0)
+            x, y = plane_from_points(X, Y, Z, self.model)
+            lens = distort_components(x, y, coefficients, self.model, slopes=False)
+            pixels = torch.stack(to_pixels(lens.x, lens.y, values), -1)
+            return pixels if all_valid else torch.where(valid[..., None], pixels, center), valid
+
+        return self._in_chunks(one, points)
+
+    def _sees(self, X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor) -> Tensor:
+        x, y = plane_from_points(X, Y, Z, self.model)
+        inside = in_region(x, y, coefficients, self.model, self.valid_region)
+        # A point infinitely far ahead would land on the axis.
+        finite = ~torch.isinf(Z)
+        return inside & finite if self.model.fisheye else inside & finite & (Z > 0)
+
+    def _in_chunks(self, function: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor) -> tuple[Tensor, Tensor]:
+        differentiated = is_differentiated(points, self.parameters_vector)
+        return in_chunks(function, points, self.valid_radius.numel(), differentiated=differentiated)
+
+    def _to_plane(self, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Pixels (..., N, 2) to x, y on the plane of the lens, and valid; every one is (..., N)."""
+        values = self.values
+        cx, cy = values[..., 2, None], values[..., 3, None]
+        u, v, finite = finite_or(pixels[..., 0], pixels[..., 1], cx, cy)
+        x, y = from_pixels(u, v, values)
+        ready = Inverse(self.valid_region, self.inverse_start)
+        return undistort_components(x, y, finite, values[..., 5:], self.model, ready)
 
     def normalize(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Map pixels to undistorted coordinates on the plane z = 1: (normalized (..., N, 2), valid (..., N))."""
+        """Map pixels to undistorted coordinates on the plane z = 1: (normalized (..., N, 2), valid (..., N)).
+
+        Pixels of a fisheye that look 89° or more off axis have no such coordinates and are not valid.
+        """
         pixels = as_points("pixels", pixels, 2)
-        # Taken out before any arithmetic: 0 * NaN in the backward pass would spoil the gradients of the parameters.
-        finite = torch.isfinite(pixels).all(-1)
-        pixels = torch.where(finite[..., None], pixels, self.center[..., None, :])
-        fx, fy, cx, cy, skew = (self.parameters_vector[..., i, None] for i in range(5))
-        y = (pixels[..., 1] - cy) / fy
-        x = (pixels[..., 0] - cx - skew * y) / fx
-        normalized, valid = undistort(torch.stack([x, y], -1), self.coefficients, self.model, self.valid_radius)
-        return normalized, valid & finite
+
+        def one(pixels: Tensor) -> tuple[Tensor, Tensor]:
+            x, y, valid = self._to_plane(pixels)
+            if self.model.fisheye:
+                X, Y, Z = rays_from_plane(x, y, self.model)
+                valid = valid & (math.cos(math.radians(89.0)) < Z)
+                x, y = (torch.where(valid, value, 0.0) / torch.where(valid, Z, 1.0) for value in (X, Y))
+            return torch.stack([x, y], -1), valid
+
+        return self._in_chunks(one, pixels)
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Map pixels to rays.
@@ -162,9 +271,13 @@ class Camera(nn.Module):
             that is not finite, is not valid, and its ray is the optical axis. Gradients by pixels and parameters
             follow the implicit function theorem.
         """
-        normalized, valid = self.normalize(pixels)
-        rays = torch.cat([normalized, torch.ones_like(normalized[..., :1])], -1)
-        return rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True), valid
+        pixels = as_points("pixels", pixels, 2)
+
+        def one(pixels: Tensor) -> tuple[Tensor, Tensor]:
+            x, y, valid = self._to_plane(pixels)
+            return torch.stack(rays_from_plane(x, y, self.model), -1), valid
+
+        return self._in_chunks(one, pixels)
 
     def inside(self, pixels: Tensor) -> Tensor:
         """Whether pixels (..., N, 2) lie on the image, whose edges are half a pixel beyond the outer centres."""
@@ -194,7 +307,15 @@ class Camera(nn.Module):
 
     def extra_repr(self) -> str:
         """Model, size and focal length for `repr`."""
-        return f"model={self.model}, size={self.size}, focal={self.focal.tolist()}"
+        text = f"model={self.model}, size={self.size}, focal={self.focal.tolist()}"
+        if self.parameters_vector.ndim > 1:
+            return text
+        share = area(self.valid_polygon()) / (self.size[0] * self.size[1])
+        return f"{text}, valid={'whole image' if share > 1 - 1e-9 else f'{share:.1%} of the image'}"
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        self.update_valid_region()
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         return super()._apply(keep_float64(fn), recurse)

@@ -9,10 +9,11 @@ Convention: `normalized` points are (x, y) on the plane z = 1 of the camera, y d
     w = sin τy x_I - cos τy sin τx y_I + cos τy cos τx
 
 The last two lines are OpenCV's tilted-sensor homography multiplied out. Sources: the paper's Eq. 4 and 10; OpenCV's
-camera-calibration documentation for the tilt.
+camera-calibration documentation for the tilt. A fisheye uses g alone, on points whose distance from the origin is the
+angle from the axis (`kcal.lens.plane`); that is the model of Kannala and Brandt (2006) as `cv2.fisheye` writes it.
 
-Inside, coordinates are separate tensors (..., N): the solver's inner loop is bound by memory, and this layout touches
-each number once.
+Inside, coordinates are separate tensors (..., N): these loops are bound by memory, and this layout touches each number
+once.
 """
 
 from __future__ import annotations
@@ -33,25 +34,43 @@ Pair = tuple[Tensor, Tensor]
 class Distorted(NamedTuple):
     """Distorted coordinates with what validity and derivatives need; every tensor is (..., N).
 
-    `point` holds ∂x/∂x, ∂x/∂y, ∂y/∂x, ∂y/∂y; `positive` is true where both the radial denominator and the tilt's
-    w are positive, that is, before any pole.
+    `point` holds ∂x/∂x, ∂x/∂y, ∂y/∂x, ∂y/∂y, or nothing if they were not asked for; `positive` is true where both
+    the radial denominator and the tilt's w are positive, that is, before any pole.
     """
 
     x: Tensor
     y: Tensor
-    point: tuple[Tensor, Tensor, Tensor, Tensor]
+    point: tuple[Tensor, ...]
     coefficients: list[Pair]
     positive: Tensor
 
+    @property
+    def determinant(self) -> Tensor:
+        """Of the derivative by the point: positive before the lens folds."""
+        a, b, d, e = self.point
+        return torch.addcmul(a * e, b, d, value=-1.0)
 
-def _polynomial(s: Tensor, coefficients: Sequence[Tensor], constant: float) -> Pair:
-    """Horner: constant + c1 s + c2 s² + ... and its derivative by s."""
-    value, slope = torch.zeros_like(s), torch.zeros_like(s)
-    for coefficient in reversed(coefficients):
-        slope = slope * s + value
-        value = value * s + coefficient
+
+def unbind_last(values: Tensor) -> tuple[Tensor, ...]:
+    """The last dimension of (..., P) as P tensors that broadcast against (..., N).
+
+    A single vector gives scalars without a dimension, which elementwise kernels take as constants.
+    """
+    return (values if values.ndim == 1 else values.unsqueeze(-2)).unbind(-1)
+
+
+def polynomial(s: Tensor, coefficients: Sequence[Tensor], constant: float, slopes: bool) -> tuple[Tensor, Tensor]:
+    """Horner: constant + c1 s + c2 s² + ... and its derivative by s, which is zero if it is not asked for."""
+    if not coefficients:
+        return torch.full_like(s, constant), torch.zeros_like(s)
+    value, *rest = reversed(coefficients)
+    slope = torch.zeros_like(value)
+    for coefficient in rest:
+        if slopes:
+            slope = torch.addcmul(value, slope, s)
+        value = torch.addcmul(coefficient, value, s)
     # value is (p - constant) / s here.
-    return constant + value * s, value + slope * s
+    return constant + value * s, torch.addcmul(value, slope, s) if slopes else slope
 
 
 def _powers(s: Tensor, count: int) -> list[Tensor]:
@@ -62,69 +81,95 @@ def _powers(s: Tensor, count: int) -> list[Tensor]:
 
 
 def distort_components(
-    x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel, wanted: Sequence[int] = ()
+    x: Tensor,
+    y: Tensor,
+    coefficients: Tensor,
+    model: LensModel,
+    wanted: Sequence[int] = (),
+    *,
+    slopes: bool = True,
 ) -> Distorted:
     """Distort separate coordinates x, y (..., N); `wanted` lists the coefficients whose derivatives are needed.
 
     Args:
-        x: (..., N) coordinates on the plane z = 1.
+        x: (..., N) coordinates on the plane z = 1; for a fisheye, on the plane of angles.
         y: likewise.
         coefficients: (..., P) in the order of `model.names`, broadcast against the leading shape of x.
         model: which terms there are.
         wanted: indices into the P coefficients, for `Distorted.coefficients`, in that order.
+        slopes: whether `Distorted.point` is needed; without it a third of the work is saved.
     """
-    c = [coefficients[..., i, None] for i in range(model.size)]
+    c = unbind_last(coefficients)
     xx, xy, yy = x * x, x * y, y * y
     s = xx + yy
 
-    numerator, numerator_slope = _polynomial(s, [c[i] for i in model.numerator_index], 1.0)
-    denominator, denominator_slope = _polynomial(s, [c[i] for i in model.denominator_index], 1.0)
-    inverse = 1.0 / denominator
-    g = numerator * inverse
-    g_slope = (numerator_slope - g * denominator_slope) * inverse
-    prism_x, prism_x_slope = _polynomial(s, [c[i] for i in model.prism_index[0]], 0.0)
-    prism_y, prism_y_slope = _polynomial(s, [c[i] for i in model.prism_index[1]], 0.0)
-
-    u, v = g * x + prism_x, g * y + prism_y
-    cross = 2.0 * g_slope * xy
-    a = g + 2.0 * (g_slope * xx + prism_x_slope * x)
-    b = cross + 2.0 * prism_x_slope * y
-    d = cross + 2.0 * prism_y_slope * x
-    e = g + 2.0 * (g_slope * yy + prism_y_slope * y)
+    g, g_slope = polynomial(s, [c[i] for i in model.numerator_index], 1.0, slopes)
+    inverse, positive = torch.ones_like(s), torch.ones_like(s, dtype=torch.bool)
+    if model.denominator:
+        denominator, denominator_slope = polynomial(s, [c[i] for i in model.denominator_index], 1.0, slopes)
+        inverse, positive = denominator.reciprocal(), denominator > 0
+        g = g * inverse
+        if slopes:
+            g_slope = (g_slope - g * denominator_slope) * inverse
+    u, v = g * x, g * y
+    point: tuple[Tensor, ...] = ()
+    if slopes:
+        double = 2.0 * g_slope
+        cross = double * xy
+        point = (torch.addcmul(g, double, xx), cross, cross, torch.addcmul(g, double, yy))
+    if model.prism:
+        prism_x, prism_x_slope = polynomial(s, [c[i] for i in model.prism_index[0]], 0.0, slopes)
+        prism_y, prism_y_slope = polynomial(s, [c[i] for i in model.prism_index[1]], 0.0, slopes)
+        u, v = u + prism_x, v + prism_y
+        if slopes:
+            rates = ((prism_x_slope, x), (prism_x_slope, y), (prism_y_slope, x), (prism_y_slope, y))
+            point = tuple(torch.addcmul(rate, r, z, value=2.0) for rate, (r, z) in zip(point, rates, strict=True))
     if model.tangential:
         p1, p2 = c[model.names.index("p1")], c[model.names.index("p2")]
-        u = u + 2.0 * p1 * xy + p2 * (s + 2.0 * xx)
-        v = v + p1 * (s + 2.0 * yy) + 2.0 * p2 * xy
-        shear = 2.0 * (p1 * x + p2 * y)
-        a, b = a + 2.0 * p1 * y + 6.0 * p2 * x, b + shear
-        d, e = d + shear, e + 6.0 * p1 * y + 2.0 * p2 * x
-    positive = denominator > 0
+        p1x, p1y, p2x, p2y = p1 * x, p1 * y, p2 * x, p2 * y
+        # p1 s + 2 y (p1 y + p2 x) is p1 (s + 2 y²) + 2 p2 x y, and likewise for x.
+        shear = 2.0 * (p1y + p2x)
+        u = torch.addcmul(torch.addcmul(u, p2, s), x, shear)
+        v = torch.addcmul(torch.addcmul(v, p1, s), y, shear)
+        if slopes:
+            a, b, d, e = point
+            # By the product rule: shear + 2 p2 x + 2 p2 x and so on.
+            turn = 2.0 * (p2y + p1x)
+            a, e = torch.add(a + shear, p2x, alpha=4.0), torch.add(e + shear, p1y, alpha=4.0)
+            point = (a, b + turn, d + turn, e)
 
     columns = _columns(x, y, s, xx, xy, yy, g, inverse, model, wanted)
     if not model.tilt:
-        return Distorted(u, v, (a, b, d, e), [pair for pair in columns if pair is not None], positive)
+        return Distorted(u, v, point, [pair for pair in columns if pair is not None], positive)
 
     tau_x, tau_y = c[model.names.index("tau_x")], c[model.names.index("tau_y")]
     cos_x, sin_x, cos_y, sin_y = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
-    w = sin_y * u - cos_y * sin_x * v + cos_y * cos_x
-    scale = 1.0 / w
+    w = sin_y * u - (cos_y * sin_x) * v + cos_y * cos_x
+    scale = w.reciprocal()
     x_tilted = cos_x * u * scale
-    y_tilted = (cos_y * v - sin_x * sin_y * u) * scale
-    # The 2x2 Jacobian of the homography.
-    m00, m01 = (cos_x - sin_y * x_tilted) * scale, cos_y * sin_x * x_tilted * scale
-    m10, m11 = -sin_y * (sin_x + y_tilted) * scale, cos_y * (1.0 + sin_x * y_tilted) * scale
-    by_angle = {
-        "tau_x": (-sin_x * u, -cos_x * sin_y * u, -cos_y * (cos_x * v + sin_x)),
-        "tau_y": (torch.zeros_like(u), -sin_x * cos_y * u - sin_y * v, cos_y * u + sin_y * (sin_x * v - cos_x)),
-    }
+    y_tilted = (cos_y * v - (sin_x * sin_y) * u) * scale
+    if slopes:
+        # The 2x2 Jacobian of the homography, times the one before it.
+        m00, m01 = (cos_x - sin_y * x_tilted) * scale, (cos_y * sin_x) * x_tilted * scale
+        m10, m11 = -sin_y * (sin_x + y_tilted) * scale, cos_y * (1.0 + sin_x * y_tilted) * scale
+        a, b, d, e = point
+        point = (m00 * a + m01 * d, m00 * b + m01 * e, m10 * a + m11 * d, m10 * b + m11 * e)
+    by_angle = (
+        {
+            "tau_x": (-sin_x * u, -cos_x * sin_y * u, -cos_y * (cos_x * v + sin_x)),
+            "tau_y": (torch.zeros_like(u), -sin_x * cos_y * u - sin_y * v, cos_y * u + sin_y * (sin_x * v - cos_x)),
+        }
+        if wanted
+        else {}
+    )
     tilted = []
     for index, pair in zip(wanted, columns, strict=True):
         if pair is None:
             x_rate, y_rate, w_rate = by_angle[model.names[index]]
             tilted.append(((x_rate - x_tilted * w_rate) * scale, (y_rate - y_tilted * w_rate) * scale))
         else:
-            tilted.append((m00 * pair[0] + m01 * pair[1], m10 * pair[0] + m11 * pair[1]))
-    point = (m00 * a + m01 * d, m00 * b + m01 * e, m10 * a + m11 * d, m10 * b + m11 * e)
+            du, dv = pair
+            tilted.append((m00 * du + m01 * dv, m10 * du + m11 * dv))
     return Distorted(x_tilted, y_tilted, point, tilted, positive & (w > 0))
 
 
@@ -178,7 +223,7 @@ def distort(normalized: Tensor, coefficients: Tensor, model: LensModel | str) ->
     """Distort points on the plane z = 1 (Eq. 4, Eq. 10).
 
     Args:
-        normalized: (..., N, 2) undistorted coordinates.
+        normalized: (..., N, 2) undistorted coordinates; for a fisheye, angles from the axis along x and y.
         coefficients: (..., P) in the order of `model.names`.
         model: a `LensModel` or a preset's name.
 
@@ -195,7 +240,12 @@ def distort(normalized: Tensor, coefficients: Tensor, model: LensModel | str) ->
         >>> distort(point, k, "opencv4").tolist()
         [[0.46875, 0.0]]
     """
-    return distort_with_jacobian(normalized, coefficients, model)[0]
+    model = LensModel.named(model)
+    normalized = as_points("normalized", normalized, 2)
+    lens = distort_components(
+        normalized[..., 0], normalized[..., 1], check_coefficients(coefficients, model), model, slopes=False
+    )
+    return torch.stack([lens.x, lens.y], -1)
 
 
 def distort_with_jacobian(

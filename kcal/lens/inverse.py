@@ -1,103 +1,70 @@
-"""From distorted back to undistorted coordinates: damped Newton that says where it failed, and where it may be asked.
+"""From distorted back to undistorted coordinates: Newton's method that says where it failed, and where it may be asked.
 
-The distortion of Eq. 4 is no bijection of the plane: it folds back (det J = 0) or meets a pole at some radius. Only
-the part around the optical axis before the first fold or pole is the lens; `valid_radius` measures it.
+Most points need three steps from the start of `kcal.lens.start`. The few that do not arrive, near a fold or without a
+preimage at all, go to `kcal.lens.hard`. Where Python may not look at values (compile, export, vmap) all points take
+the same number of steps, and what has not arrived by then is flagged.
 """
 
 from __future__ import annotations
 
-import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.checks import as_points
-from kcal.lens.distortion import check_coefficients, distort_components
+from kcal.lens.distortion import Distorted, check_coefficients, distort_components
+from kcal.lens.eager import finite_or, in_chunks, is_differentiated, known_true, may_branch
+from kcal.lens.hard import solve_hard
 from kcal.lens.model import LensModel
+from kcal.lens.region import Region, in_region, valid_radius, valid_region
+from kcal.lens.start import fit_start, start_from, without_tilt
 
-# tan 89°: nothing that projects through a plane is asked for beyond this.
-MAX_RADIUS = math.tan(math.radians(89.0))
-_ITERATIONS = 40
+__all__ = ["Inverse", "prepare_inverse", "undistort", "undistort_components", "valid_radius"]
+
 # Residual in normalized coordinates: 1e-13 is 2e-10 px at f = 2000 px, just above rounding.
-_TOLERANCE = 1e-13
+TOLERANCE = 1e-13
+# Steps before a point counts as hard, and steps where all points take the same number.
+_MOST = 6
+_FIXED = 6
+# A Jacobian taken below the first residual is good enough to be kept: each step gains some four digits with it, so
+# that below the second residual one more step reaches rounding.
+_CLOSE, _LAST = 1e-4, 1e-11
 
 
-@torch.no_grad()
-def valid_radius(coefficients: Tensor, model: LensModel | str) -> Tensor:
-    """Radius of the disc on the plane z = 1 inside which the lens neither folds nor meets a pole.
+class Inverse(NamedTuple):
+    """What is measured once a lens: where it is valid, and where Newton starts."""
 
-    Walks outward along 64 directions, 1/6° a step, to the first place where the Jacobian's determinant, the radial
-    denominator or the tilt's w is no longer positive, narrows it down, and takes the smallest.
-
-    Args:
-        coefficients: (..., P).
-        model: a `LensModel` or a preset's name.
-
-    Returns:
-        (...) float64; tan 89° where nothing goes wrong before.
-
-    Example:
-        >>> k = torch.tensor([-1.0 / 12.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-        >>> round(float(valid_radius(k, "opencv4")), 12)  # x - x³/12 turns back at x = 2
-        2.0
-    """
-    model = LensModel.named(model)
-    coefficients = check_coefficients(coefficients, model)
-    kind, place = torch.float64, coefficients.device
-    direction = torch.arange(64, dtype=kind, device=place) * (2 * math.pi / 64)
-
-    def good(radius: Tensor) -> Tensor:
-        """Radii (..., K, 64), one column a direction -> how many from the first on are regular, (..., 64)."""
-        x, y = (radius * torch.cos(direction)).flatten(-2), (radius * torch.sin(direction)).flatten(-2)
-        lens = distort_components(x, y, coefficients, model)
-        a, b, d, e = lens.point
-        regular = (lens.positive & (a * e - b * d > 0)).unflatten(-1, (-1, 64))
-        return regular.to(torch.int64).cumprod(-2).sum(-2)
-
-    # From the axis out, then each interval split in 32 again until it is as narrow as rounding.
-    radii = torch.tan(torch.linspace(0, math.radians(89.0), 535, dtype=kind, device=place))[:, None].expand(-1, 64)
-    for _ in range(11):
-        count = good(radii)
-        radii = radii.expand(*count.shape[:-1], -1, -1)
-        # A lens that is irregular on the axis itself (a tilt beyond 90°, say) has no valid disc: radius zero.
-        low = torch.gather(radii, -2, (count - 1).clamp(min=0)[..., None, :])
-        high = torch.gather(radii, -2, count.clamp(max=radii.shape[-2] - 1)[..., None, :])
-        radii = low + (high - low) * torch.linspace(0, 1, 33, dtype=kind, device=place)[:, None]
-    return low[..., 0, :].amin(-1)
+    region: Region
+    start: Tensor
 
 
-def _untilt(x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:
-    """Undo the tilt homography in closed form: a start for Newton."""
-    if not model.tilt:
-        return x, y
-    tau_x = coefficients[..., model.names.index("tau_x"), None]
-    tau_y = coefficients[..., model.names.index("tau_y"), None]
-    cos_x, sin_x, cos_y, sin_y = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
-    a, b = cos_x - sin_y * x, cos_y * sin_x * x
-    d, e = -sin_y * (sin_x + y), cos_y * (1.0 + sin_x * y)
-    right_x, right_y = cos_y * cos_x * x, cos_y * cos_x * y
-    determinant = a * e - b * d
-    return (e * right_x - b * right_y) / determinant, (a * right_y - d * right_x) / determinant
+def prepare_inverse(coefficients: Tensor, model: LensModel, reach: Tensor | None = None) -> Inverse:
+    """Measure a lens (..., P); `reach` (...) is the largest distorted radius that will be asked for."""
+    region = valid_region(coefficients, model)
+    fitted = fit_start(coefficients, model) if reach is None else fit_start(coefficients, model, reach)
+    return Inverse(region, fitted)
 
 
 def undistort(
-    distorted: Tensor, coefficients: Tensor, model: LensModel | str, radius: Tensor | None = None
+    distorted: Tensor, coefficients: Tensor, model: LensModel | str, prepared: Inverse | None = None
 ) -> tuple[Tensor, Tensor]:
     """Undo the distortion, or say that it cannot be undone.
 
-    Newton's method with the 2x2 Jacobian, each point on its own: a step that does not lower the residual, or that
-    leaves the valid disc, is halved. The last two steps stay in the autograd graph: at a solution, a Newton step
-    has the exact implicit derivative by the point and by the coefficients, and two of them the second one too.
+    Newton's method with the 2x2 Jacobian, each point on its own. The last two steps stay in the autograd graph: at a
+    solution, a Newton step has the exact implicit derivative by the point and by the coefficients, and two of them
+    the second one too.
 
     Args:
         distorted: (..., N, 2) distorted coordinates on the plane z = 1.
         coefficients: (..., P).
         model: a `LensModel` or a preset's name.
-        radius: (...) from `valid_radius`, computed here if not given.
+        prepared: from `prepare_inverse`, computed here if not given.
 
     Returns:
-        normalized (..., N, 2) and valid (..., N). Where `valid` is False there is no preimage inside the valid disc
-        (or the input was not finite), and the coordinates are zero.
+        normalized (..., N, 2), on the plane z = 1 or, for a fisheye, on the plane of angles; and valid (..., N).
+        Where `valid` is False there is no preimage inside the valid region (or the input was not finite), and the
+        coordinates are zero.
 
     Raises:
         InputError: wrong shapes or an integer dtype.
@@ -110,66 +77,100 @@ def undistort(
     model = LensModel.named(model)
     distorted = as_points("distorted", distorted, 2)
     coefficients = check_coefficients(coefficients, model)
-    if radius is None:
-        radius = valid_radius(coefficients, model)
-    target_x, target_y = distorted[..., 0], distorted[..., 1]
-    finite = torch.isfinite(target_x) & torch.isfinite(target_y)
-    target_x = torch.where(finite, target_x, 0.0)
-    target_y = torch.where(finite, target_y, 0.0)
-    limit = radius[..., None]
+    ready = prepare_inverse(coefficients.detach(), model) if prepared is None else prepared
 
+    def one(points: Tensor) -> tuple[Tensor, Tensor]:
+        origin = torch.zeros((), dtype=points.dtype, device=points.device)
+        target_x, target_y, finite = finite_or(points[..., 0], points[..., 1], origin, origin)
+        x, y, valid = undistort_components(target_x, target_y, finite, coefficients, model, ready)
+        return torch.stack([x, y], -1), valid
+
+    return in_chunks(
+        one, distorted, coefficients[..., :1].numel(), differentiated=is_differentiated(distorted, coefficients)
+    )
+
+
+def undistort_components(
+    target_x: Tensor, target_y: Tensor, usable: Tensor, coefficients: Tensor, model: LensModel, ready: Inverse
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `undistort`, for separate finite coordinates (..., N), of which only the `usable` ones count: x, y, valid."""
     with torch.no_grad():
-        x, y, converged = _newton(target_x, target_y, coefficients, model, limit)
-        # The limit itself is a fold: a little inside, the Jacobian can still be inverted.
-        valid = finite & converged & (torch.hypot(x, y) < limit)
-        x, y = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0)
-        target_x, target_y = torch.broadcast_tensors(target_x, target_y)
-    if torch.is_grad_enabled() and (distorted.requires_grad or coefficients.requires_grad):
+        solve = _solve_eagerly if may_branch(target_x, coefficients, ready.start) else _solve_in_fixed_steps
+        x, y, valid = solve(target_x, target_y, coefficients, model, ready)
+        valid = valid & usable
+        all_valid = known_true(valid)
+        if not all_valid:
+            x, y = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0)
+    if is_differentiated(target_x, target_y, coefficients):
         for _ in range(2):
-            step_x, step_y = _newton_step(x, y, target_x, target_y, coefficients, model)
-            x, y = torch.where(valid, x - step_x, 0.0), torch.where(valid, y - step_y, 0.0)
-    return torch.stack([x, y], -1), valid
+            x, y = _newton_step(x, y, target_x, target_y, coefficients, model)
+            if not all_valid:
+                x, y = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0)
+    return x, y, valid
+
+
+def _inverse_jacobian(lens: Distorted) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    a, b, d, e = lens.point
+    scale = lens.determinant.reciprocal()
+    return e * scale, b * scale, d * scale, a * scale
 
 
 def _newton_step(
     x: Tensor, y: Tensor, target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel
 ) -> tuple[Tensor, Tensor]:
     lens = distort_components(x, y, coefficients, model)
-    a, b, d, e = lens.point
-    inverse = 1.0 / (a * e - b * d)
+    e, b, d, a = _inverse_jacobian(lens)
     error_x, error_y = lens.x - target_x, lens.y - target_y
-    return (e * error_x - b * error_y) * inverse, (a * error_y - d * error_x) * inverse
+    return x - (e * error_x - b * error_y), y - (a * error_y - d * error_x)
 
 
-def _newton(
-    target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel, limit: Tensor
+def _squared_error(lens: Distorted, target_x: Tensor, target_y: Tensor) -> Tensor:
+    error_x, error_y = lens.x - target_x, lens.y - target_y
+    return torch.addcmul(error_x * error_x, error_y, error_y)
+
+
+def _squared_tolerance(target_x: Tensor, target_y: Tensor) -> Tensor:
+    return torch.addcmul(torch.addcmul(target_x.new_ones(()), target_x, target_x), target_y, target_y) * TOLERANCE**2
+
+
+def _solve_eagerly(
+    target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel, ready: Inverse
 ) -> tuple[Tensor, Tensor, Tensor]:
-    def evaluate(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        lens = distort_components(x, y, coefficients, model)
-        a, b, d, e = lens.point
-        error_x, error_y = lens.x - target_x, lens.y - target_y
-        determinant = a * e - b * d
-        inverse = torch.where(determinant > 0, 1.0 / determinant, 0.0)
-        error = torch.where(lens.positive, torch.hypot(error_x, error_y), math.inf)
-        return (e * error_x - b * error_y) * inverse, (a * error_y - d * error_x) * inverse, error
-
-    x, y = _untilt(target_x, target_y, coefficients, model)
-    step_x, step_y, error = evaluate(x, y)
-    # Never start on the rim: beside a pole Newton only doubles its distance a step. The axis is always regular.
-    lost = ~torch.isfinite(error) | ~(torch.hypot(x, y) < limit)
-    x, y = torch.where(lost, 0.0, x), torch.where(lost, 0.0, y)
-    step_x, step_y, error = evaluate(x, y)
-    tolerance = _TOLERANCE * (1.0 + torch.hypot(target_x, target_y))
-    fraction = torch.ones_like(error)
-    for _ in range(_ITERATIONS):
-        if not torch.compiler.is_compiling() and bool((error <= tolerance).all()):
+    """Plain Newton for all, and the safeguarded solver for those that it does not bring home."""
+    goal_x, goal_y, own, rest = without_tilt(target_x, target_y, coefficients, model)
+    x, y = start_from(goal_x, goal_y, rest, ready.start)
+    lens = distort_components(x, y, own, rest)
+    close = last = False
+    for _ in range(_MOST):
+        error_x, error_y = lens.x - goal_x, lens.y - goal_y
+        error = torch.addcmul(error_x * error_x, error_y, error_y)
+        if close:
+            last = known_true(error <= _LAST**2)
+        else:
+            e, b, d, a = _inverse_jacobian(lens)
+            close = known_true(error <= _CLOSE**2)
+        x = torch.addcmul(torch.addcmul(x, b, error_y), e, error_x, value=-1.0)
+        y = torch.addcmul(torch.addcmul(y, d, error_x), a, error_y, value=-1.0)
+        if last:
             break
-        trial_x, trial_y = x - fraction * step_x, y - fraction * step_y
-        next_x, next_y, next_error = evaluate(trial_x, trial_y)
-        # Refused, not moved to the rim: there, beside a fold, a point can get stuck.
-        better = (next_error < error) & (torch.hypot(trial_x, trial_y) < limit)
-        x, y = torch.where(better, trial_x, x), torch.where(better, trial_y, y)
-        step_x, step_y = torch.where(better, next_x, step_x), torch.where(better, next_y, step_y)
-        error = torch.where(better, next_error, error)
-        fraction = torch.where(better, torch.clamp(2.0 * fraction, max=1.0), 0.5 * fraction)
-    return x, y, error <= tolerance
+        lens = distort_components(x, y, own, rest, slopes=not close)
+    lens = distort_components(x, y, coefficients, model, slopes=False)
+    tolerance = _squared_tolerance(target_x, target_y)
+    valid = (_squared_error(lens, target_x, target_y) <= tolerance) & lens.positive
+    valid = valid & in_region(x, y, coefficients, model, ready.region)
+    if known_true(valid):
+        return x, y, valid
+    return solve_hard(x, y, valid, target_x, target_y, tolerance, coefficients, model, ready.region)
+
+
+def _solve_in_fixed_steps(
+    target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel, ready: Inverse
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The same steps for every point. What strays, beside a fold or without a preimage, fails the last check."""
+    goal_x, goal_y, own, rest = without_tilt(target_x, target_y, coefficients, model)
+    x, y = start_from(goal_x, goal_y, rest, ready.start)
+    for _ in range(_FIXED):
+        x, y = _newton_step(x, y, goal_x, goal_y, own, rest)
+    lens = distort_components(x, y, coefficients, model, slopes=not model.radial)
+    valid = (_squared_error(lens, target_x, target_y) <= _squared_tolerance(target_x, target_y)) & lens.positive
+    return x, y, valid & in_region(x, y, coefficients, model, ready.region, lens)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
+from typing import Any
 
 from kcal.errors import InputError
 
@@ -27,6 +27,7 @@ _PRISM = {
     "s8": (1, 4),
 }
 _ORDER = (*_OPENCV, "k7", "k8", "k9", "k10", "s5", "s6", "k11", "k12", "k13", "k14", "s7", "s8")
+_DERIVED: Any = {"init": False, "repr": False, "compare": False}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,6 +40,17 @@ class LensModel:
         tangential: whether p1, p2 are present.
         prism: highest power of r² in the thin-prism terms, 0 to 4, for x and y each.
         tilt: whether the tilted-sensor angles are present.
+        fisheye: whether the numerator's series acts on the angle from the axis instead of its tangent
+            (Kannala-Brandt): r_D = θ (1 + k1 θ² + k2 θ⁴ + ...). It has no other terms, and its coefficients are
+            called k1, k2, k3, ... in this order, as in `cv2.fisheye`.
+
+    Attributes:
+        names: coefficient names in storage order: OpenCV's 14 first, higher orders after them.
+        numerator_index: where the numerator's coefficients of r², r⁴, ... are stored.
+        denominator_index: likewise for the denominator.
+        prism_index: likewise for the prism terms, for x and for y.
+        without_tilt: the same model without its tilt; None if it has none.
+        untilted_index: where the coefficients of `untilted` are stored.
 
     Example:
         >>> LensModel(numerator=3, tangential=True).names
@@ -52,12 +64,51 @@ class LensModel:
     tangential: bool = False
     prism: int = 0
     tilt: bool = False
+    fisheye: bool = False
+
+    # What follows from the orders. Ordinary attributes, because compilers trace no lazily computed ones.
+    names: tuple[str, ...] = dataclasses.field(**_DERIVED)
+    numerator_index: tuple[int, ...] = dataclasses.field(**_DERIVED)
+    denominator_index: tuple[int, ...] = dataclasses.field(**_DERIVED)
+    prism_index: tuple[tuple[int, ...], tuple[int, ...]] = dataclasses.field(**_DERIVED)
+    without_tilt: LensModel | None = dataclasses.field(**_DERIVED)
+    untilted_index: tuple[int, ...] = dataclasses.field(**_DERIVED)
 
     def __post_init__(self) -> None:
         for name, limit in (("numerator", 7), ("denominator", 7), ("prism", 4)):
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= limit:
                 raise InputError(f"lens model: {name} must be a whole number from 0 to {limit}, got {value!r}")
+        if self.fisheye and (self.denominator or self.tangential or self.prism or self.tilt):
+            raise InputError("lens model: a fisheye has a numerator only")
+        names = self._names()
+        radial = {term: self._radial_names(term) for term in ("numerator", "denominator")}
+        prism = {order: names.index(name) for name, order in _PRISM.items() if name in names}
+        rest = dataclasses.replace(self, tilt=False) if self.tilt else None
+        derived = {
+            "names": names,
+            "numerator_index": tuple(names.index(name) for name in radial["numerator"]),
+            "denominator_index": tuple(names.index(name) for name in radial["denominator"]),
+            "prism_index": tuple(tuple(prism[k, j] for j in range(1, self.prism + 1)) for k in (0, 1)),
+            "without_tilt": rest,
+            "untilted_index": tuple(names.index(name) for name in (rest.names if rest else names)),
+        }
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)
+
+    def _names(self) -> tuple[str, ...]:
+        if self.fisheye:
+            return tuple(f"k{order}" for order in range(1, self.numerator + 1))
+        present = {name for name, (term, order) in _RADIAL.items() if order <= getattr(self, term)}
+        present |= {name for name, (_, order) in _PRISM.items() if order <= self.prism}
+        present |= {"p1", "p2"} if self.tangential else set()
+        present |= {"tau_x", "tau_y"} if self.tilt else set()
+        return tuple(name for name in _ORDER if name in present)
+
+    def _radial_names(self, term: str) -> tuple[str, ...]:
+        place = {order: name for name, (kind, order) in _RADIAL.items() if kind == term}
+        orders = range(1, getattr(self, term) + 1)
+        return tuple(f"k{order}" if self.fisheye else place[order] for order in orders)
 
     @classmethod
     def named(cls, name: str | LensModel) -> LensModel:
@@ -72,47 +123,28 @@ class LensModel:
             raise InputError(f"unknown lens model {name!r}; choose one of {', '.join(PRESETS)}")
         return PRESETS[name]
 
-    @functools.cached_property
-    def names(self) -> tuple[str, ...]:
-        """Coefficient names in storage order: OpenCV's 14 first, higher orders after them."""
-        present = {name for name, (term, order) in _RADIAL.items() if order <= getattr(self, term)}
-        present |= {name for name, (_, order) in _PRISM.items() if order <= self.prism}
-        present |= {"p1", "p2"} if self.tangential else set()
-        present |= {"tau_x", "tau_y"} if self.tilt else set()
-        return tuple(name for name in _ORDER if name in present)
-
     @property
     def size(self) -> int:
         """How many coefficients the model has."""
         return len(self.names)
 
-    @functools.cached_property
-    def numerator_index(self) -> tuple[int, ...]:
-        """Where the numerator's coefficients of r², r⁴, ... are stored."""
-        return self._radial_index("numerator")
+    @property
+    def radial(self) -> bool:
+        """Whether the lens is symmetric about its axis, so that whatever limits it is a circle."""
+        return not (self.tangential or self.prism or self.tilt)
 
-    @functools.cached_property
-    def denominator_index(self) -> tuple[int, ...]:
-        """Where the denominator's coefficients of r², r⁴, ... are stored."""
-        return self._radial_index("denominator")
-
-    @functools.cached_property
-    def prism_index(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Where the prism coefficients of r², r⁴, ... are stored, for x and for y."""
-        place = {order: self.names.index(name) for name, order in _PRISM.items() if name in self.names}
-        orders = range(1, self.prism + 1)
-        return tuple(place[0, j] for j in orders), tuple(place[1, j] for j in orders)
-
-    def _radial_index(self, term: str) -> tuple[int, ...]:
-        place = {order: name for name, (kind, order) in _RADIAL.items() if kind == term}
-        return tuple(self.names.index(place[order]) for order in range(1, getattr(self, term) + 1))
+    @property
+    def untilted(self) -> LensModel:
+        """The same model without the tilt."""
+        return self if self.without_tilt is None else self.without_tilt
 
     def contains(self, other: LensModel) -> bool:
         """Whether every lens of `other` is also a lens of this model."""
-        return set(other.names) <= set(self.names)
+        return self.fisheye == other.fisheye and set(other.names) <= set(self.names)
 
     def __str__(self) -> str:
-        return next((name for name, model in PRESETS.items() if model == self), f"({', '.join(self.names)})")
+        kind = "fisheye " if self.fisheye else ""
+        return next((name for name, model in PRESETS.items() if model == self), f"{kind}({', '.join(self.names)})")
 
 
 PRESETS: dict[str, LensModel] = {
@@ -128,4 +160,5 @@ PRESETS: dict[str, LensModel] = {
     "ext20b": LensModel(numerator=6, denominator=6, tangential=True, prism=2, tilt=True),
     "ext22": LensModel(numerator=6, denominator=6, tangential=True, prism=3, tilt=True),
     "ext24": LensModel(numerator=7, denominator=7, tangential=True, prism=3, tilt=True),
+    "fisheye4": LensModel(numerator=4, fisheye=True),
 }

@@ -4,7 +4,8 @@ Camera parameters are one vector (..., 5 + P): fx, fy, cx, cy, skew, then the le
 
     x = X / Z, y = Y / Z;  (x_D, y_D) = distortion(x, y);  u = fx x_D + skew y_D + cx,  v = fy y_D + cy
 
-(Eq. 1 to 4 of the paper). Skew is γ of Eq. 3.
+(Eq. 1 to 4 of the paper). Skew is γ of Eq. 3; `cv2.fisheye` stores it as alpha = skew / fx. A fisheye replaces the
+first step (`kcal.lens.plane`).
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.distortion import distort_components
+from kcal.lens.distortion import distort_components, unbind_last
 from kcal.lens.model import LensModel
+from kcal.lens.plane import plane_with_slopes
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "skew")
 
@@ -33,13 +35,27 @@ class Projection(NamedTuple):
         pixels: (..., 2, N).
         by_point: (..., 3, 2, N), by X, Y, Z of the point in the camera frame.
         by_camera: (..., C, 2, N), by the wanted camera parameters.
-        regular: (..., N), in front of the camera, before any pole, and not folded over (det J > 0).
+        regular: (..., N), in front of the camera (of a fisheye: anywhere), before any pole, and not folded over
+            (det J > 0).
     """
 
     pixels: Tensor
     by_point: Tensor
     by_camera: Tensor
     regular: Tensor
+
+
+def to_pixels(x: Tensor, y: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+    """Distorted coordinates (..., N) to pixels: the last stage."""
+    fx, fy, cx, cy, skew = unbind_last(parameters[..., : len(INTRINSICS)])
+    return torch.addcmul(torch.addcmul(cx, skew, y), fx, x), torch.addcmul(cy, fy, y)
+
+
+def from_pixels(u: Tensor, v: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverse of `to_pixels`."""
+    fx, fy, cx, cy, skew = unbind_last(parameters[..., : len(INTRINSICS)])
+    y = (v - cy) / fy
+    return (u - cx - skew * y) / fx, y
 
 
 def project_components(
@@ -55,22 +71,29 @@ def project_components(
             and `by_camera` are empty.
     """
     X, Y, Z = points[..., 0, :], points[..., 1, :], points[..., 2, :]
-    inverse = 1.0 / Z
-    x, y = X * inverse, Y * inverse
+    x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(X, Y, Z, model)
     offset = len(INTRINSICS)
     lens_wanted = [i - offset for i in wanted or () if i >= offset]
     lens = distort_components(x, y, parameters[..., offset:], model, lens_wanted)
-    fx, fy, cx, cy, skew = (parameters[..., i, None] for i in range(offset))
-    pixels = torch.stack([fx * lens.x + skew * lens.y + cx, fy * lens.y + cy], -2)
-    a, b, d, e = lens.point
-    regular = lens.positive & (Z > 0) & (a * e - b * d > 0)
+    fx, fy, _, _, skew = unbind_last(parameters[..., :offset])
+    pixels = torch.stack(to_pixels(lens.x, lens.y, parameters), -2)
+    regular = lens.positive & (lens.determinant > 0)
+    if not model.fisheye:
+        regular = regular & (Z > 0)
     if wanted is None:
         empty = pixels.new_zeros((*pixels.shape[:-2], 0, *pixels.shape[-2:]))
         return Projection(pixels, empty, empty, regular)
 
-    ux, uy = (fx * a + skew * d) * inverse, (fx * b + skew * e) * inverse
-    vx, vy = fy * d * inverse, fy * e * inverse
-    columns = [ux, vx, uy, vy, -(ux * x + uy * y), -(vx * x + vy * y)]
+    a, b, d, e = lens.point
+    ux, uy, vx, vy = fx * a + skew * d, fx * b + skew * e, fy * d, fy * e
+    if model.fisheye:
+        columns = [
+            ux * x_X + uy * x_Y, vx * x_X + vy * x_Y, ux * x_Y + uy * y_Y, vx * x_Y + vy * y_Y,
+            ux * x_Z + uy * y_Z, vx * x_Z + vy * y_Z,
+        ]  # fmt: skip
+    else:
+        ux, uy, vx, vy = ux * x_X, uy * x_X, vx * x_X, vy * x_X
+        columns = [ux, vx, uy, vy, -(ux * x + uy * y), -(vx * x + vy * y)]
     by_point = torch.stack(torch.broadcast_tensors(*columns), -2).unflatten(-2, (3, 2))
 
     zero, one = torch.zeros_like(lens.x), torch.ones_like(lens.x)

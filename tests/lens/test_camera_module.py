@@ -50,7 +50,7 @@ class TestPrecision:
             after = cast(module).state_dict()
             assert before.keys() == after.keys()
             assert all(torch.equal(after[name], value) for name, value in before.items())
-            assert {value.dtype for value in after.values()} == {torch.float64}
+            assert {value.dtype for value in after.values()} == {torch.float64, torch.bool}
 
     def test_a_network_around_it_is_still_cast(self) -> None:
         network = nn.Sequential(nn.Linear(2, 2), make_camera()).half()
@@ -112,7 +112,7 @@ class TestState:
         assert camera.project(point)[1].tolist() == [True]
         with torch.no_grad():
             camera.parameters_vector[5] = -1 / 12
-        camera.update_valid_radius()
+        camera.update_valid_region()
         assert float(camera.valid_radius) == pytest.approx(2.0, abs=1e-12)
         assert camera.project(point)[1].tolist() == [False]
 

@@ -14,8 +14,9 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort, distort_with_jacobian
-from kcal.lens.inverse import MAX_RADIUS, undistort, valid_radius
+from kcal.lens.inverse import undistort, valid_radius
 from kcal.lens.model import LensModel
+from kcal.lens.plane import largest_radius
 
 # Newton stops at 1e-13 in normalized coordinates, which is 2e-10 px at 2000 px of focal length.
 PIXEL_TOLERANCE = 1e-9
@@ -206,8 +207,8 @@ class TestFold:
         torch.testing.assert_close(back, normalized, rtol=0, atol=1e-13)
 
     def test_nothing_goes_wrong_in_a_pinhole(self) -> None:
-        assert float(valid_radius(torch.zeros(0), "pinhole")) == MAX_RADIUS
-        assert float(valid_radius(torch.tensor([0.1, 0.0, 0.0, 0.0]), "opencv4")) == MAX_RADIUS
+        assert float(valid_radius(torch.zeros(0), "pinhole")) == largest_radius(LensModel())
+        assert float(valid_radius(torch.tensor([0.1, 0.0, 0.0, 0.0]), "opencv4")) == largest_radius(LensModel())
 
     @settings(max_examples=15, deadline=None)
     @given(seed=st.integers(0, 2**31), model=st.sampled_from(MODELS))

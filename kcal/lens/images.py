@@ -1,0 +1,216 @@
+"""Images without distortion: where each new pixel looks in the source image, and a module that resamples.
+
+A pixel of the new image is a direction, and the lens says where that direction was imaged: only the forward model is
+needed. Positions are computed in float64. Sampling runs in the image's own precision, for which normalized positions
+are rounded once: in float32 that moves a sample by less than W * 1.2e-7 px (0.0003 px at 1920 columns), in float64 not
+at all. float16 and bfloat16 images are sampled in float32, because their 8 to 11 bits cannot hold a position.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from kornia.geometry.transform import remap
+from torch import Tensor, nn
+
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.pinhole import new_pinhole, source_pixels
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+# Where positions without a source are sent: far outside, so that the sampler's border value (black) is taken, never
+# a plausible pixel.
+NOWHERE = -1e4
+# Pixels a band: the lens's temporary values stay small, whatever the image.
+_BAND = 1 << 18
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_INTEGERS = (torch.uint8, torch.uint16)
+
+
+class UndistortMaps(NamedTuple):
+    """Source positions for `cv2.remap` (float32) and where they mean something; each (H, W) of the new image."""
+
+    map_x: NDArray[np.float32]
+    map_y: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+
+
+def undistort_maps(camera: Camera, new_camera: Camera | None = None) -> UndistortMaps:
+    """Maps for `cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR)`.
+
+    Convention: new pixel (column x, row y) takes the source's value at (map_x[y, x], map_y[y, x]); whole numbers are
+    centres of pixels. The mask is False, and both maps are -10000, where the source shows nothing: outside the centres
+    of its outer pixels, or beyond the fold of the lens. With OpenCV's default border those pixels become black.
+
+    Args:
+        camera: the camera that took the image, a single one.
+        new_camera: the camera of the new image; `new_pinhole(camera)` if not given. Any camera serves: with a lens of
+            its own, the new image is distorted as that lens would.
+
+    Returns:
+        map_x, map_y (float32) and mask (bool) as numpy arrays (H, W) of the new image's size. float32 holds positions
+        to 1e-4 px at 1920 columns.
+
+    Raises:
+        InputError: a batch of cameras, or an image less than two pixels wide or high.
+        DegenerateError: see `new_pinhole`.
+
+    Example:
+        >>> camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.2])
+        >>> maps = undistort_maps(camera)
+        >>> maps.map_x.shape, bool(maps.mask.all()), [round(float(maps.map_x[240, i]), 3) for i in (0, 639)]
+        ((480, 640), True, [0.0, 639.0])
+    """
+    with torch.no_grad():
+        pixels, mask = _source_positions(camera, new_camera or new_pinhole(camera))
+    if mask.ndim != 2:
+        raise InputError(f"undistort_maps: a single camera is needed, got a batch of shape {tuple(mask.shape[:-2])}")
+    map_x, map_y = pixels.to("cpu", torch.float32).unbind(-1)
+    return UndistortMaps(map_x.contiguous().numpy(), map_y.contiguous().numpy(), mask.cpu().numpy())
+
+
+class Undistort(nn.Module):
+    """Resample images as another camera, usually a pinhole, would have taken them.
+
+    Bilinear, by kornia's `remap` with `align_corners=True`: integer coordinates are centres of pixels, and nothing is
+    stretched. Where the source shows nothing the image is 0 and the mask False (see `undistort_maps`).
+
+    The maps are computed once and kept, for one precision at a time; they follow when a camera's parameters are
+    changed or loaded. While a camera requires gradients, they are computed anew at each call, and
+    gradients flow to its parameters too. The new camera stays as it is when the old one changes.
+
+    Args:
+        camera: the camera that took the images, or a batch of cameras.
+        new_camera: the camera of the new images, single or a batch; `new_pinhole(camera)` if not given, so that every
+            new pixel is valid.
+
+    Raises:
+        InputError: an image less than two pixels wide or high, or batches that do not fit.
+        DegenerateError: see `new_pinhole`.
+
+    Example:
+        >>> camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.2])
+        >>> undistort = Undistort(camera)
+        >>> image, mask = undistort(torch.rand(2, 3, 480, 640))
+        >>> image.shape, mask.shape, bool(mask.all())
+        (torch.Size([2, 3, 480, 640]), torch.Size([2, 480, 640]), True)
+    """
+
+    grid_x: Tensor
+    grid_y: Tensor
+    mask: Tensor
+    _made_for: Tensor
+
+    def __init__(self, camera: Camera, new_camera: Camera | None = None) -> None:
+        super().__init__()
+        self.camera = camera
+        self.new_camera = new_pinhole(camera) if new_camera is None else new_camera
+        for name, value in zip(("grid_x", "grid_y", "mask"), self._grid(torch.float32), strict=True):
+            self.register_buffer(name, value.detach(), persistent=False)
+        self.register_buffer("_made_for", self._state(), persistent=False)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Undistort images.
+
+        Args:
+            image: (..., C, H, W) of the camera's size. Floating point of any precision, or uint8 or uint16, which are
+                sampled in float32 and rounded to the nearest level. Leading dimensions are broadcast against those of
+                a batch of cameras.
+
+        Returns:
+            image (..., C, H', W') with the dtype of the input, and mask (..., H', W').
+
+        Raises:
+            InputError: no tensor, another dtype, size or device, or leading dimensions that do not fit the cameras'.
+        """
+        self._check(image)
+        precision = image.dtype if image.dtype in (torch.float32, torch.float64) else torch.float32
+        grid_x, grid_y, mask = self._maps(precision)
+        try:
+            lead = torch.broadcast_shapes(image.shape[:-3], mask.shape[:-2])
+        except RuntimeError as error:
+            raise InputError(
+                f"image: leading shape {tuple(image.shape[:-3])} does not fit {tuple(mask.shape[:-2])} cameras"
+            ) from error
+        count, channels = math.prod(lead), image.shape[-3]
+        mask = mask.expand(*lead, *mask.shape[-2:])
+        if count * channels == 0:
+            return image.new_zeros((*lead, channels, *mask.shape[-2:])), mask
+        source = image.to(precision).expand(*lead, *image.shape[-3:]).reshape(count, *image.shape[-3:])
+        x, y = (grid.expand(mask.shape).reshape(count, *mask.shape[-2:]) for grid in (grid_x, grid_y))
+        sampled = remap(source, x, y, mode="bilinear", align_corners=True, normalized_coordinates=True)
+        if image.dtype in _INTEGERS:
+            sampled = sampled.round()
+        return sampled.to(image.dtype).reshape(*lead, *sampled.shape[1:]), mask
+
+    def _check(self, image: Tensor) -> None:
+        if not isinstance(image, Tensor):
+            raise InputError(f"image: a torch tensor is needed, got {type(image).__name__}")
+        if image.dtype not in (*_FLOATS, *_INTEGERS):
+            raise InputError(f"image: floating point, uint8 or uint16 is needed, got {image.dtype}")
+        width, height = self.camera.size
+        if image.ndim < 3 or tuple(image.shape[-2:]) != (height, width):
+            raise InputError(f"image: shape (..., C, {height}, {width}) is needed, got {tuple(image.shape)}")
+        if image.device != self.mask.device:
+            raise InputError(f"image is on {image.device}, the module on {self.mask.device}; move one with .to()")
+
+    def _state(self) -> Tensor:
+        """All that the maps depend on, to notice when it changes."""
+        parts = [
+            part for camera in (self.camera, self.new_camera) for part in (*camera.parameters(), *camera.buffers())
+        ]
+        return torch.cat([part.detach().flatten().to(torch.float64) for part in parts])
+
+    def _maps(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        cameras = (self.camera, self.new_camera)
+        live = torch.is_grad_enabled() and any(c.parameters_vector.requires_grad for c in cameras)
+        compiling = torch.compiler.is_compiling()
+        if live or (compiling and self.grid_x.dtype != precision):
+            return self._grid(precision)
+        # What is compiled or exported is a snapshot: a comparison of values would break its graph. Here it costs some
+        # microseconds, and a stale map would be a wrong image.
+        if not compiling and (self.grid_x.dtype != precision or not torch.equal(self._made_for, self._state())):
+            self.grid_x, self.grid_y, self.mask = self._grid(precision)
+            self._made_for = self._state()
+        return self.grid_x, self.grid_y, self.mask
+
+    def _grid(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions as `grid_sample` wants them, -1 and 1 at the centres of the outer pixels, rounded once."""
+        pixels, mask = _source_positions(self.camera, self.new_camera)
+        last = torch.tensor(self.camera.size, dtype=pixels.dtype, device=pixels.device) - 1
+        x, y = (2 * pixels / last - 1).to(precision).unbind(-1)
+        return x.contiguous(), y.contiguous(), mask
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
+        def moved(tensor: Tensor) -> Tensor:
+            """Buffers change their device, never their precision: `.half()` would move samples by half a pixel."""
+            result = fn(tensor)
+            return tensor.to(result.device) if result.dtype != tensor.dtype else result
+
+        return super()._apply(moved, recurse)
+
+
+def _source_positions(camera: Camera, new_camera: Camera) -> tuple[Tensor, Tensor]:
+    """Source pixel (..., H, W, 2) of each pixel of the new image, and mask (..., H, W)."""
+    width, height = new_camera.size
+    if min(width, height, *camera.size) < 2:
+        raise InputError(f"images of {camera.size} and {new_camera.size}: at least 2 pixels each way are needed")
+    shapes = [tuple(c.parameters_vector.shape[:-1]) for c in (camera, new_camera)]
+    try:
+        torch.broadcast_shapes(*shapes)
+    except RuntimeError as error:
+        raise InputError(f"batches of {shapes[0]} cameras and {shapes[1]} new cameras do not fit") from error
+    bands = []
+    for pixels in new_camera.grid(width, height).flatten(0, 1).split(_BAND):
+        rays, valid = new_camera.unproject(pixels)
+        source, seen = source_pixels(camera, rays)
+        bands.append((source, seen & valid))
+    source, mask = torch.cat([band[0] for band in bands], -2), torch.cat([band[1] for band in bands], -1)
+    source = torch.where(mask[..., None], source, NOWHERE)
+    return source.unflatten(-2, (height, width)), mask.unflatten(-1, (height, width))

@@ -1,0 +1,212 @@
+"""Where a lens model is a lens: the part around the optical axis before it folds back or meets a pole.
+
+The distortion of Eq. 4 is no bijection of the plane. Seen from the axis along any direction there is a first place
+where the Jacobian's determinant, the radial denominator or the tilt's w is no longer positive, and what lies beyond it
+is not the lens. `valid_region` walks outward along 64 directions to that place. A map without folds that takes the
+edge of a region once around the origin is one-to-one inside; where the edge does not (two folds can meet in a cusp,
+inside which a pixel has several preimages), the region is pulled in until it does.
+
+For a lens without tangential, prism and tilt terms the region is a disc. For others it is the union of the largest
+disc about the axis and the regular part of what a short Fourier series encloses: the reciprocal of the limit as a
+function of the direction, rounded up so that it stays inside the 64 places.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.lens.distortion import Distorted, check_coefficients, distort_components, unbind_last
+from kcal.lens.eager import known_true
+from kcal.lens.model import LensModel
+from kcal.lens.plane import largest_radius
+
+DIRECTIONS = 64
+_HARMONICS = 6
+# How far beyond the smallest disc the region may reach, or how far inside it must stay, until it is one-to-one.
+_CAPS = (math.inf, 8.0, 4.0, 2.5, 1.7, 1.3, 1.15, 1.05, 1.0, 0.8, 0.6, 0.4, 0.2)
+# The limit is smooth along the directions: within this fraction of the smallest one no fold hides between two of them.
+_SURE = 0.95
+
+
+class Region(NamedTuple):
+    """The valid region on the plane z = 1 (for a fisheye, on the plane of angles).
+
+    Attributes:
+        radius: (...) of the largest disc about the axis inside the region.
+        edge: (..., 13) Fourier series of the reciprocal distance of the edge: constant, then cosine and sine of the
+            direction's first, second, ... multiple.
+    """
+
+    radius: Tensor
+    edge: Tensor
+
+    def covers(self, x: Tensor, y: Tensor, fraction: float = 1.0) -> Tensor:
+        """Whether points (..., N) lie in the disc, or in a fraction of it."""
+        radius = self.radius[..., None] * fraction
+        return torch.addcmul(x * x, y, y) < radius * radius
+
+    def fraction(self, x: Tensor, y: Tensor) -> Tensor:
+        """How far out points (..., N) lie, as a fraction of the way to the edge that the series describes."""
+        distance = torch.sqrt(torch.addcmul(x * x, y, y))
+        scale = torch.clamp(distance, min=1e-300).reciprocal()
+        return distance * _fourier(self.edge, x * scale, y * scale)
+
+    def outline(self, count: int) -> Tensor:
+        """Points (..., count, 2) on the edge of the region, clockwise as seen in the image, the first on the x axis."""
+        unit_x, unit_y = directions(count, self.edge)
+        reciprocal = _fourier(self.edge, unit_x, unit_y)
+        reach = torch.maximum(self.radius[..., None], reciprocal.reciprocal())
+        return torch.stack([reach * unit_x, reach * unit_y], -1)
+
+
+def _fourier(edge: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+    """The series at directions given by their cosine and sine."""
+    constant, *rest = unbind_last(edge)
+    double = 2.0 * cosine
+    value = torch.addcmul(torch.addcmul(constant, rest[0], cosine), rest[1], sine)
+    c, c_before, s, s_before = cosine, torch.ones_like(cosine), sine, torch.zeros_like(sine)
+    for k in range(1, _HARMONICS):
+        c, c_before, s, s_before = double * c - c_before, c, double * s - s_before, s
+        value = torch.addcmul(torch.addcmul(value, rest[2 * k], c), rest[2 * k + 1], s)
+    return value
+
+
+def _fit_edge(limits: Tensor) -> Tensor:
+    """The series (..., 13) that stays within limits (..., 64) at every one of the directions."""
+    angle = torch.arange(DIRECTIONS, dtype=torch.float64, device=limits.device) * (2 * math.pi / DIRECTIONS)
+    waves = [f(k * angle) for k in range(1, _HARMONICS + 1) for f in (torch.cos, torch.sin)]
+    basis = torch.stack([torch.ones_like(angle), *waves], -1)
+    weights = basis * (2.0 / DIRECTIONS)
+    weights[:, 0] *= 0.5
+    # A lens that is irregular on the axis reaches nowhere; 1e100 stands for the reciprocal of zero.
+    wanted = limits.clamp(min=1e-100).reciprocal()
+    series = wanted @ weights
+    raise_by = (wanted - series @ basis.T).amax(-1).clamp(min=0.0)
+    return torch.cat([series[..., :1] + raise_by[..., None], series[..., 1:]], -1)
+
+
+def directions(count: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine and sine (count,) of directions spread evenly, beginning on the x axis."""
+    angle = torch.arange(count, dtype=torch.float64, device=like.device) * (2 * math.pi / count)
+    return torch.cos(angle), torch.sin(angle)
+
+
+@torch.no_grad()
+def first_limits(coefficients: Tensor, model: LensModel, count: int) -> Tensor:
+    """How far the lens reaches along each of `count` directions, (..., count); see the module's first lines."""
+    unit_x, unit_y = directions(count, coefficients)
+
+    def good(radius: Tensor) -> Tensor:
+        """Radii (..., K, count), one column a direction -> how many from the first on are regular, (..., count)."""
+        x, y = (radius * unit_x).flatten(-2), (radius * unit_y).flatten(-2)
+        lens = distort_components(x, y, coefficients, model)
+        regular = (lens.positive & (lens.determinant > 0)).unflatten(-1, (-1, count))
+        return regular.to(torch.int64).cumprod(-2).sum(-2)
+
+    # From the axis out, 1/6° or so a step; then each interval is split in 32 again until it is as narrow as rounding.
+    top = largest_radius(model)
+    steps = torch.linspace(0, top if model.fisheye else math.atan(top), 535, dtype=torch.float64)
+    radii = (steps if model.fisheye else torch.tan(steps)).to(coefficients.device)[:, None].expand(-1, count)
+    fractions = torch.linspace(0, 1, 33, dtype=torch.float64, device=coefficients.device)[:, None]
+    for _ in range(11):
+        regular = good(radii)
+        radii = radii.expand(*regular.shape[:-1], -1, -1)
+        # A lens that is irregular on the axis itself (a tilt beyond 90°, say) reaches nowhere: radius zero.
+        low = torch.gather(radii, -2, (regular - 1).clamp(min=0)[..., None, :])
+        high = torch.gather(radii, -2, regular.clamp(max=radii.shape[-2] - 1)[..., None, :])
+        radii = low + (high - low) * fractions
+    return low[..., 0, :]
+
+
+def _winds_once(x: Tensor, y: Tensor) -> Tensor:
+    """Whether closed curves (..., M) run around the origin exactly once, never backwards: (...)."""
+    scale = torch.sqrt(x * x + y * y).clamp(min=1e-300)
+    x, y = x / scale, y / scale
+    next_x, next_y = x.roll(-1, -1), y.roll(-1, -1)
+    cross, dot = x * next_y - y * next_x, x * next_x + y * next_y
+    total = torch.atan2(cross, dot).sum(-1)
+    return (cross > 0).all(-1) & (total < 3 * math.pi)
+
+
+@torch.no_grad()
+def valid_region(coefficients: Tensor, model: LensModel | str) -> Region:
+    """Measure where a lens is valid.
+
+    Args:
+        coefficients: (..., P).
+        model: a `LensModel` or a preset's name.
+
+    Raises:
+        InputError: the wrong number of coefficients.
+
+    Example:
+        >>> k = torch.tensor([-1.0 / 12.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+        >>> region = valid_region(k, "opencv4")  # x - x³/12 turns back at x = 2
+        >>> round(float(region.radius), 12), [round(float(c), 12) for c in region.outline(4)[0]]
+        (2.0, [2.0, 0.0])
+    """
+    model = LensModel.named(model)
+    coefficients = check_coefficients(coefficients, model)
+    if model.radial:
+        limits = first_limits(coefficients, model, 1)
+        return Region(limits[..., 0], _fit_edge(limits.expand(*limits.shape[:-1], DIRECTIONS)))
+    limits = first_limits(coefficients, model, DIRECTIONS)
+    smallest = limits.amin(-1, keepdim=True)
+    caps = torch.tensor(_CAPS, dtype=torch.float64, device=limits.device)[:, None]
+    # No limit times a radius of zero would be NaN.
+    capped = torch.minimum(limits[..., None, :], torch.nan_to_num(caps * smallest[..., None, :], nan=0.0, posinf=1e9))
+    candidates = Region(capped.amin(-1), _fit_edge(capped))
+    outline = candidates.outline(DIRECTIONS).flatten(-3, -2)
+    lens = distort_components(outline[..., 0], outline[..., 1], coefficients, model, slopes=False)
+    fits = _winds_once(lens.x.unflatten(-1, (-1, DIRECTIONS)), lens.y.unflatten(-1, (-1, DIRECTIONS)))
+    # The first cap that fits; close to the axis every regular lens is linear, so the last one stands for it.
+    first = (fits.to(torch.int64).cumsum(-1) == 0).sum(-1).clamp(max=len(_CAPS) - 1)[..., None]
+    radius = torch.gather(candidates.radius, -1, first)[..., 0]
+    edge = torch.gather(candidates.edge, -2, first[..., None].expand(*first.shape, candidates.edge.shape[-1]))
+    return Region(radius, edge[..., 0, :])
+
+
+def in_region(
+    x: Tensor,
+    y: Tensor,
+    coefficients: Tensor,
+    model: LensModel,
+    region: Region,
+    lens: Distorted | None = None,
+) -> Tensor:
+    """Whether points (..., N) of the plane lie in the valid region.
+
+    Near the edge of a lens that is not symmetric the Jacobian itself is asked, so that a fold in between two of the
+    64 directions does not go unseen.
+
+    Args:
+        x: (..., N).
+        y: likewise.
+        coefficients: (..., P).
+        model: the lens model.
+        region: of the lens.
+        lens: the lens evaluated there with its slopes, if that is at hand.
+    """
+    if model.radial:
+        return region.covers(x, y)
+    sure = region.covers(x, y, _SURE)
+    if known_true(sure):
+        return sure
+    if lens is None:
+        lens = distort_components(x, y, coefficients, model)
+    near = region.covers(x, y) | (region.fraction(x, y) < 1.0)
+    return sure | (near & lens.positive & (lens.determinant > 0))
+
+
+def valid_radius(coefficients: Tensor, model: LensModel | str) -> Tensor:
+    """Radius (...) of the disc about the axis inside which the lens is valid; see `valid_region`.
+
+    Example:
+        >>> round(float(valid_radius(torch.tensor([-0.75, 0.0, 0.0, 0.0], dtype=torch.float64), "opencv4")), 12)
+        0.666666666667
+    """
+    return valid_region(coefficients, model).radius

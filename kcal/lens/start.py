@@ -1,0 +1,96 @@
+"""Where Newton's method starts: the radial part of a lens undone by a short polynomial.
+
+For a lens with radial terms only, the undistorted radius is a function of the distorted one. Its ratio is fitted, once
+a lens, as a polynomial in √(1 - r_D² / D²), where D is the largest distorted radius: at a fold the inverse behaves as a
+square root, so that this variable makes it smooth there too. Within the image the polynomial is good to 1e-5 or better
+for ordinary lenses; what tangential and prism terms add is left to Newton, and the tilt is undone in closed form.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcal.lens.distortion import distort_components, polynomial, unbind_last
+from kcal.lens.model import LensModel
+from kcal.lens.region import first_limits
+
+DEGREE = 11
+_NODES = 96
+# Distorted radii that the polynomial is made for, unless a camera knows its own: 56° through a pinhole.
+DEFAULT_REACH = 1.5
+
+
+@torch.no_grad()
+def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = DEFAULT_REACH) -> Tensor:
+    """The polynomial of `start_from`.
+
+    Args:
+        coefficients: (..., P).
+        model: the lens model.
+        reach: (...) or a number: the largest distorted radius that will be asked for.
+
+    Returns:
+        (..., 1 + 12): D², then the coefficients by rising powers of 2 √(1 - r_D² / D²) - 1.
+    """
+    radial = LensModel(numerator=model.numerator, denominator=model.denominator, fisheye=model.fisheye)
+    chosen = [model.names.index(name) for name in radial.names]
+    own = coefficients[..., chosen]
+    limit = first_limits(own, radial, 1)
+
+    def distorted(radius: Tensor) -> Tensor:
+        return distort_components(radius, torch.zeros_like(radius), own, radial, slopes=False).x
+
+    # D lies a little beyond the reach, or at the fold.
+    wanted = torch.as_tensor(reach, dtype=torch.float64, device=own.device)[..., None]
+    low, high = torch.zeros_like(limit), limit
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        beyond = distorted(middle) > 1.1 * wanted
+        low, high = torch.where(beyond, low, middle), torch.where(beyond, middle, high)
+    radius = high * torch.linspace(1.0 / _NODES, 1.0, _NODES, dtype=torch.float64, device=own.device)
+    values = distorted(radius)
+    largest = values[..., -1:] ** 2
+    variable = 2.0 * torch.sqrt(torch.clamp(1.0 - values * values / largest, min=0.0)) - 1.0
+    powers = variable[..., None] ** torch.arange(DEGREE + 1, device=own.device)
+    # A lens without any valid disc gives no equations; the ratio one starts as well as any.
+    usable = torch.isfinite(powers).all(-1).all(-1) & (largest[..., 0] > 0)
+    plain = torch.zeros(DEGREE + 1, dtype=torch.float64, device=own.device)
+    plain[0] = 1.0
+    powers = torch.where(usable[..., None, None], powers, 0.0)
+    ratio = torch.where(usable[..., None], radius / values, 0.0)
+    fitted = torch.linalg.pinv(powers, rtol=1e-13) @ ratio[..., None]
+    fitted = torch.where(usable[..., None], fitted[..., 0], plain)
+    return torch.cat([torch.where(usable[..., None], largest, 1.0), fitted], -1)
+
+
+def start_from(x: Tensor, y: Tensor, model: LensModel, start: Tensor) -> tuple[Tensor, Tensor]:
+    """A first guess of the undistorted coordinates for distorted ones (..., N) whose tilt is undone."""
+    if not (model.numerator or model.denominator):
+        return x, y
+    largest, constant, *rest = unbind_last(start)
+    square = torch.addcmul(x * x, y, y)
+    variable = 2.0 * torch.sqrt(torch.clamp(1.0 - square / largest, min=0.0)) - 1.0
+    ratio, _ = polynomial(variable, rest, 0.0, False)
+    ratio = ratio + constant
+    return x * ratio, y * ratio
+
+
+def without_tilt(
+    x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel
+) -> tuple[Tensor, Tensor, Tensor, LensModel]:
+    """Undo the tilt of distorted coordinates (..., N) in closed form: x, y, and the lens that remains."""
+    if not model.tilt:
+        return x, y, coefficients, model
+    c = unbind_last(coefficients)
+    tau_x, tau_y = c[model.names.index("tau_x")], c[model.names.index("tau_y")]
+    cos_x, sin_x, cos_y, sin_y = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
+    a, b = cos_x - sin_y * x, (cos_y * sin_x) * x
+    d, e = -sin_y * (sin_x + y), cos_y * (1.0 + sin_x * y)
+    scale = (cos_y * cos_x) * (a * e - b * d).reciprocal()
+    return (
+        (e * x - b * y) * scale,
+        (a * y - d * x) * scale,
+        coefficients[..., list(model.untilted_index)],
+        model.untilted,
+    )

@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from kcal.cli.main import main
+from kcal.errors import FileError, InputError
+from kcal.io.camera_file import load_camera, save_camera
+from kcal.io.images import decode_image, encode_png
+from kcal.lens.camera import Camera
+from kcal.lens.images import Undistort
+from kcal.lens.pinhole import new_pinhole
+
+CAMERA = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.02, 1e-3, -1e-3])
+
+
+def picture(kind: type, channels: int) -> np.ndarray:
+    shape = (48, 64) if channels == 1 else (48, 64, channels)
+    top = 255 if kind is np.uint8 else 65535
+    return np.random.default_rng(0).integers(0, top, shape, dtype=kind, endpoint=True)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    save_camera(CAMERA, tmp_path / "left.camera.json")
+    (tmp_path / "in").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "60")
+    return tmp_path
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["kcal", "undistort", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    return int(stop.value.code or 0)
+
+
+@pytest.mark.parametrize(("kind", "channels"), [(np.uint8, 1), (np.uint8, 3), (np.uint16, 1), (np.uint16, 3)])
+def test_depth_and_colours_are_kept(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kind: type, channels: int
+) -> None:
+    image = picture(kind, channels)
+    (folder / "in" / "a[1].png").write_bytes(encode_png(image))
+    assert run(monkeypatch, "in", "left.camera.json", "-o", "new/out", "--alpha", "1", "--mask") == 0
+    printed = capsys.readouterr().out
+    assert "1 of 1 images undistorted, 64x48 px" in printed
+
+    camera = load_camera(folder / "new/out/left_undistorted.json")
+    assert torch.equal(camera.parameters_vector, new_pinhole(CAMERA, 1).parameters_vector)
+    stored = decode_image((folder / "new/out/a[1].png").read_bytes(), "a")
+    assert stored.dtype == kind
+    expected, mask = Undistort(CAMERA, camera)(torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1))
+    assert np.array_equal(np.atleast_3d(stored), expected.permute(1, 2, 0).numpy())
+    shown = decode_image((folder / "new/out/left_mask.png").read_bytes(), "mask")
+    assert np.array_equal(shown, np.where(mask.numpy(), 255, 0))
+    assert sorted(path.name for path in (folder / "new/out").iterdir()) == [
+        "a[1].png", "left_mask.png", "left_undistorted.json",
+    ]  # fmt: skip
+
+
+def test_a_bad_image_does_not_stop_the_others(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = cv2.imencode(".jpg", picture(np.uint8, 3))[1].tobytes()
+    (folder / "in" / "1.jpg").write_bytes(whole[: len(whole) // 2])
+    (folder / "in" / "2.jpg").write_bytes(whole)
+    (folder / "in" / "3.png").write_bytes(encode_png(np.ascontiguousarray(picture(np.uint8, 1).T)))
+    assert run(monkeypatch, "in", "left.camera.json", "-o", "out") == 1
+    printed = capsys.readouterr()
+    assert "1 of 3 images undistorted" in printed.out
+    assert "100.0 % of pixels valid" in printed.out
+    assert "in/3.png: the image is 48x64 px, the camera 64x48 px" in printed.err
+    assert printed.err.splitlines()[-1].startswith("error: 2 of 3 images could not be undistorted: in/1.jpg: ")
+    assert sorted(path.name for path in (folder / "out").iterdir()) == ["2.png", "left_undistorted.json"]
+
+
+def test_nothing_usable_writes_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "in" / "1.png").write_bytes(b"no image")
+    assert run(monkeypatch, "in", "left.camera.json", "-o", "out") == 1
+    assert "none of 1 images could be undistorted: in/1.png: not an image" in capsys.readouterr().err
+    assert list((folder / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["in", "left.camera.json", "-o", "in"], "in/a.png: an input image would be overwritten"),
+        (["in", "b/a.jpg", "left.camera.json", "-o", "out"], "both in/a.png and b/a.jpg would become this file"),
+        (["in", "nothing.json", "-o", "out"], "nothing.json: cannot read"),
+        (["in", "left.camera.json", "-o", "left.camera.json"], "cannot be made a folder"),
+        (["no", "left.camera.json", "-o", "out"], "no: no such file or folder"),
+    ],
+)
+def test_refused_before_anything_is_written(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    (folder / "b").mkdir()
+    for name in ("in/a.png", "b/a.jpg"):
+        (folder / name).write_bytes(encode_png(picture(np.uint8, 1)))
+    before = sorted(folder.rglob("*"))
+    assert run(monkeypatch, *arguments) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_alpha_out_of_range(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run(monkeypatch, "in", "left.camera.json", "-o", "out", "--alpha", "1.5") == 2
+
+
+def test_new_camera_file_is_a_pinhole(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "in" / "a.png").write_bytes(encode_png(picture(np.uint8, 4)))
+    assert run(monkeypatch, "in", "left.camera.json", "-o", "out") == 0
+    content = json.loads((folder / "out" / "left_undistorted.json").read_text())
+    assert content["name"] == "left undistorted"
+    assert content["coefficients"] == {}
+
+
+def test_image_files() -> None:
+    """Channels are red, green, blue in memory, and in the file too: OpenCV reads blue, green, red."""
+    red = np.zeros((2, 3, 3), np.uint8)
+    red[..., 0] = 255
+    read = cv2.imdecode(np.frombuffer(encode_png(red), np.uint8), cv2.IMREAD_COLOR)
+    assert read is not None
+    assert np.array_equal(read, red[..., ::-1])
+    with pytest.raises(InputError, match=re.escape("got (2, 3, 2) of uint8")):
+        encode_png(red[..., :2])
+    with pytest.raises(InputError, match="float64"):
+        encode_png(red[..., 0] / 255)  # type: ignore[arg-type]
+    floats = cv2.imencode(".tiff", np.ones((4, 4), np.float32))[1].tobytes()
+    with pytest.raises(FileError, match=r"x\.tif: pixels are float32"):
+        decode_image(floats, "x.tif")
+    with pytest.raises(FileError, match="not an image"):
+        decode_image(b"", "x.png")
