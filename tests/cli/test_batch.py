@@ -228,11 +228,14 @@ def test_a_killed_run_continues_and_gives_the_same_table(folder, tmp_path):
     out, whole = tmp_path / "out", tmp_path / "whole"
     script = Path(__file__).parents[2] / "scripts" / "calibrate_batch.py"
     command = [sys.executable, str(script), str(folder), *WHAT, "--workers", "1", "-o"]
-    running = subprocess.Popen([*command, str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    # A session of its own, so that the workers die with it: one that lived on could still finish a piece.
+    running = subprocess.Popen(
+        [*command, str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
     deadline = time.monotonic() + 60
     while len(list(out.glob(".work/*.json"))) < 3 and running.poll() is None and time.monotonic() < deadline:
         time.sleep(0.002)
-    running.send_signal(signal.SIGKILL)
+    os.killpg(running.pid, signal.SIGKILL)
     running.wait()
     before = {path: path.stat().st_mtime_ns for path in out.glob(".work/*.json")}
     assert len(before) >= 3
