@@ -36,6 +36,7 @@ class LensOrders(Record):
     tangential: bool
     prism: int
     tilt: bool
+    fisheye: bool = False
 
     @pydantic.model_validator(mode="after")
     def _known(self) -> LensOrders:
@@ -223,6 +224,7 @@ def camera_to_file(
                 tangential=model.tangential,
                 prism=model.prism,
                 tilt=model.tilt,
+                fisheye=model.fisheye,
             ),
             intrinsics=Intrinsics(**{key: stored[key] for key in INTRINSICS}),
             coefficients={key: stored[key] for key in model.names},

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 from kcal.errors import InputError
 
@@ -27,7 +26,6 @@ _PRISM = {
     "s8": (1, 4),
 }
 _ORDER = (*_OPENCV, "k7", "k8", "k9", "k10", "s5", "s6", "k11", "k12", "k13", "k14", "s7", "s8")
-_DERIVED: Any = {"init": False, "repr": False, "compare": False}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,12 +65,12 @@ class LensModel:
     fisheye: bool = False
 
     # What follows from the orders. Ordinary attributes, because compilers trace no lazily computed ones.
-    names: tuple[str, ...] = dataclasses.field(**_DERIVED)
-    numerator_index: tuple[int, ...] = dataclasses.field(**_DERIVED)
-    denominator_index: tuple[int, ...] = dataclasses.field(**_DERIVED)
-    prism_index: tuple[tuple[int, ...], tuple[int, ...]] = dataclasses.field(**_DERIVED)
-    without_tilt: LensModel | None = dataclasses.field(**_DERIVED)
-    untilted_index: tuple[int, ...] = dataclasses.field(**_DERIVED)
+    names: tuple[str, ...] = dataclasses.field(init=False, repr=False, compare=False)
+    numerator_index: tuple[int, ...] = dataclasses.field(init=False, repr=False, compare=False)
+    denominator_index: tuple[int, ...] = dataclasses.field(init=False, repr=False, compare=False)
+    prism_index: tuple[tuple[int, ...], tuple[int, ...]] = dataclasses.field(init=False, repr=False, compare=False)
+    without_tilt: LensModel | None = dataclasses.field(init=False, repr=False, compare=False)
+    untilted_index: tuple[int, ...] = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name, limit in (("numerator", 7), ("denominator", 7), ("prism", 4)):
