@@ -65,6 +65,21 @@ class Exclusion(Record):
     reason: str
 
 
+class ValidRegion(Record):
+    """Where the lens is a lens: before it folds back or meets a pole.
+
+    Derived from the camera when the file is written, for readers that cannot compute it; kcal itself measures anew.
+
+    Args:
+        radius: of the disc about the optical axis that is valid: on the plane z = 1; for a fisheye, radians off axis.
+        polygon: (u, v) pixels around the part of the image that has rays, clockwise as one sees it, to 0.001 px; the
+            image's own outline where that is all of it.
+    """
+
+    radius: pydantic.NonNegativeFloat
+    polygon: tuple[tuple[float, float], ...]
+
+
 class BoardRecord(Record):
     """The board as plain fields: inner corners, and the side of a square in metres."""
 
@@ -125,6 +140,7 @@ class CameraFile(NativeFile):
         coefficients: name -> value, exactly the names of the model.
         standard_deviations: name -> one sigma of the parameter, None where it was held fixed; the whole is None
             when no covariance was computed.
+        valid_region: where the lens is valid; None if whoever wrote the file did not say.
         calibration: how the camera was calibrated, if it was.
 
     Example:
@@ -146,6 +162,7 @@ class CameraFile(NativeFile):
     intrinsics: Intrinsics
     coefficients: dict[str, float]
     standard_deviations: dict[str, pydantic.NonNegativeFloat | None] | None = None
+    valid_region: ValidRegion | None = None
     calibration: CameraCalibration | None = None
 
     @pydantic.field_validator("coefficients", "standard_deviations")
@@ -229,6 +246,10 @@ def camera_to_file(
             intrinsics=Intrinsics(**{key: stored[key] for key in INTRINSICS}),
             coefficients={key: stored[key] for key in model.names},
             standard_deviations=standard_deviations,
+            valid_region=ValidRegion(
+                radius=float(camera.valid_radius),
+                polygon=tuple((round(u, 3), round(v, 3)) for u, v in camera.valid_polygon().tolist()),
+            ),
             calibration=calibration,
         )
     except pydantic.ValidationError as error:

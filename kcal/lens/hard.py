@@ -2,7 +2,10 @@
 
 Each starts from the nearest of some thousand samples of the valid region, so that it begins on the right side of every
 fold, and takes damped steps that may not leave the region. Inside it the Jacobian's determinant is positive, so that
-the residual has no minimum but the solution: a point that stops elsewhere stops at the edge, and has no preimage.
+the residual has no minimum but the solution: a point that stops elsewhere stops at the edge. Where the region is not
+convex that edge may lie between a start and the solution. The image of the region, though, is a star about the origin
+(`kcal.lens.region`), and so the way along a straight line of images from the axis to the target is free: what stopped
+is led along that line.
 """
 
 from __future__ import annotations
@@ -17,6 +20,13 @@ from kcal.lens.region import DIRECTIONS, Region, in_region
 
 _RINGS = 16
 _STEPS = 60
+# Where what is no part of the lens is put.
+_NOWHERE = 1e150
+# Places on the way from the axis to a target; they crowd at its end, where a fold may be.
+_WAY = 96
+# How much farther out than the image of the region's edge, known at 64 directions, a target may be: to be tried at
+# all, and to be led to.
+_OUTSIDE, _AGAIN = 1.02, 1.002
 # Points at a time: their distances to all samples are one matrix.
 _BLOCK = 1024
 
@@ -55,18 +65,29 @@ def solve_hard(
     radius = region.radius.expand(lead).reshape(cameras)
     edges = region.edge.expand(*lead, -1).reshape(cameras, -1)
     sample_x, sample_y, image_x, image_y = _samples(lenses, model, Region(radius, edges))
+    inner_x, inner_y = image_x[:, :-DIRECTIONS], image_y[:, :-DIRECTIONS]
 
-    camera, place = (~valid).nonzero(as_tuple=True)
+    outward = _outward(target_x, target_y, image_x, image_y)
+    # Negated, so that what cannot be compared is tried.
+    camera, place = (~valid & ~(outward > _OUTSIDE)).nonzero(as_tuple=True)
+    if not len(camera):
+        return x.reshape(shape), y.reshape(shape), valid.reshape(shape)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     for c, n in zip(camera.split(_BLOCK), place.split(_BLOCK), strict=True):
-        goal_x, goal_y, enough = target_x[c, n], target_y[c, n], tolerance[c, n]
-        nearest = ((image_x[c] - goal_x[:, None]) ** 2 + (image_y[c] - goal_y[:, None]) ** 2).argmin(-1)
-        own = lenses[c] if cameras > 1 else lenses[0]
-        here = Region(radius[c], edges[c]) if cameras > 1 else Region(radius[0], edges[0])
         # One lens a point where there are several: points then have a dimension of their own, of length one.
         tail = (-1, 1) if cameras > 1 else (-1,)
-        args = (goal_x.reshape(tail), goal_y.reshape(tail), enough.reshape(tail), own, model, here)
-        found.append(_damped(sample_x[c, nearest].reshape(tail), sample_y[c, nearest].reshape(tail), *args))
+        goal_x, goal_y, enough = (value[c, n].reshape(tail) for value in (target_x, target_y, tolerance))
+        lens = lenses[c] if cameras > 1 else lenses[0]
+        here = Region(radius[c], edges[c]) if cameras > 1 else Region(radius[0], edges[0])
+        distances = (inner_x[c] - goal_x.reshape(-1, 1)) ** 2 + (inner_y[c] - goal_y.reshape(-1, 1)) ** 2
+        nearest = distances.argmin(-1)
+        start_x, start_y = (value[c, nearest].reshape(tail) for value in (sample_x, sample_y))
+        part = _damped(start_x, start_y, goal_x, goal_y, enough, lens, model, here)
+        if not known_true(part[2] | (outward[c, n] > _AGAIN).reshape(tail)):
+            start_x, start_y = _led(goal_x, goal_y, lens, model)
+            led = _damped(start_x, start_y, goal_x, goal_y, enough, lens, model, here)
+            part = tuple(torch.where(part[2], old, new) for old, new in zip(part, led, strict=True))
+        found.append(part)
     solved = [torch.cat([part[i].reshape(-1) for part in found]) for i in range(3)]
     x, y, valid = (
         old.index_put((camera, place), new).reshape(shape) for old, new in zip((x, y, valid), solved, strict=True)
@@ -75,8 +96,12 @@ def solve_hard(
 
 
 def _samples(lenses: Tensor, model: LensModel, region: Region) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points of each region on rings like its edge, axis included, and where they are mapped: (cameras, 1025) each."""
-    rings = torch.arange(1, _RINGS + 1, dtype=torch.float64, device=lenses.device) / (_RINGS + 0.5)
+    """Points of each region on rings like its edge, and where they are mapped: (cameras, 1089) each, the axis first.
+
+    The last ring lies just inside the edge. Newton's first step from there would be a wild one: no starts.
+    """
+    rings = torch.arange(1, _RINGS + 2, dtype=torch.float64, device=lenses.device) / (_RINGS + 0.5)
+    rings[-1] = 1 - 1e-9
     points = (rings[:, None, None] * region.outline(DIRECTIONS)[:, None]).flatten(1, 2)
     points = torch.cat([torch.zeros_like(points[:, :1]), points], 1)
     x, y = points.unbind(-1)
@@ -84,9 +109,41 @@ def _samples(lenses: Tensor, model: LensModel, region: Region) -> tuple[Tensor, 
     regular = lens.positive & (lens.determinant > 0)
     # Far enough never to be the nearest, and still finite when squared.
     image_x, image_y = (
-        torch.where(regular, value, 1e150).clamp(-1e150, 1e150).nan_to_num(1e150) for value in (lens.x, lens.y)
+        torch.where(regular, value, _NOWHERE).clamp(-_NOWHERE, _NOWHERE).nan_to_num(_NOWHERE)
+        for value in (lens.x, lens.y)
     )
     return x, y, image_x, image_y
+
+
+def _outward(x: Tensor, y: Tensor, image_x: Tensor, image_y: Tensor) -> Tensor:
+    """How far out targets (cameras, N) lie, as a fraction of the way to the image of the region's edge.
+
+    The region's image is a star about the origin (`kcal.lens.region`): its edge, the image of the last ring, is a
+    function of the direction.
+    """
+    edge_x, edge_y = image_x[:, -DIRECTIONS:], image_y[:, -DIRECTIONS:]
+    angle, order = torch.atan2(edge_y, edge_x).sort(-1)
+    reach = torch.gather(torch.hypot(edge_x, edge_y), -1, order)
+    after = torch.searchsorted(angle, torch.atan2(y, x)) % DIRECTIONS
+    before = (after - 1) % DIRECTIONS
+    limit = torch.maximum(torch.gather(reach, -1, before), torch.gather(reach, -1, after))
+    return torch.hypot(x, y) / limit
+
+
+def _led(target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:
+    """Follow the solution for t * target from t = 0, where it is the axis, to 1."""
+    x, y = torch.zeros_like(target_x), torch.zeros_like(target_y)
+    for k in range(1, _WAY + 1):
+        t = 1.0 - (1.0 - k / _WAY) ** 2
+        for _ in range(2):
+            lens = distort_components(x, y, coefficients, model)
+            a, b, d, e = lens.point
+            error_x, error_y = (lens.x - t * target_x), (lens.y - t * target_y)
+            scale = lens.determinant.reciprocal()
+            next_x, next_y = x - (e * error_x - b * error_y) * scale, y - (a * error_y - d * error_x) * scale
+            usable = torch.isfinite(next_x + next_y)
+            x, y = torch.where(usable, next_x, x), torch.where(usable, next_y, y)
+    return x, y
 
 
 def _damped(

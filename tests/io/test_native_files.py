@@ -120,8 +120,28 @@ class TestCamera:
             "intrinsics": {"fx": 800.0, "fy": 801.0, "cx": 320.0, "cy": 240.0, "skew": 0.0},
             "coefficients": {"k1": 0.1, "k2": 0.0, "p1": 0.0, "p2": 0.0},
             "standard_deviations": None,
+            "valid_region": {
+                "radius": math.tan(math.radians(89.0)),
+                "polygon": [[-0.5, 479.5], [-0.5, -0.5], [639.5, -0.5], [639.5, 479.5]],
+            },
             "calibration": None,
         }
+
+    def test_valid_region_of_a_lens_that_folds(self, tmp_path: Path) -> None:
+        camera = Camera.build(focal=(400, 400), center=(320, 240), size=(640, 480), coefficients=[-0.3, 0.0])
+        stored = CameraFile.load(save_camera(camera, tmp_path / "camera.json")).valid_region
+        assert stored is not None
+        assert stored.radius == pytest.approx(1 / math.sqrt(0.9), abs=1e-12)
+        polygon = torch.tensor(stored.polygon, dtype=torch.float64)
+        # x - 0.3 x³ turns back at two thirds of 1 / √0.9, 281 px off axis: a circle cut by the image above and below.
+        outward = polygon - camera.center
+        reach = torch.linalg.vector_norm(outward, dim=-1)
+        on_circle = (reach - 400 * 2 / 3 / math.sqrt(0.9)).abs() < 2e-3
+        on_border = (polygon[:, 1] + 0.5).abs().minimum((polygon[:, 1] - 479.5).abs()) < 1e-3
+        assert bool((on_circle | on_border).all())
+        assert int(on_circle.sum()) > 50
+        assert camera.unproject(camera.center + 0.999 * outward)[1].all()
+        assert not camera.unproject(camera.center + 1.001 * outward[on_circle])[1].any()
 
     def test_values_go_by_name(self, tmp_path: Path, camera: Camera) -> None:
         content = camera_to_file(camera).dump()
