@@ -1,6 +1,8 @@
 """Undistortion of 1080p images: kcal beside `cv2.remap` and kornia's `undistort_image`, eager, on the CPU.
 
-    python scripts/bench_undistort.py [--quick] [--markdown FILE]
+    python scripts/bench_undistort.py [--quick]
+
+`scripts/bench_lens.py` puts the same table into docs/lens.md.
 
 One image, one lens of 8 coefficients. The maps of kcal and OpenCV are made beforehand, as one would for a video;
 kornia's function has no way to keep them. All three keep the source's intrinsics. In each round every side runs once,
@@ -10,19 +12,14 @@ in turn, and ratios are taken within a round; median (smallest to largest). One 
 from __future__ import annotations
 
 import argparse
-import platform
-import statistics
-import time
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
-import kornia
 import numpy as np
 import torch
 from kornia.geometry.calibration import undistort_image
+from timing import ratios, show, spread, times
 
-import kcal
 from kcal.lens.camera import Camera
 from kcal.lens.images import Undistort, undistort_maps
 
@@ -40,22 +37,18 @@ CASES = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="3 rounds in place of 30")
-    parser.add_argument("--markdown", type=Path, help="also write the tables to this file")
-    arguments = parser.parse_args()
-    rounds = 3 if arguments.quick else 30
+    tables(3 if parser.parse_args().quick else 30)
 
+
+def tables(rounds: int) -> list[str]:
+    """Print the table and return its lines."""
     camera = Camera.build(focal=(1400, 1400), center=(957, 541), size=SIZE, coefficients=LENS, model="opencv8")
     new = Camera.build(focal=(1400, 1400), center=(957, 541), size=SIZE, model="pinhole")
-    lines = _show(
+    lines = show(
         [
-            "# Undistortion of 1080p images",
-            "",
-            f"Made by `scripts/bench_undistort.py` with kcal {kcal.__version__}, torch {torch.__version__}, kornia "
-            f"{kornia.__version__}, OpenCV {cv2.__version__}, {platform.processor() or platform.machine()}; "
-            f"{rounds} rounds, milliseconds: median (smallest to largest). A ratio is the other's time over kcal's: "
-            "above 1, kcal is faster.",
-            "",
-            f"Making kcal's maps, once a camera: {_spread(_times([lambda: undistort_maps(camera, new)], 3)[0])} ms.",
+            "One image, 8 coefficients, eager, milliseconds. The maps of kcal and OpenCV are made beforehand, as one "
+            "would for a video; kornia's function has no way to keep them. Making kcal's maps, once a camera: "
+            f"{_milliseconds(times([lambda: undistort_maps(camera, new)], 3)[0])} ms.",
             "",
             "| image | threads | kcal, maps kept | `cv2.remap` | kornia `undistort_image` | cv2 / kcal | kornia / kcal "
             "| largest difference to cv2, levels of 255 |",
@@ -67,9 +60,8 @@ def main() -> None:
         torch.set_num_threads(threads)
         cv2.setNumThreads(threads)
         for name, channels, dtype in CASES:
-            lines += _show([_row(name, threads, camera, undistort, _image(channels, dtype), rounds)])
-    if arguments.markdown:
-        arguments.markdown.write_text("\n".join(lines) + "\n")
+            lines += show([_row(name, threads, camera, undistort, _image(channels, dtype), rounds)])
+    return lines
 
 
 def _image(channels: int, dtype: torch.dtype) -> torch.Tensor:
@@ -93,37 +85,17 @@ def _row(name: str, threads: int, camera: Camera, undistort: Undistort, image: t
     ]
     if image.is_floating_point():
         calls.append(lambda: undistort_image(image, matrix, lens))
-    times = _times(calls, rounds)
-    ratios = [
-        _spread([other / own for own, other in zip(times[0], other_times, strict=True)], 2) for other_times in times[1:]
-    ]
+    found = times(calls, rounds)
+    faster = [ratios(found[0], other) for other in found[1:]]
     theirs = torch.from_numpy(np.atleast_3d(cv2.remap(array, maps.map_x, maps.map_y, cv2.INTER_LINEAR)))
     difference = float((undistort(image)[0][0].double() - theirs.permute(2, 0, 1).double()).abs().max())
-    cells = [name, str(threads), *(_spread(t) for t in times), *["–"] * (3 - len(times))]
-    cells += [*ratios, *["–"] * (2 - len(ratios)), f"{difference:.3f}"]
+    cells = [name, str(threads), *(_milliseconds(t) for t in found), *["–"] * (3 - len(found))]
+    cells += [*faster, *["–"] * (2 - len(faster)), f"{difference:.3f}"]
     return f"| {' | '.join(cells)} |"
 
 
-def _times(calls: list[Callable[[], object]], rounds: int) -> list[list[float]]:
-    """Milliseconds of each call in each round; one run of each first, not counted."""
-    for call in calls:
-        call()
-    times: list[list[float]] = [[] for _ in calls]
-    for _ in range(rounds):
-        for which, call in enumerate(calls):
-            start = time.perf_counter()
-            call()
-            times[which].append(1e3 * (time.perf_counter() - start))
-    return times
-
-
-def _spread(values: list[float], digits: int = 1) -> str:
-    return f"{statistics.median(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
-
-
-def _show(lines: list[str]) -> list[str]:
-    print("\n".join(lines), flush=True)
-    return lines
+def _milliseconds(seconds: list[float]) -> str:
+    return spread([1e3 * value for value in seconds])
 
 
 if __name__ == "__main__":

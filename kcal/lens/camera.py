@@ -13,13 +13,13 @@ from torch import Tensor, nn
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.distortion import distort_components
-from kcal.lens.eager import finite_or, in_chunks, is_differentiated, known_true
+from kcal.lens.eager import finite_or, in_chunks, is_differentiated, known_true, separate
 from kcal.lens.inverse import Inverse, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
 from kcal.lens.outline import area, image_outline
 from kcal.lens.plane import plane_from_points, rays_from_plane
 from kcal.lens.projection import INTRINSICS, from_pixels, parameter_names, to_pixels
-from kcal.lens.region import Region, in_region
+from kcal.lens.region import Region, in_region, surely_in_region
 
 
 class Camera(nn.Module):
@@ -101,6 +101,8 @@ class Camera(nn.Module):
     @property
     def values(self) -> Tensor:
         """(..., 5 + P) the parameters, with gradients only to those that are free."""
+        if not self.parameters_vector.requires_grad:
+            return self.parameters_vector
         return torch.where(self.free_mask, self.parameters_vector, self.parameters_vector.detach())
 
     @property
@@ -208,27 +210,40 @@ class Camera(nn.Module):
         values = self.values
         coefficients, center = values[..., 5:], values[..., None, 2:4]
 
+        differentiated = is_differentiated(points, values)
+
         def one(points: Tensor) -> tuple[Tensor, Tensor]:
-            X, Y, Z = points.unbind(-1)
+            X, Y, Z = separate(points)
             with torch.no_grad():
-                valid = self._sees(X, Y, Z, coefficients)
+                valid, settled = self._may_see(X, Y, Z)
                 all_valid = known_true(valid)
             if not all_valid:
                 # The axis is a harmless stand-in: no NaN in values or gradients.
                 X, Y, Z = torch.where(valid, X, 0.0), torch.where(valid, Y, 0.0), torch.where(valid, Z, 1.0)
             x, y = plane_from_points(X, Y, Z, self.model)
-            lens = distort_components(x, y, coefficients, self.model, slopes=False)
+            lens = distort_components(x, y, coefficients, self.model, slopes=not (settled or differentiated))
+            if not settled:
+                with torch.no_grad():
+                    known = None if differentiated else lens
+                    valid = valid & in_region(x, y, coefficients, self.model, self.valid_region, known)
             pixels = torch.stack(to_pixels(lens.x, lens.y, values), -1)
-            return pixels if all_valid else torch.where(valid[..., None], pixels, center), valid
+            return pixels if all_valid and settled else torch.where(valid[..., None], pixels, center), valid
 
         return self._in_chunks(one, points)
 
-    def _sees(self, X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor) -> Tensor:
+    def _may_see(self, X: Tensor, Y: Tensor, Z: Tensor) -> tuple[Tensor, bool]:
+        """Where points are usable and within the outline of the valid region, and whether that settles it."""
         x, y = plane_from_points(X, Y, Z, self.model)
-        inside = in_region(x, y, coefficients, self.model, self.valid_region)
         # A point infinitely far ahead would land on the axis.
-        finite = ~torch.isinf(Z)
-        return inside & finite if self.model.fisheye else inside & finite & (Z > 0)
+        usable = Z.abs() < torch.inf
+        if not self.model.fisheye:
+            usable = usable & (Z > 0)
+        if self.model.radial:
+            return usable & self.valid_region.covers(x, y), True
+        sure = usable & surely_in_region(x, y, self.valid_region)
+        if known_true(sure):
+            return sure, True
+        return usable & self.valid_region.encloses(x, y), False
 
     def _in_chunks(self, function: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor) -> tuple[Tensor, Tensor]:
         differentiated = is_differentiated(points, self.parameters_vector)

@@ -55,6 +55,10 @@ class Region(NamedTuple):
         scale = torch.clamp(distance, min=1e-300).reciprocal()
         return distance * _fourier(self.edge, x * scale, y * scale)
 
+    def encloses(self, x: Tensor, y: Tensor) -> Tensor:
+        """Whether points (..., N) lie within the outline, where all of the valid region is."""
+        return self.covers(x, y) | (self.fraction(x, y) < 1.0)
+
     def outline(self, count: int) -> Tensor:
         """Points (..., count, 2) on the edge of the region, clockwise as seen in the image, the first on the x axis."""
         unit_x, unit_y = directions(count, self.edge)
@@ -193,13 +197,17 @@ def in_region(
     """
     if model.radial:
         return region.covers(x, y)
-    sure = region.covers(x, y, _SURE)
+    sure = surely_in_region(x, y, region)
     if known_true(sure):
         return sure
     if lens is None:
         lens = distort_components(x, y, coefficients, model)
-    near = region.covers(x, y) | (region.fraction(x, y) < 1.0)
-    return sure | (near & lens.positive & (lens.determinant > 0))
+    return sure | (region.encloses(x, y) & lens.positive & (lens.determinant > 0))
+
+
+def surely_in_region(x: Tensor, y: Tensor, region: Region) -> Tensor:
+    """Whether points (..., N) lie so far inside that nothing else need be asked."""
+    return region.covers(x, y, _SURE)
 
 
 def valid_radius(coefficients: Tensor, model: LensModel | str) -> Tensor:

@@ -1,0 +1,45 @@
+"""What the benchmarks of this folder share: calls timed in turn, so that ratios are taken within a round."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+
+# A call faster than this is repeated within a round until it takes as long.
+SHORTEST_S = 0.003
+
+
+def times(calls: Sequence[Callable[[], object]], rounds: int) -> list[list[float]]:
+    """Seconds of each call in each round; some runs of each first, not counted, settle how often it is repeated."""
+    repeats = []
+    for call in calls:
+        call()
+        start = time.perf_counter()
+        call()
+        repeats.append(max(1, math.ceil(SHORTEST_S / max(time.perf_counter() - start, 1e-7))))
+    found: list[list[float]] = [[] for _ in calls]
+    for _ in range(rounds):
+        for which, call in enumerate(calls):
+            start = time.perf_counter()
+            for _ in range(repeats[which]):
+                call()
+            found[which].append((time.perf_counter() - start) / repeats[which])
+    return found
+
+
+def spread(values: Sequence[float], digits: int = 1) -> str:
+    """`median (smallest to largest)`."""
+    return f"{statistics.median(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
+
+
+def ratios(own: Sequence[float], other: Sequence[float], digits: int = 2) -> str:
+    """`spread` of the other's time over one's own, round by round: above 1, one's own is faster."""
+    return spread([b / a for a, b in zip(own, other, strict=True)], digits)
+
+
+def show(lines: list[str]) -> list[str]:
+    """Print lines and return them."""
+    print("\n".join(lines), flush=True)
+    return lines
