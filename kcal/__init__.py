@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     from kcal.io.camera_file import load_camera, save_camera
     from kcal.io.rig_file import load_rig, save_rig
     from kcal.lens.camera import Camera
+    from kcal.lens.images import Undistort, undistort_maps
     from kcal.lens.model import LensModel
+    from kcal.lens.modules import Unproject
+    from kcal.lens.pinhole import new_pinhole
     from kcal.lens.rig import StereoRig
     from kcal.locate.geodesy import Origin
     from kcal.locate.stereo import Triangulate
@@ -40,13 +43,17 @@ __all__ = [
     "RigOptions",
     "StereoRig",
     "Triangulate",
+    "Undistort",
+    "Unproject",
     "calibrate_camera",
     "calibrate_rig",
     "detect_images",
     "load_camera",
     "load_rig",
+    "new_pinhole",
     "save_camera",
     "save_rig",
+    "undistort_maps",
 ]
 
 _HOME = {
@@ -62,13 +69,17 @@ _HOME = {
     "RigOptions": "kcal.calibrate.stereo",
     "StereoRig": "kcal.lens.rig",
     "Triangulate": "kcal.locate.stereo",
+    "Undistort": "kcal.lens.images",
+    "Unproject": "kcal.lens.modules",
     "calibrate_camera": "kcal.calibrate.mono",
     "calibrate_rig": "kcal.calibrate.stereo",
     "detect_images": "kcal.corners.detect",
     "load_camera": "kcal.io.camera_file",
     "load_rig": "kcal.io.rig_file",
+    "new_pinhole": "kcal.lens.pinhole",
     "save_camera": "kcal.io.camera_file",
     "save_rig": "kcal.io.rig_file",
+    "undistort_maps": "kcal.lens.images",
 }
 
 

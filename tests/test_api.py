@@ -28,13 +28,17 @@ PUBLIC = {
     "RigOptions",
     "StereoRig",
     "Triangulate",
+    "Undistort",
+    "Unproject",
     "calibrate_camera",
     "calibrate_rig",
     "detect_images",
     "load_camera",
     "load_rig",
+    "new_pinhole",
     "save_camera",
     "save_rig",
+    "undistort_maps",
 }
 
 

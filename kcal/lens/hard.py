@@ -72,7 +72,7 @@ def solve_hard(
     camera, place = (~valid & ~(outward > _OUTSIDE)).nonzero(as_tuple=True)
     if not len(camera):
         return x.reshape(shape), y.reshape(shape), valid.reshape(shape)
-    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    found: list[tuple[Tensor, ...]] = []
     for c, n in zip(camera.split(_BLOCK), place.split(_BLOCK), strict=True):
         # One lens a point where there are several: points then have a dimension of their own, of length one.
         tail = (-1, 1) if cameras > 1 else (-1,)
@@ -86,8 +86,9 @@ def solve_hard(
         if not known_true(part[2] | (outward[c, n] > _AGAIN).reshape(tail)):
             start_x, start_y = _led(goal_x, goal_y, lens, model)
             led = _damped(start_x, start_y, goal_x, goal_y, enough, lens, model, here)
-            part = tuple(torch.where(part[2], old, new) for old, new in zip(part, led, strict=True))
-        found.append(part)
+            found.append(tuple(torch.where(part[2], old, new) for old, new in zip(part, led, strict=True)))
+        else:
+            found.append(part)
     solved = [torch.cat([part[i].reshape(-1) for part in found]) for i in range(3)]
     x, y, valid = (
         old.index_put((camera, place), new).reshape(shape) for old, new in zip((x, y, valid), solved, strict=True)

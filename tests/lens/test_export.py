@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import onnxruntime
 import pytest
 import safetensors.torch
 import torch
@@ -72,8 +73,6 @@ def test_compiles_as_one_graph_and_exports(preset: str, direction: str) -> None:
 @pytest.mark.parametrize("direction", DIRECTIONS)
 @pytest.mark.parametrize("preset", ["opencv5", "opencv14", "fisheye4"])
 def test_onnx(preset: str, direction: str, tmp_path: Path) -> None:
-    onnxruntime = pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnxscript")
     camera = make_camera(preset)
     module, points = module_and_input(camera, direction)
     path = tmp_path / "camera.onnx"
