@@ -214,13 +214,14 @@ class Camera(nn.Module):
 
         def one(points: Tensor) -> tuple[Tensor, Tensor]:
             X, Y, Z = separate(points)
+            x, y = plane_from_points(X, Y, Z, self.model)
             with torch.no_grad():
-                valid, settled = self._may_see(X, Y, Z)
+                valid, settled = self._may_see(x, y, Z)
                 all_valid = known_true(valid)
             if not all_valid:
                 # The axis is a harmless stand-in: no NaN in values or gradients.
                 X, Y, Z = torch.where(valid, X, 0.0), torch.where(valid, Y, 0.0), torch.where(valid, Z, 1.0)
-            x, y = plane_from_points(X, Y, Z, self.model)
+                x, y = plane_from_points(X, Y, Z, self.model)
             lens = distort_components(x, y, coefficients, self.model, slopes=not (settled or differentiated))
             if not settled:
                 with torch.no_grad():
@@ -231,9 +232,8 @@ class Camera(nn.Module):
 
         return self._in_chunks(one, points)
 
-    def _may_see(self, X: Tensor, Y: Tensor, Z: Tensor) -> tuple[Tensor, bool]:
+    def _may_see(self, x: Tensor, y: Tensor, Z: Tensor) -> tuple[Tensor, bool]:
         """Where points are usable and within the outline of the valid region, and whether that settles it."""
-        x, y = plane_from_points(X, Y, Z, self.model)
         # A point infinitely far ahead would land on the axis.
         usable = Z.abs() < torch.inf
         if not self.model.fisheye:
@@ -253,7 +253,8 @@ class Camera(nn.Module):
         """Pixels (..., N, 2) to x, y on the plane of the lens, and valid; every one is (..., N)."""
         values = self.values
         cx, cy = values[..., 2, None], values[..., 3, None]
-        u, v, finite = finite_or(pixels[..., 0], pixels[..., 1], cx, cy)
+        u, v = separate(pixels)
+        u, v, finite = finite_or(u, v, cx, cy)
         x, y = from_pixels(u, v, values)
         ready = Inverse(self.valid_region, self.inverse_start)
         return undistort_components(x, y, finite, values[..., 5:], self.model, ready)
