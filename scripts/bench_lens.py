@@ -26,6 +26,7 @@ from torch import Tensor
 
 import kcal
 from kcal.lens.camera import Camera
+from kcal.lens.distortion import distort
 from kcal.lens.modules import Unproject
 
 SIZE = (1920, 1080)
@@ -161,8 +162,6 @@ def honesty() -> list[str]:
 
 def _answer(normalized: Tensor, camera: Camera, pixels: Tensor) -> tuple[str, str]:
     """The answer, and how far from the pixel the formulas of the lens put it (no fold asked after)."""
-    from kcal.lens.distortion import distort
-
     again = distort(normalized[None], camera.coefficients, camera.model) * camera.focal + camera.center
     x, y = normalized.tolist()
     return f"{x:.4g}, {y:.4g}", f"{float((again - pixels).norm()):.2g}"
