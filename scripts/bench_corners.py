@@ -29,8 +29,7 @@ from torch import Tensor
 from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_images
-from kcal.corners.erf import erf_saddle
-from kcal.corners.grid import line_bend, local_side
+from kcal.corners.grid import local_side
 from kcal.corners.images import expand_images
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import saddle
@@ -142,8 +141,7 @@ def run_cell(square: int, blur: float, noise: float, count: int) -> dict[str, Er
         light = torch.from_numpy(image).double()
         first = saddle(light, start, side).pixels
         cell["kcal saddle"].error.append(_lost(first, truth))
-        bend = line_bend(first, BOARD.columns, BOARD.rows)
-        fit = erf_saddle(light, first, side, bend=bend)
+        fit = refine_corners(image, start, side, "erf", (BOARD.columns, BOARD.rows))
         cell["kcal erf"].error.append(_lost(fit.pixels, truth))
         assert fit.covariance is not None
         cell["kcal erf"].covariance.append(fit.covariance)
