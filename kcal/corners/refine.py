@@ -70,7 +70,8 @@ def refine_corners(
     if pixels.ndim != 2 or side.shape != pixels.shape[:1]:
         raise InputError(f"pixels {tuple(pixels.shape)} and side {tuple(side.shape)}: (N, 2) and (N,) are needed")
     if method in ("erf", "saddle"):
-        light = torch.from_numpy(image.astype(np.float64))
+        # Only the surroundings of the corners become float64; float32 holds 16 bits exactly.
+        light = torch.from_numpy(image if image.dtype == np.uint8 else image.astype(np.float32))
         found = saddle(light, pixels, side)
         return found if method == "saddle" else _erf(light, pixels, found, side, _extremes(image), grid)
 
