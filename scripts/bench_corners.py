@@ -5,7 +5,7 @@ with a gamma of 2.2, given noise, rounded and compressed as JPEG (quality 95). R
 detectors start from nothing. Errors beyond 2 px count as lost and are shown as a share.
 
     python scripts/bench_corners.py --quick
-    python scripts/bench_corners.py --markdown > corners.md
+    python scripts/bench_corners.py --write
     KCAL_DATA=DATA python scripts/bench_corners.py --quick --real
 """
 
@@ -24,13 +24,13 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from page import write_section
 from torch import Tensor
 
 from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_images
-from kcal.corners.erf import erf_saddle
-from kcal.corners.grid import line_bend, local_side
+from kcal.corners.grid import local_side
 from kcal.corners.images import expand_images
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import saddle
@@ -142,8 +142,7 @@ def run_cell(square: int, blur: float, noise: float, count: int) -> dict[str, Er
         light = torch.from_numpy(image).double()
         first = saddle(light, start, side).pixels
         cell["kcal saddle"].error.append(_lost(first, truth))
-        bend = line_bend(first, BOARD.columns, BOARD.rows)
-        fit = erf_saddle(light, first, side, bend=bend)
+        fit = refine_corners(image, start, side, "erf", (BOARD.columns, BOARD.rows))
         cell["kcal erf"].error.append(_lost(fit.pixels, truth))
         assert fit.covariance is not None
         cell["kcal erf"].covariance.append(fit.covariance)
@@ -156,24 +155,38 @@ def _lost(pixels: Tensor, truth: Tensor) -> Tensor:
     return torch.nan_to_num(pixels - truth, nan=1e3)
 
 
-def print_table(cells: dict[tuple[int, float, float], dict[str, Errors]], markdown: bool) -> None:
+def table(cells: dict[tuple[int, float, float], dict[str, Errors]]) -> list[str]:
     """RMS per axis of every method, then bias and the predicted over the true standard deviation of the erf fit."""
     names = list(next(iter(cells.values())))
-    bar = " | " if markdown else "  "
     head = ["square", "blur", "noise", *names, "erf bias u", "erf bias v", "predicted/true σ"]
-    print(bar.join(head).join(("| ", " |") if markdown else ("", "")))
-    if markdown:
-        print("|" + "---|" * len(head))
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for (square, blur, noise), cell in cells.items():
         row = [f"{square}", f"{blur:g}", f"{noise:g}"]
         for errors in cell.values():
             rms, _, _, lost, _ = errors.row()
             row.append("lost" if math.isnan(rms) else f"{rms:.4f}" + (f" ({100 * lost:.1f} %)" if lost > 5e-4 else ""))
         _, bias_u, bias_v, _, ratio = cell["kcal erf"].row()
-        row += [f"{bias_u:+.4f}", f"{bias_v:+.4f}", f"{ratio:.2f}"]
-        if not markdown:
-            row = [text.ljust(len(title)) for text, title in zip(row, head, strict=True)]
-        print(bar.join(row).join(("| ", " |") if markdown else ("", "")), flush=True)
+        lines.append("| " + " | ".join([*row, f"{bias_u:+.4f}", f"{bias_v:+.4f}", f"{ratio:.2f}"]) + " |")
+    return lines
+
+
+def summary(cells: dict[tuple[int, float, float], dict[str, Errors]]) -> str:
+    """What the table says of the erf fit, in a sentence or two."""
+    ratios = {key: cell["kcal erf"].row()[4] for key, cell in cells.items()}
+    noisy = [ratio for (_, _, noise), ratio in ratios.items() if noise > 0]
+    clean = [ratio for (_, _, noise), ratio in ratios.items() if noise == 0]
+    bias = max(max(map(abs, cell["kcal erf"].row()[1:3])) for cell in cells.values())
+    worse = [
+        f"{square} px, blur {blur:g}, noise {noise:g} ({name})"
+        for (square, blur, noise), cell in cells.items()
+        for name, errors in cell.items()
+        if name != "kcal erf" and errors.row()[0] < cell["kcal erf"].row()[0]
+    ]
+    return (
+        f"Predicted over true σ is {min(noisy):.2f} to {max(noisy):.2f} where there is noise and {min(clean):.2f} to "
+        f"{max(clean):.2f} where there is none but rounding and JPEG. The largest mean error is {bias:.4f} px. Cells "
+        f"in which another method has a smaller RMS than the erf fit: {', '.join(worse) or 'none'}."
+    )
 
 
 def print_real(folder: Path) -> None:
@@ -193,13 +206,16 @@ def print_real(folder: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Accuracy of corner refinement.")
     parser.add_argument("--quick", action="store_true", help="2 boards a cell instead of 20, without 8 px squares")
-    parser.add_argument("--markdown", action="store_true", help="print a Markdown table")
+    parser.add_argument("--write", action="store_true", help="write the table of docs/corners.md")
     parser.add_argument("--real", action="store_true", help="also calibrate the images in KCAL_DATA")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     squares, count = (SQUARES[1:], 2) if arguments.quick else (SQUARES, 20)
     cells = {(s, b, n): run_cell(s, b, n, count) for s, b, n in itertools.product(squares, BLURS, NOISES)}
-    print_table(cells, arguments.markdown)
+    lines = [*table(cells), "", summary(cells)]
+    print(*lines, sep="\n")
+    if arguments.write:
+        write_section("corners.md", "bench_corners.py", "\n".join(lines))
     if arguments.real:
         folder = os.environ.get("KCAL_DATA")
         if not folder:

@@ -51,6 +51,9 @@ def detect(
         Path | None, typer.Option(help="A .png file: the views with their corners, worst first.")
     ] = None,
     coverage: Annotated[Path | None, typer.Option(help="A .png file: where in the image corners were seen.")] = None,
+    time_limit: Annotated[
+        float, typer.Option(help="Seconds for one image; a slower one is given up and listed.", min=0.1)
+    ] = 60.0,
 ) -> None:
     """Find the board in the images of one camera.
 
@@ -91,13 +94,13 @@ def detect(
             searched += 1
 
         with err.status("searching the video"):
-            observations = detect_video(images[0], board, refine.value, progress=count)
+            observations = detect_video(images[0], board, refine.value, progress=count, time_limit=time_limit)
         source = f"of {searched} sharp frames (repeats left out)"
     else:
         paths = expand_images(images)
         check_writable(output, *paths)
         with steps("detecting", len(paths)) as advance:
-            observations = detect_images(paths, board, refine.value, progress=advance)
+            observations = detect_images(paths, board, refine.value, progress=advance, time_limit=time_limit)
         turned = turned_images([path for path in paths if path.is_file()])
         source = f"of {len(paths)} images"
     observations.save(output)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.erf import SHARE
+from kcal.corners.erf_fit import SHARE
 from kcal.corners.grid import as_grid, local_side
 from kcal.errors import InputError
 

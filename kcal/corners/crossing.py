@@ -10,24 +10,44 @@ they are not, as on a tilted board.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 NAMES = ("dx", "dy", "angle1", "angle2", "log_blur", "mean", "contrast", "ramp_x", "ramp_y", "bow")
+PARAMETERS = len(NAMES)
+ODD = (0, 1, 7, 8)  # the parameters whose derivatives change their sign from one side of the corner to the opposite one
 _ORDER = 5  # of the series: what is left out is below 0.1 % of the contrast for edges 50° apart
 
 
-def crossing(parameters: Tensor, where: Tensor, bend: Tensor) -> tuple[Tensor, Tensor]:
+class Beside(NamedTuple):
+    """What lies beyond the four squares round a corner: the next line on either side of each edge.
+
+    They move with the corner, and widen with the blur; how far they are is not fitted.
+
+    Args:
+        distance: (..., 2, 2, K) pixels from each edge to the next line, on the side of its normal and on the other, at
+            each place where grey levels are wanted.
+        turn: (..., 2, 2, 1) what the edge's sign does there: 1 where squares alternate once more, 0.5 where the light
+            margin of the board begins, 0 where nothing is known.
+    """
+
+    distance: Tensor
+    turn: Tensor
+
+
+def crossing(parameters: Tensor, where: Tensor, bend: Tensor, beside: Beside | None = None) -> tuple[Tensor, Tensor]:
     """Grey levels of crossing edges and their Jacobian.
 
     Args:
         parameters: (..., 10): the centre (dx, dy) in pixels, the directions of both edges in radians, the logarithm of
             the blur's sigma in pixels, mean grey level, half the contrast (its sign says which squares are light),
-            a ramp of illumination in grey levels a pixel, and by how much edges are lighter than the mean (a camera's
-            tone curve bends the profile of a blurred edge).
+            a ramp of illumination (by which share light grows a pixel), and by how much edges are lighter than the mean
+            (a camera's tone curve bends the profile of a blurred edge).
         where: (..., K, 2) pixels at which the grey levels are wanted.
         bend: (..., 2) curvature of each edge, 1 / pixels, positive towards its normal (direction + 90°, x to y).
+        beside: the lines next to the edges, if their blur reaches here.
 
     Returns:
         levels (..., K) and their derivatives (..., 10, K).
@@ -45,22 +65,28 @@ def crossing(parameters: Tensor, where: Tensor, bend: Tensor) -> tuple[Tensor, T
     px, py = where.unbind(-1)
     x, y = px - dx, py - dy
     blur = log_blur.exp()
-    scaled, by_x, by_y, by_angle = [], [], [], []
+    profiles, by_x, by_y, by_angle = [], [], [], []
     for i, angle in enumerate((angle1, angle2)):
         curve = bend[..., i, None]
         cos, sin = angle.cos(), angle.sin()
         along, across = cos * x + sin * y, cos * y - sin * x
-        scaled.append((across - 0.5 * curve * along**2) / blur)
+        lines = None if beside is None else Beside(*(value[..., i, :, :] for value in beside))
+        profiles.append(_profile((across - 0.5 * curve * (along**2 + blur**2)) / blur, curve * blur, blur, lines))
         by_x.append((sin + curve * along * cos) / blur)
         by_y.append((-cos + curve * along * sin) / blur)
         by_angle.append(-along * (1.0 + curve * across) / blur)
-    a, b = scaled
+    a, b = profiles
     rho = torch.cos(angle1 - angle2)
-    sign, by_a, by_b, by_rho = _signs(a, b, rho)
-    by_rho = by_rho * torch.sin(angle1 - angle2)
-    slope = contrast - 2.0 * bow * sign
-    by_a, by_b, by_rho = slope * by_a, slope * by_b, slope * by_rho
+    sign, by_a, by_b, by_blur, by_rho = _signs(a, b, rho)
+    light = contrast.detach().sign()
+    sign = sign + light * (a.margin + b.margin)
+    by_a, by_b = by_a + light * a.margin_slope, by_b + light * b.margin_slope
+    by_blur = by_blur + light * (a.margin_widening + b.margin_widening)
+    light_here = 1.0 + ramp_x * px + ramp_y * py
+    slope = light_here * (contrast - 2.0 * bow * sign)
+    by_a, by_b, by_rho = slope * by_a, slope * by_b, slope * by_rho * torch.sin(angle1 - angle2)
     edge = 1.0 - sign * sign
+    level = mean + contrast * sign + bow * edge
     one = torch.ones_like(sign)
     jacobian = torch.stack(
         [
@@ -68,44 +94,79 @@ def crossing(parameters: Tensor, where: Tensor, bend: Tensor) -> tuple[Tensor, T
             by_a * by_y[0] + by_b * by_y[1],
             by_a * by_angle[0] - by_rho,
             by_b * by_angle[1] + by_rho,
-            -by_a * a - by_b * b,
-            one,
-            sign,
-            px * one,
-            py * one,
-            edge,
+            slope * by_blur,
+            light_here * one,
+            light_here * sign,
+            px * level,
+            py * level,
+            light_here * edge,
         ],
         -2,
     )
-    return mean + contrast * sign + ramp_x * px + ramp_y * py + bow * edge, jacobian
+    return light_here * level, jacobian
 
 
-def _signs(a: Tensor, b: Tensor, rho: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """E[sign(a + u) sign(b + v)] for standard normal u, v with correlation rho, and its derivatives by a, b, rho."""
-    density_a, density_b = _density(a), _density(b)
-    even_a, even_b = torch.erf(a * math.sqrt(0.5)), torch.erf(b * math.sqrt(0.5))
-    # Density times Hermite polynomials of degree 0 to _ORDER; the derivative of one is minus the next.
-    hermite_a, hermite_b = _hermite(a, density_a), _hermite(b, density_b)
-    value = even_a * even_b
-    by_a, by_b = 2.0 * density_a * even_b, 2.0 * density_b * even_a
+class _Profile(NamedTuple):
+    """One edge across: its blurred sign, and the terms of Mehler's series, each with its derivatives.
+
+    value[0] is the sign, value[k + 1] the density times Hermite's polynomial of degree k; slope is the derivative by
+    the distance in sigmas, widening the one by the logarithm of sigma.
+    """
+
+    value: list[Tensor]
+    slope: list[Tensor]
+    widening: list[Tensor]
+    margin: Tensor
+    margin_slope: Tensor
+    margin_widening: Tensor
+
+
+def _profile(scaled: Tensor, flat: Tensor, blur: Tensor, beside: Beside | None) -> _Profile:
+    value, slope = _terms(scaled)
+    widening = [-(scaled + flat) * term for term in slope]
+    margin = margin_slope = margin_widening = torch.zeros_like(scaled)
+    if beside is None:
+        return _Profile(value, slope, widening, margin, margin_slope, margin_widening)
+    for i, side in enumerate((1.0, -1.0)):
+        distance, turn = beside.distance[..., i, :], beside.turn[..., i, :]
+        from_line = scaled - side * distance / blur
+        line, line_slope = _terms(from_line)
+        line[0] = line[0] + side  # 0 on the corner's side of the line
+        value = [one - turn * other for one, other in zip(value, line, strict=True)]
+        slope = [one - turn * other for one, other in zip(slope, line_slope, strict=True)]
+        widening = [one + turn * (from_line + flat) * other for one, other in zip(widening, line_slope, strict=True)]
+        light = 0.5 * side * (turn == 0.5)
+        margin = margin + light * line[0]
+        margin_slope = margin_slope + light * line_slope[0]
+        margin_widening = margin_widening - light * (from_line + flat) * line_slope[0]
+    return _Profile(value, slope, widening, margin, margin_slope, margin_widening)
+
+
+def _terms(a: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+    density = torch.exp(-0.5 * a * a) * (1.0 / math.sqrt(2.0 * math.pi))
+    hermite = [density, a * density]
+    for k in range(1, _ORDER):
+        hermite.append(a * hermite[k] - k * hermite[k - 1])
+    # The derivative of one is minus the next.
+    return [torch.erf(a * math.sqrt(0.5)), *hermite[:-1]], [2.0 * density, *(-value for value in hermite[1:])]
+
+
+def _signs(a: _Profile, b: _Profile, rho: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """E[sign(a + u) sign(b + v)] for standard normal u, v with correlation rho, and its derivatives.
+
+    By a, b, the logarithm of the blur, and rho.
+    """
+    value = a.value[0] * b.value[0]
+    by_a, by_b = a.slope[0] * b.value[0], a.value[0] * b.slope[0]
+    by_blur = a.widening[0] * b.value[0] + a.value[0] * b.widening[0]
     by_rho = torch.zeros_like(value)
     power = torch.full_like(rho, 4.0)
-    for k in range(_ORDER):
-        both = hermite_a[k] * hermite_b[k]
+    for k in range(1, _ORDER + 1):
+        both = a.value[k] * b.value[k]
         by_rho = by_rho + power * both
-        power = power * rho / (k + 1)
+        power = power * rho / k
         value = value + power * both
-        by_a = by_a - power * hermite_a[k + 1] * hermite_b[k]
-        by_b = by_b - power * hermite_a[k] * hermite_b[k + 1]
-    return value, by_a, by_b, by_rho
-
-
-def _density(a: Tensor) -> Tensor:
-    return torch.exp(-0.5 * a * a) * (1.0 / math.sqrt(2.0 * math.pi))
-
-
-def _hermite(a: Tensor, density: Tensor) -> list[Tensor]:
-    values = [density, a * density]
-    for k in range(1, _ORDER):
-        values.append(a * values[k] - k * values[k - 1])
-    return values
+        by_a = by_a + power * a.slope[k] * b.value[k]
+        by_b = by_b + power * a.value[k] * b.slope[k]
+        by_blur = by_blur + power * (a.widening[k] * b.value[k] + a.value[k] * b.widening[k])
+    return value, by_a, by_b, by_blur, by_rho

@@ -19,6 +19,7 @@ from kcal.corners.board import Board
 from kcal.corners.charuco import MIN_CORNERS, enough, find_charuco, free_side
 from kcal.corners.grid import MIN_SHARPNESS, grid_trouble, local_side, sharpness
 from kcal.corners.images import Grey, decode_grey, read_bytes, to_8bit, unique_names
+from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.order import canonical_order
 from kcal.corners.refine import Refinement, refine_corners
@@ -131,6 +132,7 @@ def detect_images(
     board: Board,
     refine: Refinement = "erf",
     progress: Callable[[str], None] | None = None,
+    time_limit: float | None = None,
 ) -> Observations:
     """Find the board in the images of one camera.
 
@@ -142,6 +144,8 @@ def detect_images(
         board: the board.
         refine: see `kcal.corners.refine.refine_corners`.
         progress: called with each image's name when it is done.
+        time_limit: seconds after which an image is given up and becomes a failure; none by default. See
+            `kcal.corners.limited.Limited`.
 
     Raises:
         InputError: no images, images of two sizes, or no board in any image.
@@ -164,24 +168,28 @@ def detect_images(
     views: list[View] = []
     failures: list[Failure] = []
     size: tuple[int, int] | None = None
-    for name, file in zip(names, files, strict=True):
-        try:
-            data = read_bytes(file)
-            image = decode_grey(data, file)
-        except FileError as error:
-            failures.append(Failure(name=name, reason=str(error).removeprefix(f"{file}: ")))
-        else:
-            size = size or _size(image)
-            if _size(image) != size:
-                raise InputError(_sizes_differ(files, names))
-            found = detect_board(image, board, refine)
-            if found.pixels is None:
-                failures.append(Failure(name=name, reason=found.reason))
+    with Limited(time_limit) as limited:
+        for name, file in zip(names, files, strict=True):
+            try:
+                data = read_bytes(file)
+                image = decode_grey(data, file)
+            except FileError as error:
+                failures.append(Failure(name=name, reason=str(error).removeprefix(f"{file}: ")))
             else:
-                digest = hashlib.sha256(data).hexdigest()
-                views.append(view_of(found, name, image=str(file), sha256=digest))
-        if progress is not None:
-            progress(name)
+                size = size or _size(image)
+                if _size(image) != size:
+                    raise InputError(_sizes_differ(files, names))
+                try:
+                    found = limited(detect_board, image, board, refine)
+                except TookTooLongError as error:
+                    found = Detection(None, str(error))
+                if found.pixels is None:
+                    failures.append(Failure(name=name, reason=found.reason))
+                else:
+                    digest = hashlib.sha256(data).hexdigest()
+                    views.append(view_of(found, name, image=str(file), sha256=digest))
+            if progress is not None:
+                progress(name)
     if size is None or not views:
         first = f"{failures[0].name}: {failures[0].reason}"
         raise InputError(f"no board in any of {len(files)} images ({first}){_hint(files, board)}")

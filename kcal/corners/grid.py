@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -224,9 +226,9 @@ def _bend(grid: Tensor) -> Tensor:
 def line_bend(pixels: Tensor, columns: int, rows: int) -> Tensor:
     """How a distorting lens bends the board's lines at each corner: curvature vectors, (corners, 2, 2) in 1 / pixels.
 
-    From the circle through three successive corners (K. Menger's curvature), of the row first, then of the column. At
-    the border, and where a neighbour was not seen, the nearest three corners of the line are taken; 0 where there are
-    none. Perspective bends no line and changes nothing.
+    From the circle through three successive corners (K. Menger's curvature), of the row first, then of the column.
+    Three corners know it badly, and it changes smoothly: a quadratic over the board is fitted to what they say. 0 where
+    no three corners on a line were seen. Perspective bends no line and changes nothing.
 
     Example:
         >>> angle = torch.tensor([-0.1, 0.0, 0.1], dtype=torch.float64)
@@ -236,9 +238,94 @@ def line_bend(pixels: Tensor, columns: int, rows: int) -> Tensor:
         ([0.0, 0.005], [0.0, 0.0])
     """
     grid = as_grid(pixels, columns, rows)
-    across = _curvature(grid)
-    down = _curvature(grid.transpose(0, 1)).transpose(0, 1)
+    across = _smooth(_curvature(grid))
+    down = _smooth(_curvature(grid.transpose(0, 1))).transpose(0, 1)
     return torch.stack([across, down], -2).reshape(-1, 2, 2)
+
+
+def _smooth(values: Tensor) -> Tensor:
+    """A quadratic in both directions of a grid (L, N, 2) instead of its values, of which NaN are not known."""
+    axes = (torch.linspace(-1.0, 1.0, size, dtype=torch.float64, device=values.device) for size in values.shape[:2])
+    i, j = (axis.reshape(-1) for axis in torch.meshgrid(*axes, indexing="ij"))
+    design = torch.stack([i**m * j**n for m in range(3) for n in range(3 - m)], -1)
+    flat = values.reshape(-1, 2)
+    known = torch.isfinite(flat).all(-1)
+    if not bool(known.any()):
+        return torch.zeros_like(values)
+    # Too few corners leave the smallest coefficients that explain them.
+    solution = torch.linalg.lstsq(design[known], flat[known], driver="gelsd").solution
+    return (design @ solution).reshape(values.shape)
+
+
+class Neighbours(NamedTuple):
+    """Where the next corners are: left, right, up and down in the board's order.
+
+    Args:
+        step: (..., N, 4, 2) pixels from each corner to its neighbour. At the board's border it leads to where the outer
+            square ends; there and where none was seen it follows from the two corners on the other side, NaN without.
+        change: (..., N, 4, 2) by how much that step differs from one corner to the next along the other line: along
+            rows for the steps up and down.
+        outer: (..., N, 4) whether the board ends there.
+    """
+
+    step: Tensor
+    change: Tensor
+    outer: Tensor
+
+
+def neighbours(pixels: Tensor, columns: int, rows: int) -> Neighbours:
+    """The steps from each corner of a board to the corners next to it.
+
+    Example:
+        >>> corners = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [3.0, 4.0]])
+        >>> around = neighbours(corners, 2, 2)
+        >>> around.step[0].tolist(), around.outer[0].tolist()
+        ([[-3.0, 0.0], [3.0, 0.0], [0.0, -4.0], [0.0, 4.0]], [True, False, True, False])
+    """
+    grid = as_grid(pixels, columns, rows)
+    across, down = _steps(grid), [value.transpose(0, 1) for value in _steps(grid.transpose(0, 1))]
+    step, change, outer = (torch.cat(both, 2) for both in zip(across, down, strict=True))
+    return Neighbours(step.reshape(-1, 4, 2), change.reshape(-1, 4, 2), outer.reshape(-1, 4))
+
+
+def _steps(lines: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Steps back and forth (L, N, 2, 2) along lines of corners, their change (L, N, 2, 2), and the ends (L, N, 2)."""
+    forth = torch.full_like(lines, float("nan"))
+    forth[:, :-1] = lines.diff(dim=1)
+    back = -forth.roll(1, 1)
+    step = torch.stack(
+        [
+            torch.where(torch.isnan(back), _beyond(forth, forth.roll(-1, 1)), back),
+            torch.where(torch.isnan(forth), _beyond(back, back.roll(1, 1)), forth),
+        ],
+        2,
+    )
+    outer = torch.zeros(step.shape[:-1], dtype=torch.bool, device=lines.device)
+    outer[:, 0, 0] = outer[:, -1, 1] = True
+    return step, torch.nan_to_num(_slope(step)), outer
+
+
+def _beyond(step: Tensor, following: Tensor) -> Tensor:
+    """The step to the other side, from the two steps that go on from a corner; perspective changes them by its law.
+
+    Along a line of even marks, perspective puts mark t at b t / (1 + c t); steps 0 to 1 and 1 to 2 give c. What the
+    lens bends them sideways goes on as it was. c is the median over all lines: one alone amplifies the corners' noise.
+    Without a second step the first one's mirror image remains.
+    """
+    square = step.square().sum(-1, keepdim=True)
+    ratio = (following * step).sum(-1, keepdim=True) / square
+    c = (0.5 * (1.0 / ratio.clamp(0.5, 2.0) - 1.0)).nanmedian(0).values.nan_to_num()
+    sideways = (following - ratio * step).nan_to_num()
+    return sideways - step * (1.0 + c) / (1.0 - c)
+
+
+def _slope(values: Tensor) -> Tensor:
+    """Change from one to the next along dim 0, central where both neighbours are known, else one-sided."""
+    after = torch.full_like(values, float("nan"))
+    before = after.clone()
+    after[:-1] = values.diff(dim=0)
+    before[1:] = after[:-1]
+    return torch.stack([before, after]).nanmean(0)
 
 
 def _curvature(lines: Tensor) -> Tensor:
@@ -252,7 +339,4 @@ def _curvature(lines: Tensor) -> Tensor:
         product = torch.stack(list(lengths)).prod(0)
         normal = torch.stack([-chord[..., 1], chord[..., 0]], -1) / torch.linalg.vector_norm(chord, dim=-1)[..., None]
         bend[:, 1:-1] = (2.0 * area / product)[..., None] * normal
-        for shift in (1, -1):  # a neighbour's three corners where its own are not all there
-            beside = bend.roll(shift, 1)
-            bend = torch.where(torch.isnan(bend), beside, bend)
-    return torch.nan_to_num(bend)
+    return bend

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -12,13 +12,14 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.corners.erf import erf_saddle
-from kcal.corners.grid import line_bend
+from kcal.corners.grid import line_bend, neighbours
 from kcal.corners.images import Grey
 from kcal.corners.saddle import MAX_MOVE, MOVE_SHARE, SQUARE_SHARE, Refined, Status, saddle
 from kcal.errors import InputError
 
 Refinement = Literal["erf", "saddle", "opencv", "skimage", "none"]
 
+SECOND_BLUR = 0.12  # of the square side: blur above which the erf fit is repeated from its own corners
 _OPENCV_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
 
@@ -69,7 +70,8 @@ def refine_corners(
     if pixels.ndim != 2 or side.shape != pixels.shape[:1]:
         raise InputError(f"pixels {tuple(pixels.shape)} and side {tuple(side.shape)}: (N, 2) and (N,) are needed")
     if method in ("erf", "saddle"):
-        light = torch.from_numpy(image.astype(np.float64))
+        # Only the surroundings of the corners become float64; float32 holds 16 bits exactly.
+        light = torch.from_numpy(image if image.dtype == np.uint8 else image.astype(np.float32))
         found = saddle(light, pixels, side)
         return found if method == "saddle" else _erf(light, pixels, found, side, _extremes(image), grid)
 
@@ -98,11 +100,13 @@ def _erf(
     grid: tuple[int, int] | None,
 ) -> Refined:
     """The erf fit from the saddle's corners; where the saddle has given up, its reason stays, or saturation is it."""
-    bend = line_bend(found.pixels, *grid) if grid is not None else None
     settled = found.status == Status.GOOD
-    fit = erf_saddle(light, torch.where(settled[:, None], found.pixels, start), side, bend=bend, levels=levels)
-    assert fit.covariance is not None
-    assert fit.blur is not None
+    fit = _fit(light, torch.where(settled[:, None], found.pixels, start), found.pixels, side, levels, grid)
+    blurred = settled & (fit.blur > SECOND_BLUR * side)
+    if grid is not None and bool(blurred.any()):
+        # There a corner depends on where the next ones are, and the saddle's error would go from one to the other.
+        better = torch.where((fit.status == Status.GOOD)[:, None], fit.pixels, found.pixels)
+        fit = _fit(light, torch.where(settled[:, None], better, start), better, side, levels, grid)
     nan = float("nan")
     return Refined(
         torch.where(settled[:, None], fit.pixels, nan),
@@ -110,6 +114,29 @@ def _erf(
         torch.where(settled[:, None, None], fit.covariance, nan),
         torch.where(settled, fit.blur, nan),
     )
+
+
+class _Full(NamedTuple):
+    pixels: Tensor
+    status: Tensor
+    covariance: Tensor
+    blur: Tensor
+
+
+def _fit(
+    light: Tensor,
+    start: Tensor,
+    known: Tensor,
+    side: Tensor,
+    levels: tuple[float, float],
+    grid: tuple[int, int] | None,
+) -> _Full:
+    bend = line_bend(known, *grid) if grid is not None else None
+    around = neighbours(known, *grid) if grid is not None else None
+    fit = erf_saddle(light, start, side, bend=bend, around=around, levels=levels)
+    assert fit.covariance is not None
+    assert fit.blur is not None
+    return _Full(fit.pixels, fit.status, fit.covariance, fit.blur)
 
 
 def _extremes(image: Grey) -> tuple[float, float]:

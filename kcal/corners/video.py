@@ -14,7 +14,8 @@ from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.corners.detect import Detection, detect_board, view_of
-from kcal.corners.observations import Observations, View
+from kcal.corners.limited import Limited, TookTooLongError
+from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.refine import Refinement
 from kcal.errors import FileError, InputError
 
@@ -88,6 +89,7 @@ def detect_video(
     *,
     most: int = MOST_VIEWS,
     progress: Callable[[str], None] | None = None,
+    time_limit: float | None = None,
 ) -> Observations:
     """Find the board in the frames of a video of one camera.
 
@@ -101,6 +103,7 @@ def detect_video(
         refine: see `kcal.corners.refine.refine_corners`.
         most: views after which the search ends.
         progress: called with each searched frame's name.
+        time_limit: seconds after which a frame is given up; none by default.
 
     Raises:
         FileError: the file is missing or no video.
@@ -112,21 +115,27 @@ def detect_video(
     views: list[View] = []
     size = (1, 1)
     reason = ""
-    for frame in sharpest(read_frames(path)):
-        name = f"{Path(path).name}#{frame.number:06d}"
-        size = frame.image.shape[1], frame.image.shape[0]
-        found = detect_board(frame.image, board, refine)
-        reason = found.reason or reason
-        if found.pixels is not None and _novel(found, kept, _NOVELTY * size[0]):
-            kept.append(found.pixels)
-            views.append(view_of(found, name, image=str(path)))
-        if progress is not None:
-            progress(name)
-        if len(views) == most:
-            break
+    failures: list[Failure] = []
+    with Limited(time_limit) as limited:
+        for frame in sharpest(read_frames(path)):
+            name = f"{Path(path).name}#{frame.number:06d}"
+            size = frame.image.shape[1], frame.image.shape[0]
+            try:
+                found = limited(detect_board, frame.image, board, refine)
+            except TookTooLongError as error:
+                found = Detection(None, str(error))
+                failures.append(Failure(name=name, reason=found.reason))
+            reason = found.reason or reason
+            if found.pixels is not None and _novel(found, kept, _NOVELTY * size[0]):
+                kept.append(found.pixels)
+                views.append(view_of(found, name, image=str(path)))
+            if progress is not None:
+                progress(name)
+            if len(views) == most:
+                break
     if not views:
         raise InputError(f"{path}: no board in any frame ({reason})")
-    return Observations(board=board, image_size=size, refinement=refine, views=tuple(views))
+    return Observations(board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures))
 
 
 def _novel(found: Detection, kept: list[Tensor], least: float) -> bool:
