@@ -175,7 +175,7 @@ class TestFit:
         y, x = np.mgrid[: image.shape[0], : image.shape[1]]
         shaded = torch.from_numpy(image * (1 + 0.003 * x - 0.002 * y))
         found = erf_saddle(shaded, start, side)
-        # 0.013 if a slope of light is not allowed for; the renderer's sampling alone is 0.001.
+        # The renderer's sampling alone is some 0.001.
         assert float((found.pixels - truth).square().mean().sqrt()) < 0.002
 
     def test_blur_of_a_fifth_of_the_square_is_fitted_with_the_next_lines(self):
@@ -376,7 +376,7 @@ class TestNeighbours:
             - middle[:, :, None]
         )
         miss = (around.step - wanted.reshape(-1, 4, 2)).norm(dim=-1)
-        # Of 14 to 31 px: c is not quite the same on all lines. Mirror images are off by 4 px.
+        # Of 14 to 31 px: c is not quite the same on all lines.
         assert float(miss.max()) < 0.8
         assert int(around.outer.sum()) == 2 * (5 + 4)
 
