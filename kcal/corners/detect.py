@@ -227,7 +227,7 @@ def _search(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor | None, 
         if factor in tried:
             break
         tried.add(factor)
-        small, scale = _shrunk(image, factor)
+        small, scale = _shrunk(image, factor, _size(image))
         for find in (_find_classic, _find_sector):
             corners = find(small, board)
             if corners is None:
@@ -261,21 +261,28 @@ def _climb(image: Grey, pixels: Tensor, board: Board, factor: float) -> Tensor:
     The first steps are on images four and two times smaller still, because OpenCV leaves single corners 3 px off
     where its own refinement failed, out of reach at full size. The squares must still be large enough there.
     """
+    factors = []
     factor = 4 * factor
     while factor > 1:
-        small, scale = _shrunk(image, factor)
+        factors.append(factor)
+        factor = factor / 2
+    # Each from the one twice as large: shrinking a large image is what takes the time.
+    steps, source = [], image
+    for factor in reversed(factors):
+        source, scale = _shrunk(source, factor, _size(image))
+        steps.append((source, scale))
+    for small, scale in reversed(steps):
         start = (pixels + 0.5) / scale - 0.5
         side = local_side(start, board.columns, board.rows)
         refined = refine_corners(small, start, side, "saddle")
         good = ((refined.status == Status.GOOD) & (side >= MIN_CLIMB_SIDE))[:, None]
         pixels = _scaled(torch.where(good, refined.pixels, start), scale)
-        factor = factor / 2
     return pixels
 
 
-def _shrunk(image: Grey, factor: float) -> tuple[Grey, Tensor]:
-    """The image made `factor` times smaller by averaging, and the exact scale (x, y) back."""
-    height, width = image.shape
+def _shrunk(image: Grey, factor: float, whole: tuple[int, int]) -> tuple[Grey, Tensor]:
+    """What was once `whole` (width, height) made `factor` times smaller by averaging, and the exact scale back."""
+    width, height = whole
     if factor <= 1:
         return image, torch.ones(2, dtype=torch.float64)
     size = round(width / factor), round(height / factor)
