@@ -52,7 +52,9 @@ class CalibrationOptions:
     model: LensModel | str = "opencv5"
     board_warp: bool = False
     weighted: bool = True
-    solver: LMOptions = dataclasses.field(default_factory=lambda: LMOptions(max_iterations=1000))
+    solver: LMOptions = dataclasses.field(
+        default_factory=lambda: LMOptions(max_iterations=1000, tolerance=1e-12, flatness=2e-6)
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -148,7 +150,7 @@ def calibrate_camera(
 
     # The first model's poses were looked at; look once more under another lens.
     result = minimum.result
-    problem = views.problem(model)
+    problem = views.problem(model, terms=minimum.terms)
     if len(ladder) > 1:
         state, flipped = unflip(board, seen, [model], result.state)
         if flipped:
@@ -160,7 +162,13 @@ def calibrate_camera(
         # The residuals of the plain solution tell how much there is beyond the corners' own noise.
         weights = whitening(covariances, 2.0 * plain_cost / problem.residual_count)
         problem = BoardProblem(
-            board, seen, [model], problem.free, free_warp=options.board_warp, whitening=weights[:, None]
+            board,
+            seen,
+            [model],
+            problem.free,
+            free_warp=options.board_warp,
+            whitening=weights[:, None],
+            terms=minimum.terms,
         )
         result = minimise(problem, result.state, solver)
         spent += int(result.iterations)

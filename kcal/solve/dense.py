@@ -35,6 +35,8 @@ class DenseLinearisation:
 class DenseProblem:
     """Residuals r(x, data) for x (..., P), the leading dimensions a batch of independent problems."""
 
+    joint = False
+
     def __init__(self, residual: Callable[..., Tensor], batch: tuple[int, ...], data: tuple[Tensor, ...] = ()) -> None:
         self.batch = tuple(batch)
         self._data = tuple(tensor.detach() for tensor in data)

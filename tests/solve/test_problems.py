@@ -216,6 +216,21 @@ class TestCallback:
         assert result.status.tolist() == [Status.EXACT, Status.INTERRUPTED]
 
 
+def test_a_flat_valley_is_left_and_called_so() -> None:
+    """Twenty steps of exp(-x) -> 0 gain a little each, for ever."""
+
+    def valley(x: Tensor) -> Tensor:
+        return torch.stack([1.0 + 1e-3 * torch.exp(-1e-2 * x[0]), 0.0 * x[0]])
+
+    start = vector(0.0)
+    endless = LevenbergMarquardt(valley, LMOptions(max_iterations=60, tolerance=0.0))(start)
+    assert int(endless.status) == Status.ITERATION_LIMIT
+    left = LevenbergMarquardt(valley, LMOptions(max_iterations=60, tolerance=0.0, flatness=0.5))(start)
+    assert int(left.status) == Status.FLAT
+    assert not bool(left.converged)
+    assert int(left.iterations) == 20
+
+
 class TestRefusals:
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.int64])
     def test_dtype(self, dtype: torch.dtype) -> None:
