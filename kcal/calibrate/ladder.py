@@ -40,12 +40,14 @@ _FOLD_PRICE = 20.0
 _STRETCH, _STRETCHES = 12, 40
 # With fewer corners than this, all starts are solved on all views.
 _FEW_CORNERS = 1000
-# Models at which the search on folded views stops on its way to a richer one.
-_LANDINGS = ("opencv8", "opencv14", "ext20")
+# Models that are solved on the way to a richer one where minima are searched on folded views.
+_LANDINGS = ("opencv8", "opencv12", "opencv14", "ext16", "ext18", "ext20")
 # Enough to tell the minima apart and to come near the best one.
 _SEARCH = LMOptions(max_iterations=60, tolerance=1e-7, initial_damping=1e-6)
 # Height of the wall before a fold, in units of the noise.
 _WALL = 0.3
+# For models on the way: as good as their solution.
+_LANDING = LMOptions(max_iterations=100, tolerance=1e-7, flatness=2e-5, initial_damping=1e-6)
 # Squared residuals of the wall, in units of the noise, from which on a lens counts as held back.
 _AT_WALL = 0.1
 # Where near-cancelling starts put their bump, as a fraction of the largest observed r².
@@ -145,23 +147,48 @@ def climb(
         The lowest minimum found for the last model. Among states that fold or meet a pole inside the radius that was
         observed none is chosen.
     """
-    small, large = models[0], models[-1]
+    small = models[0]
     if len(models) == 1:
         return Minimum(result=minimise(views.problem(small), first, options), iterations=0)
     if views.corner_count <= _FEW_CORNERS or views.rms(first, small) > _SUSPICIOUS_RMS:
         return _climb_wholly(views, first, cold, models, options, progress)
-    radius, noise = views.regular_radius(first, small), views.noise(first, small)
-    terms = (RadialBound(large, radius, _WALL * noise),)
-    problem = views.problem(large, terms=terms)
-    starts, spent = search(views, first, models, radius, noise, progress)
-    results = [minimise(problem, start, options) for start in starts[:1]]
-    nested = (embed(first[0], small, large), *first[1:])
-    if not float(results[0].cost) <= float(problem.cost(nested)):
-        results.append(minimise(problem, nested, options))
-    best = min(results, key=lambda result: float(torch.nan_to_num(result.cost, nan=torch.inf)))
-    progress(str(large))
-    spent += sum(int(result.iterations) for result in results)
-    return _minimum(views, best, terms, large, [nested, *starts[1:]], spent)
+    return _climb_folded(views, first, models, options, progress)
+
+
+def _climb_folded(
+    views: Views, first: State, models: Sequence[LensModel], options: LMOptions, progress: Progress
+) -> Minimum:
+    """Search each model's minima on folded views (`kcal.calibrate.reduced`), and solve from the best one on all views.
+
+    Where that ends above the solution of the model before, it is solved again from there: a richer model never ends
+    above the one nested in it.
+    """
+    small, radius, noise = models[0], views.regular_radius(first, models[0]), views.noise(first, models[0])
+    observed = float(views.observed_radius(first))
+    folded = fold(views.problem(small, poses_only=True), first, observed)
+    kept, reached, spent = [first[0]], first, 0
+    for large in [model for model in models[1:-1] if str(model) in _LANDINGS] + [models[-1]]:
+        terms = (RadialBound(large, radius, _WALL * noise),)
+        starts = [embed(parameters, small, large) for parameters in kept]
+        if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
+            starts += [near_cancelling(starts[0], large, observed**2, place) for place in _BUMPS]
+        search = ReducedProblem(folded, large, free_parameters(large), terms, (len(starts),))
+        found = minimise(search, search.start(torch.stack(starts)), _SEARCH)
+        kept = [found.state[0][i] for i in _distinct(found)]
+        ends = [search.unfold(pick(found.state, i)) for i in _distinct(found)]
+
+        problem = views.problem(large, terms=terms)
+        enough = options if large == models[-1] else _LANDING
+        result = minimise(problem, ends[0], enough)
+        nested = (embed(reached[0], small, large), *reached[1:])
+        spent += int(found.iterations.max()) + int(result.iterations)
+        if not float(result.cost) <= float(problem.cost(nested)):
+            result = minimise(problem, nested, enough)
+            spent += int(result.iterations)
+        reached, small = result.state, large
+        progress(str(large))
+    others = [(embed(first[0], models[0], small), *first[1:]), *ends[1:]]
+    return _minimum(views, result, terms, small, others, spent)
 
 
 def _minimum(
@@ -176,41 +203,6 @@ def _minimum(
     result = dataclasses.replace(result, cost=cost, status=status)
     rivals = tuple((float(plain.cost(state)), state) for state in others)
     return Minimum(result=result, iterations=spent, rivals=rivals, terms=terms)
-
-
-def search(
-    views: Views, first: State, models: Sequence[LensModel], radius: float, noise: float, progress: Progress
-) -> tuple[list[State], int]:
-    """Look for the minima of the last model on folded views (`kcal.calibrate.reduced`), and unfold the best few.
-
-    Args:
-        views: the data.
-        first: a solution of `models[0]`.
-        models: each nested in the next.
-        radius: up to which lenses must be regular.
-        noise: of the residuals along an axis, pixels.
-        progress: told the name of each model that was looked at.
-
-    Returns:
-        states of the last model, best first, and the trial steps spent.
-    """
-    small = models[0]
-    observed = float(views.observed_radius(first))
-    folded = fold(views.problem(small, poses_only=True), first, observed)
-    kept, spent = [first[0]], 0
-    for large in [model for model in models[1:-1] if str(model) in _LANDINGS] + [models[-1]]:
-        starts = [embed(parameters, small, large) for parameters in kept]
-        if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
-            starts += [near_cancelling(starts[0], large, observed**2, place) for place in _BUMPS]
-        terms = [RadialBound(large, radius, _WALL * noise)]
-        problem = ReducedProblem(folded, large, free_parameters(large), terms, (len(starts),))
-        found = minimise(problem, problem.start(torch.stack(starts)), _SEARCH)
-        spent += int(found.iterations.max())
-        ends = _distinct(found)
-        kept, small = [found.state[0][i] for i in ends], large
-        if large != models[-1]:
-            progress(f"{large} (folded)")
-    return [problem.unfold(pick(found.state, i)) for i in ends], spent
 
 
 def _distinct(found: Result) -> list[int]:
