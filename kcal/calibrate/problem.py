@@ -20,7 +20,8 @@ from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, project_components
 from kcal.solve.result import State
-from kcal.solve.schur import SchurProblem
+from kcal.solve.robust import RobustLoss
+from kcal.solve.schur import SchurLinearisation, SchurProblem
 
 _ALL = slice(None)
 # Numbers in the rows of derivatives that are formed at a time: as many as the cache of one core holds.
@@ -90,6 +91,7 @@ class BoardProblem(SchurProblem):
         free_warp: whether the board's warp is estimated.
         whitening: (..., V, C, N, 2, 2) by which each corner's residual is multiplied (`kcal.calibrate.weights`), or
             None: all corners count alike.
+        loss: of the length of each corner's residual (after whitening), or None for plain least squares.
         terms: priors and bounds on the first camera's parameters and the warp, beside the corners.
         batch: leading shape of the states, () for one solve.
     """
@@ -105,6 +107,7 @@ class BoardProblem(SchurProblem):
         *,
         free_warp: bool = False,
         whitening: Tensor | None = None,
+        loss: RobustLoss | None = None,
         terms: Sequence[Term] = (),
         batch: tuple[int, ...] = (),
     ) -> None:
@@ -113,6 +116,7 @@ class BoardProblem(SchurProblem):
         self.free_warp = free_warp
         self.batch = batch
         self._terms = tuple(terms)
+        self._loss = loss
         self._board = board_points.T.contiguous()
         self._shape = warp_shape(board_points)
         self.seen = torch.isfinite(pixels).all(-1)
@@ -137,6 +141,11 @@ class BoardProblem(SchurProblem):
     def whitened(self) -> bool:
         """Whether corners count by their own weights."""
         return self._whitening is not None
+
+    @property
+    def robust(self) -> bool:
+        """Whether a robust loss is minimised."""
+        return self._loss is not None
 
     def unpack(self, state: State) -> BoardState:
         """The solver's tuple as named tensors."""
@@ -173,6 +182,28 @@ class BoardProblem(SchurProblem):
         if self._whitening is not None:
             errors = torch.einsum("...uwn,...wn->...un", self._whitening, errors)
         return errors.flatten(-3)
+
+    def view_cost(self, state: State) -> Tensor:
+        """See `SchurProblem.view_cost`."""
+        if self._loss is None:
+            return super().view_cost(state)
+        return 0.5 * self._loss.value(self._squared(self.residuals(state))).sum((-2, -1))
+
+    def corner_weights(self, state: State) -> Tensor:
+        """(..., V, C, N) by which the robust loss lets each corner's squared residual count; 1 without a loss."""
+        squared = self._squared(self.residuals(state))
+        return torch.ones_like(squared) if self._loss is None else self._loss.weight(squared)
+
+    def _squared(self, residuals: Tensor) -> Tensor:
+        """Squared lengths (..., V, C, N) of residuals (..., V, C 2 N)."""
+        return residuals.unflatten(-1, (len(self.models), 2, -1)).square().sum(-2)
+
+    def linearise(self, state: State) -> SchurLinearisation:
+        """See `Problem.linearise`."""
+        linear = super().linearise(state)
+        if self._loss is not None:
+            linear.cost = self.cost(state)
+        return linear
 
     def pixel_errors(self, state: State) -> Tensor:
         """Projected minus observed, (..., V, C, 2, N) pixels, not weighted; 0 where not seen."""
@@ -234,6 +265,9 @@ class BoardProblem(SchurProblem):
             rows = torch.where(seen[..., None, :, None, :], rows, 0.0)
         if self._whitening is not None:
             rows = torch.einsum("...cuwn,...pcwn->...pcun", self._whitening[..., views, :, :, :, :], rows)
+        if self._loss is not None:
+            squared = rows[..., -1, :, :, :].square().sum(-2)
+            rows = rows * self._loss.weight(squared).sqrt()[..., None, :, None, :]
         return rows.flatten(-3)
 
     def shared_rows(self, state: State) -> Tensor | None:

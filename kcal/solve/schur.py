@@ -83,7 +83,8 @@ def _damped(matrix: Tensor, damping: Tensor) -> Tensor:
 class SchurProblem(ABC):
     """Base of problems with a state (shared, local), `local` beginning with the views.
 
-    Subclasses give `rows`, `residuals` and `retract`.
+    Subclasses give `rows`, `residuals` and `retract`. With a robust loss the cost is not half the squared length of the
+    rows' residuals: they overwrite `view_cost` as well.
     """
 
     batch: tuple[int, ...]
@@ -111,10 +112,14 @@ class SchurProblem(ABC):
         """(..., S + 1, Q), see `SchurLinearisation`: priors and bounds; None where there are none."""
         return None
 
+    def view_cost(self, state: State) -> Tensor:
+        """(..., V) what each view adds to the cost."""
+        residuals = self.residuals(state)
+        return 0.5 * (residuals * residuals).sum(-1)
+
     def cost(self, state: State) -> Tensor:
         """See `Problem.cost`."""
-        residuals = self.residuals(state)
-        cost = 0.5 * (residuals * residuals).sum((-2, -1))
+        cost = self.view_cost(state).sum(-1)
         shared = self.shared_rows(state)
         return cost if shared is None else cost + 0.5 * (shared[..., -1, :] ** 2).sum(-1)
 
