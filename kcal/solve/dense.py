@@ -39,7 +39,7 @@ class DenseProblem:
 
     def __init__(self, residual: Callable[..., Tensor], batch: tuple[int, ...], data: tuple[Tensor, ...] = ()) -> None:
         self.batch = tuple(batch)
-        self._data = tuple(tensor.detach() for tensor in data)
+        self._data = tuple(data)
         value, jacobian = residual, torch.func.jacfwd(residual)
         for _ in self.batch:
             value, jacobian = torch.func.vmap(value), torch.func.vmap(jacobian)

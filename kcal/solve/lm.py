@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -60,9 +60,13 @@ def _where(mask: Tensor, new: State, old: State) -> State:
     )
 
 
-@torch.no_grad()
 def minimise(
-    problem: Problem, start: State, options: LMOptions | None = None, callback: Callback | None = None
+    problem: Problem,
+    start: State,
+    options: LMOptions | None = None,
+    callback: Callback | None = None,
+    *,
+    unroll: bool = False,
 ) -> Result:
     """Minimise half the sum of squares by Levenberg and Marquardt's method.
 
@@ -76,11 +80,17 @@ def minimise(
         start: the state to begin with.
         options: see `LMOptions`.
         callback: called after each trial with the trial's number and the best cost; return True to stop.
+        unroll: record the accepted steps for autograd, as far as the problem's operations are differentiable. What
+            decides about them (damping, acceptance) counts as constant.
 
     Returns:
         The best state with its status. Nothing is raised for a failure to converge: read `status`.
     """
-    options = options or LMOptions()
+    with torch.set_grad_enabled(unroll and torch.is_grad_enabled()):
+        return _minimise(problem, start, options or LMOptions(), callback)
+
+
+def _minimise(problem: Problem, start: State, options: LMOptions, callback: Callback | None) -> Result:
     state = start
     linear = problem.linearise(state)
     device = linear.cost.device
@@ -165,9 +175,12 @@ class LevenbergMarquardt(nn.Module):
             differentiate.
         options: see `LMOptions`.
 
-    Convention: float64 only, because squared condition numbers leave float32 nothing. Where data require gradients,
-    the solution `x` carries them: exact first derivatives by the implicit function theorem, at the price of one
-    Hessian. Elements that did not converge carry none.
+        backward: where data require gradients, how the solution `x` gets them. "implicit": exact first derivatives by
+            the implicit function theorem, at the price of one Hessian; elements that did not converge carry none.
+            "unroll": autograd through the steps that were taken, also of a start that requires gradients; memory grows
+            with the steps, and the derivative lags one step behind the solution. "none": no gradients.
+
+    Convention: float64 only, because squared condition numbers leave float32 nothing.
 
     Example:
         >>> def rosenbrock(x):
@@ -177,10 +190,19 @@ class LevenbergMarquardt(nn.Module):
         ([1.0, 1.0], 'converged: the residual is zero to rounding')
     """
 
-    def __init__(self, residual: Callable[..., Tensor], options: LMOptions | None = None) -> None:
+    def __init__(
+        self,
+        residual: Callable[..., Tensor],
+        options: LMOptions | None = None,
+        *,
+        backward: Literal["implicit", "unroll", "none"] = "implicit",
+    ) -> None:
         super().__init__()
+        if backward not in ("implicit", "unroll", "none"):
+            raise InputError(f"LevenbergMarquardt: backward must be implicit, unroll or none, got {backward!r}")
         self.residual = residual
         self.options = options or LMOptions()
+        self.backward = backward
 
     def forward(self, start: Tensor, *data: Tensor, callback: Callback | None = None) -> Result:
         """Minimise from `start` (..., P); each data tensor has the same leading shape (...).
@@ -204,9 +226,14 @@ class LevenbergMarquardt(nn.Module):
                     f"LevenbergMarquardt: data of shape {tuple(tensor.shape)} do not begin with the batch shape "
                     f"{tuple(start.shape[:-1])}"
                 )
-        problem = DenseProblem(self.residual, start.shape[:-1], data)
+        if self.backward == "unroll":
+            return minimise(
+                DenseProblem(self.residual, start.shape[:-1], data), (start,), self.options, callback, unroll=True
+            )
+        constant = tuple(tensor.detach() for tensor in data)
+        problem = DenseProblem(self.residual, start.shape[:-1], constant)
         result = minimise(problem, (start.detach(),), self.options, callback)
-        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in data):
+        if self.backward == "implicit" and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in data):
             x = attach_implicit_gradient(self.residual, result.x, result.converged, data)
             result = dataclasses.replace(result, state=(x,))
         return result
