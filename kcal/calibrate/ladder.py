@@ -29,7 +29,7 @@ from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import Result, State, Status
 
 # For each start of a batch; the best one is then taken to convergence.
-_SCOUT = LMOptions(max_iterations=150, tolerance=1e-7, flatness=1e-4, initial_damping=1e-6)
+_SCOUT = LMOptions(max_iterations=150, tolerance=1e-9, flatness=1e-5)
 _KEPT = 4
 # Where the smaller model leaves more than this (pixels), the lens may be too wide for it.
 _SUSPICIOUS_RMS = 2.0
@@ -37,7 +37,7 @@ _SUSPICIOUS_RMS = 2.0
 # parameters that a step of the ladder adds.
 _FOLD_PRICE = 20.0
 # Trial steps between two looks at a lens that is about to fold, and how often to look.
-_STRETCH, _STRETCHES = 12, 40
+_STRETCH, _STRETCHES = 12, 20
 # With fewer corners than this, all starts are solved on all views.
 _FEW_CORNERS = 1000
 # Models that are solved on the way to a richer one where minima are searched on folded views.
@@ -221,17 +221,15 @@ def _climb_wholly(
     """As `climb`, all starts solved on all views: for poses that are not settled yet, and few views of many minima."""
     small = models[0]
     kept, spent = [first], 0
-    settled = views.rms(first, small) <= _SUSPICIOUS_RMS
     for large in models[1:]:
         plain = (embed(cold[0], models[0], large), *cold[1:])
         carried = [(embed(state[0], small, large), *state[1:]) for state in kept]
-        terms = _walls(views, carried[0], large, views.seen_radius(carried[0])) if settled else ()
-        found = _scout(views, carried, plain, small, large, terms, options)
+        found = _scout(views, carried, plain, small, large, options)
         kept = _rank(views, found, carried[0], large)
         result, terms = _finish(views, kept[0], large, options)
         spent += int(found.iterations.max()) + int(result.iterations)
         kept[0] = result.state
-        small, settled = large, True
+        small = large
         progress(str(large))
     others = [(embed(first[0], models[0], small), *first[1:]), *kept[1:]]
     return _minimum(views, result, terms, small, others, spent)
@@ -271,13 +269,15 @@ def _finish(views: Views, start: State, model: LensModel, options: LMOptions) ->
         break
     else:
         # A tilted lens folds elsewhere than the wall knows: in short stretches, until just before.
-        state, status = start, Status.AT_BOUND
+        state = start
         for _ in range(_STRETCHES):
             result = minimise(problem, state, dataclasses.replace(options, max_iterations=_STRETCH))
             if views.trouble(result.state, model) > limit:
                 break
             state = result.state
-        result = dataclasses.replace(result, state=state, status=torch.full_like(result.status, int(status)))
+            if int(result.status) != Status.ITERATION_LIMIT:
+                break
+        result = dataclasses.replace(result, state=state, status=torch.full_like(result.status, int(Status.AT_BOUND)))
         ends.append((float(plain.cost(state)) + price * limit, result, terms))
     fallback = dataclasses.replace(result, state=start, status=torch.full_like(result.status, int(Status.AT_BOUND)))
     ends.append((before + price * limit, fallback, terms))
@@ -291,7 +291,6 @@ def _scout(
     plain: State,
     small: LensModel,
     large: LensModel,
-    terms: tuple[Term, ...],
     options: LMOptions,
 ) -> Result:
     """Solve for `large` from all starts side by side, with a limited number of steps."""
@@ -302,7 +301,7 @@ def _scout(
         largest = float(views.observed_radius(carried[0])) ** 2
         starts += [(near_cancelling(carried[0][0], large, largest, b), *carried[0][1:]) for b in _BUMPS]
     limited = dataclasses.replace(_SCOUT, max_iterations=min(_SCOUT.max_iterations, options.max_iterations))
-    return minimise(views.problem(large, (len(starts),), terms), stack(starts), limited)
+    return minimise(views.problem(large, (len(starts),)), stack(starts), limited)
 
 
 def _rank(views: Views, found: Result, carried: State, model: LensModel) -> list[State]:
