@@ -19,25 +19,37 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.views import Views
+from kcal.calibrate.reduced import ReducedProblem, fold
+from kcal.calibrate.terms import RadialBound, Term
+from kcal.calibrate.views import Views, free_parameters
 from kcal.calibrate.wide import wide_starts
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
 from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import Result, State, Status
 
-# Trial steps given to each start of a batch; the best one is then taken to convergence.
-_SCOUT_STEPS = 150
+# For each start of a batch; the best one is then taken to convergence.
+_SCOUT = LMOptions(max_iterations=150, tolerance=1e-9, flatness=1e-5)
 _KEPT = 4
 # Where the smaller model leaves more than this (pixels), the lens may be too wide for it.
 _SUSPICIOUS_RMS = 2.0
 # How much χ² a lens that folds inside the image must gain on one that does not: 20 is far beyond chance for the few
 # parameters that a step of the ladder adds.
 _FOLD_PRICE = 20.0
-# Trial steps between two looks at a lens that is about to fold.
-_STRETCH = 12
-# How far beyond the outermost corner a lens must be regular.
-_MARGIN = 1.02
+# Trial steps between two looks at a lens that is about to fold, and how often to look.
+_STRETCH, _STRETCHES = 12, 20
+# With fewer corners than this, all starts are solved on all views.
+_FEW_CORNERS = 1000
+# Models that are solved on the way to a richer one where minima are searched on folded views.
+_LANDINGS = ("opencv8", "opencv12", "opencv14", "ext16", "ext18", "ext20")
+# Enough to tell the minima apart and to come near the best one.
+_SEARCH = LMOptions(max_iterations=60, tolerance=1e-7, initial_damping=1e-6)
+# Height of the wall before a fold, in units of the noise.
+_WALL = 0.3
+# For models on the way: as good as their solution.
+_LANDING = LMOptions(max_iterations=100, tolerance=1e-7, flatness=2e-5, initial_damping=1e-6)
+# Squared residuals of the wall, in units of the noise, from which on a lens counts as held back.
+_AT_WALL = 0.1
 # Where near-cancelling starts put their bump, as a fraction of the largest observed r².
 _BUMPS = (0.1, 0.25, 0.5)
 Progress = Callable[[str], None]
@@ -52,11 +64,13 @@ class Minimum:
         iterations: trial steps spent on the way.
         rivals: other ends for the last model as (cost, state): further minima, and the first model's solution. Where
             one fits almost as well but lies far away, the data do not determine the model.
+        terms: the bounds that held the solution to regular lenses.
     """
 
     result: Result
     iterations: int
     rivals: tuple[tuple[float, State], ...] = ()
+    terms: tuple[Term, ...] = ()
 
 
 def steps_to(model: LensModel) -> list[LensModel]:
@@ -134,45 +148,150 @@ def climb(
         observed none is chosen.
     """
     small = models[0]
-    result = minimise(views.problem(small), first, options)
-    kept, spent = [result.state], int(result.iterations)
+    if len(models) == 1:
+        return Minimum(result=minimise(views.problem(small), first, options), iterations=0)
+    if views.corner_count <= _FEW_CORNERS or views.rms(first, small) > _SUSPICIOUS_RMS:
+        return _climb_wholly(views, first, cold, models, options, progress)
+    return _climb_folded(views, first, models, options, progress)
+
+
+def _climb_folded(
+    views: Views, first: State, models: Sequence[LensModel], options: LMOptions, progress: Progress
+) -> Minimum:
+    """Search each model's minima on folded views (`kcal.calibrate.reduced`), and solve from the best one on all views.
+
+    Where that ends above the solution of the model before, it is solved again from there: a richer model never ends
+    above the one nested in it.
+    """
+    small, radius, noise = models[0], views.regular_radius(first, models[0]), views.noise(first, models[0])
+    observed = float(views.observed_radius(first))
+    folded = fold(views.problem(small, poses_only=True), first, observed)
+    kept, reached, spent = [first[0]], first, 0
+    for large in [model for model in models[1:-1] if str(model) in _LANDINGS] + [models[-1]]:
+        terms = (RadialBound(large, radius, _WALL * noise),)
+        starts = [embed(parameters, small, large) for parameters in kept]
+        if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
+            starts += [near_cancelling(starts[0], large, observed**2, place) for place in _BUMPS]
+        search = ReducedProblem(folded, large, free_parameters(large), terms, (len(starts),))
+        found = minimise(search, search.start(torch.stack(starts)), _SEARCH)
+        kept = [found.state[0][i] for i in _distinct(found)]
+        ends = [search.unfold(pick(found.state, i)) for i in _distinct(found)]
+
+        problem = views.problem(large, terms=terms)
+        enough = options if large == models[-1] else _LANDING
+        result = minimise(problem, ends[0], enough)
+        nested = (embed(reached[0], small, large), *reached[1:])
+        spent += int(found.iterations.max()) + int(result.iterations)
+        if not float(result.cost) <= float(problem.cost(nested)):
+            result = minimise(problem, nested, enough)
+            spent += int(result.iterations)
+        reached, small = result.state, large
+        progress(str(large))
+    others = [(embed(first[0], models[0], small), *first[1:]), *ends[1:]]
+    return _minimum(views, result, terms, small, others, spent)
+
+
+def _minimum(
+    views: Views, result: Result, terms: tuple[Term, ...], model: LensModel, others: list[State], spent: int
+) -> Minimum:
+    """A ladder's end, its cost without the wall; told `AT_BOUND` where the wall matters."""
+    plain = views.problem(model)
+    cost = plain.cost(result.state)
+    status = result.status
+    if result.converged and float(result.cost - cost) > _AT_WALL * float(cost) / plain.residual_count:
+        status = torch.full_like(status, int(Status.AT_BOUND))
+    result = dataclasses.replace(result, cost=cost, status=status)
+    rivals = tuple((float(plain.cost(state)), state) for state in others)
+    return Minimum(result=result, iterations=spent, rivals=rivals, terms=terms)
+
+
+def _distinct(found: Result) -> list[int]:
+    """The lowest few of a batch, those that ended in the same place counted once."""
+    kept: list[int] = []
+    for i in torch.argsort(torch.nan_to_num(found.cost, nan=torch.inf)).tolist():
+        cost = float(found.cost[i])
+        if not kept or (math.isfinite(cost) and all(cost > (1.0 + 1e-6) * float(found.cost[k]) for k in kept)):
+            kept.append(i)
+    return kept[:_KEPT]
+
+
+def _climb_wholly(
+    views: Views, first: State, cold: State, models: Sequence[LensModel], options: LMOptions, progress: Progress
+) -> Minimum:
+    """As `climb`, all starts solved on all views: for poses that are not settled yet, and few views of many minima."""
+    small = models[0]
+    kept, spent = [first], 0
     for large in models[1:]:
         plain = (embed(cold[0], models[0], large), *cold[1:])
         carried = [(embed(state[0], small, large), *state[1:]) for state in kept]
         found = _scout(views, carried, plain, small, large, options)
         kept = _rank(views, found, carried[0], large)
-        result = _finish(views, kept[0], large, options)
+        result, terms = _finish(views, kept[0], large, options)
         spent += int(found.iterations.max()) + int(result.iterations)
         kept[0] = result.state
         small = large
         progress(str(large))
-    last = views.problem(small)
     others = [(embed(first[0], models[0], small), *first[1:]), *kept[1:]]
-    rivals = tuple((float(last.cost(state)), state) for state in others) if len(models) > 1 else ()
-    return Minimum(result=result, iterations=spent, rivals=rivals)
+    return _minimum(views, result, terms, small, others, spent)
 
 
-def _finish(views: Views, start: State, model: LensModel, options: LMOptions) -> Result:
-    """Solve to convergence, or until the lens would fold in a part of the image where it did not at the start."""
-    limit = views.trouble(start, model)
-    problem = views.problem(model, radius=_MARGIN * float(views.observed_radius(start)))
-    result = minimise(problem, start, options)
-    if views.trouble(result.state, model) <= limit:
-        return result
-    # Go again in short stretches, and stop before the one that folds the lens.
-    best = dataclasses.replace(result, state=start, cost=problem.cost(start))
-    for _ in range(options.max_iterations // _STRETCH):
-        result = minimise(problem, best.state, dataclasses.replace(options, max_iterations=_STRETCH))
-        if views.trouble(result.state, model) > limit:
-            break
-        best = result
-        if best.status != Status.ITERATION_LIMIT:
-            return best
-    return dataclasses.replace(best, status=torch.full_like(best.status, int(Status.AT_BOUND)))
+def _price(cost: float, residual_count: int) -> float:
+    """Of a fold in the image; where data are exact, a thousandth of a pixel counts as their noise."""
+    return _FOLD_PRICE * max(cost / residual_count, 1e-6)
+
+
+def _walls(views: Views, state: State, model: LensModel, radius: float) -> tuple[Term, ...]:
+    """The wall at a radius, if `state` stands behind it."""
+    wall = RadialBound(model, radius, _WALL * views.noise(state, model))
+    return (wall,) if bool(torch.isfinite(wall.rows(torch.cat([state[0], state[1]]))).all()) else ()
+
+
+def _finish(views: Views, start: State, model: LensModel, options: LMOptions) -> tuple[Result, tuple[Term, ...]]:
+    """Solve to convergence behind a wall: around the corners seen, or around the image where that is not enough.
+
+    Among the ends and the start itself the best is chosen, folds in the image at their price. The plain cost never
+    rises: where a wall would push the start back, the start is the result.
+    """
+    plain = views.problem(model)
+    limit, before = views.trouble(start, model), float(plain.cost(start))
+    price = _price(before, plain.residual_count)
+    ends: list[tuple[float, Result, tuple[Term, ...]]] = []
+    for radius in (views.seen_radius(start), views.regular_radius(start, model)):
+        terms = _walls(views, start, model, radius)
+        problem = views.problem(model, terms=terms)
+        result = minimise(problem, start, options)
+        trouble, cost = views.trouble(result.state, model), float(plain.cost(result.state))
+        if trouble > limit:
+            ends.append((cost + price * trouble, result, terms))
+            continue
+        if cost <= before:
+            ends.append((cost + price * trouble, result, terms))
+        break
+    else:
+        # A tilted lens folds elsewhere than the wall knows: in short stretches, until just before.
+        state = start
+        for _ in range(_STRETCHES):
+            result = minimise(problem, state, dataclasses.replace(options, max_iterations=_STRETCH))
+            if views.trouble(result.state, model) > limit:
+                break
+            state = result.state
+            if int(result.status) != Status.ITERATION_LIMIT:
+                break
+        result = dataclasses.replace(result, state=state, status=torch.full_like(result.status, int(Status.AT_BOUND)))
+        ends.append((float(plain.cost(state)) + price * limit, result, terms))
+    fallback = dataclasses.replace(result, state=start, status=torch.full_like(result.status, int(Status.AT_BOUND)))
+    ends.append((before + price * limit, fallback, terms))
+    _, result, terms = min((end for end in ends if math.isfinite(end[0]) or end[1] is fallback), key=lambda end: end[0])
+    return dataclasses.replace(result, cost=plain.cost(result.state)), terms
 
 
 def _scout(
-    views: Views, carried: list[State], plain: State, small: LensModel, large: LensModel, options: LMOptions
+    views: Views,
+    carried: list[State],
+    plain: State,
+    small: LensModel,
+    large: LensModel,
+    options: LMOptions,
 ) -> Result:
     """Solve for `large` from all starts side by side, with a limited number of steps."""
     starts = [*carried, plain]
@@ -181,7 +300,7 @@ def _scout(
             starts += wide_starts(views, large)
         largest = float(views.observed_radius(carried[0])) ** 2
         starts += [(near_cancelling(carried[0][0], large, largest, b), *carried[0][1:]) for b in _BUMPS]
-    limited = dataclasses.replace(options, max_iterations=min(_SCOUT_STEPS, options.max_iterations))
+    limited = dataclasses.replace(_SCOUT, max_iterations=min(_SCOUT.max_iterations, options.max_iterations))
     return minimise(views.problem(large, (len(starts),)), stack(starts), limited)
 
 
@@ -195,7 +314,7 @@ def _rank(views: Views, found: Result, carried: State, model: LensModel) -> list
         if math.isfinite(cost) and not any(abs(cost - other) <= 1e-7 * other for other, _ in candidates[1:]):
             candidates.append((cost, pick(found.state, i)))
     # In units of the noise variance, estimated from the best fit there is.
-    price = _FOLD_PRICE * max(min(cost for cost, _ in candidates), 1e-300) / problem.residual_count
+    price = _price(min(cost for cost, _ in candidates), problem.residual_count)
     ranked = [(cost > limit, cost + price * views.trouble(state, model), state) for cost, state in candidates]
     # A richer model must not end above the one nested in it, whatever the price says.
     ranked = sorted((entry for entry in ranked if math.isfinite(entry[1])), key=lambda entry: entry[:2])

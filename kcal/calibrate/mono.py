@@ -28,6 +28,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import Result, State, Status
+from kcal.solve.robust import RobustLoss
 
 _MINIMUM_VIEWS = 3
 _MINIMUM_CORNERS = 6
@@ -46,13 +47,24 @@ class CalibrationOptions:
         board_warp: estimate how the board bends (two more parameters).
         weighted: let corners count by their covariances where all views have them (`kcal.calibrate.weights`);
             False minimises the plain RMS, as OpenCV does.
+        loss: a robust loss of each corner's residual in pixels, for data with wrong corners, or None. It is used after
+            a plain solution has been found; a scale of some three times the noise is good.
+        focal: roughly known focal length in pixels (from EXIF or the field of view), tried first as a start, or None.
         solver: options of the Levenberg-Marquardt solver.
     """
 
     model: LensModel | str = "opencv5"
     board_warp: bool = False
     weighted: bool = True
-    solver: LMOptions = dataclasses.field(default_factory=lambda: LMOptions(max_iterations=1000))
+    loss: RobustLoss | None = None
+    focal: float | None = None
+    solver: LMOptions = dataclasses.field(
+        default_factory=lambda: LMOptions(max_iterations=1000, tolerance=1e-12, flatness=2e-6)
+    )
+
+    def __post_init__(self) -> None:
+        if self.focal is not None and not 0 < self.focal < float("inf"):
+            raise InputError(f"CalibrationOptions: focal must be positive pixels, got {self.focal}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,7 +74,8 @@ class CameraCalibrationResult:
     Args:
         camera: the camera.
         rms: sqrt(mean ‖r‖²) over all corners, pixels (Eq. 5), plain also where the corners were weighted.
-        weighted_rms: likewise of the weighted residuals that were minimised, None where all corners counted alike.
+        weighted_rms: likewise of what was minimised, by the corners' weights and under the robust loss; None where all
+            corners counted alike.
         per_view_rms: (V,) likewise for each view, in the order of the observations.
         residuals: (V, N, 2) projected minus observed, pixels; NaN where a corner was not seen.
         cam_from_board_rotation: (V, 3, 3).
@@ -148,19 +161,28 @@ def calibrate_camera(
 
     # The first model's poses were looked at; look once more under another lens.
     result = minimum.result
-    problem = views.problem(model)
+    problem = views.problem(model, terms=minimum.terms)
     if len(ladder) > 1:
         state, flipped = unflip(board, seen, [model], result.state)
         if flipped:
             result = minimise(problem, state, solver)
             spent += int(result.iterations)
     plain_cost = float(result.cost)
-    covariances = observations.covariances()
-    if options.weighted and covariances is not None:
+    covariances = observations.covariances() if options.weighted else None
+    weights = None
+    if covariances is not None:
         # The residuals of the plain solution tell how much there is beyond the corners' own noise.
-        weights = whitening(covariances, 2.0 * plain_cost / problem.residual_count)
+        weights = whitening(covariances, 2.0 * plain_cost / problem.residual_count)[:, None]
+    if weights is not None or options.loss is not None:
         problem = BoardProblem(
-            board, seen, [model], problem.free, free_warp=options.board_warp, whitening=weights[:, None]
+            board,
+            seen,
+            [model],
+            problem.free,
+            free_warp=options.board_warp,
+            whitening=weights,
+            loss=options.loss,
+            terms=minimum.terms,
         )
         result = minimise(problem, result.state, solver)
         spent += int(result.iterations)
@@ -209,7 +231,11 @@ def _first(
     homography = homographies(board, pixels)
     spent = 0
     best: tuple[float, State, State] | None = None
-    for intrinsics in intrinsics_candidates(homography, size):
+    candidates = intrinsics_candidates(homography, size)
+    if options.focal is not None:
+        centre = [(size[0] - 1) / 2, (size[1] - 1) / 2]
+        candidates.insert(0, torch.tensor([options.focal, options.focal, *centre], dtype=torch.float64))
+    for intrinsics in candidates:
         rotation, translation = poses_from_homographies(homography, intrinsics)
         zero = torch.zeros(len(INTRINSICS) + model.size, dtype=torch.float64)
         zero[:4] = intrinsics
@@ -269,7 +295,7 @@ def _result(
     return CameraCalibrationResult(
         camera=camera,
         rms=rms,
-        weighted_rms=float(torch.sqrt(2.0 * solved.cost / seen.sum())) if problem.whitened else None,
+        weighted_rms=float(torch.sqrt(2.0 * solved.cost / seen.sum())) if problem.whitened or problem.robust else None,
         per_view_rms=per_view,
         residuals=torch.where(seen[..., None], residuals, torch.nan),
         cam_from_board_rotation=s.first_from_board_rotation,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from kcal.calibrate.init import flipped_poses
@@ -13,6 +12,9 @@ from kcal.solve.result import State
 
 # Enough to tell which of two tilts fits; what is chosen is refined with everything else afterwards.
 _ROUGH = LMOptions(max_iterations=10, tolerance=1e-4)
+# After so many steps a twin that is still this many times worse has no chance, which is true of most.
+_GLANCE = LMOptions(max_iterations=4, tolerance=1e-4)
+_HOPELESS = 30.0
 
 
 def refine_poses(
@@ -57,9 +59,15 @@ def unflip(board_points: Tensor, pixels: Tensor, models: list[LensModel], state:
     """
     problem = BoardProblem(board_points, pixels, models, [() for _ in models])
     cost = 0.5 * (problem.residuals(state) ** 2).sum(-1)
-    twin, cost_twin = refine_poses(board_points, pixels, models, flipped_poses(board_points, state), _ROUGH)
-    better = cost_twin < 0.999 * cost
+    twin, cost_twin = refine_poses(board_points, pixels, models, flipped_poses(board_points, state), _GLANCE)
+    near = (cost_twin < _HOPELESS * cost).nonzero()[:, 0]
     *shared, rotation, translation = state
-    rotation = torch.where(better[:, None, None], twin[-2], rotation)
-    translation = torch.where(better[:, None], twin[-1], translation)
-    return (*shared, rotation, translation), better.nonzero()[:, 0].tolist()
+    if not len(near):
+        return state, []
+    start = (*shared, twin[-2][near], twin[-1][near])
+    twin, cost_twin = refine_poses(board_points, pixels[near], models, start, _ROUGH)
+    better = cost_twin < 0.999 * cost[near]
+    changed = near[better]
+    rotation, translation = rotation.clone(), translation.clone()
+    rotation[changed], translation[changed] = twin[-2][better], twin[-1][better]
+    return (*shared, rotation, translation), changed.tolist()

@@ -8,16 +8,24 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
+from kcal.calibrate.motion import screw
+from kcal.calibrate.terms import Term
 from kcal.lens.model import LensModel
-from kcal.lens.pose import move, nearest_rotation, step_rows
+from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, project_components
 from kcal.solve.result import State
-from kcal.solve.schur import SchurProblem
+from kcal.solve.robust import RobustLoss
+from kcal.solve.schur import SchurLinearisation, SchurProblem
+
+_ALL = slice(None)
+# Numbers in the rows of derivatives that are formed at a time: as many as the cache of one core holds.
+_CHUNK = 600_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,6 +71,15 @@ def warp_shape(board_points: Tensor) -> Tensor:
     return (1.0 - scaled**2).T
 
 
+def _turn_rows(by_point: Tensor, rotated: Tensor, out: Tensor) -> None:
+    """The first half of `kcal.lens.pose.step_rows`, derivatives by ω, written in place: point × derivative."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        row = out[..., i, :, :]
+        torch.mul(by_point[..., k, :, :], rotated[..., j, None, :], out=row)
+        row.addcmul_(by_point[..., j, :, :], rotated[..., k, None, :], value=-1.0)
+
+
 class BoardProblem(SchurProblem):
     """Reprojection residuals (pixels) of boards; every tensor of a state may have leading batch dimensions.
 
@@ -74,8 +91,8 @@ class BoardProblem(SchurProblem):
         free_warp: whether the board's warp is estimated.
         whitening: (..., V, C, N, 2, 2) by which each corner's residual is multiplied (`kcal.calibrate.weights`), or
             None: all corners count alike.
-        guard: (3, K) points in front of the camera at which every camera's lens must be regular, whether a corner was
-            seen there or not; None: only at seen corners. States that break this have no cost.
+        loss: of the length of each corner's residual (after whitening), or None for plain least squares.
+        terms: priors and bounds on the first camera's parameters and the warp, beside the corners.
         batch: leading shape of the states, () for one solve.
     """
 
@@ -90,24 +107,26 @@ class BoardProblem(SchurProblem):
         *,
         free_warp: bool = False,
         whitening: Tensor | None = None,
-        guard: Tensor | None = None,
+        loss: RobustLoss | None = None,
+        terms: Sequence[Term] = (),
         batch: tuple[int, ...] = (),
     ) -> None:
         self.models = tuple(models)
         self.free = tuple(tuple(indices) for indices in free)
         self.free_warp = free_warp
         self.batch = batch
-        self._guard = guard
+        self._terms = tuple(terms)
+        self._loss = loss
         self._board = board_points.T.contiguous()
         self._shape = warp_shape(board_points)
-        self._seen = torch.isfinite(pixels).all(-1)
-        self._all_seen = bool(self._seen.all())
-        self._target = torch.where(self._seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
+        self.seen = torch.isfinite(pixels).all(-1)
+        self._all_seen = bool(self.seen.all())
+        self._target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
         self._whitening: Tensor | None = None
         if whitening is not None:
-            seen = self._seen[..., None, None]
+            seen = self.seen[..., None, None]
             self._whitening = torch.where(seen, whitening, 0.0).movedim(-3, -1).contiguous()  # (..., V, C, 2, 2, N)
-        self.residual_count = 2 * int(self._seen.sum((-3, -2, -1)).max())
+        self.residual_count = 2 * int(self.seen.sum((-3, -2, -1)).max())
         self._sizes = [len(INTRINSICS) + model.size for model in self.models]
         # Where each block of shared parameters stands in a step: cameras, poses of the further cameras, warp.
         counts = [*(len(indices) for indices in self.free), *[6] * (len(self.models) - 1), 2 * free_warp]
@@ -123,6 +142,11 @@ class BoardProblem(SchurProblem):
         """Whether corners count by their own weights."""
         return self._whitening is not None
 
+    @property
+    def robust(self) -> bool:
+        """Whether a robust loss is minimised."""
+        return self._loss is not None
+
     def unpack(self, state: State) -> BoardState:
         """The solver's tuple as named tensors."""
         parameters, *rest = state
@@ -131,7 +155,7 @@ class BoardProblem(SchurProblem):
             **dict(zip([field.name for field in dataclasses.fields(BoardState)][1:], rest, strict=True)),
         )
 
-    def _points(self, s: BoardState) -> tuple[Tensor, Tensor]:
+    def points(self, s: BoardState) -> tuple[Tensor, Tensor]:
         """Board points rotated into the first camera (..., V, 3, N), and moved there."""
         flat = self._board
         if self.free_warp or bool(s.warp.any()):
@@ -143,7 +167,7 @@ class BoardProblem(SchurProblem):
 
     def _views(self, s: BoardState) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
         """For each camera: its number, points rotated by its pose, points in its frame, its parameters."""
-        _, points = self._points(s)
+        _, points = self.points(s)
         for c, parameters in enumerate(s.parameters):
             if c == 0:
                 yield c, points, points, parameters[..., None, :]
@@ -159,27 +183,64 @@ class BoardProblem(SchurProblem):
             errors = torch.einsum("...uwn,...wn->...un", self._whitening, errors)
         return errors.flatten(-3)
 
+    def view_cost(self, state: State) -> Tensor:
+        """See `SchurProblem.view_cost`."""
+        if self._loss is None:
+            return super().view_cost(state)
+        return 0.5 * self._loss.value(self._squared(self.residuals(state))).sum((-2, -1))
+
+    def corner_weights(self, state: State) -> Tensor:
+        """(..., V, C, N) by which the robust loss lets each corner's squared residual count; 1 without a loss."""
+        squared = self._squared(self.residuals(state))
+        return torch.ones_like(squared) if self._loss is None else self._loss.weight(squared)
+
+    def _squared(self, residuals: Tensor) -> Tensor:
+        """Squared lengths (..., V, C, N) of residuals (..., V, C 2 N)."""
+        return residuals.unflatten(-1, (len(self.models), 2, -1)).square().sum(-2)
+
+    def linearise(self, state: State) -> SchurLinearisation:
+        """See `Problem.linearise`."""
+        linear = super().linearise(state)
+        if self._loss is not None:
+            linear.cost = self.cost(state)
+        return linear
+
     def pixel_errors(self, state: State) -> Tensor:
         """Projected minus observed, (..., V, C, 2, N) pixels, not weighted; 0 where not seen."""
         out = []
         for c, _, points, parameters in self._views(self.unpack(state)):
             projected = project_components(points, parameters, self.models[c])
             error = projected.pixels - self._target[..., c, :, :]
-            seen = self._seen[..., c, None, :]
+            seen = self.seen[..., c, None, :]
             bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
             error = torch.where(seen, error + bad, 0.0)
-            if self._guard is not None:
-                kept = project_components(self._guard, parameters[..., 0, :], self.models[c]).regular.all(-1)
-                error = torch.where(kept[..., None, None, None], error, torch.nan)
             out.append(error)
         return torch.stack(out, -3)
 
-    def rows(self, state: State) -> Tensor:
-        """See `SchurProblem.rows`."""
+    def gram(self, state: State) -> Tensor:
+        """See `SchurProblem.gram`; a few views at a time, so that their rows stay in the cache."""
+        *shared, rotation, translation = state
+        count = rotation.shape[-3]
+        row = 2 * self._board.shape[-1] * len(self.models) * (6 + self.shared_size + 1) * max(1, math.prod(self.batch))
+        size = max(1, _CHUNK // row)
+        if count <= size:
+            return super().gram(state)
+        out = []
+        for start in range(0, count, size):
+            views = slice(start, start + size)
+            part = (*shared, rotation[..., views, :, :], translation[..., views, :])
+            rows = self.rows(part, views)
+            out.append(rows @ rows.transpose(-1, -2))
+        return torch.cat(out, -3)
+
+    def rows(self, state: State, views: slice = _ALL) -> Tensor:
+        """See `SchurProblem.rows`; of a state that holds the poses of some views only, if these are given."""
         s = self.unpack(state)
-        rotated_board, points = self._points(s)
+        seen, target = self.seen[..., views, :, :], self._target[..., views, :, :, :]
+        rotated_board, points = self.points(s)
         shape = (*points.shape[:-2], 6 + self.shared_size + 1, len(self.models), 2, points.shape[-1])
-        rows = points.new_zeros(shape)
+        # What a camera's rows do not depend on is zero: the parameters of the others.
+        rows = points.new_empty(shape) if len(self.models) == 1 else points.new_zeros(shape)
         shared = rows[..., 6:-1, :, :, :]
         for c, rotated, moved, parameters in self._views(s):
             projected = project_components(moved, parameters, self.models[c], self.free[c])
@@ -188,20 +249,41 @@ class BoardProblem(SchurProblem):
                 turn = s.cam_from_first_rotation[..., c - 1, :, :]
                 shared[..., self._pose_slots[c - 1], c, :, :] = step_rows(projected.by_point, rotated)
                 by_first = torch.einsum("...vkun,...kj->...vjun", projected.by_point, turn)
-            rows[..., :6, c, :, :] = step_rows(by_first, rotated_board)
+            _turn_rows(by_first, rotated_board, rows[..., :3, c, :, :])
+            rows[..., 3:6, c, :, :] = by_first
             shared[..., self._camera_slots[c], c, :, :] = projected.by_camera
             if self.free_warp:
                 normal = s.first_from_board_rotation[..., 2]
                 along = torch.einsum("...vkun,...vk->...vun", by_first, normal)
                 shared[..., self._warp_slot, c, :, :] = along[..., None, :, :] * self._shape[:, None]
+            error = rows[..., -1, c, :, :]
+            torch.sub(projected.pixels, target[..., c, :, :], out=error)
             # As in `residuals`, so that a start that is no projection is told from one that is.
-            bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
-            rows[..., -1, c, :, :] = projected.pixels - self._target[..., c, :, :] + bad
+            if not bool(projected.regular.all()):
+                error += torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
         if not self._all_seen:
-            rows = torch.where(self._seen[..., None, :, None, :], rows, 0.0)
+            rows = torch.where(seen[..., None, :, None, :], rows, 0.0)
         if self._whitening is not None:
-            rows = torch.einsum("...cuwn,...pcwn->...pcun", self._whitening, rows)
+            rows = torch.einsum("...cuwn,...pcwn->...pcun", self._whitening[..., views, :, :, :, :], rows)
+        if self._loss is not None:
+            squared = rows[..., -1, :, :, :].square().sum(-2)
+            rows = rows * self._loss.weight(squared).sqrt()[..., None, :, None, :]
         return rows.flatten(-3)
+
+    def shared_rows(self, state: State) -> Tensor | None:
+        """See `SchurProblem.shared_rows`."""
+        if not self._terms:
+            return None
+        s = self.unpack(state)
+        values = torch.cat([s.parameters[0], s.warp], -1)
+        found = torch.cat([term.rows(values) for term in self._terms], -1)
+        if not found.shape[-1]:
+            return None
+        rows = found.new_zeros((*found.shape[:-2], self.shared_size + 1, found.shape[-1]))
+        rows[..., self._camera_slots[0], :] = found[..., list(self.free[0]), :]
+        rows[..., self._warp_slot, :] = found[..., -3 : -3 + 2 * self.free_warp, :]
+        rows[..., -1, :] = found[..., -1, :]
+        return rows
 
     def retract(self, state: State, step: State) -> State:
         """See `SchurProblem.retract`."""
@@ -215,8 +297,8 @@ class BoardProblem(SchurProblem):
         rotation, translation = s.cam_from_first_rotation, s.cam_from_first_translation
         if self._pose_slots:
             poses = torch.stack([shared[..., slot] for slot in self._pose_slots], -2)
-            rotation, translation = move(rotation, translation, poses)
-        board = move(s.first_from_board_rotation, s.first_from_board_translation, local)
+            rotation, translation = screw(rotation, translation, poses)
+        board = screw(s.first_from_board_rotation, s.first_from_board_translation, local)
         return BoardState(
             parameters=tuple(parameters),
             warp=s.warp + shared[..., self._warp_slot] if self.free_warp else s.warp,

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.terms import Term
 from kcal.lens.camera import Camera
 from kcal.lens.inverse import valid_radius
 from kcal.lens.model import LensModel
-from kcal.lens.projection import INTRINSICS, parameter_names
+from kcal.lens.projection import INTRINSICS, parameter_names, project_components
 from kcal.solve.result import State
+
+# How far beyond the outermost point a lens must be regular; the image's corners move a little with the lens.
+_MARGIN = 1.05
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,17 +37,33 @@ class Views:
     size: tuple[int, int]
     free_warp: bool
 
-    def problem(self, model: LensModel, batch: tuple[int, ...] = (), radius: float | None = None) -> BoardProblem:
-        """The least-squares problem of one lens model, which must be regular up to `radius` on the plane z = 1."""
+    def problem(
+        self, model: LensModel, batch: tuple[int, ...] = (), terms: Sequence[Term] = (), *, poses_only: bool = False
+    ) -> BoardProblem:
+        """The least-squares problem of one lens model, or of the poses (and the warp) under a given lens."""
+        free = [] if poses_only else free_parameters(model)
         return BoardProblem(
-            self.board_points,
-            self.pixels,
-            [model],
-            [free_parameters(model)],
-            free_warp=self.free_warp,
-            guard=None if radius is None else _disc(radius),
-            batch=batch,
+            self.board_points, self.pixels, [model], [free], free_warp=self.free_warp, terms=terms, batch=batch
         )
+
+    def seen_radius(self, state: State) -> float:
+        """Radius on the plane z = 1 around all corners that were seen, with a margin."""
+        return _MARGIN * float(self.observed_radius(state))
+
+    def regular_radius(self, state: State, model: LensModel) -> float:
+        """Likewise around the whole image, if the lens reaches it."""
+        rim = _rim(state[0], model, self.size)
+        return self.seen_radius(state) if rim is None else max(self.seen_radius(state), _MARGIN * rim)
+
+    def noise(self, state: State, model: LensModel) -> float:
+        """Standard deviation (pixels) of the residuals along an axis."""
+        problem = self.problem(model)
+        return math.sqrt(2.0 * float(problem.cost(state)) / problem.residual_count)
+
+    @property
+    def corner_count(self) -> int:
+        """How many corners were seen."""
+        return int(torch.isfinite(self.pixels).all(-1).sum())
 
     def rms(self, state: State, model: LensModel) -> float:
         """Root mean square distance (pixels) between corners and their projections."""
@@ -64,12 +85,24 @@ class Views:
         return 0.0 if bool(Camera(state[0], size=self.size, model=model).covers_image()) else 1.0
 
 
-def _disc(radius: float) -> Tensor:
-    """Points (3, K) on the plane z = 1, closer together than a pole or fold of a rational lens is wide."""
-    r = torch.linspace(0.0, radius, 49, dtype=torch.float64)[1:]
-    turn = torch.linspace(0.0, 2.0 * math.pi, 13, dtype=torch.float64)[:-1]
-    x, y = torch.outer(r, torch.cos(turn)).flatten(), torch.outer(r, torch.sin(turn)).flatten()
-    return torch.stack([x, y, torch.ones_like(x)])
+def _rim(parameters: Tensor, model: LensModel, size: tuple[int, int]) -> float | None:
+    """Largest radius on the plane z = 1 that the image's border shows; None where the lens does not reach it."""
+    width, height = size[0] - 1.0, size[1] - 1.0
+    u = torch.tensor([0.0, 0.5, 1.0, 0.0, 1.0, 0.0, 0.5, 1.0], dtype=torch.float64) * width
+    v = torch.tensor([0.0, 0.0, 0.0, 0.5, 0.5, 1.0, 1.0, 1.0], dtype=torch.float64) * height
+    wanted = torch.stack([u, v])
+    x, y = (u - parameters[2]) / parameters[0], (v - parameters[3]) / parameters[1]
+    for _ in range(12):
+        seen = project_components(torch.stack([x, y, torch.ones_like(x)]), parameters, model, ())
+        error = wanted - seen.pixels
+        if not bool(seen.regular.all()):
+            return None
+        if float(error.abs().max()) < 1e-3:
+            return float(torch.hypot(x, y).max())
+        ux, vx, uy, vy = seen.by_point[:2].flatten(0, 1)
+        scale = 1.0 / (ux * vy - uy * vx)
+        x, y = x + (vy * error[0] - uy * error[1]) * scale, y + (ux * error[1] - vx * error[0]) * scale
+    return None
 
 
 def free_parameters(model: LensModel) -> list[int]:

@@ -25,6 +25,14 @@ def calibrate(
         ),
     ] = "opencv5",
     board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
+    focal: Annotated[
+        float | None, typer.Option(help="Roughly known focal length in pixels (EXIF, field of view), as a start.")
+    ] = None,
+    loss: Annotated[
+        str | None,
+        typer.Option(metavar="KIND", help="Robust loss against wrong corners: huber, cauchy or tukey."),
+    ] = None,
+    loss_scale: Annotated[float, typer.Option(help="Where the robust loss sets in, pixels.")] = 1.0,
     name: Annotated[str, typer.Option(help="Name of the camera; the observations' file name if not given.")] = "",
     picture: Annotated[Path | None, typer.Option(help="A .png file: coverage, residuals and views.")] = None,
 ) -> None:
@@ -55,10 +63,14 @@ def calibrate(
     from kcal.calibrate.ladder import steps_to
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
     from kcal.corners.observations import Observations
+    from kcal.solve.robust import RobustLoss
 
+    # An unknown kind is refused by the loss itself.
+    robust = None if loss is None else RobustLoss(kind=loss, scale=loss_scale)  # type: ignore[arg-type]
+    options = CalibrationOptions(model=lens, board_warp=board_warp, focal=focal, loss=robust)
     seen = Observations.load(observations)
     with steps("calibrating", 1 + max(1, len(steps_to(lens)) - 1)) as advance:
-        result = calibrate_camera(seen, CalibrationOptions(model=lens, board_warp=board_warp), advance)
+        result = calibrate_camera(seen, options, advance)
     file = record(result, seen, name or observations.name.split(".")[0], observations.name)
     file.save(output)
     if picture is not None:

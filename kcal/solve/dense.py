@@ -35,9 +35,11 @@ class DenseLinearisation:
 class DenseProblem:
     """Residuals r(x, data) for x (..., P), the leading dimensions a batch of independent problems."""
 
+    joint = False
+
     def __init__(self, residual: Callable[..., Tensor], batch: tuple[int, ...], data: tuple[Tensor, ...] = ()) -> None:
         self.batch = tuple(batch)
-        self._data = tuple(tensor.detach() for tensor in data)
+        self._data = tuple(data)
         value, jacobian = residual, torch.func.jacfwd(residual)
         for _ in self.batch:
             value, jacobian = torch.func.vmap(value), torch.func.vmap(jacobian)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -21,6 +22,8 @@ Callback = Callable[[int, Tensor], bool | None]
 
 _LOWEST_DAMPING, _HIGHEST_DAMPING = 1e-14, 1e10
 _LITTLE_DAMPING = 1e-3
+# Trial steps over which `LMOptions.flatness` is judged.
+_PATIENCE = 20
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -31,18 +34,22 @@ class LMOptions:
         max_iterations: trial steps at the most, rejected ones counted.
         tolerance: stop when the next step is predicted to lower the cost by less than this fraction. 1e-12 of the
             cost is 5e-13 of the RMS.
+        flatness: stop when 20 steps together have lowered the cost by less than this fraction; 0: never.
         initial_damping: λ at the start, in units of the scaled normal matrix, whose diagonal is one.
         residual_floor: a root-mean-square residual below this counts as zero.
     """
 
     max_iterations: int = 300
     tolerance: float = 1e-12
+    flatness: float = 0.0
     initial_damping: float = 1e-3
     residual_floor: float = 1e-12
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1 or not 0 <= self.tolerance < 1:
             raise InputError("LMOptions: max_iterations must be at least 1 and tolerance in [0, 1)")
+        if not 0 <= self.flatness < 1:
+            raise InputError("LMOptions: flatness must be in [0, 1)")
         if not self.initial_damping > 0 or not self.residual_floor >= 0:
             raise InputError("LMOptions: initial_damping must be positive, residual_floor not negative")
 
@@ -53,9 +60,13 @@ def _where(mask: Tensor, new: State, old: State) -> State:
     )
 
 
-@torch.no_grad()
 def minimise(
-    problem: Problem, start: State, options: LMOptions | None = None, callback: Callback | None = None
+    problem: Problem,
+    start: State,
+    options: LMOptions | None = None,
+    callback: Callback | None = None,
+    *,
+    unroll: bool = False,
 ) -> Result:
     """Minimise half the sum of squares by Levenberg and Marquardt's method.
 
@@ -69,62 +80,91 @@ def minimise(
         start: the state to begin with.
         options: see `LMOptions`.
         callback: called after each trial with the trial's number and the best cost; return True to stop.
+        unroll: record the accepted steps for autograd, as far as the problem's operations are differentiable. What
+            decides about them (damping, acceptance) counts as constant.
 
     Returns:
         The best state with its status. Nothing is raised for a failure to converge: read `status`.
     """
-    options = options or LMOptions()
+    with torch.set_grad_enabled(unroll and torch.is_grad_enabled()):
+        return _minimise(problem, start, options or LMOptions(), callback)
+
+
+def _minimise(problem: Problem, start: State, options: LMOptions, callback: Callback | None) -> Result:
     state = start
     linear = problem.linearise(state)
-    cost = linear.cost
-    damping = torch.full_like(cost, options.initial_damping)
-    growth = torch.full_like(cost, 2.0)
-    status = torch.zeros_like(cost, dtype=torch.int64)
-    iterations = torch.zeros_like(status)
-    status = torch.where(torch.isfinite(cost), status, int(Status.BAD_START))
+    device = linear.cost.device
+
+    def on_host(values: Tensor) -> np.ndarray:
+        return values.detach().cpu().numpy().copy()
+
+    def on_device(values: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.asarray(values)).to(device)
+
+    # What decides is a handful of numbers for each element: numpy handles these several times faster than torch.
+    cost = on_host(linear.cost)
+    damping, growth = np.full_like(cost, options.initial_damping), np.full_like(cost, 2.0)
+    iterations = np.zeros(cost.shape, np.int64)
+    status = np.where(np.isfinite(cost), int(Status.RUNNING), int(Status.BAD_START))
     floor = 0.5 * problem.residual_count * options.residual_floor**2
-    status = torch.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
+    status = np.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
     history = [cost]
 
     for trial in range(1, options.max_iterations + 1):
         running = status == Status.RUNNING
-        if not bool(running.any()):
+        if not running.any():
             break
-        step, predicted = linear.step(damping)
+        step, decrease = linear.step(on_device(damping))
         candidate = problem.retract(state, step)
-        new_cost = problem.cost(candidate)
-        solved = torch.isfinite(predicted)
-        gain = (cost - new_cost) / torch.where(solved & (predicted > 0), predicted, torch.inf)
-        accept = running & solved & torch.isfinite(new_cost) & (new_cost < cost)
+        joint = problem.linearise(candidate) if problem.joint else None
+        new_cost = on_host(problem.cost(candidate) if joint is None else joint.cost)
+        predicted = on_host(decrease)
+        solved = np.isfinite(predicted)
+        gain = (cost - np.where(np.isfinite(new_cost), new_cost, np.inf)) / np.where(
+            solved & (predicted > 0), predicted, np.inf
+        )
+        accept = running & solved & (new_cost < cost)
         iterations = iterations + running
 
         # A tiny prediction means a minimum only where little damping shaped the step.
         flat = running & solved & (predicted <= options.tolerance * cost) & (damping <= _LITTLE_DAMPING)
-        shrink = torch.clamp(1.0 - (2.0 * gain - 1.0) ** 3, min=1.0 / 10.0)
-        damping = torch.where(accept, damping * shrink, torch.where(running, damping * growth, damping))
-        damping = damping.clamp(min=_LOWEST_DAMPING)
-        growth = torch.where(accept, 2.0, torch.where(running, growth * 2.0, growth))
-        state = _where(accept, candidate, state)
-        cost = torch.where(accept, new_cost, cost)
+        shrink = np.maximum(1.0 - (2.0 * np.where(accept, gain, 0.5) - 1.0) ** 3, 1.0 / 10.0)
+        damping = np.where(accept, damping * shrink, np.where(running, damping * growth, damping))
+        damping = np.maximum(damping, _LOWEST_DAMPING)
+        growth = np.where(accept, 2.0, np.where(running, growth * 2.0, growth))
+        if accept.all():
+            state = candidate
+        elif accept.any():
+            state = _where(on_device(accept), candidate, state)
+        cost = np.where(accept, new_cost, cost)
         history.append(cost)
 
-        status = torch.where(flat, int(Status.CONVERGED), status)
-        status = torch.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
+        status = np.where(flat, int(Status.CONVERGED), status)
+        status = np.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
         stalled = (status == 0) & ~accept & (damping > _HIGHEST_DAMPING)
-        if bool(stalled.any()):
+        if stalled.any():
             # Where the residual stays large and curved, steps need damping even at the minimum and end in rounding:
             # whether it is one is told by the step that would be free of damping.
-            _, free = linear.step(torch.full_like(damping, _LITTLE_DAMPING))
-            at_minimum = stalled & (free <= options.tolerance * cost)
-            status = torch.where(at_minimum, int(Status.CONVERGED), status)
-            status = torch.where(stalled & ~at_minimum, int(Status.STALLED), status)
-        if callback is not None and callback(trial, cost):
-            status = torch.where(status == 0, int(Status.INTERRUPTED), status)
-        if bool((accept & (status == 0)).any()):
-            linear = problem.linearise(state)
+            _, free = linear.step(on_device(np.full_like(damping, _LITTLE_DAMPING)))
+            at_minimum = stalled & (on_host(free) <= options.tolerance * cost)
+            status = np.where(at_minimum, int(Status.CONVERGED), status)
+            status = np.where(stalled & ~at_minimum, int(Status.STALLED), status)
+        if options.flatness and trial >= _PATIENCE:
+            slow = history[-1 - _PATIENCE] - cost <= options.flatness * cost
+            status = np.where((status == 0) & slow, int(Status.FLAT), status)
+        if callback is not None and callback(trial, on_device(cost)):
+            status = np.where(status == 0, int(Status.INTERRUPTED), status)
+        if (accept & (status == 0)).any():
+            linear = problem.linearise(state) if joint is None or not accept.all() else joint
 
-    status = torch.where(status == 0, int(Status.ITERATION_LIMIT), status)
-    return Result(state=state, cost=cost, status=status, iterations=iterations, history=torch.stack(history))
+    status = np.where(status == 0, int(Status.ITERATION_LIMIT), status)
+    return Result(
+        state=state,
+        cost=on_device(cost),
+        status=on_device(status),
+        iterations=on_device(iterations),
+        history=on_device(np.stack(history)),
+    )
 
 
 class LevenbergMarquardt(nn.Module):
@@ -135,9 +175,12 @@ class LevenbergMarquardt(nn.Module):
             differentiate.
         options: see `LMOptions`.
 
-    Convention: float64 only, because squared condition numbers leave float32 nothing. Where data require gradients,
-    the solution `x` carries them: exact first derivatives by the implicit function theorem, at the price of one
-    Hessian. Elements that did not converge carry none.
+        backward: where data require gradients, how the solution `x` gets them. "implicit": exact first derivatives by
+            the implicit function theorem, at the price of one Hessian; elements that did not converge carry none.
+            "unroll": autograd through the steps that were taken, also of a start that requires gradients; memory grows
+            with the steps, and the derivative lags one step behind the solution. "none": no gradients.
+
+    Convention: float64 only, because squared condition numbers leave float32 nothing.
 
     Example:
         >>> def rosenbrock(x):
@@ -147,10 +190,19 @@ class LevenbergMarquardt(nn.Module):
         ([1.0, 1.0], 'converged: the residual is zero to rounding')
     """
 
-    def __init__(self, residual: Callable[..., Tensor], options: LMOptions | None = None) -> None:
+    def __init__(
+        self,
+        residual: Callable[..., Tensor],
+        options: LMOptions | None = None,
+        *,
+        backward: Literal["implicit", "unroll", "none"] = "implicit",
+    ) -> None:
         super().__init__()
+        if backward not in ("implicit", "unroll", "none"):
+            raise InputError(f"LevenbergMarquardt: backward must be implicit, unroll or none, got {backward!r}")
         self.residual = residual
         self.options = options or LMOptions()
+        self.backward = backward
 
     def forward(self, start: Tensor, *data: Tensor, callback: Callback | None = None) -> Result:
         """Minimise from `start` (..., P); each data tensor has the same leading shape (...).
@@ -174,9 +226,14 @@ class LevenbergMarquardt(nn.Module):
                     f"LevenbergMarquardt: data of shape {tuple(tensor.shape)} do not begin with the batch shape "
                     f"{tuple(start.shape[:-1])}"
                 )
-        problem = DenseProblem(self.residual, start.shape[:-1], data)
+        if self.backward == "unroll":
+            return minimise(
+                DenseProblem(self.residual, start.shape[:-1], data), (start,), self.options, callback, unroll=True
+            )
+        constant = tuple(tensor.detach() for tensor in data)
+        problem = DenseProblem(self.residual, start.shape[:-1], constant)
         result = minimise(problem, (start.detach(),), self.options, callback)
-        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in data):
+        if self.backward == "implicit" and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in data):
             x = attach_implicit_gradient(self.residual, result.x, result.converged, data)
             result = dataclasses.replace(result, state=(x,))
         return result

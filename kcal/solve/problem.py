@@ -41,6 +41,11 @@ class Problem(Protocol):
         ...
 
     @property
+    def joint(self) -> bool:
+        """Whether a linearisation costs little more than the cost alone, so that trial states are linearised."""
+        ...
+
+    @property
     def residual_count(self) -> int:
         """Number of scalar residuals of one element, for the rounding floor."""
         ...

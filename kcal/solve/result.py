@@ -17,7 +17,8 @@ class Status(enum.IntEnum):
     `CONVERGED`: no step can lower the cost by more than the tolerance. `EXACT`: the residual is zero to rounding.
     `ITERATION_LIMIT`: still improving. `STALLED`: a lower cost was predicted but no step, however short, gave one.
     `BAD_START`: the cost at the start is not finite. `INTERRUPTED`: the caller's callback asked to stop. `AT_BOUND`:
-    the caller held the solution back, because lower costs lie where the problem makes no sense.
+    the caller held the solution back, because lower costs lie where the problem makes no sense. `FLAT`: still
+    improving, but many steps together by too little to matter: the data hardly determine some direction.
     """
 
     RUNNING = 0
@@ -28,6 +29,7 @@ class Status(enum.IntEnum):
     BAD_START = 5
     INTERRUPTED = 6
     AT_BOUND = 7
+    FLAT = 8
 
     @property
     def message(self) -> str:
@@ -43,6 +45,7 @@ _MESSAGES = {
     Status.STALLED: "stalled: no step lowers the cost although one was predicted",
     Status.BAD_START: "the cost at the start is not finite",
     Status.AT_BOUND: "stopped at a bound: lower costs lie beyond what is allowed",
+    Status.FLAT: "stopped in a flat valley: the last steps lowered the cost by too little to matter",
     Status.INTERRUPTED: "interrupted; this is the best state so far",
 }
 

@@ -15,18 +15,19 @@ from kcal.solve.result import State
 
 
 class SchurLinearisation:
-    """Normal equations built from each view's rows of derivatives.
+    """Normal equations built from what each view contributes.
 
     Args:
-        rows: (..., V, L + S + 1, R): for each view the derivatives of its R residuals by its L local parameters, by
-            the S shared ones, and the residuals themselves.
+        gram: (..., V, L + S + 1, L + S + 1): for each view the products of its rows, see `SchurProblem.rows`.
         local_size: L.
+        shared_rows: (..., S + 1, Q): likewise of Q residuals that depend on the shared parameters alone, or None.
     """
 
-    def __init__(self, rows: Tensor, local_size: int) -> None:
+    def __init__(self, gram: Tensor, local_size: int, shared_rows: Tensor | None = None) -> None:
         L = local_size
-        gram = rows @ rows.transpose(-1, -2)
         total = gram[..., L:, L:].sum(-3)
+        if shared_rows is not None:
+            total = total + shared_rows @ shared_rows.transpose(-1, -2)
         self.cost = 0.5 * total[..., -1, -1]
         local, coupling, shared = gram[..., :L, :L], gram[..., :L, L:-1], total[..., :-1, :-1]
         self._local_scale = _inverse_root(local.diagonal(dim1=-2, dim2=-1))
@@ -82,12 +83,14 @@ def _damped(matrix: Tensor, damping: Tensor) -> Tensor:
 class SchurProblem(ABC):
     """Base of problems with a state (shared, local), `local` beginning with the views.
 
-    Subclasses give `rows`, `residuals` and `retract`.
+    Subclasses give `rows`, `residuals` and `retract`. With a robust loss the cost is not half the squared length of the
+    rows' residuals: they overwrite `view_cost` as well.
     """
 
     batch: tuple[int, ...]
     local_size: int
     residual_count: int
+    joint = False
 
     @abstractmethod
     def residuals(self, state: State) -> Tensor:
@@ -95,17 +98,36 @@ class SchurProblem(ABC):
 
     @abstractmethod
     def rows(self, state: State) -> Tensor:
-        """(..., V, L + S + 1, R), see `SchurLinearisation`."""
+        """(..., V, L + S + 1, R).
+
+        For each view the derivatives of its R residuals by its L local parameters, by the S shared ones, and the
+        residuals themselves.
+        """
 
     @abstractmethod
     def retract(self, state: State, step: State) -> State:
         """Apply a step (shared (..., S), local (..., V, L))."""
 
+    def shared_rows(self, state: State) -> Tensor | None:
+        """(..., S + 1, Q), see `SchurLinearisation`: priors and bounds; None where there are none."""
+        return None
+
+    def view_cost(self, state: State) -> Tensor:
+        """(..., V) what each view adds to the cost."""
+        residuals = self.residuals(state)
+        return 0.5 * (residuals * residuals).sum(-1)
+
     def cost(self, state: State) -> Tensor:
         """See `Problem.cost`."""
-        residuals = self.residuals(state)
-        return 0.5 * (residuals * residuals).sum((-2, -1))
+        cost = self.view_cost(state).sum(-1)
+        shared = self.shared_rows(state)
+        return cost if shared is None else cost + 0.5 * (shared[..., -1, :] ** 2).sum(-1)
+
+    def gram(self, state: State) -> Tensor:
+        """(..., V, L + S + 1, L + S + 1) products of the rows of each view."""
+        rows = self.rows(state)
+        return rows @ rows.transpose(-1, -2)
 
     def linearise(self, state: State) -> SchurLinearisation:
         """See `Problem.linearise`."""
-        return SchurLinearisation(self.rows(state), self.local_size)
+        return SchurLinearisation(self.gram(state), self.local_size, self.shared_rows(state))

@@ -58,13 +58,19 @@ class TestNoiseFree:
     @pytest.mark.parametrize("model", ["opencv14", "ext20"])
     def test_truth_comes_back_as_a_mapping_where_coefficients_hardly_differ(self, model: str) -> None:
         truth = camera(model)
+        pixels = pixels_of(truth, motions(truth, 8, 1))
         result = calibrate_camera(
-            observe(pixels_of(truth, motions(truth, 8, 1))),
+            observe(pixels),
             # Residuals below 1e-7 px tell nothing more, and the last steps of 20 coefficients are endless.
             CalibrationOptions(model=model, solver=LMOptions(max_iterations=150, residual_floor=1e-7)),
         )
         assert result.rms < 1e-4
-        assert far_apart(result.camera, truth) < 1e-2
+        # Within the outermost corner: beyond it a few corners of eight boards do not determine 20 coefficients.
+        rays, _ = truth.unproject(truth.grid(33, 25).reshape(-1, 2))
+        corners, _ = truth.unproject(pixels.reshape(-1, 2))
+        rays = rays[rays[:, 2] > 1.01 * corners[:, 2].min()]
+        assert len(rays) > 400
+        assert float((result.camera.project(rays)[0] - truth.project(rays)[0]).norm(dim=-1).max()) < 1e-2
 
     def test_board_warp_comes_back(self) -> None:
         truth = camera()
@@ -162,7 +168,8 @@ class TestNumbers:
         cv2 = pytest.importorskip("cv2")
         truth = camera(model)
         pixels = pixels_of(truth, motions(truth, 14, 9), noise=0.2, seed=3).float()
-        result = solve(pixels.double(), model)
+        # To the bottom: σ is steep about the minimum with eight coefficients.
+        result = solve(pixels.double(), model, solver=LMOptions(max_iterations=1000, tolerance=1e-13))
         assert result.warnings == ()
         lens = torch.zeros(14).double()
         lens[: truth.model.size] = result.camera.coefficients
@@ -178,7 +185,7 @@ class TestNumbers:
         names = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]
         known = dict(zip(names, out[5][:, 0].tolist(), strict=False))
         for name, sigma in result.sigma.items():
-            # As above; with eight coefficients σ is steep about the minimum.
+            # As above.
             assert sigma == pytest.approx(known[name], rel=1e-5 if model == "opencv5" else 1e-3), name
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import Tensor
 
+from kcal.errors import InputError
 from kcal.solve.lm import LevenbergMarquardt, LMOptions
 
 TIMES = torch.linspace(0.0, 2.0, 9, dtype=torch.float64)
@@ -64,3 +66,32 @@ class TestGradient:
     def test_none_without_grad(self) -> None:
         with torch.no_grad():
             assert not LevenbergMarquardt(decay)(START, observations().requires_grad_(True)).x.requires_grad
+
+
+class TestBackward:
+    def test_unrolled_steps_agree_with_the_implicit_gradient(self) -> None:
+        """Steps that go on after convergence make the derivative converge too."""
+        observed = observations(2).requires_grad_(True)
+        options = LMOptions(tolerance=1e-18)
+        gradients = []
+        for backward in ("implicit", "unroll"):
+            x = LevenbergMarquardt(decay, options, backward=backward)(START.expand(2, 3), observed).x
+            gradients.append(torch.autograd.grad(x[:, 1].sum(), observed)[0])
+        torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-4, atol=1e-6)
+
+    def test_one_unrolled_step_is_the_derivative_of_that_step(self) -> None:
+        solver = LevenbergMarquardt(decay, LMOptions(max_iterations=1), backward="unroll")
+        start = START.clone().requires_grad_(True)
+        assert torch.autograd.gradcheck(
+            lambda x, observed: solver(x, observed).x, (start, observations().requires_grad_(True)), atol=1e-6
+        )
+
+    def test_none(self) -> None:
+        observed = observations().requires_grad_(True)
+        result = LevenbergMarquardt(decay, backward="none")(START, observed)
+        assert not result.x.requires_grad
+        assert torch.equal(result.x, LevenbergMarquardt(decay)(START, observed).x)
+
+    def test_refuses_other_words(self) -> None:
+        with pytest.raises(InputError, match="implicit, unroll or none"):
+            LevenbergMarquardt(decay, backward="explicit")

@@ -216,6 +216,20 @@ class TestCallback:
         assert result.status.tolist() == [Status.EXACT, Status.INTERRUPTED]
 
 
+def test_a_flat_valley_is_left_and_called_so() -> None:
+    """x² only halves x at each step, beside a residual that nothing lowers."""
+
+    def valley(x: Tensor) -> Tensor:
+        return torch.stack([x[0] ** 2, 1e-3 + 0.0 * x[0]])
+
+    left = LevenbergMarquardt(valley, LMOptions(tolerance=0.0, flatness=0.5))(vector(3.0))
+    assert int(left.status) == Status.FLAT
+    assert not bool(left.converged)
+    # The first step after twenty that gained less than half of what is left.
+    assert float(left.history[-21]) <= 1.5 * float(left.cost) < float(left.history[-22])
+    assert int(LevenbergMarquardt(valley, LMOptions(tolerance=0.0))(vector(3.0)).status) != Status.FLAT
+
+
 class TestRefusals:
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.int64])
     def test_dtype(self, dtype: torch.dtype) -> None:

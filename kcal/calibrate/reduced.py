@@ -1,0 +1,279 @@
+"""The lens problem alone: all views folded into a few hundred numbers, whose size does not grow with the views.
+
+Near a solution a change of the lens moves corners by a smooth field over the image, and each board pose answers
+linearly. Both can be used once and for all: the field is written in a basis of smooth functions, the poses are
+eliminated, and what is left of V views is one quadratic form in the field's coefficients. The lens, whose parameters
+are what makes calibration ill-conditioned and multi-modal, stays fully nonlinear. So a search over its many minima
+costs the same for ten views and for a thousand. What it finds is exact but for the curvature of the poses and the
+basis; a few steps on the whole problem remove both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.motion import screw
+from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.terms import Term
+from kcal.lens.model import LensModel
+from kcal.lens.pose import rotation_from_vector, step_rows
+from kcal.lens.projection import project_components
+from kcal.solve.dense import DenseLinearisation
+from kcal.solve.result import State
+
+# The basis: products of a polynomial in the radius and a wave of the polar angle (Zernike's scheme), by the highest
+# degree and the highest number of periods. A lens of few tilted and decentred terms has only slow waves.
+_DEGREE, _PERIODS = 14, 4
+_RADII, _ANGLES = 20, 9
+# Poses answer as if each had been measured with this share of the information that the corners give about it along
+# each of its six axes: the tilt of a board that is seen face-on would leave the range of its linear answer otherwise.
+_DAMPING = 1e-3
+# Relative to the largest diagonal element: directions of the field that no corner sees stay free of noise.
+_JITTER = 1e-13
+# Corners that are looked at for where corners are.
+_SAMPLE = 3000
+
+
+def angle_coordinates(points: Tensor) -> Tensor:
+    """Points (..., 3, N) of the camera frame to (..., 2, N): the angle off the axis, in the direction of (X, Y).
+
+    Of all simple coordinates these make the difference between two lenses smoothest, narrow or wide.
+    """
+    across = points[..., :2, :]
+    distance = torch.linalg.vector_norm(across, dim=-2, keepdim=True)
+    angle = torch.atan2(distance, points[..., 2:, :])
+    return across * (angle / distance.clamp_min(1e-12))
+
+
+def field_basis(place: Tensor) -> Tensor:
+    """Smooth functions on the unit disc at points (..., 2, N): (..., F, N)."""
+    x, y = place[..., 0, :], place[..., 1, :]
+    s = x * x + y * y
+    t = 2.0 * s - 1.0
+    # Chebyshev polynomials of 2 r² - 1.
+    radial = [torch.ones_like(t), t]
+    while len(radial) <= _DEGREE // 2:
+        radial.append(2.0 * t * radial[-1] - radial[-2])
+    out = list(radial)
+    cosine, sine = x, y
+    for m in range(1, _PERIODS + 1):
+        for n in range((_DEGREE - m) // 2 + 1):
+            out += [cosine * radial[n], sine * radial[n]]
+        cosine, sine = cosine * x - sine * y, cosine * y + sine * x
+    return torch.stack(out, -2)
+
+
+def _nodes() -> Tensor:
+    """Points (2, K) of the unit disc from which the field's coefficients are found."""
+    k = torch.arange(_RADII, dtype=torch.float64)
+    radius = torch.sqrt(0.5 + 0.5 * torch.cos(math.pi * (k + 0.5) / _RADII))
+    turn = 2.0 * math.pi * torch.arange(_ANGLES, dtype=torch.float64) / _ANGLES
+    # Every second ring turned by half a step.
+    turn = turn + (k % 2)[:, None] * math.pi / _ANGLES
+    return torch.stack([(radius[:, None] * torch.cos(turn)).flatten(), (radius[:, None] * torch.sin(turn)).flatten()])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Folded:
+    """All views at one state, folded: the squared residuals after the poses have answered are ‖A c + offset‖².
+
+    c are the shifts (pixels) of the nodes' images, then the change of the board's warp.
+
+    Args:
+        state: where the views were folded.
+        points: (3, K) directions of the nodes.
+        pixels: (2, K) images of the nodes at `state`.
+        matrix: (2 K + W, R), A transposed.
+        offset: (R,).
+        answer: (V 6, 2 K + W + 1): what the poses see of c and of the present residuals.
+        factor: (V, 6, 6) of the poses' damped normal matrices.
+    """
+
+    state: State
+    points: Tensor
+    pixels: Tensor
+    matrix: Tensor
+    offset: Tensor
+    answer: Tensor
+    factor: Tensor
+
+
+def fold(problem: BoardProblem, state: State, radius: float) -> Folded:
+    """Fold the views of one camera.
+
+    Args:
+        problem: of one camera, none of whose parameters is free but the warp, if it is to be estimated.
+        state: of this problem.
+        radius: largest radius on the plane z = 1 at which a corner is seen.
+    """
+    s = problem.unpack(state)
+    rows = problem.rows(state)
+    views = len(rows)
+    top = math.atan(radius)
+    points = angle_coordinates(problem.points(s)[1])
+    basis = field_basis(points / top) * problem.seen[:, 0, None]
+    size = basis.shape[-2]
+    disc = _nodes()
+    nodes = _directions(disc, top)
+    coefficients = torch.linalg.pinv(field_basis(disc).T)  # (F, K)
+
+    by_pose, others = rows[:, :6], rows[:, 6:]
+    gram = by_pose @ by_pose.transpose(-1, -2)
+    gram = gram + torch.diag_embed(_DAMPING * gram.diagonal(dim1=-2, dim2=-1))
+    factor = torch.linalg.cholesky(gram)
+    across = torch.linalg.solve_triangular(factor, by_pose, upper=False)
+    # What the poses see of the field, u and v, and of the warp and the residuals.
+    field = across.unflatten(-1, (2, -1)).flatten(1, 2) @ basis.transpose(-1, -2)
+    seen = torch.cat([field.reshape(views, 6, 2 * size), across @ others.transpose(-1, -2)], -1).flatten(0, 1)
+    flat = basis.transpose(0, 1).reshape(size, -1)
+    whole = -(seen.T @ seen)
+    square = flat @ flat.T
+    whole[:size, :size] += square
+    whole[size : 2 * size, size : 2 * size] += square
+    planes = others.unflatten(-1, (2, -1)).permute(1, 2, 0, 3)
+    cross = (planes.flatten(-2) @ flat.T).flatten(1)
+    whole[2 * size :, : 2 * size] += cross
+    whole[: 2 * size, 2 * size :] += cross.T
+    flat_others = planes.flatten(1)
+    whole[2 * size :, 2 * size :] += flat_others @ flat_others.T
+
+    normal, gradient, constant = whole[:-1, :-1], whole[:-1, -1], whole[-1, -1]
+    normal.diagonal().add_(_JITTER * normal.diagonal().max())
+    root = torch.linalg.cholesky(normal)
+    offset = torch.linalg.solve_triangular(root, gradient[:, None], upper=False)
+    left = (constant - (offset * offset).sum()).clamp_min(0.0).sqrt()
+    to_field = torch.block_diag(coefficients, coefficients, torch.eye(len(normal) - 2 * size, dtype=flat.dtype))
+    matrix = to_field.T @ root
+    rough = _roughness(disc, coefficients, points / top, problem.seen[:, 0])
+    rough = torch.cat([rough, rough.new_zeros(len(matrix) - len(rough), rough.shape[1])])
+    zero = matrix.new_zeros(len(matrix), 1)
+    return Folded(
+        state=state,
+        points=nodes,
+        pixels=project_components(nodes, s.parameters[0], problem.models[0]).pixels,
+        matrix=torch.cat([matrix, zero, rough], 1),
+        offset=torch.cat([offset[:, 0], left[None], offset.new_zeros(rough.shape[1])]),
+        answer=torch.cat([seen[:, :-1] @ to_field, seen[:, -1:]], 1),
+        factor=factor,
+    )
+
+
+def _directions(disc: Tensor, top: float) -> Tensor:
+    """Unit vectors (3, K) whose `angle_coordinates` are `top` times the points (2, K)."""
+    angle = top * torch.linalg.vector_norm(disc, dim=0)
+    return torch.cat([torch.sin(angle) / angle * top * disc, torch.cos(angle)[None]])
+
+
+def _roughness(disc: Tensor, coefficients: Tensor, points: Tensor, seen: Tensor) -> Tensor:
+    """What the basis cannot express, ring by ring, as residuals (2 K, Q) of the shifts of the nodes.
+
+    A lens whose numerator and denominator nearly cancel has a bump that is narrower than the basis resolves. Left out
+    it would cost nothing. It is a shift along the radius, the same at all angles; what is left of it after the basis
+    counts as often as there are corners around its ring.
+    """
+    radius = torch.linalg.vector_norm(disc, dim=0)
+    outward = (disc / radius).unflatten(-1, (_RADII, _ANGLES))
+    mean = torch.zeros(2, _RADII, _ANGLES, _RADII, dtype=disc.dtype)
+    ring = torch.arange(_RADII)
+    mean[:, ring, :, ring] = outward.transpose(0, 1) / _ANGLES
+    corners = torch.linalg.vector_norm(points.transpose(-1, -2)[seen], dim=-1)
+    some = corners[:: 1 + len(corners) // _SAMPLE]
+    nearest = (some[:, None] - radius[::_ANGLES]).abs().argmin(1)
+    count = torch.bincount(nearest, minlength=_RADII).to(disc.dtype) * (len(corners) / len(some))
+    left = torch.eye(disc.shape[1], dtype=disc.dtype) - coefficients.T @ field_basis(disc)
+    return (left @ (mean.flatten(1, 2) * count.sqrt())).flatten(0, 1)
+
+
+class ReducedProblem:
+    """The lens and the warp on folded views, a batch of states at once.
+
+    A state is (parameters (..., 5 + P), warp (..., 2), rotation (..., 3, 3)). The rotation turns all boards about the
+    camera's centre: with it a lens may shift its axis far, which is what rich models do, and no pose has to answer.
+
+    Args:
+        folded: see `fold`.
+        model: the lens model; need not be the one of `folded`.
+        free: indices of its free parameters.
+        terms: priors and bounds.
+        batch: leading shape of the states.
+    """
+
+    joint = True
+
+    def __init__(
+        self,
+        folded: Folded,
+        model: LensModel,
+        free: Sequence[int],
+        terms: Sequence[Term] = (),
+        batch: tuple[int, ...] = (),
+    ) -> None:
+        self.batch = batch
+        self.residual_count = len(folded.offset)
+        self._folded, self._model, self._free, self._terms = folded, model, list(free), tuple(terms)
+        self._nodes = 2 * folded.points.shape[-1]
+        self._warps = len(folded.matrix) - self._nodes
+
+    def start(self, parameters: Tensor) -> State:
+        """The state of folding with other parameters (..., 5 + P)."""
+        shape = parameters.shape[:-1]
+        identity = torch.eye(3, dtype=parameters.dtype, device=parameters.device)
+        return parameters, self._folded.state[1].expand(*shape, 2), identity.expand(*shape, 3, 3)
+
+    def cost(self, state: State) -> Tensor:
+        """See `Problem.cost`."""
+        return self.linearise(state).cost
+
+    def linearise(self, state: State) -> DenseLinearisation:
+        """See `Problem.linearise`."""
+        parameters, warp, rotation = state
+        folded = self._folded
+        points = rotation @ folded.points
+        seen = project_components(points, parameters, self._model, self._free)
+        turn = step_rows(seen.by_point, points)[..., :3, :, :]
+        matrix = folded.matrix[: self._nodes]
+        residuals = (seen.pixels - folded.pixels).flatten(-2) @ matrix + folded.offset
+        jacobian = torch.cat([seen.by_camera, turn], -3).flatten(-2) @ matrix
+        if self._warps:
+            by_warp = folded.matrix[self._nodes :]
+            residuals = residuals + (warp - folded.state[1]) @ by_warp
+            jacobian = torch.cat([jacobian, by_warp.expand(*self.batch, -1, -1)], -2)
+        residuals = torch.where(seen.regular.all(-1, keepdim=True), residuals, torch.nan)
+        if self._terms:
+            values = torch.cat([parameters, warp], -1)
+            found = torch.cat([term.rows(values) for term in self._terms], -1)
+            if found.shape[-1]:
+                residuals = torch.cat([residuals, found[..., -1, :]], -1)
+                none = found.new_zeros((*found.shape[:-2], 3, found.shape[-1]))
+                by_value = [found[..., self._free, :], none, found[..., -3 : -3 + self._warps, :]]
+                jacobian = torch.cat([jacobian, torch.cat(by_value, -2)], -1)
+        return DenseLinearisation(residuals, jacobian.transpose(-1, -2))
+
+    def retract(self, state: State, step: State) -> State:
+        """See `Problem.retract`."""
+        parameters, warp, rotation = state
+        lens, turn, bend = step[0].split([len(self._free), 3, self._warps], -1)
+        parameters = parameters.clone()
+        parameters[..., self._free] += lens
+        return parameters, warp + bend if self._warps else warp, rotation_from_vector(turn) @ rotation
+
+    def unfold(self, state: State) -> State:
+        """One solution (no batch) with the poses that answer it, as a state of `BoardProblem`."""
+        parameters, warp, rotation = state
+        folded = self._folded
+        pixels = project_components(rotation @ folded.points, parameters, self._model).pixels
+        change = [
+            (pixels - folded.pixels).flatten(),
+            (warp - folded.state[1])[: self._warps],
+            torch.ones_like(warp[:1]),
+        ]
+        seen = (folded.answer @ torch.cat(change)).unflatten(0, (-1, 6))
+        answer = -torch.linalg.solve_triangular(folded.factor.transpose(-1, -2), seen[..., None], upper=True)[..., 0]
+        board_rotation, board_translation = screw(folded.state[-2], folded.state[-1], answer)
+        board = (rotation @ board_rotation, (rotation @ board_translation[..., None])[..., 0])
+        return (parameters, warp, *folded.state[2:-2], *board)
