@@ -10,6 +10,7 @@ import typer
 from rich.markup import escape
 
 from kcal.cli.console import err, out, steps
+from kcal.errors import FileError, InputError
 from kcal.files import check_writable
 
 
@@ -28,7 +29,8 @@ def detect(
         list[str],
         typer.Argument(
             metavar="IMAGES",
-            help="Images of one camera: files, folders or quoted wildcards; or one video.",
+            help="Images of one camera: files, folders or quoted wildcards; or one video; or a stream, rtsp://... or "
+            "camera:0.",
             show_default=False,
         ),
     ],
@@ -54,6 +56,10 @@ def detect(
     time_limit: Annotated[
         float, typer.Option(help="Seconds for one image; a slower one is given up and listed.", min=0.1)
     ] = 60.0,
+    duration: Annotated[float, typer.Option(help="Seconds for which a live stream is watched.", min=1.0)] = 120.0,
+    keep: Annotated[
+        Path | None, typer.Option(help="A folder for the frames of a video or stream that became views, as PNG.")
+    ] = None,
 ) -> None:
     """Find the board in the images of one camera.
 
@@ -65,6 +71,8 @@ def detect(
     `kcal detect left/ --board 9x6 --square 25mm -o left.obs.json`
 
     `kcal detect left/ --board charuco:9x6:5x5_100:18mm --square 25mm -o left.obs.json`
+
+    `kcal detect rtsp://10.0.0.7/main --board 9x6 --square 25mm -o left.obs.json --duration 60 --keep frames/`
 
     `kcal detect "shots/left*.png" --board 9x6 --square 25mm -o left.obs.json --refine opencv`
     """
@@ -83,18 +91,25 @@ def detect(
     from kcal.corners.detect import detect_images
     from kcal.corners.images import expand_images
     from kcal.corners.orientation import turned_images
-    from kcal.corners.video import SUFFIXES, detect_video
+    from kcal.corners.video import SUFFIXES, detect_video, is_stream, source_name
 
     turned: list[Path] = []
-    if len(images) == 1 and Path(images[0]).suffix.lower() in SUFFIXES:
+    streams = [source_name(image) for image in images if is_stream(image)]
+    if streams and len(images) > 1:
+        raise InputError(f"{streams[0]}: a stream is searched alone, without other images")
+    if keep is not None and not keep.is_dir():
+        raise FileError(f"{keep}: no such folder")
+    if streams or (len(images) == 1 and Path(images[0]).suffix.lower() in SUFFIXES):
         searched = 0
 
         def count(_: str) -> None:
             nonlocal searched
             searched += 1
 
-        with err.status("searching the video"):
-            observations = detect_video(images[0], board, refine.value, progress=count, time_limit=time_limit)
+        with err.status(f"watching {streams[0]} for {duration:g} s" if streams else "searching the video"):
+            observations = detect_video(
+                images[0], board, refine.value, progress=count, time_limit=time_limit, duration=duration, keep=keep
+            )
         source = f"of {searched} sharp frames (repeats left out)"
     else:
         paths = expand_images(images)

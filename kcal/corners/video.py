@@ -1,10 +1,13 @@
-"""Frames of a video that are worth calibrating with: sharp ones that show the board in a place not seen yet."""
+"""Frames of a video or a live stream that are worth calibrating with: sharp ones with the board in a new place."""
 
 from __future__ import annotations
 
+import re
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -18,9 +21,15 @@ from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.refine import Refinement
 from kcal.errors import FileError, InputError
+from kcal.files import write_atomic
 
 SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"})
 MOST_VIEWS = 40
+# How long a live stream is watched, seconds, unless told otherwise.
+DURATION = 120.0
+# How long to wait for a stream to open, and for its next frame, milliseconds.
+_PATIENCE = 10_000
+_STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|srt)://|camera:\d+$", re.IGNORECASE)
 _NOVELTY = 0.04  # of the image's width: how far the board's corners must have moved, root mean square
 _PEAK = 3  # frames on each side than which a frame must not be less sharp
 
@@ -32,22 +41,52 @@ class Frame(NamedTuple):
     image: npt.NDArray[np.uint8]
 
 
-def read_frames(path: str | Path) -> Iterator[Frame]:
-    """The frames of a video file, grey, turned as the sensor wrote them.
+def is_stream(source: str | Path) -> bool:
+    """Whether a source is live: an address such as `rtsp://...`, or `camera:0`, a device of this machine.
+
+    Example:
+        >>> is_stream("rtsp://10.0.0.7/main"), is_stream("camera:0"), is_stream("shots.mp4")
+        (True, True, False)
+    """
+    return _STREAM.match(str(source)) is not None
+
+
+def source_name(source: str | Path) -> str:
+    """What views of a source are called: the file's name, the device, or the stream's host without any password.
+
+    Example:
+        >>> source_name("rtsp://user:secret@10.0.0.7:554/main?token=1"), source_name("camera:0")
+        ('10.0.0.7', 'camera:0')
+    """
+    text = str(source)
+    if "://" in text and is_stream(source):
+        return urlsplit(text).hostname or "stream"
+    return text if is_stream(source) else Path(source).name
+
+
+def read_frames(source: str | Path, duration: float | None = None) -> Iterator[Frame]:
+    """The frames of a video file or a live stream, grey, turned as the sensor wrote them.
+
+    Args:
+        source: a video file, or a live source as in `is_stream`.
+        duration: seconds after which a live source ends.
 
     Raises:
-        FileError: the file is missing or no video, or no frame of it can be decoded.
+        FileError: the file is missing or no video, the stream does not answer, or no frame can be decoded.
     """
-    if not Path(path).is_file():
-        raise FileError(f"{path}: no such file")
-    video = cv2.VideoCapture(str(path))
+    live, name = is_stream(source), source_name(source) if is_stream(source) else str(source)
+    if not live and not Path(source).is_file():
+        raise FileError(f"{source}: no such file")
+    video = _open(str(source)) if live else cv2.VideoCapture(str(source))
+    until = time.monotonic() + (DURATION if duration is None else duration) if live else float("inf")
     try:
         if not video.isOpened():
-            raise FileError(f"{path}: not a video that can be read; use MP4, AVI, MOV or MKV")
+            what = "no stream that answers" if live else "not a video that can be read; use MP4, AVI, MOV or MKV"
+            raise FileError(f"{name}: {what}")
         # A phone's orientation tag would swap width and height; the lens does not turn with it.
         video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         number = -1
-        while True:
+        while number < 0 or time.monotonic() < until:
             done, frame = video.read()
             if not done:
                 break
@@ -55,9 +94,16 @@ def read_frames(path: str | Path) -> Iterator[Frame]:
             grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
             yield Frame(number, np.asarray(grey, np.uint8))
         if number < 0:
-            raise FileError(f"{path}: the video has no frame that can be decoded")
+            raise FileError(f"{name}: no frame that can be decoded")
     finally:
         video.release()
+
+
+def _open(stream: str) -> cv2.VideoCapture:
+    if stream.lower().startswith("camera:"):
+        return cv2.VideoCapture(int(stream.split(":")[1]))
+    waits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _PATIENCE, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _PATIENCE]
+    return cv2.VideoCapture(stream, cv2.CAP_FFMPEG, waits)
 
 
 def sharpest(frames: Iterator[Frame]) -> Iterator[Frame]:
@@ -83,30 +129,34 @@ def sharpest(frames: Iterator[Frame]) -> Iterator[Frame]:
 
 
 def detect_video(
-    path: str | Path,
+    source: str | Path,
     board: Board,
     refine: Refinement = "erf",
     *,
     most: int = MOST_VIEWS,
     progress: Callable[[str], None] | None = None,
     time_limit: float | None = None,
+    duration: float | None = None,
+    keep: str | Path | None = None,
 ) -> Observations:
-    """Find the board in the frames of a video of one camera.
+    """Find the board in the frames of a video or a live stream of one camera.
 
     Of every seven frames the sharpest is searched, and kept where the board's corners are, root mean square, at least
     4 % of the image's width away from those of every frame kept before. Views are named `video.mp4#000123` by the
-    frame's number from 0.
+    frame's number from 0; those of a stream by its host.
 
     Args:
-        path: a video file.
+        source: a video file, `rtsp://...` or another address, or `camera:0` for a device of this machine.
         board: the board.
         refine: see `kcal.corners.refine.refine_corners`.
         most: views after which the search ends.
         progress: called with each searched frame's name.
         time_limit: seconds after which a frame is given up; none by default.
+        duration: seconds after which a live stream is left; 120 by default.
+        keep: folder for the frames that became views, as PNG: a stream cannot be read again.
 
     Raises:
-        FileError: the file is missing or no video.
+        FileError: the file is missing or no video, a stream does not answer, or a frame cannot be kept.
         InputError: no board in any frame.
     """
     if most < 1:
@@ -117,8 +167,8 @@ def detect_video(
     reason = ""
     failures: list[Failure] = []
     with Limited(time_limit) as limited:
-        for frame in sharpest(read_frames(path)):
-            name = f"{Path(path).name}#{frame.number:06d}"
+        for frame in sharpest(read_frames(source, duration)):
+            name = f"{source_name(source)}#{frame.number:06d}"
             size = frame.image.shape[1], frame.image.shape[0]
             try:
                 found = limited(detect_board, frame.image, board, refine)
@@ -128,14 +178,22 @@ def detect_video(
             reason = found.reason or reason
             if found.pixels is not None and _novel(found, kept, _NOVELTY * size[0]):
                 kept.append(found.pixels)
-                views.append(view_of(found, name, image=str(path)))
+                image = None if is_stream(source) else str(source)
+                if keep is not None:
+                    image = str(_keep(frame, Path(keep), name))
+                views.append(view_of(found, name, image=image))
             if progress is not None:
                 progress(name)
             if len(views) == most:
                 break
     if not views:
-        raise InputError(f"{path}: no board in any frame ({reason})")
+        raise InputError(f"{source_name(source)}: no board in any frame ({reason})")
     return Observations(board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures))
+
+
+def _keep(frame: Frame, folder: Path, name: str) -> Path:
+    path = folder / (re.sub(r"[^\w.-]+", "_", name) + ".png")
+    return write_atomic(path, cv2.imencode(".png", frame.image)[1].tobytes())
 
 
 def _novel(found: Detection, kept: list[Tensor], least: float) -> bool:

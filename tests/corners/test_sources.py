@@ -1,4 +1,6 @@
+import http.server
 import struct
+import threading
 
 import cv2
 import numpy as np
@@ -75,6 +77,65 @@ class TestVideo:
         assert result.exit_code == 0
         assert "board found in 3 of 4 sharp frames" in result.output
         assert len(Observations.load(output).views) == 3
+
+
+@pytest.fixture
+def stream(video):
+    """The address at which a server of this machine sends the video."""
+    path, _ = video
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_):
+            pass
+
+    server = http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0),
+        lambda *a: Quiet(*a, directory=str(path.parent)),  # type: ignore[arg-type]
+    )
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://user:secret@127.0.0.1:{server.server_address[1]}/{path.name}"
+    server.shutdown()
+    server.server_close()
+
+
+class TestStream:
+    def test_views_equal_those_of_the_file(self, stream, video, tmp_path):
+        path, _ = video
+        folder = tmp_path / "frames"
+        folder.mkdir()
+        live, file = detect_video(stream, BOARD, keep=folder), detect_video(path, BOARD)
+        assert live.names == tuple(name.replace("shots.avi", "127.0.0.1") for name in file.names)
+        assert torch.equal(live.pixels(), file.pixels())
+        # What was kept is what was measured; no password anywhere.
+        kept = [view.image for view in live.views]
+        assert sorted(map(str, folder.iterdir())) == sorted(kept)
+        image = cv2.imread(kept[0], cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(image, next(f.image for f in read_frames(path) if f.number == 2))
+        assert "secret" not in live.model_dump_json()
+
+    def test_ends_in_time(self, stream):
+        assert [frame.number for frame in read_frames(stream, duration=1e-9)] == [0]
+
+    def test_refusals(self, stream, tmp_path):
+        with pytest.raises(FileError, match=r"^127\.0\.0\.1: no stream that answers"):
+            detect_video(stream.replace("shots", "other"), BOARD)
+        with pytest.raises(FileError, match="camera:97: no stream that answers"):
+            detect_video("camera:97", BOARD)
+        base = ["--board", "6x5", "--square", "2cm", "-o", str(tmp_path / "o.json")]
+        result = CliRunner().invoke(app, ["detect", stream, "a.png", *base])
+        assert result.exit_code == 1
+        assert "searched alone" in str(result.exception) + result.output
+        result = CliRunner().invoke(app, ["detect", stream, *base, "--keep", str(tmp_path / "none")])
+        assert "no such folder" in str(result.exception) + result.output
+
+    def test_command(self, stream, tmp_path):
+        path = tmp_path / "o.json"
+        words = ["detect", stream, "--board", "6x5", "--square", "2cm", "-o", str(path), "--duration", "30"]
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 0, result.output
+        assert len(Observations.load(path).views) == 3
+        assert "secret" not in path.read_text() + result.output
 
 
 def with_orientation(jpeg, value, order):
