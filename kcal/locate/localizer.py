@@ -168,12 +168,7 @@ class StereoLocalizer(nn.Module):
         Raises:
             InputError: not floating point, or shapes that are wrong or unlike.
         """
-        left, right = as_points("pixels_left", pixels_left, 2), as_points("pixels_right", pixels_right, 2)
-        if left.shape != right.shape or left.ndim < 2:
-            raise InputError(
-                "pixels_left and pixels_right: the same shape (..., N, 2) is needed, "
-                f"got {tuple(left.shape)} and {tuple(right.shape)}"
-            )
+        left, right = _checked_pairs(pixels_left, pixels_right)
         if cov is not None:
             cov = as_points("cov", cov, 4)
             if cov.ndim < 2 or cov.shape[-2] != 4:
@@ -293,7 +288,7 @@ class StereoLocalizer(nn.Module):
             range_low=_reach(inverse_range + QUANTILE * sigma, known, usable, 0.0),
             range_high=_reach(inverse_range - QUANTILE * sigma, known, usable, math.inf),
             status=code,
-            bearing=torch.where(usable[..., None], bearing, 0.0),
+            bearing=torch.where((usable | (code == int(Status.PARALLEL)))[..., None], bearing, 0.0),
             inverse_range=inverse_range,
             inverse_range_sigma=sigma,
             reprojection=_lengths(fit.residual),
@@ -307,7 +302,7 @@ class StereoLocalizer(nn.Module):
             pixels_left: (..., N, 2).
             pixels_right: (..., N, 2).
         """
-        left, right = as_points("pixels_left", pixels_left, 2), as_points("pixels_right", pixels_right, 2)
+        left, right = _checked_pairs(pixels_left, pixels_right)
         fit, scale, _, usable = self._fit(left, right, None, None, False)
         known = usable & (fit.inverse > 0)
         inverse = torch.where(known, fit.inverse, 1.0)
@@ -323,6 +318,16 @@ class StereoLocalizer(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         return super()._apply(keep_float64(fn), recurse)
+
+
+def _checked_pairs(pixels_left: Tensor, pixels_right: Tensor) -> tuple[Tensor, Tensor]:
+    left, right = as_points("pixels_left", pixels_left, 2), as_points("pixels_right", pixels_right, 2)
+    if left.shape != right.shape or left.ndim < 2:
+        raise InputError(
+            "pixels_left and pixels_right: the same shape (..., N, 2) is needed, "
+            f"got {tuple(left.shape)} and {tuple(right.shape)}"
+        )
+    return left, right
 
 
 def calibration_effect(fit: Fit, scale: Tensor) -> Tensor:
