@@ -50,6 +50,16 @@ def locate(
         typer.Option("--output", "-o", help="A .geojson, .csv, .kml or .cot file to write; may be repeated."),
     ] = None,
     picture: Annotated[Path | None, typer.Option(help="A .png file for the map.")] = None,
+    web_map: Annotated[
+        Path | None, typer.Option("--map", help="An .html file for an interactive map that needs no network.")
+    ] = None,
+    tiles: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="For --map: tiles FOLDER/zoom/x/y.png to embed.")
+    ] = None,
+    image: Annotated[Path | None, typer.Option(metavar="TIF", help="For --map: a GeoTIFF to embed.")] = None,
+    online: Annotated[
+        bool, typer.Option("--online", help="For --map: let the page load tiles of OpenStreetMap.")
+    ] = False,
 ) -> None:
     """Locate what was marked in both images: latitude, longitude, height and an honest range interval.
 
@@ -63,6 +73,8 @@ def locate(
     **Examples**
 
     `kcal locate rig.json points.csv --origin 19.07,72.87,14 --heading 35 -o points.geojson`
+
+    `kcal locate rig.json points.csv --origin 19.07,72.87,14 --heading 35 --map map.html`
 
     `kcal locate rig.json points.csv --origin -33.9,151.2,10 --heading 250 --pitch -1.5 -o p.geojson -o p.csv
     --picture map.png`
@@ -82,6 +94,7 @@ def locate(
     from kcal.locate.marks import read_marks
     from kcal.locate.positions import locate as locate_pairs
     from kcal.report.figures import check_picture_format
+    from kcal.report.map_page import check_map_format, save_map
     from kcal.report.positions import save_positions_picture
 
     outputs = output or []
@@ -91,6 +104,9 @@ def locate(
     if picture is not None:
         check_picture_format(picture)
         check_writable(picture)
+    if web_map is not None:
+        check_map_format(web_map)
+        check_writable(web_map)
     place = Origin.parse(origin)
     marks = read_marks(points)
     solved = load_rig(rig)
@@ -113,7 +129,7 @@ def locate(
         refraction=refraction,
         geoid=heights,
     )
-    written = [*outputs, *([] if picture is None else [picture])]
+    written = [*outputs, *(path for path in (picture, web_map) if path is not None)]
     with steps("writing", len(written)) as advance:
         for path in outputs:
             write_positions(path, located)
@@ -121,6 +137,9 @@ def locate(
         if picture is not None:
             save_positions_picture(picture, located)
             advance(picture.name)
+        if web_map is not None:
+            save_map(web_map, located, tiles=tiles, image=image, online=online)
+            advance(web_map.name)
     for line in _table(located):
         out.print(line, markup=False)
     for position in located.positions:
