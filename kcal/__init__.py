@@ -24,8 +24,11 @@ if TYPE_CHECKING:
     from kcal.lens.modules import Unproject
     from kcal.lens.pinhole import new_pinhole
     from kcal.lens.rig import StereoRig
+    from kcal.locate.errors import RigCovariance
     from kcal.locate.geodesy import Origin
+    from kcal.locate.localizer import StereoLocalizer
     from kcal.locate.stereo import Triangulate
+    from kcal.locate.views import TriangulateViews
     from kcal.solve.lm import LevenbergMarquardt, LMOptions
 
 __version__ = "0.1.0"
@@ -40,9 +43,12 @@ __all__ = [
     "LevenbergMarquardt",
     "Observations",
     "Origin",
+    "RigCovariance",
     "RigOptions",
+    "StereoLocalizer",
     "StereoRig",
     "Triangulate",
+    "TriangulateViews",
     "Undistort",
     "Unproject",
     "calibrate_camera",
@@ -66,9 +72,12 @@ _HOME = {
     "LevenbergMarquardt": "kcal.solve.lm",
     "Observations": "kcal.corners.observations",
     "Origin": "kcal.locate.geodesy",
+    "RigCovariance": "kcal.locate.errors",
     "RigOptions": "kcal.calibrate.stereo",
+    "StereoLocalizer": "kcal.locate.localizer",
     "StereoRig": "kcal.lens.rig",
     "Triangulate": "kcal.locate.stereo",
+    "TriangulateViews": "kcal.locate.views",
     "Undistort": "kcal.lens.images",
     "Unproject": "kcal.lens.modules",
     "calibrate_camera": "kcal.calibrate.mono",

@@ -73,6 +73,7 @@ def _simulated(output: Path, seed: int) -> None:
     from kcal.locate.export import write_positions
     from kcal.locate.geodesy import Origin
     from kcal.locate.positions import locate
+    from kcal.report.map_page import save_map
     from kcal.report.positions import save_positions_picture
     from kcal.sim.scene import DemoScene
 
@@ -108,6 +109,7 @@ def _simulated(output: Path, seed: int) -> None:
     write_positions(output / "points.geojson", located)
     write_positions(output / "positions.csv", located)
     save_positions_picture(output / "map.png", located, targets.enu)
+    save_map(output / "map.html", located, targets.enu)
     print_truth(located, exact, targets.enu)
     out.print(
         f"Marks have {scene.mark_sigma:g} px of noise in each image, and the interval covers that alone. The last "
@@ -128,6 +130,7 @@ def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: flo
     from kcal.io.rig_file import load_rig
     from kcal.locate.export import write_positions
     from kcal.locate.positions import locate
+    from kcal.report.map_page import save_map
     from kcal.report.positions import save_positions_picture
 
     seen = {side: _detect(_side_images(folder, side), board, output / f"{side}.obs.json") for side in _SIDES}
@@ -149,6 +152,7 @@ def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: flo
     write_positions(output / "points.geojson", located)
     write_positions(output / "positions.csv", located)
     save_positions_picture(output / "map.png", located)
+    save_map(output / "map.html", located)
     print_diagonals(located, board)
     if origin == type(origin)(lat=0.0, lon=0.0, height=0.0):
         err.print("[yellow]note:[/] no --origin was given: positions are placed at latitude 0, longitude 0")

@@ -81,6 +81,7 @@ def print_results(output: Path, again: str) -> None:
     out.print(f"\nResults are in {output.resolve()}:", markup=False)
     for name, what in (
         ("map.png", "the map"),
+        ("map.html", "the map, interactive, for any browser"),
         ("points.geojson", "positions for a GIS"),
         ("positions.csv", "the same as a table"),
         ("left.png, right.png", "coverage and residuals of each camera"),

@@ -25,17 +25,48 @@ def locate(
     roll: Annotated[
         float, typer.Option(metavar="DEG", help="Roll of the left camera, clockwise as seen from behind it.")
     ] = 0.0,
+    grid: Annotated[
+        str | None,
+        typer.Option(metavar="CRS", help="The heading counts from this map's grid north, e.g. EPSG:32643."),
+    ] = None,
     pixel_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of the marks along each axis.")] = 0.3,
+    yaw_sigma: Annotated[
+        float, typer.Option(metavar="DEG", help="One sigma of the rig's relative yaw; it widens the intervals.", min=0)
+    ] = 0.0,
+    heading_sigma: Annotated[
+        float, typer.Option(metavar="DEG", help="One sigma of the heading; it widens the regions.", min=0)
+    ] = 0.0,
+    origin_sigma: Annotated[
+        float, typer.Option(metavar="M", help="One sigma of the origin along each axis.", min=0)
+    ] = 0.0,
+    refraction: Annotated[
+        float, typer.Option(metavar="K", help="Bending of light; 0.13 in standard air, 0 for straight lines.")
+    ] = 0.0,
+    geoid: Annotated[
+        Path | None, typer.Option(help="A geoid grid (.tif, .gtx); one that PROJ finds is used if not given.")
+    ] = None,
     output: Annotated[
-        list[Path] | None, typer.Option("--output", "-o", help="A .geojson or .csv file to write; may be repeated.")
+        list[Path] | None,
+        typer.Option("--output", "-o", help="A .geojson, .csv, .kml or .cot file to write; may be repeated."),
     ] = None,
     picture: Annotated[Path | None, typer.Option(help="A .png file for the map.")] = None,
+    web_map: Annotated[
+        Path | None, typer.Option("--map", help="An .html file for an interactive map that needs no network.")
+    ] = None,
+    tiles: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="For --map: tiles FOLDER/zoom/x/y.png to embed.")
+    ] = None,
+    image: Annotated[Path | None, typer.Option(metavar="TIF", help="For --map: a GeoTIFF to embed.")] = None,
+    online: Annotated[
+        bool, typer.Option("--online", help="For --map: let the page load tiles of OpenStreetMap.")
+    ] = False,
 ) -> None:
     """Locate what was marked in both images: latitude, longitude, height and an honest range interval.
 
-    The interval holds the true range for 95 % of marks with the given noise. Errors of the calibration, the heading
-    and the origin come on top: 0.01° of relative yaw is 436 m at 5 km with a baseline of 10 m. Where the parallax is
-    below three sigma only the bearing is given. Heights are ellipsoidal, not above sea level.
+    The interval holds the true range for 95 % of marks with the given noise. Errors of the calibration come on top:
+    0.01° of relative yaw is 436 m at 5 km with a baseline of 10 m; `--yaw-sigma` puts them in. Where the parallax is
+    below three sigma only the bearing is given. Heights are ellipsoidal; with a geoid grid the files also hold the
+    height of the geoid.
 
     Ends with exit code 1 if nothing at all could be located.
 
@@ -43,18 +74,27 @@ def locate(
 
     `kcal locate rig.json points.csv --origin 19.07,72.87,14 --heading 35 -o points.geojson`
 
+    `kcal locate rig.json points.csv --origin 19.07,72.87,14 --heading 35 --map map.html`
+
     `kcal locate rig.json points.csv --origin -33.9,151.2,10 --heading 250 --pitch -1.5 -o p.geojson -o p.csv
     --picture map.png`
     """
+    import math
+
+    import torch
+
     from kcal.cli.console import out, steps
     from kcal.errors import DegenerateError
     from kcal.files import check_writable
     from kcal.io.rig_file import load_rig
+    from kcal.locate.datum import find_geoid, true_from_grid
+    from kcal.locate.errors import RigCovariance, mounting_covariance
     from kcal.locate.export import check_format, write_positions
     from kcal.locate.geodesy import Origin
     from kcal.locate.marks import read_marks
     from kcal.locate.positions import locate as locate_pairs
     from kcal.report.figures import check_picture_format
+    from kcal.report.map_page import check_map_format, save_map
     from kcal.report.positions import save_positions_picture
 
     outputs = output or []
@@ -64,20 +104,32 @@ def locate(
     if picture is not None:
         check_picture_format(picture)
         check_writable(picture)
+    if web_map is not None:
+        check_map_format(web_map)
+        check_writable(web_map)
     place = Origin.parse(origin)
     marks = read_marks(points)
+    solved = load_rig(rig)
+    yaw = torch.zeros(6, 6, dtype=torch.float64)
+    yaw[1, 1] = math.radians(yaw_sigma) ** 2
+    standing = mounting_covariance(origin_m=[origin_sigma] * 3, attitude_deg=(0.0, 0.0, heading_sigma))
+    heights = find_geoid(geoid)
     located = locate_pairs(
-        load_rig(rig),
+        solved,
         marks.left,
         marks.right,
         origin=place,
-        heading_deg=heading,
+        heading_deg=heading if grid is None else true_from_grid(heading, place, grid),
         pitch_deg=pitch,
         roll_deg=roll,
         pixel_sigma=pixel_sigma,
         names=marks.names,
+        calibration=RigCovariance.of(solved, pose=yaw) if yaw_sigma else None,
+        mounting=standing if heading_sigma or origin_sigma else None,
+        refraction=refraction,
+        geoid=heights,
     )
-    written = [*outputs, *([] if picture is None else [picture])]
+    written = [*outputs, *(path for path in (picture, web_map) if path is not None)]
     with steps("writing", len(written)) as advance:
         for path in outputs:
             write_positions(path, located)
@@ -85,12 +137,16 @@ def locate(
         if picture is not None:
             save_positions_picture(picture, located)
             advance(picture.name)
+        if web_map is not None:
+            save_map(web_map, located, tiles=tiles, image=image, online=online)
+            advance(web_map.name)
     for line in _table(located):
         out.print(line, markup=False)
     for position in located.positions:
         if position.reason:
             out.print(f"* {position.name}: {position.reason}", markup=False)
-    out.print(f"Interval: 95 % of the marks' noise ({pixel_sigma:g} px); calibration errors are not included.")
+    out.print(f"Interval: {located.interval_note}; marks have {pixel_sigma:g} px.")
+    out.print(f"Heights are ellipsoidal; geoid: {located.geoid or 'none at hand'}.")
     for path in written:
         out.print(f"wrote {path}", markup=False)
     if located.count == 0:

@@ -11,6 +11,7 @@ from rich.markup import escape
 import kcal
 from kcal.cli.batch import batch
 from kcal.cli.board import board
+from kcal.cli.budget import budget
 from kcal.cli.calibrate import calibrate
 from kcal.cli.console import err
 from kcal.cli.demo import demo
@@ -52,6 +53,7 @@ app.command("calibrate")(calibrate)
 app.command("batch")(batch)
 app.command("rig")(rig)
 app.command("locate")(locate)
+app.command("budget")(budget)
 app.command("undistort")(undistort)
 
 

@@ -1,4 +1,4 @@
-"""Positions as files: GeoJSON (RFC 7946) and CSV, with every float64 digit."""
+"""Positions as files: GeoJSON (RFC 7946), CSV, KML and Cursor-on-Target; numbers keep every float64 digit."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from typing import Any
 
 from kcal.errors import InputError
 from kcal.files import dump_json, write_atomic
+from kcal.locate.cot import to_cot
+from kcal.locate.kml import to_kml
 from kcal.locate.positions import Located, Position
-
-_INTERVAL = "95 % of the marks' noise; calibration errors are not included"
+from kcal.locate.region import REGION_SHARE, cut_at_antimeridian, region_rings
 
 
 def to_geojson(located: Located) -> dict[str, Any]:
     """A FeatureCollection after RFC 7946: coordinates are [longitude, latitude, ellipsoidal WGS84 height in metres].
 
-    The cameras come first (`kind` is "camera"), then one feature for each pair of marks (`kind` is "point"). A pair
-    without a position has a null geometry, its status and the reason. `range_high_m` is null where it is infinite,
-    because JSON has no infinity; `range_high_infinite` tells that from unknown.
+    The cameras come first (`kind` is "camera"), then one feature for each pair of marks (`kind` is "point"), and last
+    a polygon for each position (`kind` is "region"): where it lies with 95 %, a long and slightly skewed ellipse. A
+    pair without a position has a null geometry, its status and the reason. `range_high_m` is null where it is
+    infinite, because JSON has no infinity; `range_high_infinite` tells that from unknown.
 
     Example:
         >>> from kcal.locate.geodesy import Origin
@@ -40,7 +42,8 @@ def to_geojson(located: Located) -> dict[str, Any]:
                 "pitch_deg": located.pitch_deg,
                 "roll_deg": located.roll_deg,
                 "pixel_sigma": located.pixel_sigma,
-                "range_interval": _INTERVAL,
+                "range_interval": located.interval_note,
+                "geoid": located.geoid,
             }
         features.append(_feature(camera.geodetic, properties))
     for position in located.positions:
@@ -48,6 +51,14 @@ def to_geojson(located: Located) -> dict[str, Any]:
         if position.lat is not None and position.lon is not None and position.height is not None:
             place = (position.lat, position.lon, position.height)
         features.append(_feature(place, {"kind": "point", **_row(position)}))
+    for position, ring in region_rings(located):
+        # Section 3.1.6: closed, counterclockwise; section 3.1.9: a polygon across the antimeridian is cut in two.
+        parts = [[[lon, lat] for lat, lon in part] for part in cut_at_antimeridian(ring)]
+        shape = {"type": "Polygon", "coordinates": parts}
+        if len(parts) > 1:
+            shape = {"type": "MultiPolygon", "coordinates": [[part] for part in parts]}
+        properties = {"kind": "region", "name": position.name, "share": REGION_SHARE}
+        features.append({"type": "Feature", "geometry": shape, "properties": properties})
     return {"type": "FeatureCollection", "features": features}
 
 
@@ -58,7 +69,18 @@ def _feature(place: tuple[float, float, float] | None, properties: dict[str, Any
         geometry = {"type": "Point", "coordinates": [lon, lat, height]}
     if properties.get("range_high_m") == float("inf"):
         properties |= {"range_high_m": None, "range_high_infinite": True}
+    if properties.get("cep95_m") == float("inf"):
+        properties |= {"cep95_m": None, "cep95_infinite": True}
     return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+# Of east, north, up in square metres; the first letters of the two axes.
+_COVARIANCE = ("cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2")
+
+
+def _upper(position: Position) -> list[float | None]:
+    c = position.covariance
+    return [None] * 6 if c is None else [c[0][0], c[0][1], c[0][2], c[1][1], c[1][2], c[2][2]]
 
 
 def _row(position: Position) -> dict[str, Any]:
@@ -72,12 +94,18 @@ def _row(position: Position) -> dict[str, Any]:
         "lat": position.lat,
         "lon": position.lon,
         "height_ellipsoidal_m": position.height,
+        "geoid_height_m": position.geoid_height,
         "east_m": east,
         "north_m": north,
         "up_m": up,
         "range_m": position.range_m,
         "range_low_m": position.range_low_m,
         "range_high_m": position.range_high_m,
+        **dict(zip(_COVARIANCE, _upper(position), strict=True)),
+        "cep50_m": position.cep50_m,
+        "cep95_m": position.cep95_m,
+        "range_m_per_px": position.metres_per_pixel,
+        "range_m_per_deg_yaw": position.metres_per_degree,
         "azimuth_deg": position.azimuth_deg,
         "elevation_deg": position.elevation_deg,
         "reprojection_left_px": left,
@@ -101,6 +129,8 @@ _FORMATS: dict[str, Callable[[Located], str]] = {
     ".geojson": lambda located: dump_json(to_geojson(located)),
     ".json": lambda located: dump_json(to_geojson(located)),
     ".csv": to_csv,
+    ".kml": to_kml,
+    ".cot": to_cot,
 }
 
 
@@ -111,7 +141,7 @@ def check_format(path: str | Path) -> None:
 
 
 def write_positions(path: str | Path, located: Located) -> Path:
-    """Write positions as GeoJSON or CSV, chosen by the suffix (.geojson, .json or .csv), atomically.
+    """Write positions, atomically, in the format of the suffix: .geojson or .json, .csv, .kml, .cot (Cursor-on-Target).
 
     Raises:
         InputError: another suffix.

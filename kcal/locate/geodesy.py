@@ -5,23 +5,23 @@ Conventions, all of them pinned by tests:
 * ENU: x east, y north, z up, tangent to the WGS84 ellipsoid at the origin, metres. Up is not height: at 5 km the
   ellipsoid has fallen 1.96 m below the tangent plane, and the conversion here accounts for it.
 * Heights are ellipsoidal (WGS84, what GNSS receivers call HAE), not above mean sea level; the two differ by up to
-  100 m. Refraction of light is not modelled (0.26 m of height at 5 km in standard air).
-* Headings count clockwise from true north, not from magnetic or grid north.
+  100 m (`kcal.locate.datum` has the difference where a geoid grid is at hand).
+* Refraction of light is an option (`lower_by_refraction`): 0.26 m of height at 5 km in standard air.
+* Headings count clockwise from true north, not from magnetic or grid north (`kcal.locate.datum` converts the latter).
 * Order is latitude, longitude, height everywhere but in GeoJSON.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 
-import pyproj
 import torch
 from torch import Tensor
 
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
+from kcal.locate.ellipsoid import ecef_from_enu_rotation, ecef_to_geodetic, geodetic_to_ecef, mean_radius
 
 
 def enu_from_cam(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Tensor:
@@ -123,30 +123,26 @@ class Origin:
             raise InputError(f"origin {text!r}: write three numbers LAT,LON,HEIGHT, for example 19.07,72.87,14")
         return cls(lat=values[0], lon=values[1], height=values[2])
 
-
-@functools.lru_cache(maxsize=16)
-def _pipeline(origin: Origin) -> pyproj.Transformer:
-    """Geodetic longitude, latitude (degrees), height to ENU and, inverted, back."""
-    return pyproj.Transformer.from_pipeline(
-        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
-        f"+step +proj=topocentric +ellps=WGS84 +lat_0={origin.lat!r} +lon_0={origin.lon!r} +h_0={origin.height!r}"
-    )
+    @property
+    def geodetic(self) -> Tensor:
+        """(3,) float64: latitude, longitude, height."""
+        return torch.tensor([self.lat, self.lon, self.height], dtype=torch.float64)
 
 
 def enu_to_geodetic(enu: Tensor, origin: Origin) -> Tensor:
-    """Latitude, longitude (degrees) and ellipsoidal WGS84 height (metres) of ENU points.
+    """Latitude, longitude (degrees) and ellipsoidal WGS84 height (metres) of ENU points, differentiable.
 
     Args:
         enu: (..., 3) metres.
         origin: where (0, 0, 0) is.
 
     Returns:
-        (..., 3) float64 on the CPU, without gradient; longitudes in [-180, 180).
+        (..., 3) float64 on the device of `enu`; longitudes in [-180, 180).
 
     Raises:
         InputError: wrong shape or dtype, or a value that is not finite.
 
-    Source: PROJ's topocentric and cart conversions (EPSG methods 9836 and 9602).
+    Source: EPSG methods 9836 (topocentric) and 9602 (geocentric), see `kcal.locate.ellipsoid`.
 
     Example:
         >>> origin = Origin(lat=0.0, lon=180.0, height=0.0)
@@ -155,14 +151,23 @@ def enu_to_geodetic(enu: Tensor, origin: Origin) -> Tensor:
     """
     enu = as_points("enu", enu, 3)
     require_finite("enu", enu)
-    east, north, up = (axis.numpy() for axis in enu.detach().cpu().unbind(-1))
-    lon, lat, height = _pipeline(origin).transform(east, north, up, direction="INVERSE")
-    lat, lon, height = (torch.as_tensor(value, dtype=torch.float64) for value in (lat, lon, height))
-    return torch.stack([lat, (lon + 180.0) % 360.0 - 180.0, height], -1)
+    return place_enu(enu, *anchor(origin, enu.device))
+
+
+def anchor(origin: Origin, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+    """Rotation (3, 3) and translation (3,) of ENU into ECEF."""
+    return ecef_from_enu_rotation(origin.lat, origin.lon).to(device), geodetic_to_ecef(origin.geodetic).to(device)
+
+
+def place_enu(enu: Tensor, ecef_from_enu: Tensor, ecef_of_origin: Tensor) -> Tensor:
+    """ENU (..., 3) to latitude, longitude, height, given the `anchor`; no checks, so that it can be compiled."""
+    geodetic = ecef_to_geodetic(enu @ ecef_from_enu.mT + ecef_of_origin)
+    lat, lon, height = geodetic.unbind(-1)
+    return torch.stack([lat, torch.where(lon >= 180.0, lon - 360.0, lon), height], -1)
 
 
 def geodetic_to_enu(geodetic: Tensor, origin: Origin) -> Tensor:
-    """ENU metres of (..., 3) latitude, longitude (degrees), ellipsoidal WGS84 height (metres), float64.
+    """ENU metres of (..., 3) latitude, longitude (degrees), ellipsoidal WGS84 height (metres); differentiable.
 
     Raises:
         InputError: wrong shape, less than float64 (a float32 degree is rounded by up to 0.8 m), a value that is
@@ -178,8 +183,30 @@ def geodetic_to_enu(geodetic: Tensor, origin: Origin) -> Tensor:
     if geodetic.dtype != torch.float64:
         raise InputError(f"geodetic: float64 is needed; {geodetic.dtype} has already rounded degrees by up to a metre")
     require_finite("geodetic", checked)
-    lat, lon, height = (axis.numpy() for axis in checked.detach().cpu().unbind(-1))
-    if (abs(lat) > 90).any():
+    if bool((checked[..., 0].abs() > 90).any()):
         raise InputError("geodetic: a latitude is outside -90 to 90; the order is latitude, longitude, height")
-    enu = _pipeline(origin).transform(lon, lat, height)
-    return torch.stack([torch.as_tensor(axis, dtype=torch.float64) for axis in enu], -1)
+    rotation, translation = anchor(origin, checked.device)
+    return (geodetic_to_ecef(checked) - translation) @ rotation
+
+
+# Share of the Earth's curvature by which light bends downward in standard air.
+STANDARD_REFRACTION = 0.13
+
+
+def lower_by_refraction(enu: Tensor, origin: Origin, coefficient: float = STANDARD_REFRACTION) -> Tensor:
+    """Take the bending of light out of points (..., 3) found along straight lines of sight from the origin.
+
+    Light that arrives level has come up a little: the target stands lower than it seems, by k d² / (2 R) with the
+    horizontal distance d and the Earth's radius R. The coefficient k is 0.13 in standard air; over hot ground or cold
+    water it may be anything from -1 to 1, so that this is a correction on average, not for the day.
+
+    Example:
+        >>> point = torch.tensor([5000.0, 0.0, 0.0], dtype=torch.float64)
+        >>> round(lower_by_refraction(point, Origin(lat=19.0, lon=73.0, height=0.0))[2].item(), 3)
+        -0.255
+    """
+    enu = as_points("enu", enu, 3)
+    if not -2.0 <= coefficient <= 2.0:
+        raise InputError(f"refraction {coefficient}: a coefficient such as 0.13 is needed, not beyond ±2")
+    drop = coefficient / (2.0 * mean_radius(origin.lat)) * (enu[..., 0] ** 2 + enu[..., 1] ** 2)
+    return torch.stack([enu[..., 0], enu[..., 1], enu[..., 2] - drop], -1)

@@ -13,8 +13,12 @@ from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
+from kcal.locate.cep import circular_error
+from kcal.locate.datum import Geoid, geoid_heights
+from kcal.locate.errors import RigCovariance
 from kcal.locate.geodesy import Origin, azimuth_elevation, enu_from_cam, enu_to_geodetic
-from kcal.locate.stereo import Status, Triangulate, Triangulation
+from kcal.locate.localizer import Localization, StereoLocalizer
+from kcal.locate.stereo import Status
 
 # A reprojection error of this many sigma is not noise: two different things were marked, or the rig has moved.
 _MISMATCH_SIGMAS = 10.0
@@ -24,6 +28,7 @@ _REASONS = {
     Status.BEHIND: "the lines of sight cross behind a camera: are the marks the same thing?",
     Status.NOT_FINITE: "a pixel coordinate is not finite",
     Status.OUTSIDE_IMAGE: "a mark lies outside its image",
+    Status.BAD_COVARIANCE: "the covariance of the marks is none",
 }
 
 
@@ -34,9 +39,13 @@ class Position:
     Latitude, longitude (degrees) and the ellipsoidal WGS84 `height` (metres), `enu` and the best estimate `range_m`
     are there only if the status is `OK`. Azimuth and elevation in degrees and the range interval are also there if
     it is `BEARING_ONLY` or `PARALLEL`, the interval only if some range explains the marks. Ranges are metres from the
-    left camera; `range_high_m` may be infinite. The interval covers 95 % of the marks' noise, and no error of the
-    calibration. `reason` is empty, says why there is no
-    position, or warns of one that looks wrong.
+    left camera; `range_high_m` may be infinite. The interval covers 95 % of the errors that `Located.interval_note`
+    names. `reason` is empty, says why there is no position, or warns of one that looks wrong.
+
+    `height` is above the ellipsoid; `geoid_height` is that of the geoid, known only with a grid, and
+    `height - geoid_height` is close to the height above the sea. `covariance` is of `enu`, to first order; `cep50_m`
+    and `cep95_m` are the radii of horizontal circles that hold the true position with 50 and 95 %, infinite where it
+    may lie at infinity. The sensitivities are slopes of the range by a pixel of a mark and by a degree of relative yaw.
     """
 
     name: str
@@ -45,7 +54,13 @@ class Position:
     lat: float | None = None
     lon: float | None = None
     height: float | None = None
+    geoid_height: float | None = None
     enu: tuple[float, float, float] | None = None
+    covariance: tuple[tuple[float, float, float], ...] | None = None
+    cep50_m: float | None = None
+    cep95_m: float | None = None
+    metres_per_pixel: float | None = None
+    metres_per_degree: float | None = None
     range_m: float | None = None
     range_low_m: float | None = None
     range_high_m: float | None = None
@@ -73,7 +88,11 @@ class Viewpoint:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Located:
-    """Result of `locate`: one position for each pair of marks, in order, and where the rig stood."""
+    """Result of `locate`: one position for each pair of marks, in order, and where the rig stood.
+
+    `included` names the errors that the intervals and covariances hold; `geoid` the grid of the geoid heights, None if
+    there was none.
+    """
 
     positions: tuple[Position, ...]
     cameras: tuple[Viewpoint, Viewpoint]
@@ -82,6 +101,17 @@ class Located:
     pitch_deg: float
     roll_deg: float
     pixel_sigma: float
+    included: tuple[str, ...] = ("marks",)
+    geoid: str | None = None
+
+    @property
+    def interval_note(self) -> str:
+        """What the intervals hold and what they do not, as a sentence without a full stop."""
+        missing = [name for name in ("calibration", "mounting") if name not in self.included]
+        note = "95 % of the " + " and the ".join(
+            "marks' noise" if name == "marks" else f"{name}'s errors" for name in self.included
+        )
+        return note + (f"; {' and '.join(missing)} errors are not included" if missing else "")
 
     @property
     def count(self) -> int:
@@ -107,6 +137,11 @@ def locate(
     roll_deg: float = 0.0,
     pixel_sigma: float = 0.3,
     names: Sequence[str] | None = None,
+    cov: Tensor | None = None,
+    calibration: RigCovariance | None = None,
+    mounting: Tensor | None = None,
+    refraction: float = 0.0,
+    geoid: Geoid | None = None,
 ) -> Located:
     """Positions on the Earth of things marked in both images of a stereo rig.
 
@@ -120,6 +155,11 @@ def locate(
         roll_deg: of the left camera, positive clockwise as seen from behind.
         pixel_sigma: standard deviation of a mark along each axis, px.
         names: one for each pair; numbered from 1 if left out.
+        cov: (N, 4, 4) covariance of each pair's four coordinates, in place of `pixel_sigma`.
+        calibration: how well the rig is known.
+        mounting: how well origin and attitude are known, see `mounting_covariance`.
+        refraction: bending of light as a share of the Earth's curvature, see `StereoLocalizer`.
+        geoid: a grid from `kcal.locate.datum.find_geoid`.
 
     Returns:
         A position, or the reason why there is none, for each pair. A pair whose parallax is below three sigma is
@@ -149,20 +189,22 @@ def locate(
         raise InputError(f"names: {len(names)} for {len(pixels_left)} pairs of marks; one each is needed")
     rotation = enu_from_cam(heading_deg, pitch_deg, roll_deg)
     with torch.no_grad():
-        result = Triangulate(rig, pixel_sigma)(pixels_left, pixels_right)
-        result = Triangulation(*(tensor.cpu() for tensor in result))
+        localize = StereoLocalizer(
+            rig, origin=origin, heading_deg=heading_deg, pitch_deg=pitch_deg, roll_deg=roll_deg,
+            pixel_sigma=pixel_sigma, calibration=calibration, mounting=mounting, refraction=refraction,
+        )  # fmt: skip
+        slopes = [slope.tolist() for slope in localize.sensitivity(pixels_left, pixels_right)]
+        result = Localization(*(tensor.cpu() for tensor in localize(pixels_left, pixels_right, cov)))
         cameras = _viewpoints(rig, rotation, origin)
-    enu = result.points @ rotation.T
-    geodetic = enu_to_geodetic(enu, origin).tolist()
-    angles = azimuth_elevation(result.rays @ rotation.T).tolist()
+    angles = azimuth_elevation(result.bearing).tolist()
+    circles = circular_error(result.enu, result.covariance).tolist()
+    sigmas = [pixel_sigma] * len(names) if cov is None else _marks_sigma(cov, len(names))
+    baseline = float(rig.baseline)
 
     positions = []
     for i, name in enumerate(names):
         status = Status(int(result.status[i]))
-        bearing_only = bool(result.bearing_only[i])
-        if status == Status.OK and bearing_only:
-            status = Status.BEARING_ONLY
-        position = Position(name=name, status=status, reason=_reason(status, result, i, pixel_sigma))
+        position = Position(name=name, status=status, reason=_reason(status, result, i, sigmas[i], baseline))
         if status in (Status.OK, Status.BEARING_ONLY, Status.PARALLEL):
             position = dataclasses.replace(position, azimuth_deg=angles[i][0], elevation_deg=angles[i][1])
             low, high = float(result.range_low[i]), float(result.range_high[i])
@@ -172,17 +214,15 @@ def locate(
             left, right = result.reprojection[i].tolist()
             position = dataclasses.replace(position, reprojection_px=(left, right))
         if status == Status.OK:
-            east, north, up = enu[i].tolist()
-            lat, lon, height = geodetic[i]
+            position = _placed(position, result, i)
             position = dataclasses.replace(
-                position,
-                lat=lat,
-                lon=lon,
-                height=height,
-                enu=(east, north, up),
-                range_m=float(torch.linalg.vector_norm(result.points[i])),
-            )
+                position, cep50_m=circles[i][0], cep95_m=circles[i][1], metres_per_pixel=slopes[0][i],
+                metres_per_degree=slopes[1][i],
+            )  # fmt: skip
         positions.append(position)
+    if geoid is not None:
+        positions = _with_geoid(positions, geoid)
+    errors = (("marks", True), ("calibration", calibration is not None), ("mounting", mounting is not None))
     return Located(
         positions=tuple(positions),
         cameras=cameras,
@@ -191,15 +231,41 @@ def locate(
         pitch_deg=pitch_deg,
         roll_deg=roll_deg,
         pixel_sigma=pixel_sigma,
+        included=tuple(name for name, there in errors if there),
+        geoid=None if geoid is None else geoid.name,
     )
 
 
-def _reason(status: Status, result: Triangulation, i: int, pixel_sigma: float) -> str:
+def _placed(position: Position, result: Localization, i: int) -> Position:
+    east, north, up = result.enu[i].tolist()
+    lat, lon, height = result.geodetic[i].tolist()
+    first, second, third = (tuple(row) for row in result.covariance[i].tolist())
+    return dataclasses.replace(
+        position, lat=lat, lon=lon, height=height, enu=(east, north, up), covariance=(first, second, third),
+        range_m=float(1.0 / result.inverse_range[i]),
+    )  # fmt: skip
+
+
+def _with_geoid(positions: list[Position], geoid: Geoid) -> list[Position]:
+    known = [i for i, position in enumerate(positions) if position.lat is not None]
+    places = [(positions[i].lat or 0.0, positions[i].lon or 0.0) for i in known]
+    for i, height in zip(known, geoid_heights(geoid, places), strict=True):
+        positions[i] = dataclasses.replace(positions[i], geoid_height=height)
+    return positions
+
+
+def _marks_sigma(cov: Tensor, count: int) -> list[float]:
+    """The largest standard deviation of each pair's coordinates; infinite where there is none."""
+    variance = cov.detach().cpu().double().diagonal(dim1=-2, dim2=-1).amax(-1).expand(count)
+    return [math.sqrt(value) if value > 0 else math.inf for value in variance.tolist()]
+
+
+def _reason(status: Status, result: Localization, i: int, pixel_sigma: float, baseline: float) -> str:
     if status in _REASONS:
         return _REASONS[status]
     low = float(result.range_low[i])
     if status == Status.PARALLEL and math.isinf(low):
-        angle = -math.degrees(float(result.parallax[i]))
+        angle = math.degrees(math.atan(-baseline * float(result.inverse_range[i])))
         return f"the lines of sight diverge by {angle:.3g}°, more than noise: not the same thing, or the rig has turned"
     if status == Status.PARALLEL and low == 0:
         return "a mark lies in the direction of the other camera: no range can be measured along that line"

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 # Two-sided 95 % of a normal distribution.
-_QUANTILE = 1.959963984540054
+QUANTILE = 1.959963984540054
 # A parallax below this many standard deviations gives a bearing, but no range worth the name.
-_BEARING_SIGMAS = 3.0
+BEARING_SIGMAS = 3.0
 
 
 class RangeInterval(NamedTuple):
@@ -80,9 +80,9 @@ def range_interval(
         >>> round(interval.low.item(), 1), round(interval.high.item(), 1), interval.bearing_only.item()
         (3827.8, 7207.1, False)
     """
-    reach = _QUANTILE * parallax_sigma
+    reach = QUANTILE * parallax_sigma
     return RangeInterval(
         low=range_from_parallax(baseline, bearing, parallax + reach),
         high=range_from_parallax(baseline, bearing, parallax - reach),
-        bearing_only=parallax < _BEARING_SIGMAS * parallax_sigma,
+        bearing_only=parallax < BEARING_SIGMAS * parallax_sigma,
     )

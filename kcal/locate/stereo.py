@@ -13,8 +13,8 @@ from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
+from kcal.locate.angular import triangulate_pairs
 from kcal.locate.ranges import range_interval
-from kcal.locate.triangulate import triangulate_linear
 
 # Radians. A smaller parallax is parallel for any camera: the point would be a billion baselines away.
 _PARALLEL = 1e-9
@@ -34,6 +34,8 @@ class Status(enum.IntEnum):
     NOT_FINITE = 4
     OUTSIDE_IMAGE = 5
     BEARING_ONLY = 6
+    MASKED = 7
+    BAD_COVARIANCE = 8
 
 
 # Plain numbers: torch.compile cannot compare a tensor with an enum's member.
@@ -45,7 +47,8 @@ class Triangulation(NamedTuple):
 
     Attributes:
         points: (..., N, 3) metres in the rig frame (the left camera's); zeros unless the status is OK.
-        status: (..., N) int8, codes of `Status` (never BEARING_ONLY: the geometry alone cannot tell).
+        status: (..., N) int8, codes of `Status` (never BEARING_ONLY: the geometry alone cannot tell; nor the last two,
+            which speak of what `StereoLocalizer` is given besides).
         rays: (..., N, 3) unit rays of the left camera; its optical axis where the lens has none.
         reprojection: (..., N, 2) distance in px between mark and reprojected point, left and right; zeros unless OK.
         parallax: (..., N) radians by which the rays converge in the epipolar plane, negative where they diverge.
@@ -119,26 +122,8 @@ class Triangulate(nn.Module):
                 f"got {tuple(pixels_left.shape)} and {tuple(pixels_right.shape)}"
             )
         rotation, translation = self.rig.right_from_left_rotation, self.rig.right_from_left_translation
-        rays_left, seen_left = self.rig.left.unproject(pixels_left)
-        rays_right, seen_right = self.rig.right.unproject(pixels_right)
-        inside = self.rig.left.inside(pixels_left) & self.rig.right.inside(pixels_right)
-        finite = (torch.isfinite(pixels_left) & torch.isfinite(pixels_right)).all(-1)
-
-        pair = _epipolar(rays_left, rays_right @ rotation, -translation @ rotation)
-        code = torch.full(rays_left.shape[:-1], _OK, dtype=torch.int8, device=rays_left.device)
-        for condition, status in (
-            ((pair.parallax <= _PARALLEL) | pair.along_baseline, Status.PARALLEL),
-            (pair.opposite & ~pair.along_baseline, Status.BEHIND),
-            (~(seen_left & seen_right), Status.OUTSIDE_LENS),
-            (~inside, Status.OUTSIDE_IMAGE),
-            (~finite, Status.NOT_FINITE),
-        ):
-            code = torch.where(condition, code.new_full((), int(status)), code)
-
-        left_from_rig = torch.eye(3, 4, dtype=torch.float64, device=rotation.device)
-        cameras = torch.stack([left_from_rig, torch.cat([rotation, translation[:, None]], -1)])
-        points, solved = triangulate_linear(cameras, torch.stack([rays_left, rays_right], -2))
-        code = torch.where((code == _OK) & ~solved, code.new_full((), _AT_INFINITY), code)
+        lines = sight_lines(self.rig, pixels_left, pixels_right)
+        rays_left, pair, code, points = lines.rays_left, lines.pair, lines.status, lines.points
 
         ok = (code == _OK)[..., None]
         points = torch.where(ok, points, rays_left)
@@ -151,7 +136,9 @@ class Triangulate(nn.Module):
         with torch.no_grad():
             sizes = (
                 _pixel_angle(self.rig.left, rays_left, pair.turn_left, pair.normal_left),
-                _pixel_angle(self.rig.right, rays_right, pair.turn_right @ rotation.T, pair.normal_right @ rotation.T),
+                _pixel_angle(
+                    self.rig.right, lines.rays_right, pair.turn_right @ rotation.T, pair.normal_right @ rotation.T
+                ),
             )
             sigma = self.pixel_sigma * torch.hypot(*sizes)
             # One pixel of a camera never spans more than this; a broken lens model may say anything.
@@ -172,7 +159,46 @@ class Triangulate(nn.Module):
         )
 
 
-class _Pair(NamedTuple):
+class SightLines(NamedTuple):
+    """What the rays of pixel pairs say before any noise is thought of.
+
+    Attributes:
+        rays_left: (..., N, 3) unit rays in the left camera's frame.
+        rays_right: (..., N, 3) likewise in the right camera's.
+        points: (..., N, 3) in the same frame, of `triangulate_pairs`; zeros where the rays do not meet ahead.
+        status: (..., N) int8, as in `Triangulation`.
+        pair: the angles of the two rays.
+    """
+
+    rays_left: Tensor
+    rays_right: Tensor
+    points: Tensor
+    status: Tensor
+    pair: PairAngles
+
+
+def sight_lines(rig: StereoRig, pixels_left: Tensor, pixels_right: Tensor) -> SightLines:
+    """Rays, closed-form points and statuses of float64 pixels, both (..., N, 2)."""
+    rotation, translation = rig.right_from_left_rotation, rig.right_from_left_translation
+    rays_left, seen_left = rig.left.unproject(pixels_left)
+    rays_right, seen_right = rig.right.unproject(pixels_right)
+    inside = rig.left.inside(pixels_left) & rig.right.inside(pixels_right)
+    finite = (torch.isfinite(pixels_left) & torch.isfinite(pixels_right)).all(-1)
+    pair = _epipolar(rays_left, rays_right @ rotation, -translation @ rotation)
+    points, solved = triangulate_pairs(rays_left, rays_right, (rotation, translation))
+    code = torch.full(rays_left.shape[:-1], _OK, dtype=torch.int8, device=rays_left.device)
+    for condition, status in (
+        ((pair.parallax <= _PARALLEL) | pair.along_baseline, Status.PARALLEL),
+        ((pair.opposite | (~solved & (pair.parallax > _PARALLEL))) & ~pair.along_baseline, Status.BEHIND),
+        (~(seen_left & seen_right), Status.OUTSIDE_LENS),
+        (~inside, Status.OUTSIDE_IMAGE),
+        (~finite, Status.NOT_FINITE),
+    ):
+        code = torch.where(condition, code.new_full((), int(status)), code)
+    return SightLines(rays_left, rays_right, points, code, pair)
+
+
+class PairAngles(NamedTuple):
     """Two rays seen in the plane of the left ray and the baseline; vectors are in the rig frame."""
 
     bearing: Tensor
@@ -185,7 +211,7 @@ class _Pair(NamedTuple):
     normal_right: Tensor
 
 
-def _epipolar(left: Tensor, right: Tensor, baseline: Tensor) -> _Pair:
+def _epipolar(left: Tensor, right: Tensor, baseline: Tensor) -> PairAngles:
     """Angles of unit rays (..., N, 3), both in the rig frame; `baseline` points from the left camera to the right."""
     axis = (baseline / torch.linalg.vector_norm(baseline)).expand_as(left)
     normal, sine, left_ok = _safe_unit(torch.linalg.cross(axis, left))
@@ -195,7 +221,7 @@ def _epipolar(left: Tensor, right: Tensor, baseline: Tensor) -> _Pair:
     normal_right, _, right_ok = _safe_unit(torch.linalg.cross(axis, right))
     # The right ray in the plane: the rest of it, the epipolar error, says nothing about the range.
     in_plane = left_ok & right_ok & (torch.hypot(along, across) > _EPIPOLE)
-    return _Pair(
+    return PairAngles(
         bearing=torch.atan2(torch.where(left_ok, sine, 1.0), torch.where(left_ok, cosine, 0.0)),
         parallax=torch.atan2(
             torch.where(in_plane, cosine * across - sine * along, 0.0),

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.checks import as_points
-from kcal.errors import InputError
+from kcal.locate.angular import checked_views
 
 # Below this gap of the squared singular values (the rays have unit length, the cameras a spread of one) the answer
 # is not determined: all rays lie along the line through the camera centres.
@@ -50,14 +49,7 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Te
         >>> round(points[0, 2].item(), 6), valid.tolist()
         (5000.0, [True])
     """
-    cam_from_world = as_points("cam_from_world", cam_from_world, 4)
-    rays = as_points("rays", rays, 3)
-    if cam_from_world.ndim < 3 or cam_from_world.shape[-2] != 3 or cam_from_world.shape[-3] < 2:
-        raise InputError(f"cam_from_world: shape (..., C >= 2, 3, 4) is needed, got {tuple(cam_from_world.shape)}")
-    if rays.ndim < 3 or rays.shape[-2] != cam_from_world.shape[-3]:
-        raise InputError(
-            f"rays: shape (..., N, {cam_from_world.shape[-3]}, 3) is needed to fit the cameras, got {tuple(rays.shape)}"
-        )
+    cam_from_world, rays = checked_views(cam_from_world, rays)
     rotation, translation = cam_from_world[..., :3], cam_from_world[..., 3]
     centers = -(rotation.mT @ translation[..., None])[..., 0]
     middle = centers.mean(-2, keepdim=True)

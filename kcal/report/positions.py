@@ -32,8 +32,8 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
     """Draw located points as seen from above, north up, and their range intervals.
 
     Distances from the left camera are drawn as log(1 + range / r0), azimuths as they are, so that 100 m and 5 km can
-    both be read. A bar along the line of sight is the 95 % range interval of the marks' noise (calibration errors are
-    not in it); with an arrow head it goes on to infinity.
+    both be read. A bar along the line of sight is the 95 % range interval (`Located.interval_note` says of which
+    errors); with an arrow head it goes on to infinity.
 
     Args:
         located: from `kcal.locate.positions.locate`.
@@ -294,10 +294,7 @@ def _estimate(position: Position) -> str:
 
 
 def _footer(located: Located) -> str:
-    lines = [
-        f"Bars: 95 % range interval from marks with {located.pixel_sigma:g} px of noise. "
-        "Errors of the calibration and of the heading are not included."
-    ]
+    lines = [f"Bars: range interval, {located.interval_note}; marks have {located.pixel_sigma:g} px of noise."]
     failed: Sequence[Position] = [p for p in located.positions if p.range_low_m is None]
     lines += [f"{p.name}: {p.reason}" for p in failed[:3]]
     if len(failed) > 3:

@@ -47,12 +47,34 @@ def test_writes_files_and_a_table(
     # 1 km west (0.0108116 degrees) and 10 m north (9.0e-5); a straight line west bends 5 cm north of the parallel.
     assert line.split()[1:5] == ["-33.8999094", "151.1891884", "10.1", "1000"]
     assert "lost: a mark lies outside its image" in printed
-    assert "calibration errors are not included" in printed
+    assert "calibration and mounting errors are not included" in printed
     features = json.loads((folder / "out.geojson").read_text())["features"]
-    assert [feature["properties"]["name"] for feature in features[2:]] == ["[b]mast", "lost"]
+    assert [feature["properties"]["name"] for feature in features[2:]] == ["[b]mast", "lost", "[b]mast"]
     with (folder / "out.csv").open() as file:
         assert [row["status"] for row in csv.DictReader(file)] == ["ok", "outside_image"]
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_options_for_errors_grids_and_formats(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["rig.json", "points.csv", "--origin", "19.07,72.87,14", "--heading", "0.0", "-o", "out.csv"]
+    assert run(monkeypatch, *arguments, "--pixel-sigma", "0.1") == 0
+    plain = next(iter(csv.DictReader((folder / "out.csv").open())))
+    more = ["--grid", "EPSG:32643", "--yaw-sigma", "0.05", "--heading-sigma", "0.1", "--refraction", "0.13"]
+    outputs = ["-o", "out.kml", "-o", "out.cot"]
+    assert run(monkeypatch, *arguments, "--pixel-sigma", "0.1", *more, *outputs) == 0
+    row = next(iter(csv.DictReader((folder / "out.csv").open())))
+    # Grid north of Mumbai's UTM zone is 0.70 degrees west of true north; the mark lies 0.57 degrees to the right.
+    assert float(row["azimuth_deg"]) == pytest.approx(float(plain["azimuth_deg"]) - 0.6962 + 360, abs=1e-3)
+    # 87 m for 0.05 degrees at 1 km.
+    assert float(row["range_high_m"]) - 1000 > 5 * (float(plain["range_high_m"]) - 1000)
+    assert float(row["up_m"]) < float(plain["up_m"])
+    printed = capsys.readouterr().out
+    assert "marks' noise and the calibration's errors and the mounting's errors" in printed
+    assert "geoid: " in printed
+    assert (folder / "out.kml").read_text().startswith("<?xml")
+    assert "<event " in (folder / "out.cot").read_text()
 
 
 def test_nothing_located_is_a_failure_with_its_reasons(
@@ -73,7 +95,7 @@ def test_nothing_located_is_a_failure_with_its_reasons(
         (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--pixel-sigma", "0"], "pixel_sigma"),
         (["rig.json", "nothing.csv", "--origin", ORIGIN, "--heading", "0"], "nothing.csv: cannot read"),
         (["points.csv", "points.csv", "--origin", ORIGIN, "--heading", "0"], "points.csv: not a JSON file"),
-        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "-o", "a.kml"], "a.kml: unknown format"),
+        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "-o", "a.shp"], "a.shp: unknown format"),
         (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "-o", "no/a.csv"], "does not exist"),
         (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--picture", "a.pdf"], "end with .png"),
     ],

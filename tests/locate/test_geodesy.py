@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from locate_rigs import tensor
 
 from kcal.errors import InputError
+from kcal.locate.ellipsoid import ecef_to_geodetic, geodetic_to_ecef
 from kcal.locate.geodesy import Origin, azimuth_elevation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
 
 ORIGINS = [
@@ -96,6 +97,49 @@ def test_positions_agree_with_closed_form_ecef_and_round_trip(origin: Origin, di
         assert np.abs(ecef(lat, lon, height) - expected).max() < 1e-7
         assert -180 <= lon < 180
     assert (geodetic_to_enu(geodetic, origin) - enu).abs().max() < 1e-7
+
+
+@pytest.mark.parametrize("lat", [-85.0, -60.0, -33.9, 0.0, 19.07, 45.0, 85.0])
+@pytest.mark.parametrize("lon", [-180.0, -179.999, 0.0, 72.87, 179.999])
+def test_positions_agree_with_proj(lat: float, lon: float) -> None:
+    origin = Origin(lat=lat, lon=lon, height=120.0)
+    pipeline = pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        f"+step +proj=topocentric +ellps=WGS84 +lat_0={lat!r} +lon_0={lon!r} +h_0=120.0"
+    )
+    for distance in (0.0, 100.0, 5000.0, 10_000.0):
+        enu = around(distance)
+        geodetic = enu_to_geodetic(enu, origin)
+        latitudes, longitudes, heights = geodetic.numpy().T
+        by_proj = np.stack(pipeline.transform(longitudes, latitudes, heights), -1)
+        # The requirement is 1e-6 m; ECEF coordinates hold 1e-9 m.
+        assert np.abs(by_proj - enu.numpy()).max() < 2e-8
+        assert (geodetic_to_enu(geodetic, origin) - enu).abs().max() < 2e-8
+
+
+def test_gradients_of_the_closed_form_also_at_a_pole() -> None:
+    origin = Origin(lat=60.0, lon=25.0, height=0.0)
+    enu = tensor([300.0, -2000.0, 50.0], [0.0, 0.0, 0.0]).requires_grad_()
+    scale = tensor(1e5, 1e5, 1.0)
+    home = origin.geodetic
+    # Degrees hold 1e-14: with steps of 1 m that is 1e-9 of a slope in metres.
+    assert torch.autograd.gradcheck(
+        lambda p: (enu_to_geodetic(p, origin) - home) * scale, enu, eps=1.0, rtol=1e-3, atol=1e-4
+    )
+    pole = tensor([0.0, 0.0, 6_356_752.3142 + 10.0]).requires_grad_()
+    found = ecef_to_geodetic(pole)
+    assert found[0].tolist() == pytest.approx([90.0, 0.0, 10.0], abs=1e-4)
+    (gradient,) = torch.autograd.grad(found.sum(), pole)
+    assert torch.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("height", [-10_000.0, 0.0, 9000.0, 4e5, 3.6e7])
+def test_heights_from_the_sea_floor_to_geostationary_orbits(height: float) -> None:
+    lat = torch.linspace(-90, 90, 37, dtype=torch.float64)
+    geodetic = torch.stack([lat, torch.linspace(-179, 179, 37, dtype=torch.float64), torch.full_like(lat, height)], -1)
+    again = ecef_to_geodetic(geodetic_to_ecef(geodetic))
+    assert (again - geodetic)[:, 2].abs().max() < 2e-8
+    assert (again - geodetic)[1:-1, :2].abs().max() < 1e-12
 
 
 @pytest.mark.parametrize("origin", ORIGINS, ids=str)

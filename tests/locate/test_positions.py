@@ -1,9 +1,14 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
+import datetime
 import io
+import itertools
 import json
 import math
+import struct
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
@@ -11,8 +16,12 @@ import torch
 from locate_rigs import pinhole_rig, real_rig, spread_points, tensor
 
 from kcal.errors import FileError, InputError
+from kcal.locate.cot import to_cot
+from kcal.locate.datum import find_geoid
+from kcal.locate.errors import RigCovariance
 from kcal.locate.export import to_csv, to_geojson, write_positions
-from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic
+from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic, geodetic_to_enu
+from kcal.locate.kml import to_kml
 from kcal.locate.positions import Located, Position, locate
 from kcal.locate.stereo import Status
 
@@ -144,16 +153,24 @@ def test_geojson_follows_rfc_7946(tmp_path: Path) -> None:
     for feature in content["features"]:
         assert set(feature) == {"type", "geometry", "properties"}
         assert feature["type"] == "Feature"
-        if feature["geometry"] is not None:
+        if feature["properties"]["kind"] != "region" and feature["geometry"] is not None:
             assert feature["geometry"]["type"] == "Point"
             longitude, latitude, _ = feature["geometry"]["coordinates"]
             # Section 3.1.1: longitude first.
             assert longitude == pytest.approx(151.2, abs=0.1)
             assert latitude == pytest.approx(-33.9, abs=0.1)
-    cameras, points = content["features"][:2], content["features"][2:]
+    cameras, points, (region,) = content["features"][:2], content["features"][2:-1], content["features"][-1:]
+    assert (region["properties"]["name"], region["properties"]["share"]) == ("mast", 0.95)
+    (ring,) = region["geometry"]["coordinates"]
+    assert ring[0] == ring[-1]
+    # Section 3.1.6: counterclockwise.
+    assert sum(a[0] * b[1] - b[0] * a[1] for a, b in itertools.pairwise(ring)) > 0
+    east = [geodetic_to_enu(tensor(lat, lon, 40.0), ORIGIN)[0].item() for lon, lat in ring]
+    # 0.3 px in each mark at 1 km: 26.5 m, times 2.45, and skewed outward.
+    assert (1000 - min(east), max(east) - 1000) == pytest.approx((61.0, 69.5), abs=1.0)
     assert [camera["properties"]["name"] for camera in cameras] == ["left camera", "right camera"]
     assert cameras[0]["geometry"]["coordinates"] == [151.2, -33.9, 40.0]
-    assert "not included" in cameras[0]["properties"]["range_interval"]
+    assert "are not included" in cameras[0]["properties"]["range_interval"]
     assert [point["geometry"] is None for point in points] == [False, True, True, True, True, True]
     mast, far = points[0]["properties"], points[1]["properties"]
     position = located.positions[0]
@@ -181,6 +198,81 @@ def test_csv_keeps_every_digit(tmp_path: Path) -> None:
     ):
         assert float(rows[0][column]) == value
     assert (rows[1]["status"], rows[1]["lat"], rows[1]["range_high_m"]) == ("bearing_only", "", "inf")
+
+
+def test_covariances_circles_and_slopes_of_a_position() -> None:
+    position = one((975.5, 539.5), (959.5, 539.5), pixel_sigma=0.1)
+    # Z² / (f b) = 62.5 m/px at 1 km, and 17.45 m for 0.01 degrees.
+    assert position.metres_per_pixel == pytest.approx(62.5, rel=1e-3)
+    assert position.metres_per_degree == pytest.approx(1745, rel=1e-3)
+    along = math.sqrt(position.covariance[1][1])
+    assert along == pytest.approx(62.5 * 0.1 * math.sqrt(2), rel=1e-3)
+    assert position.cep50_m == pytest.approx(0.6745 * along, rel=0.01)
+    assert position.cep95_m == pytest.approx(1.96 * along, rel=0.01)
+    wide = locate(
+        RIG, tensor([975.5, 539.5]), tensor([959.5, 539.5]), origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1,
+        calibration=RigCovariance.of(RIG, pose=torch.diag(tensor(0, 1e-4, 0, 0, 0, 0) ** 2)),
+    )  # fmt: skip
+    assert "calibration's errors; mounting errors are not included" in wide.interval_note
+    assert wide.positions[0].covariance[1][1] == pytest.approx(along**2 + (1e-4 * 1e6 / 10) ** 2, rel=1e-3)
+
+
+def test_geoid_heights_are_stated(tmp_path: Path) -> None:
+    # One degree around the place, N = 22.5 m everywhere.
+    path = tmp_path / "flat.gtx"
+    path.write_bytes(struct.pack(">4d2i9f", -35.0, 150.0, 1.0, 1.0, 3, 3, *[22.5] * 9))
+    marks = tensor([975.5, 539.5]), tensor([959.5, 539.5])
+    located = locate(RIG, *marks, origin=ORIGIN, heading_deg=0.0, geoid=find_geoid(path))
+    assert (located.geoid, located.positions[0].geoid_height) == ("flat", pytest.approx(22.5))
+    document = ET.fromstring(to_kml(located))
+    coordinates = [element.text.split(",") for element in document.iter("{http://www.opengis.net/kml/2.2}coordinates")]
+    assert float(coordinates[2][2]) == pytest.approx(located.positions[0].height - 22.5)
+
+
+def test_kml() -> None:
+    located = mixed()
+    space = {"k": "http://www.opengis.net/kml/2.2"}
+    document = ET.fromstring(to_kml(located))
+    names = [element.text for element in document.findall(".//k:Placemark/k:name", space)]
+    assert names == ["left camera", "right camera", "mast", "mast, 95 %"]
+    mast = document.find(".//k:Placemark[k:name='mast']/k:Point", space)
+    # Without a geoid an ellipsoidal height must not be taken for one above the sea.
+    assert mast.find("k:altitudeMode", space).text == "clampToGround"
+    assert [float(x) for x in mast.find("k:coordinates", space).text.split(",")] == [
+        located.positions[0].lon,
+        located.positions[0].lat,
+    ]
+
+
+def test_cursor_on_target() -> None:
+    located = mixed()
+    moment = datetime.datetime(2026, 5, 4, 12, 0, tzinfo=datetime.timezone(datetime.timedelta(hours=2)))
+    (event,) = ET.fromstring(to_cot(located, time=moment, stale_s=60))
+    assert (event.get("version"), event.get("type")) == ("2.0", "a-u-G")
+    assert (event.get("start"), event.get("stale")) == ("2026-05-04T10:00:00.000Z", "2026-05-04T10:01:00.000Z")
+    point, position = event.find("point"), located.positions[0]
+    assert (float(point.get("lat")), float(point.get("lon"))) == (position.lat, position.lon)
+    assert float(point.get("hae")) == pytest.approx(position.height, abs=1e-3)
+    assert float(point.get("ce")) == pytest.approx(position.cep95_m, abs=1e-3)
+    assert float(point.get("le")) == pytest.approx(1.96 * math.sqrt(position.covariance[2][2]), abs=1e-3)
+    assert event.find("detail/contact").get("callsign") == "mast"
+    with pytest.raises(InputError, match="time zone"):
+        to_cot(located, time=datetime.datetime(2026, 5, 4))
+    unknown = dataclasses.replace(located, positions=(dataclasses.replace(position, cep95_m=math.inf),))
+    assert ET.fromstring(to_cot(unknown, time=moment))[0].find("point").get("ce") == "9999999.0"
+
+
+def test_regions_across_the_antimeridian_are_cut() -> None:
+    origin = Origin(lat=10.0, lon=179.9921, height=0.0)
+    rig = pinhole_rig()
+    located = locate(rig, tensor([975.5, 539.5]), tensor([959.5, 539.5]), origin=origin, heading_deg=60.0)
+    region = to_geojson(located)["features"][-1]["geometry"]
+    assert region["type"] == "MultiPolygon"
+    sides = sorted((min(lon for lon, _ in ring), max(lon for lon, _ in ring)) for (ring,) in region["coordinates"])
+    assert sides[0][0] == -180.0
+    assert sides[1][1] == 180.0
+    assert sides[0][1] - sides[0][0] + sides[1][1] - sides[1][0] < 0.01
+    assert all(ring[0] == ring[-1] for (ring,) in region["coordinates"])
 
 
 def test_unknown_formats_and_places_are_refused(tmp_path: Path) -> None:

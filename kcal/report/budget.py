@@ -1,0 +1,54 @@
+"""A picture of a depth budget: range errors against distance, on logarithmic scales."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from kcal.locate.budget import RangeError
+from kcal.report.figures import new_figure, save_png
+
+_COLOURS = {"disparity": "#2b6cb0", "yaw": "#c02a6b", "baseline": "#4b5563", "timing": "#dd7a1f"}
+
+
+def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]) -> Figure:
+    """Lines for each source: outward solid, inward dotted, the slope of the first order thin and dashed.
+
+    Args:
+        distances: (D,) metres.
+        found: from `range_errors`.
+        labels: what each source's line is called.
+    """
+    figure = new_figure(8.6, 6.0)
+    axes = figure.add_subplot()
+    far = distances.numpy()
+    for name, error in found.items():
+        colour = _COLOURS.get(name, "#111827")
+        outward = error.farther.clone()
+        # Infinity is not drawn: the line leaves the picture there.
+        outward[~outward.isfinite()] = float("nan")
+        axes.plot(far, outward.numpy(), color=colour, linewidth=2.0, label=labels.get(name, name))
+        axes.plot(far, error.nearer.abs().numpy(), color=colour, linewidth=1.4, linestyle=":")
+        axes.plot(far, error.first_order.numpy(), color=colour, linewidth=0.8, linestyle=(0, (6, 4)), alpha=0.8)
+    axes.plot([], [], color="#6b7280", linewidth=1.4, linestyle=":", label="inward")
+    axes.plot([], [], color="#6b7280", linewidth=0.8, linestyle=(0, (6, 4)), label="first order")
+    axes.set(xscale="log", yscale="log", xlim=(far.min(), far.max()), xlabel="range, m", ylabel="error of the range, m")
+    low = min(float(error.nearer.abs()[error.nearer.abs() > 0].min()) for error in found.values())
+    axes.set_ylim(max(low, 1e-4), float(far.max()) * 2)
+    axes.grid(which="major", color="#e5e7eb", linewidth=0.8)
+    axes.grid(which="minor", color="#f3f4f6", linewidth=0.5)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=9, loc="upper left")
+    axes.set_title("Range error by source: outward, inward, and to first order", fontsize=11, color="#374151")
+    figure.tight_layout()
+    return figure
+
+
+def save_budget_picture(
+    path: str | Path, distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]
+) -> Path:
+    """Write the picture of `budget_figure` as a PNG, atomically."""
+    return save_png(path, budget_figure(distances, found, labels))

@@ -1,0 +1,79 @@
+"use strict";
+(function () {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const map = L.map("map", {preferCanvas: false, maxZoom: 22, zoomSnap: 0.25, worldCopyJump: false});
+  map.attributionControl.setPrefix("kcal, Leaflet");
+  L.control.scale({imperial: false, maxWidth: 200}).addTo(map);
+  const text = (value) => document.createTextNode(value);
+  const overlays = {};
+  const layer = (name) => overlays[name] || (overlays[name] = L.layerGroup().addTo(map));
+  const label = (shape, name, side) => shape.bindTooltip(() => { const s = document.createElement("span"); s.append(text(name)); return s; },
+    {permanent: true, direction: side || "right", className: "name", offset: side ? [0, 0] : [6, 0]});
+
+  if (data.image) {
+    L.imageOverlay(data.image.uri, data.image.bounds, {attribution: data.image.name}).addTo(map);
+  }
+  if (data.tiles) {
+    const Local = L.GridLayer.extend({createTile: function (at) {
+      const tile = document.createElement("img");
+      const uri = data.tiles.images[at.z + "/" + at.x + "/" + at.y];
+      if (uri) tile.src = uri;
+      return tile;
+    }});
+    new Local({minNativeZoom: data.tiles.zooms[0], maxNativeZoom: data.tiles.zooms[1], attribution: data.tiles.name}).addTo(map);
+  }
+  if (data.online) {
+    L.tileLayer(data.online.url, {maxNativeZoom: 19, attribution: data.online.attribution}).addTo(map);
+  }
+  // What would only clutter at this zoom: [marker, end, end, least distance in pixels].
+  const small = [];
+  const tidy = () => {
+    for (const [shape, from, to, least] of small) {
+      const far = map.latLngToContainerPoint(from).distanceTo(map.latLngToContainerPoint(to)) >= least;
+      const element = shape.getElement && shape.getElement();
+      if (element) element.style.display = far ? "" : "none";
+      const tip = shape.getTooltip();
+      if (tip && tip.getElement()) tip.getElement().style.display = far ? "" : "none";
+    }
+  };
+  for (const view of data.cameras) {
+    if (view.fan) L.polygon(view.fan, {color: view.colour, weight: 1, opacity: 0.7, fillOpacity: 0.06, smoothFactor: 0.2, interactive: false}).addTo(layer("fields of view"));
+    label(L.circleMarker(view.place, {radius: 6, color: "#fff", weight: 1.5, fillColor: view.colour, fillOpacity: 1})
+      .addTo(layer("cameras")), view.name, view.side);
+  }
+  for (const arc of data.arcs) {
+    L.polyline(arc.line, {color: "#4b5563", weight: 1, dashArray: "5 4", smoothFactor: 0.2, interactive: false}).addTo(layer("range arcs"));
+    const end = L.circleMarker(arc.line[arc.line.length - 1], {radius: 0, opacity: 0, interactive: false});
+    small.push([label(end.addTo(layer("range arcs")), arc.name), data.cameras[0].place, end.getLatLng(), 50]);
+  }
+  for (const ring of data.regions) {
+    L.polygon(ring, {color: "#111827", weight: 1.5, fillOpacity: 0.2, interactive: false}).addTo(layer("95 % regions"));
+  }
+  for (const line of data.bearings) {
+    L.polyline(line, {color: "#8a5a00", weight: 1.5, dashArray: "3 4", interactive: false}).addTo(layer("bearings only"));
+  }
+  for (const arrow of data.arrows) {
+    L.polyline(arrow.line, {color: "#c02a6b", weight: 1.6, interactive: false}).addTo(layer("true positions"));
+    const head = L.marker(arrow.line[1], {interactive: false, icon: L.divIcon({className: "head", iconSize: [12, 12],
+      html: '<svg viewBox="-6 -6 12 12" style="transform:rotate(' + Number(arrow.azimuth) + 'deg)"><path d="M0,0 L-4,6 L4,6 Z" fill="#c02a6b"/></svg>'})});
+    small.push([head.addTo(layer("true positions")), arrow.line[0], arrow.line[1], 16]);
+  }
+  for (const spot of data.truth) {
+    L.circleMarker(spot, {radius: 5, color: "#fff", weight: 1, fillColor: "#c02a6b", fillOpacity: 1, interactive: false}).addTo(layer("true positions"));
+  }
+  for (const spot of data.points) {
+    const shape = L.circleMarker(spot.place, {radius: 6, color: "#111827", weight: 2, fillColor: "#fff", fillOpacity: 1}).addTo(layer("estimated positions"));
+    label(shape, spot.name);
+    const rows = document.createElement("table");
+    for (const [name, value] of spot.rows) {
+      const row = rows.insertRow();
+      row.insertCell().append(text(name));
+      row.insertCell().append(text(value));
+    }
+    shape.bindPopup(rows);
+  }
+  L.control.layers(null, overlays, {collapsed: false}).addTo(map);
+  map.on("zoomend moveend overlayadd", tidy);
+  map.fitBounds(data.bounds, {padding: [30, 30]});
+  map.whenReady(() => { tidy(); document.documentElement.dataset.drawn = data.points.length + "/" + document.querySelectorAll("#map path").length; });
+})();

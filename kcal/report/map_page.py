@@ -1,0 +1,222 @@
+"""An interactive map as one HTML file that needs nothing else: no network, no server, no other file.
+
+Leaflet (BSD-2-Clause, in the folder `leaflet`) draws; all geometry is computed here, on the ellipsoid, and written into
+the page. Unless online tiles are asked for, the page's own content policy forbids it to load anything at all.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.files import write_atomic
+from kcal.locate.geodesy import enu_to_geodetic
+from kcal.locate.positions import Located, Position
+from kcal.locate.region import near, region_rings
+from kcal.locate.stereo import Status
+from kcal.report.backdrop import local_image, local_tiles
+
+ARCS_M = (250.0, 1000.0, 5000.0)
+_COLOURS = ("#2b6cb0", "#dd7a1f")
+_ONLINE = {
+    "url": "https://tile.openstreetmap.org/{z}/{x}/{y}.png",
+    "attribution": '&copy; <a href="https://www.openstreetmap.org/copyright">OpenStreetMap</a> contributors',
+}
+_STYLE = """
+html, body { margin: 0; height: 100%; font: 14px/1.4 system-ui, sans-serif; color: #111827; }
+body { display: flex; flex-direction: column; }
+header { padding: 8px 14px; border-bottom: 1px solid #d1d5db; }
+header b { font-size: 16px; }
+header p { margin: 2px 0 0; color: #4b5563; font-size: 12px; }
+#map { flex: 1; background: #f3f1ea; }
+.leaflet-tooltip.name { background: none; border: 0; box-shadow: none; padding: 0; font: 600 12px system-ui, sans-serif;
+  color: #111827; text-shadow: 0 0 3px #fff, 0 0 3px #fff, 0 0 3px #fff, 0 0 3px #fff; }
+.leaflet-tooltip.name::before { display: none; }
+.leaflet-popup-content td { padding: 1px 8px 1px 0; white-space: nowrap; }
+.head { overflow: visible; } .head svg { transform-origin: 50% 50%; overflow: visible; }
+"""
+LatLon = tuple[float, float]
+
+
+def map_page(
+    located: Located,
+    truth: Tensor | None = None,
+    *,
+    tiles: str | Path | None = None,
+    image: str | Path | None = None,
+    online: bool = False,
+) -> str:
+    """The page: positions with 95 % regions, true ones with arrows, cameras, fields of view, arcs at 250 m to 5 km.
+
+    Args:
+        located: from `kcal.locate.positions.locate`.
+        truth: (N, 3) true east, north, up in metres, NaN where unknown; an arrow leads from each to its estimate.
+        tiles: a folder of map tiles `z/x/y.png` (or .jpg, .webp) in Web Mercator; those in view are embedded.
+        image: a GeoTIFF to lie below, for example an orthophoto; embedded, at 2048 pixels along its longer side.
+        online: also load tiles of OpenStreetMap when the page is opened with a network.
+
+    Raises:
+        InputError: a truth of the wrong shape, or an image without a place on the Earth.
+        FileError: a folder or file that cannot be read.
+    """
+    if truth is not None and tuple(truth.shape) != (len(located.positions), 3):
+        raise InputError(f"truth: shape ({len(located.positions)}, 3) is needed, got {tuple(truth.shape)}")
+    content = _content(located, truth)
+    south, west, north, east = _box(content)
+    content["bounds"] = [[south, west], [north, east]]
+    margin = 0.25 * max(north - south, east - west, 1e-4)
+    view = (south - margin, west - margin, north + margin, east + margin)
+    content["tiles"] = None if tiles is None else local_tiles(tiles, view)
+    content["image"] = None if image is None else local_image(image)
+    content["online"] = _ONLINE if online else None
+    library = resources.files("kcal.report") / "leaflet"
+    style = (library / "leaflet.css").read_text(encoding="utf-8")
+    # Pictures of controls that this page does not show.
+    for picture in ("images/layers.png", "images/layers-2x.png", "images/marker-icon.png"):
+        style = style.replace(f"url({picture})", "none")
+    own = (resources.files("kcal.report") / "map_page.js").read_text(encoding="utf-8")
+    # Inside a script element nothing but "</" ends the text.
+    payload = json.dumps(content, allow_nan=False).replace("</", "<\\/")
+    allowed = "data: https://tile.openstreetmap.org" if online else "data:"
+    title = f"{located.count} of {len(located.positions)} points located"
+    note = (
+        f"From {located.origin.lat:.6f}°, {located.origin.lon:.6f}°, heading {located.heading_deg:g}° from true north. "
+        f"Regions and intervals: {located.interval_note}. Geoid: {located.geoid or 'none at hand'}."
+    )
+    key = "White dots: estimated; click one for its numbers. Black outlines: where it lies with 95 %."
+    key += " Red dots: true, with an arrow to the estimate." if truth is not None else ""
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src {allowed}">
+<title>{html.escape(title)}</title>
+<style>{style}</style>
+<style>{_STYLE}</style>
+</head>
+<body>
+<header><b>{html.escape(title)}</b><p>{html.escape(note)}<br>{html.escape(key)}</p></header>
+<div id="map"></div>
+<script type="application/json" id="data">{payload}</script>
+<script>{(library / "leaflet.js").read_text(encoding="utf-8")}</script>
+<script>{own}</script>
+</body>
+</html>
+"""
+
+
+def save_map(path: str | Path, located: Located, truth: Tensor | None = None, **options: Any) -> Path:
+    """Write `map_page` to an .html file, atomically; for the options see there.
+
+    Raises:
+        InputError: another suffix, or as `map_page`.
+        FileError: the file cannot be written.
+    """
+    check_map_format(path)
+    return write_atomic(path, map_page(located, truth, **options))
+
+
+def check_map_format(path: str | Path) -> None:
+    """Raise `InputError` unless `path` ends with .html or .htm."""
+    if Path(path).suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{path}: the map is a web page; the file name must end with .html")
+
+
+def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
+    def places(enu: Tensor) -> list[LatLon]:
+        geodetic = enu_to_geodetic(enu.detach().cpu().double(), located.origin).tolist()
+        return [(lat, near(lon, located.origin.lon)) for lat, lon, _ in geodetic]
+
+    def fan(foot: tuple[float, float, float], azimuths: Tensor, reach: float) -> Tensor:
+        angle = torch.deg2rad(azimuths)
+        rim = torch.stack([angle.sin(), angle.cos(), torch.zeros_like(angle)], -1) * reach
+        return rim + torch.tensor(foot, dtype=torch.float64)
+
+    ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
+    reach = 1.15 * max([*ranges, 300.0])
+    cameras, edges = [], []
+    for view, colour, side in zip(located.cameras, _COLOURS, _label_sides(located), strict=True):
+        outline = None
+        if view.azimuths_deg is not None:
+            first, last = view.azimuths_deg
+            sweep = torch.linspace(first, first + (last - first) % 360, 60, dtype=torch.float64)
+            foot = torch.tensor([view.enu], dtype=torch.float64)
+            outline = places(torch.cat([foot, fan(view.enu, sweep, reach)]))
+            edges += [(float(a) - located.heading_deg + 180) % 360 - 180 for a in sweep[[0, -1]]]
+        place = (view.geodetic[0], near(view.geodetic[1], located.origin.lon))
+        cameras.append({"name": view.name, "place": place, "fan": outline, "colour": colour, "side": side})
+    low, high = (min(edges), max(edges)) if edges else (-180.0, 180.0)
+    sweep = torch.linspace(low, high, 90, dtype=torch.float64) + located.heading_deg
+    arcs = [
+        {"name": f"{arc:g} m" if arc < 1000 else f"{arc / 1000:g} km", "line": places(fan((0, 0, 0), sweep, arc))}
+        for arc in ARCS_M
+        if arc < reach
+    ]
+    bearings = [
+        places(fan((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0) * ends)
+        for p in located.positions
+        if p.azimuth_deg is not None and p.status != Status.OK
+        for ends in [torch.tensor([[min(p.range_low_m or 0.0, reach)], [reach]], dtype=torch.float64)]
+    ]
+    arrows, true = [], []
+    for position, row in zip(located.positions, [] if truth is None else truth, strict=truth is not None):
+        if not bool(torch.isfinite(row).all()):
+            continue
+        (spot,) = places(row[None])
+        true.append(spot)
+        if position.enu is not None and position.lat is not None and position.lon is not None:
+            miss = torch.tensor(position.enu, dtype=torch.float64) - row.detach().cpu().double()
+            azimuth = math.degrees(math.atan2(float(miss[0]), float(miss[1])))
+            arrows.append({"line": [spot, (position.lat, near(position.lon, located.origin.lon))], "azimuth": azimuth})
+    points = [
+        {"name": p.name, "place": (p.lat, near(p.lon, located.origin.lon)), "rows": _rows(p)}
+        for p in located.positions
+        if p.lat is not None and p.lon is not None
+    ]
+    rings = [[(lat, near(lon, located.origin.lon)) for lat, lon in ring] for _, ring in region_rings(located)]
+    return {
+        "cameras": cameras, "arcs": arcs, "regions": rings, "bearings": bearings, "arrows": arrows, "truth": true,
+        "points": points,
+    }  # fmt: skip
+
+
+def _label_sides(located: Located) -> tuple[str, str]:
+    """On which side of its dot each camera's name is written: outward, as the two stand close."""
+    return ("left", "right") if located.cameras[1].enu[0] >= 0 else ("right", "left")
+
+
+def _rows(position: Position) -> list[tuple[str, str]]:
+    rows = [
+        ("latitude", f"{position.lat:.7f}°"),
+        ("longitude", f"{position.lon:.7f}°"),
+        ("ellipsoidal height", f"{position.height:.2f} m"),
+    ]
+    if position.geoid_height is not None and position.height is not None:
+        rows.append(("above the geoid", f"{position.height - position.geoid_height:.2f} m"))
+    rows += [
+        ("range", f"{position.range_m:.1f} m"),
+        ("95 % interval", f"{position.range_low_m:.1f} to {position.range_high_m:.1f} m"),
+        ("CEP50, CEP95", f"{position.cep50_m:.1f}, {position.cep95_m:.1f} m"),
+        ("a pixel is", f"{position.metres_per_pixel:.1f} m"),
+        ("0.01° of yaw is", f"{0.01 * (position.metres_per_degree or 0.0):.1f} m"),
+    ]
+    return [*rows, ("", position.reason)] if position.reason else rows
+
+
+def _box(content: dict[str, Any]) -> tuple[float, float, float, float]:
+    spots: list[LatLon] = [*content["truth"], *(spot["place"] for spot in content["points"])]
+    spots += [camera["place"] for camera in content["cameras"]]
+    for line in (*content["regions"], *content["bearings"]):
+        spots += line
+    lats, lons = zip(*spots, strict=True)
+    return min(lats), min(lons), max(lats), max(lons)

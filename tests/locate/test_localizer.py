@@ -1,0 +1,346 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from kornia.geometry.subpix import spatial_soft_argmax2d
+from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turned
+
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.projection import project_components
+from kcal.lens.rig import StereoRig
+from kcal.locate.errors import RigCovariance, mounting_covariance
+from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic
+from kcal.locate.localizer import Localization, StereoLocalizer
+from kcal.locate.stereo import Status, Triangulate
+
+ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
+RIG = real_rig()
+ATTITUDE = {"heading_deg": 200.0, "pitch_deg": 3.0, "roll_deg": -2.0}
+N = 8000
+
+
+def localizer(rig: StereoRig = RIG, **options: object) -> StereoLocalizer:
+    return StereoLocalizer(rig, **{"origin": ORIGIN, **ATTITUDE, **options})
+
+
+def noise(sigma: float, *shape: int, seed: int = 3) -> torch.Tensor:
+    return sigma * torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def covered(found: Localization, truth: torch.Tensor) -> float:
+    return ((found.range_low <= truth) & (truth <= found.range_high)).double().mean().item()
+
+
+def test_exact_marks_give_enu_and_wgs84() -> None:
+    points = spread_points(torch.logspace(1.8, 4, 40, dtype=torch.float64))
+    left, right, _ = RIG(points)
+    found = localizer(pixel_sigma=0.01)(left, right)
+    enu = points @ enu_from_cam(*ATTITUDE.values()).T
+    assert (found.status == Status.OK).all()
+    # At range Z pixels that hold 1e-13 give Z² / (f b) * 1e-13 m.
+    assert ((found.enu - enu).norm(dim=-1) / points.norm(dim=-1)).max() < 1e-10
+    expected = enu_to_geodetic(enu, ORIGIN)
+    assert torch.allclose(found.geodetic, expected, rtol=0, atol=1e-6)
+    assert (found.geodetic - expected)[:, :2].abs().max() < 1e-11
+    assert torch.allclose(found.bearing, enu / enu.norm(dim=-1, keepdim=True), atol=1e-12)
+    assert torch.allclose(1.0 / found.inverse_range, points.norm(dim=-1), rtol=1e-10)
+    assert found.reprojection.max() < 1e-9
+
+
+def test_the_point_has_the_least_weighted_reprojection_error() -> None:
+    left, right, _ = RIG(spread_points(tensor(80.0, 400.0, 2500.0)))
+    left, right = left + noise(0.4, 3, 2), right + noise(0.4, 3, 2, seed=4)
+    root = noise(0.3, 3, 4, 4, seed=5) + 0.3 * torch.eye(4, dtype=torch.float64)
+    cov = root @ root.mT + 0.02 * torch.eye(4, dtype=torch.float64)
+    points = localizer()(left, right, cov).enu @ enu_from_cam(*ATTITUDE.values())
+    points = points.requires_grad_()
+    again = torch.cat(RIG(points)[:2], -1)
+    misses = again - torch.cat([left, right], -1)
+    cost = (misses[:, None] @ torch.linalg.inv(cov) @ misses[..., None]).sum()
+    (gradient,) = torch.autograd.grad(cost, points)
+    # Per metre; the cost changes by one over some metres here.
+    assert gradient.abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("z", [100.0, 1000.0, 5000.0])
+def test_covariance_and_interval_cover_what_noise_does(z: float) -> None:
+    point = z * tensor([0.2, -0.05, 1.0])
+    left, right, _ = RIG(point)
+    # Unlike and correlated noise in the four coordinates.
+    root = 0.1 * tensor([1.0, 0, 0, 0], [0.3, 0.8, 0, 0], [0.2, 0, 1.5, 0], [0, 0.1, 0.4, 0.5])
+    marks = torch.cat([left, right], -1) + noise(1.0, N, 4) @ root.T
+    found = localizer()(marks[:, :2], marks[:, 2:], root @ root.T)
+    assert (found.status == Status.OK).all()
+    # 8000 draws know 95 % to 0.24 %.
+    assert 0.94 < covered(found, point.norm()) < 0.96
+    spread, claimed = torch.cov(found.enu.T), found.covariance.median(0).values
+    scale = claimed.diagonal().sqrt()
+    # To first order; at 5 km the range spreads by 3 % and is skewed.
+    assert ((spread - claimed) / scale[:, None] / scale[None, :]).abs().max() < 0.06
+
+
+@pytest.mark.parametrize("z", [150.0, 5000.0])
+def test_errors_of_the_calibration_are_in_the_interval(z: float) -> None:
+    """Rigs drawn from their own covariance, with correlations, seen by a user who believes the mean rig."""
+    left = Camera.build(focal=(1600, 1605), center=(957, 541), size=SIZE, coefficients=[-0.2, 0.05], model="opencv4")
+    rig = StereoRig(left, left, turned(0.5, 0.2), tensor(-10.0, 0.1, 0.3))
+    sigma = torch.cat(
+        [tensor(0.4, 0.4, 0.3, 0.3, 0.0, 1e-4, 1e-4, 1e-5, 1e-5)] * 2 + [tensor(3e-5, 3e-5, 3e-5, 1e-3, 1e-3, 1e-3)]
+    )
+    root = torch.diag(sigma)
+    root[20, 1] = root[19, 18] = 2e-5  # the rig's rotation leans on the cameras, as after a joint solve
+    known = RigCovariance.of(rig, joint=root @ root.T)
+    assert torch.allclose(known.factor() @ known.factor().T, known.matrix, rtol=1e-9, atol=1e-18)
+    count = 4000
+    draws = noise(1.0, count, len(sigma), seed=8) @ root.T
+    point = z * tensor([0.15, 0.1, 1.0])
+    turn = rotation_from_vector(draws[:, 18:21]) @ rig.right_from_left_rotation
+    in_right = (turn @ point[0])[:, None] + (rig.right_from_left_translation + draws[:, 21:])[:, None]
+    seen = [
+        project_components(points.mT, left.parameters_vector + part, left.model).pixels[..., 0]
+        for points, part in ((point.expand(count, 1, 3), draws[:, :9]), (in_right, draws[:, 9:18]))
+    ]
+    marks = torch.cat(seen, -1) + noise(0.1, count, 4, seed=9)
+    found = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1, calibration=known)(
+        marks[:, :2], marks[:, 2:]
+    )
+    # 4000 draws know 95 % to 0.34 %; three of those.
+    assert 0.94 < covered(found, point.norm()) < 0.96
+    blind = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1)(marks[:, :2], marks[:, 2:])
+    assert covered(blind, point.norm()) < 0.85
+
+
+def test_mounting_adds_the_origin_and_what_a_turn_does_at_a_distance() -> None:
+    left, right, _ = RIG(spread_points(tensor(1000.0)))
+    plain = localizer()(left, right)
+    standing = mounting_covariance(origin_m=(0.5, 0.0, 0.0), attitude_deg=(0.0, 0.0, 0.1))
+    added = localizer(mounting=standing)(left, right).covariance - plain.covariance
+    east, north, _ = plain.enu[0].tolist()
+    turn = math.radians(0.1)
+    expected = tensor(
+        [0.25 + (turn * north) ** 2, -(turn**2) * east * north, 0],
+        [-(turn**2) * east * north, (turn * east) ** 2, 0],
+        [0, 0, 0],
+    )
+    assert torch.allclose(added[0], expected, atol=1e-9)
+
+
+def test_refraction_lowers_the_point() -> None:
+    left, right, _ = RIG(spread_points(tensor(5000.0)))
+    straight, bent = localizer()(left, right), localizer(refraction=0.13)(left, right)
+    assert (straight.enu - bent.enu)[0, 2].item() == pytest.approx(
+        0.13 * float(straight.enu[0, :2].norm()) ** 2 / 2 / 6.37e6, rel=5e-3
+    )
+    assert (straight.geodetic - bent.geodetic)[0, 2].item() == pytest.approx(0.255, abs=0.005)
+
+
+BAD = [
+    # left, right, status; f = 1600 px, b = 10 m, centre (959.5, 539.5), sigma 0.3 px
+    ((980.0, 540.0), (970.0, 540.0), Status.OK),
+    ((980.0, 540.0), (979.5, 540.0), Status.BEARING_ONLY),
+    ((970.0, 540.0), (970.0, 540.0), Status.PARALLEL),
+    ((960.0, 540.0), (970.0, 540.0), Status.PARALLEL),
+    ((math.nan, 540.0), (970.0, 540.0), Status.NOT_FINITE),
+    ((980.0, 540.0), (970.0, math.inf), Status.NOT_FINITE),
+    ((-0.6, 540.0), (-20.0, 540.0), Status.OUTSIDE_IMAGE),
+    ((980.0, 540.0), (970.0, 540.0), Status.MASKED),
+    ((980.0, 540.0), (970.0, 540.0), Status.BAD_COVARIANCE),
+    ((980.0, 540.0), (970.0, 540.0), Status.BAD_COVARIANCE),
+]  # fmt: skip
+
+
+def test_statuses_and_no_nan_in_values_or_gradients() -> None:
+    left = tensor(*(row[0] for row in BAD)).requires_grad_()
+    right = tensor(*(row[1] for row in BAD)).requires_grad_()
+    cov = (0.09 * torch.eye(4, dtype=torch.float64)).repeat(len(BAD), 1, 1)
+    cov[8, 0, 0], cov[9, 1, 2] = -1.0, math.nan
+    cov.requires_grad_()
+    mask = torch.ones(len(BAD), dtype=torch.bool)
+    mask[7] = False
+    found = StereoLocalizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)(left, right, cov, mask)
+    assert [Status(s).name for s in found.status.tolist()] == [row[2].name for row in BAD]
+    for name, value in found._asdict().items():
+        assert not torch.isnan(value).any(), name
+    assert (found.enu[1:] == 0).all()
+    assert torch.isinf(found.covariance[1:].diagonal(dim1=-2, dim2=-1)).all()
+    # Disparity 0.5 px: nearest is 16 000 / (0.5 + 1.96 * 0.42) m, farthest is open; at -10 px no range is left.
+    assert found.range_low[1].item() == pytest.approx(12_016, rel=1e-3)
+    assert torch.isinf(found.range_high[1:4]).all()
+    assert torch.isinf(found.range_low[3])
+    assert (found.range_low[4:] == 0).all()
+    assert (found.bearing[:4].norm(dim=-1) - 1).abs().max() < 1e-12
+    total = sum(torch.where(torch.isfinite(v), v, 0.0).sum() for v in found if v.is_floating_point())
+    for gradient in torch.autograd.grad(total, (left, right, cov)):
+        assert torch.isfinite(gradient).all()
+        assert (gradient[0] != 0).any()
+        assert (gradient[4:] == 0).all()
+    # Also without a point: the inverse range leads a detector back from beyond infinity.
+    (slope,) = torch.autograd.grad(localizer()(left, right).inverse_range[1:4].sum(), left)
+    assert (slope[1:4, 0] > 0).all()
+
+
+def test_gradients_of_everything() -> None:
+    left, right, _ = RIG(spread_points(tensor(60.0, 900.0)))
+    left, right = left + noise(0.5, 2, 2), right + noise(0.5, 2, 2, seed=4)
+    cov = 0.1 * torch.eye(4, dtype=torch.float64).repeat(2, 1, 1) + 0.02
+    module = localizer()
+    home = ORIGIN.geodetic
+
+    def outputs(left: torch.Tensor, right: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        found = module(left, right, 0.5 * (half + half.mT))
+        # 1e5 m a degree: all in metres.
+        place = (found.geodetic - home) * tensor(1e5, 1e5, 1.0)
+        return (
+            found.enu,
+            place,
+            1e6 * found.inverse_range,
+            found.covariance * 1e-2,
+            found.range_high,
+            found.reprojection,
+        )
+
+    inputs = (left.requires_grad_(), right.requires_grad_(), cov.requires_grad_())
+    # Degrees of 151 hold 3e-14: with steps of 1e-4 that is 3e-5 of a slope.
+    assert torch.autograd.gradcheck(outputs, inputs, eps=1e-4, rtol=1e-5, atol=1e-3)
+
+
+def test_gradients_reach_freed_parameters_of_a_camera() -> None:
+    rig = real_rig()
+    left, right, _ = rig(spread_points(tensor(800.0)))
+    module = localizer(rig)
+    rig.right.free("cx")
+    module(left, right).enu.norm().backward()
+    moved = {
+        sign: Camera(
+            rig.right.parameters_vector.detach() + sign * 1e-3 * tensor(0, 0, 1.0, *[0] * 7), size=SIZE, model="opencv5"
+        )
+        for sign in (1, -1)
+    }
+    ranges = {}
+    for sign, camera in moved.items():
+        other = StereoRig(rig.left, camera, rig.right_from_left_rotation, rig.right_from_left_translation)
+        ranges[sign] = localizer(other)(left, right).enu.norm().item()
+    slope = (ranges[1] - ranges[-1]) / 2e-3
+    assert rig.right.parameters_vector.grad[2].item() == pytest.approx(slope, rel=1e-6)
+
+
+def test_batches_pieces_and_precision() -> None:
+    points = spread_points(torch.linspace(50, 3000, 40_000, dtype=torch.float64))
+    left, right, _ = RIG(points)
+    module = localizer()
+    flat = module(left, right)
+    deep = module(left[:24].reshape(2, 3, 4, 2), right[:24].reshape(2, 3, 4, 2))
+    assert deep.enu.shape == (2, 3, 4, 3)
+    assert deep.covariance.shape == (2, 3, 4, 3, 3)
+    for own, other in zip(deep, flat, strict=True):
+        assert own.shape[:3] == (2, 3, 4)
+        assert torch.allclose(own.reshape(24, *own.shape[3:]), other[:24], rtol=1e-8)
+    assert module(left[:0], right[:0]).enu.shape == (0, 3)
+    halved = localizer(real_rig()).half()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        got = halved(left[:9].float(), right[:9].float())
+    for own, other in zip(got, module(left[:9].float().double(), right[:9].float().double()), strict=True):
+        assert torch.equal(own, other)
+
+
+def test_agrees_with_triangulate() -> None:
+    left, right, _ = RIG(spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64)))
+    ours, theirs = localizer(pixel_sigma=0.1)(left, right), Triangulate(RIG, 0.1)(left, right)
+    # The two derive the noise of the range in different ways.
+    assert torch.allclose(ours.range_high, theirs.range_high, rtol=1e-3)
+    assert torch.allclose(ours.range_low, theirs.range_low, rtol=1e-3)
+
+
+def test_sensitivities() -> None:
+    rig = pinhole_rig(1600.0, 10.0)
+    left, right, _ = rig(tensor([0.0, 0.0, 5000.0], [0.0, 0.0, 1000.0]))
+    slopes = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0).sensitivity(left, right)
+    # Z² / (f b) m/px, and Z² / b m/rad: 436 m for 0.01° at 5 km.
+    assert slopes.metres_per_pixel.tolist() == pytest.approx([1562.5, 62.5], rel=1e-3)
+    assert slopes.metres_per_degree.tolist() == pytest.approx([43_633, 1745.3], rel=1e-3)
+    # By turning the rig and locating again.
+    turned_rig = StereoRig(rig.left, rig.right, turned(1e-4), rig.right_from_left_translation)
+    module = StereoLocalizer(turned_rig, origin=ORIGIN, heading_deg=0.0)
+    moved = module(left, right).enu.norm(dim=-1) - tensor(5000.0, 1000.0)
+    assert moved.abs().tolist() == pytest.approx([4.3633, 0.17453], rel=2e-3)
+
+
+def test_compiles_as_one_graph() -> None:
+    rig = pinhole_rig()
+    module = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0)
+    left, right = tensor([980.0, 540.0], [960.0, 540.0]), tensor([970.0, 540.2], [970.0, 540.0])
+    compiled = torch.compile(module, fullgraph=True, backend="eager")
+    for own, other in zip(module(left, right), compiled(left, right), strict=True):
+        assert torch.allclose(own, other, rtol=1e-9)
+
+
+def test_a_detector_is_trained_through_it() -> None:
+    """Heat maps, kornia's soft-argmax, a crop's offset, metres: the loss is the position, no pixel is given."""
+    torch.manual_seed(0)
+    rig = pinhole_rig(1600.0, 10.0)
+    truth = torch.stack(
+        [torch.linspace(-30, 30, 16), torch.linspace(8, -8, 16), torch.linspace(250, 600, 16)], -1
+    ).double()
+    left, right, _ = rig(truth)
+    corners = [pixels.detach().round() - 16 for pixels in (left, right)]
+    grid = torch.arange(33.0)
+    crops = []
+    for pixels, corner in zip((left, right), corners, strict=True):
+        u, v = ((pixels - corner).float()[:, i, None, None] for i in (0, 1))
+        crops.append(torch.exp(-((grid - u) ** 2 + (grid[:, None] - v) ** 2) / 8.0))
+    images = torch.stack(crops, 1).reshape(32, 1, 33, 33) + 0.02 * torch.rand(32, 1, 33, 33)
+    net = torch.nn.Sequential(torch.nn.Conv2d(1, 4, 5, padding=2), torch.nn.ReLU(), torch.nn.Conv2d(4, 1, 5, padding=2))
+    module = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0)
+    aim = truth @ enu_from_cam(0.0).T
+
+    def located() -> Localization:
+        spots = spatial_soft_argmax2d(8.0 * net(images), normalized_coordinates=False).reshape(16, 2, 2)
+        return module(spots[:, 0] + corners[0], spots[:, 1] + corners[1])
+
+    def range_error(found: Localization) -> float:
+        return ((1.0 / found.inverse_range.detach() - aim.norm(dim=-1)).abs()).median().item()
+
+    optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
+    before = range_error(located())
+    for _ in range(60):
+        found = located()
+        loss = ((found.inverse_range * aim.norm(dim=-1) - 1.0) ** 2).mean() + (
+            (found.bearing - aim / aim.norm(dim=-1, keepdim=True)) ** 2
+        ).sum(-1).mean() * 1e4
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert range_error(located()) < 0.3 * before
+
+
+def test_bad_arguments() -> None:
+    module, marks = localizer(), tensor([980.0, 540.0])
+    for arguments, message in (
+        ((marks.long(), marks), "floating point"),
+        ((marks, marks[0]), "same shape"),
+        ((marks, marks, torch.eye(2).double()), "cov"),
+        ((marks, marks, None, torch.ones(1)), "bool"),
+    ):
+        with pytest.raises(InputError, match=message):
+            module(*arguments)
+    for options, message in (
+        ({"pixel_sigma": 0.0}, "pixel_sigma"),
+        ({"refraction": 13.0}, "refraction"),
+        ({"mounting": torch.eye(3)}, "mounting"),
+        ({"calibration": RigCovariance(matrix=torch.eye(3))}, "joint covariance"),
+        ({"heading_deg": math.nan}, "heading"),
+    ):
+        with pytest.raises(InputError, match=message):
+            localizer(**options)
+    with pytest.raises(InputError, match="no negative eigenvalue"):
+        RigCovariance.of(RIG, pose=-torch.eye(6, dtype=torch.float64))
+    with pytest.raises(InputError, match="not both"):
+        RigCovariance.of(RIG, pose=torch.eye(6), joint=torch.eye(26))
+    with pytest.raises(InputError, match="sigmas"):
+        mounting_covariance(origin_m=(-1.0, 0.0, 0.0))
+    with pytest.raises(DegenerateError, match="same place"):
+        localizer(StereoRig(RIG.left, RIG.left, torch.eye(3), torch.zeros(3)))

@@ -1,0 +1,148 @@
+"""The map as a file, and in a real browser where there is one."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from locate_rigs import pinhole_rig, tensor
+from PIL import Image, TiffImagePlugin
+
+from kcal.errors import FileError, InputError
+from kcal.locate.geodesy import Origin, enu_from_cam, geodetic_to_enu
+from kcal.locate.positions import Located, locate
+from kcal.report.backdrop import local_image, local_tiles
+from kcal.report.map_page import map_page, save_map
+
+ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
+TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])
+BROWSER = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+
+
+def scene(origin: Origin = ORIGIN) -> tuple[Located, torch.Tensor]:
+    left, right, _ = pinhole_rig()(TRUTH)
+    names = ["gate", "</script><b>mast", "ship", "cloud"]
+    located = locate(pinhole_rig(), left, right + tensor([0.3, 0.0]), origin=origin, heading_deg=300.0, names=names)
+    return located, TRUTH @ enu_from_cam(300.0).T
+
+
+def data(page: str) -> dict[str, object]:
+    return json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
+
+
+def test_everything_is_where_it_should_be() -> None:
+    located, truth = scene()
+    content = data(map_page(located, truth))
+    assert [point["name"] for point in content["points"]] == ["gate", "</script><b>mast", "ship"]
+    assert [arc["name"] for arc in content["arcs"]] == ["250 m", "1 km", "5 km"]
+    for arc, metres in zip(content["arcs"], (250, 1000, 5000), strict=True):
+        places = torch.tensor([[*place, ORIGIN.height] for place in arc["line"]], dtype=torch.float64)
+        horizontal = geodetic_to_enu(places, ORIGIN)[:, :2].norm(dim=-1)
+        # Drawn at the origin's height, not in its tangent plane.
+        assert (horizontal - metres).abs().max() < 0.02
+    for spot, row in zip(content["truth"], truth, strict=True):
+        # The drop of the ellipsoid at 60 km moves a horizontal place by less than a metre per metre of height.
+        enu = geodetic_to_enu(tensor(*spot, ORIGIN.height), ORIGIN)
+        assert (enu - row)[:2].norm() < 1e-5 * row.norm() * max(1.0, float(row.norm()) / 1000)
+    assert len(content["regions"]) == 3
+    assert len(content["bearings"]) == 1
+    assert len(content["arrows"]) == 3
+    assert data(map_page(located))["truth"] == []
+
+
+def test_it_may_load_nothing_unless_asked() -> None:
+    page = map_page(scene()[0])
+    assert 'img-src data:"' in page
+    assert "default-src 'none'" in page
+    # No element that loads, no style that does.
+    assert not re.search(r"<(link|img|iframe|script[^>]* src)", page.split("<script")[0])
+    assert "url(images" not in page
+    assert data(page)["online"] is None
+    assert "img-src data: https://tile.openstreetmap.org" in map_page(scene()[0], online=True)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine: the map was not opened in a browser")
+@pytest.mark.parametrize("lon", [72.87, 179.99])
+def test_a_browser_draws_it_without_errors(tmp_path: Path, lon: float) -> None:
+    located, truth = scene(Origin(lat=19.07, lon=lon, height=14.0))
+    path = save_map(tmp_path / "map.html", located, truth)
+    done = subprocess.run(
+        [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
+         f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=2000", "--dump-dom", path.as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert "CONSOLE" not in done.stderr, done.stderr
+    # Points, true ones, cameras with fields, arcs with ends, regions, arrows with heads, a bearing.
+    assert 'data-drawn="3/' in done.stdout
+    assert int(re.search(r'data-drawn="3/(\d+)"', done.stdout).group(1)) == 3 + 4 + 4 + 6 + 3 + 6 + 1
+    for text in ("gate", "&lt;/script&gt;&lt;b&gt;mast", "ship", "5 km", "estimated positions"):
+        assert text in done.stdout
+
+
+def geotiff(path: Path) -> Path:
+    """100 x 80 pixels of 20 m in UTM zone 43 north, its top left corner at 273 000 E, 2 111 000 N; a red square."""
+    pixels = np.full((80, 100, 3), 200, np.uint8)
+    pixels[38:43, 68:73] = (255, 0, 0)
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[33550], tags[33922] = (20.0, 20.0, 0.0), (0.0, 0.0, 0.0, 273_000.0, 2_111_000.0, 0.0)
+    tags[34735] = (1, 1, 0, 2, 1025, 0, 1, 1, 3072, 0, 1, 32643)
+    tags.tagtype[33550] = tags.tagtype[33922] = 12
+    tags.tagtype[34735] = 3
+    Image.fromarray(pixels).save(path, tiffinfo=tags)
+    return path
+
+
+def test_a_geotiff_lies_where_it_belongs(tmp_path: Path) -> None:
+    import base64
+    import io
+
+    import pyproj
+
+    image = local_image(geotiff(tmp_path / "ortho.tif"))
+    raw = base64.b64decode(image["uri"].split(",")[1])
+    pixels = np.asarray(Image.open(io.BytesIO(raw)).convert("RGBA")).astype(int)
+    row, column = np.argwhere((pixels[..., 0] - pixels[..., 1] > 60) & (pixels[..., 3] > 0)).mean(0)
+    (south, west), (north, east) = image["bounds"]
+    lon = west + (column + 0.5) / pixels.shape[1] * (east - west)
+    lat = north - (row + 0.5) / pixels.shape[0] * (north - south)
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32643", always_xy=True).transform(lon, lat)
+    # Half a pixel of 20 m, and the colours of WEBP spread over more.
+    assert (x, y) == pytest.approx((273_000 + 70.5 * 20, 2_111_000 - 40.5 * 20), abs=30)
+    page = map_page(scene()[0], image=tmp_path / "ortho.tif")
+    assert data(page)["image"]["name"] == "ortho.tif"
+
+
+def test_tiles_in_view_are_embedded(tmp_path: Path) -> None:
+    # Zoom 13 of Mumbai: x = (72.87 + 180) / 360 * 8192 = 5754, y = 3654.
+    for x, y in ((5754, 3654), (100, 100)):
+        (tmp_path / "13" / str(x)).mkdir(parents=True)
+        Image.new("RGB", (256, 256), "green").save(tmp_path / "13" / str(x) / f"{y}.png")
+    content = data(map_page(scene()[0], tiles=tmp_path))
+    assert list(content["tiles"]["images"]) == ["13/5754/3654"]
+    assert content["tiles"]["zooms"] == [13, 13]
+    with pytest.raises(FileError, match="shows this place"):
+        local_tiles(tmp_path, (50.0, 8.0, 51.0, 9.0))
+
+
+def test_bad_arguments(tmp_path: Path) -> None:
+    located, truth = scene()
+    with pytest.raises(InputError, match=r"truth: shape \(4, 3\)"):
+        map_page(located, truth[:2])
+    with pytest.raises(InputError, match=r"end with \.html"):
+        save_map(tmp_path / "map.png", located)
+    with pytest.raises(FileError, match="no such folder"):
+        map_page(located, tiles=tmp_path / "none")
+    Image.new("RGB", (4, 4)).save(tmp_path / "plain.tif")
+    with pytest.raises(InputError, match="no GeoTIFF"):
+        map_page(located, image=tmp_path / "plain.tif")
+    (tmp_path / "text.tif").write_text("no image")
+    with pytest.raises(FileError, match="cannot read this image"):
+        map_page(located, image=tmp_path / "text.tif")
