@@ -1,4 +1,4 @@
-"""Time and accuracy of calibration against other solvers on simulated views; writes docs/solver.md.
+"""Time and accuracy of calibration against other solvers on simulated views; a section of docs/solver.md.
 
     python scripts/bench_solver.py                          all sizes and models, three runs each
     python scripts/bench_solver.py --views 15 50 --coefficients 5 14 --repeats 1
@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from page import write_section
 
 MODELS = {5: "opencv5", 8: "opencv8", 14: "opencv14", 20: "ext20"}
 SIZE, COLUMNS, ROWS, SQUARE, NOISE = (1920, 1080), 6, 7, 0.05, 0.2
@@ -249,12 +250,12 @@ def main() -> None:
     parser.add_argument("--coefficients", type=int, nargs="*", default=list(MODELS), choices=list(MODELS))
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--timeout", type=float, default=120.0)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "solver.md")
+    parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
     arguments.solvers = ["OpenCV", *(["Ceres"] if os.environ.get("KCAL_PEERS") else [])]
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     lines = [
-        "# The solver against others",
+        "## Beside other solvers",
         "",
         f"Made by `scripts/bench_solver.py`: simulated views of a {COLUMNS}x{ROWS} board, {SIZE[0]}x{SIZE[1]} px, "
         f"noise {NOISE} px an axis, {os.environ['OMP_NUM_THREADS']} thread(s), median of {arguments.repeats} "
@@ -271,7 +272,8 @@ def main() -> None:
             for line in compare(views, coefficients, arguments):
                 print(line, flush=True)
                 lines.append(line)
-    arguments.out.write_text("\n".join(lines) + "\n")
+    if not arguments.dry:
+        write_section("solver.md", "beside other solvers", "\n".join(lines))
 
 
 if __name__ == "__main__":

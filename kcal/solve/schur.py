@@ -69,6 +69,22 @@ class SchurLinearisation:
         matrix, _, _, _ = self._reduce(torch.zeros_like(self.cost))
         return matrix, self._shared_scale
 
+    def answers(self) -> tuple[Tensor, Tensor]:
+        """How each view's local parameters follow the shared ones, and what is left of them when these are held.
+
+        Returns:
+            A (..., V, L, S), by which a change of the shared parameters moves the best local ones, and the inverse
+            (..., V, L, L) of each local normal matrix; both in the parameters' own units. With Σ the covariance of
+            the shared parameters, that of the local ones of views v and w is A_v Σ A_wᵀ, plus that inverse times the
+            noise variance where v = w. A local block that is singular to rounding gives NaN.
+        """
+        factor, info = torch.linalg.cholesky_ex(self._local)
+        factor = torch.where((info == 0)[..., None, None], factor, torch.nan)
+        along = torch.cholesky_solve(self._coupling, factor)
+        column, row = self._local_scale[..., :, None], self._local_scale[..., None, :]
+        inverse = torch.cholesky_inverse(factor) * column * row
+        return -along * column / self._shared_scale[..., None, None, :], inverse
+
 
 def _inverse_root(diagonal: Tensor) -> Tensor:
     """Scale of each column; a column of zeros keeps its place and never moves."""
