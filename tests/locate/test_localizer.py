@@ -269,13 +269,19 @@ def test_sensitivities() -> None:
     assert moved.abs().tolist() == pytest.approx([4.3633, 0.17453], rel=2e-3)
 
 
-def test_compiles_as_one_graph() -> None:
-    rig = pinhole_rig()
-    module = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0)
-    left, right = tensor([980.0, 540.0], [960.0, 540.0]), tensor([970.0, 540.2], [970.0, 540.0])
+def test_compiles_as_one_graph_with_its_gradients() -> None:
+    module = StereoLocalizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)
+    left, right = tensor([980.0, 540.0], [960.0, 540.0], [1.0, 1.0]), tensor([970.0, 540.2], [970.0, 540.0], [1.0, 1.0])
+    cov, mask = 0.04 * torch.eye(4, dtype=torch.float64).repeat(3, 1, 1), torch.tensor([True, True, False])
     compiled = torch.compile(module, fullgraph=True, backend="eager")
-    for own, other in zip(module(left, right), compiled(left, right), strict=True):
-        assert torch.allclose(own, other, rtol=1e-9)
+    gradients = []
+    for call in (module, compiled):
+        marks = left.clone().requires_grad_()
+        found = call(marks, right, cov, mask)
+        gradients.append(torch.autograd.grad(found.enu.sum() + found.inverse_range.sum(), marks)[0])
+        for own, other in zip(module(left, right, cov, mask), found, strict=True):
+            assert torch.allclose(own, other, rtol=1e-9)
+    assert torch.allclose(*gradients, rtol=1e-9)
 
 
 def test_a_detector_is_trained_through_it() -> None:
