@@ -60,7 +60,7 @@ class Outcome(NamedTuple):
 
     def __str__(self) -> str:
         folds = ", the yardstick folds" if self.yardstick_folds else ""
-        return f"seed {self.seed}: {self.excess:+.1e} (k1 {self.k1:.2f}, noise {self.noise:.2f} px{folds})"
+        return f"seed {self.seed}: {self.excess:+.1e} (k1 {self.k1:.3f}, noise {self.noise:.3f} px{folds})"
 
 
 def random_camera(rng: np.random.Generator, model: LensModel) -> Camera:
