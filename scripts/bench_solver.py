@@ -22,10 +22,13 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from page import write_section
+
+if TYPE_CHECKING:
+    from kcal.lens.camera import Camera
 
 MODELS = {5: "opencv5", 8: "opencv8", 14: "opencv14", 20: "ext20"}
 SIZE, COLUMNS, ROWS, SQUARE, NOISE = (1920, 1080), 6, 7, 0.05, 0.2
@@ -33,7 +36,9 @@ TRUTH = [-0.35, 0.15, 3e-4, -2e-4, -0.03, 0.02, -0.015, 0.005, 4e-4, -2e-4, -3e-
 SAME = 1e-4
 
 
-def simulate(count: int) -> dict[str, np.ndarray]:
+def simulate(
+    count: int, camera: Camera | None = None, *, noise: float = NOISE, seed: int | None = None
+) -> dict[str, np.ndarray]:
     """Views of a board that is wholly inside the image, tilted up to 45 degrees, with normal noise."""
     import torch
 
@@ -41,8 +46,10 @@ def simulate(count: int) -> dict[str, np.ndarray]:
     from kcal.lens.camera import Camera
     from kcal.lens.pose import rotation_from_vector
 
-    rng = np.random.default_rng(count)
-    camera = Camera.build(focal=(1600, 1600), center=(963, 536), size=SIZE, coefficients=TRUTH, model="opencv14")
+    rng = np.random.default_rng(count if seed is None else seed)
+    if camera is None:
+        camera = Camera.build(focal=(1600, 1600), center=(963, 536), size=SIZE, coefficients=TRUTH, model="opencv14")
+    focal = float(camera.focal[0])
     board = Board(columns=COLUMNS, rows=ROWS, square=SQUARE).points
     rotations: list[np.ndarray] = []
     translations: list[np.ndarray] = []
@@ -53,7 +60,7 @@ def simulate(count: int) -> dict[str, np.ndarray]:
         axis = torch.tensor([[np.cos(azimuth), np.sin(azimuth), 0.0], [0.0, 0.0, 0.0]]).double() * tilt
         axis[1, 2] = rng.uniform(-np.pi / 6, np.pi / 6)
         rotation = rotation_from_vector(axis[0]) @ rotation_from_vector(axis[1])
-        depth = 1600 * SQUARE * (ROWS - 1) / (rng.uniform(0.18, 0.55) * SIZE[1])
+        depth = focal * SQUARE * (ROWS - 1) / (rng.uniform(0.18, 0.55) * SIZE[1])
         ray = camera.normalize(middle)[0][0]
         centre = depth * torch.cat([ray, torch.ones(1).double()])
         translation = centre - rotation @ board.mean(0)
@@ -61,7 +68,7 @@ def simulate(count: int) -> dict[str, np.ndarray]:
         if bool((valid & camera.inside(seen)).all()):
             rotations.append(rotation.numpy())
             translations.append(translation.numpy())
-            pixels.append(seen.detach().numpy() + rng.normal(0, NOISE, seen.shape))
+            pixels.append(seen.detach().numpy() + rng.normal(0, noise, seen.shape))
     return {
         "board": board.numpy(),
         "pixels": np.array(pixels),
