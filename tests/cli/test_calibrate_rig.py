@@ -123,6 +123,25 @@ class TestCalibrate:
         assert row[1] == f"{float(found.focal[0]):.3f}"
         assert (folder / "left.png").read_bytes().startswith(b"\x89PNG")
 
+    def test_outliers_are_left_out_and_listed(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        content = json.loads((folder / "left.obs.json").read_text())
+        u, v = content["views"][2]["pixels"][5]
+        content["views"][2]["pixels"][5] = [u + 12.0, v]
+        (folder / "one.obs.json").write_text(json.dumps(content))
+        assert run(monkeypatch, "calibrate", "one.obs.json", "-o", "one.json", "--reject") == 0
+        printed = capsys.readouterr()
+        assert "6 views, 251 corners" in printed.out
+        assert "left out: 0.40 % of the corners" in printed.out
+        assert "left02.png corner 5: " in printed.out
+        calibration = CameraFile.load(folder / "one.json").calibration
+        assert calibration is not None
+        assert [entry.name for entry in calibration.excluded] == ["left02.png corner 5"]
+        assert calibration.points == 251
+        assert run(monkeypatch, "calibrate", "one.obs.json", "-o", "one.json") == 0
+        assert "corner 5 of view left02.png" in capsys.readouterr().err
+
     def test_board_warp_and_a_warning(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
