@@ -29,7 +29,7 @@ from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimise
-from kcal.solve.result import Result, State, Status
+from kcal.solve.result import State, Status
 from kcal.solve.robust import RobustLoss
 
 __all__ = ["CalibrationOptions", "CameraCalibrationResult", "calibrate_camera"]
@@ -61,7 +61,7 @@ def calibrate_camera(
         progress: told what has just been finished.
 
     Returns:
-        the camera with its residuals and error bars. Skew stays 0.
+        the camera with its residuals and error bars. Skew stays 0 unless `free` or `fixed` name it.
 
     Raises:
         DegenerateError: fewer than three views, too few corners for the model, or views that do not determine the
@@ -92,8 +92,7 @@ def calibrate_camera(
 
 
 def _judge(observations: Observations, solved: Solved, options: CalibrationOptions) -> CameraCalibrationResult:
-    model = LensModel.named(options.model)
-    found = _result(observations, solved.problem, solved.result, solved.spent, model)
+    found = _result(observations, solved, options)
     doubts = rival_warnings(found.camera, found.sigma, solved.minimum, solved.plain_cost, solved.problem.residual_count)
     doubts += standing_out(observations.names, _weighted_residuals(solved.problem, solved.result.state))
     return dataclasses.replace(found, warnings=(*found.warnings, *doubts))
@@ -196,9 +195,8 @@ def _robust_residuals(observations: Observations, solved: Solved, options: Calib
     return torch.where(unreached[..., None], torch.inf, residuals), spent
 
 
-def _result(
-    observations: Observations, problem: BoardProblem, solved: Result, spent: int, model: LensModel
-) -> CameraCalibrationResult:
+def _result(observations: Observations, found: Solved, options: CalibrationOptions) -> CameraCalibrationResult:
+    problem, solved, model = found.problem, found.result, LensModel.named(options.model)
     state = problem.tidy(solved.state)
     s = problem.unpack(state)
     pixels = observations.pixels()
@@ -209,9 +207,12 @@ def _result(
     per_view = torch.sqrt(squared.sum(-1) / seen.sum(-1))
     rms = float(torch.sqrt(squared.sum() / seen.sum()))
     count = problem.shared_size + 6 * len(pixels)
-    uncertainty = spread(problem.linearise(state), problem.residual_count, count)
-    names = [name for name in camera.names if name != "skew"]
-    check_focal(uncertainty, s.parameters[0])
+    uncertainty = spread(problem.linearise(state), problem.residual_count + len(options.priors), count)
+    free = problem.free[0]
+    slot = {camera.names[i]: k for i, k in zip(free.indices, free.slots, strict=True)}
+    names = [" = ".join(name for name in slot if slot[name] == k) for k in range(len(free))]
+    check_focal({name: float(uncertainty.sigma[k]) for name, k in slot.items()}, s.parameters[0])
+    known = uncertainty.determined.tolist()
     status = Status(int(solved.status))
     return CameraCalibrationResult(
         camera=camera,
@@ -223,9 +224,12 @@ def _result(
         cam_from_board_translation=s.first_from_board_translation,
         board_warp=s.warp if problem.free_warp else None,
         sigma={
-            name: float(sigma) if bool(known) else None for name, sigma, known in zip(names, *uncertainty, strict=False)
+            name: float(uncertainty.sigma[slot[name]]) if name in slot and known[slot[name]] else None
+            for name in camera.names
+            if name in slot or name in options.fixed
         },
+        fixed=tuple(name for name in camera.names if name in options.fixed),
         status=status,
-        iterations=spent,
+        iterations=found.spent,
         warnings=tuple(warnings_of(observations, camera, rms, per_view, uncertainty, names, status)),
     )

@@ -18,7 +18,7 @@ from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
 from kcal.calibrate.options import CalibrationOptions
 from kcal.calibrate.poses import unflip
 from kcal.calibrate.problem import BoardProblem
-from kcal.calibrate.views import Views, free_parameters
+from kcal.calibrate.views import Views
 from kcal.calibrate.weights import whitening
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
@@ -34,6 +34,9 @@ _MINIMUM_CORNERS = 6
 _MINIMUM_WIDTH = 0.5
 # A first fit worse than this many pixels is retried from other focal lengths.
 _SUSPICIOUS_RMS = 2.0
+
+# Of a corner, pixels; and how often it is measured anew beside priors.
+_LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,14 +56,23 @@ def solve(observations: Observations, options: CalibrationOptions, progress: Pro
     model = LensModel.named(options.model)
     board = observations.board.points
     pixels = observations.pixels()
-    _check(observations, pixels, model, options.board_warp)
+    rules = options.rules(observations.image_size)
+    _check(observations, pixels, len(rules.parameters(model)), options.board_warp)
 
     solver = options.solver
-    ladder = steps_to(model)
+    ladder = [step for step in steps_to(model) if rules.allows(step)]
     first, cold, spent = _first(board, pixels, observations.image_size, ladder[0], options)
     progress(f"start ({ladder[0]})")
     seen = pixels[:, None]
-    views = Views(board_points=board, pixels=seen, size=observations.image_size, free_warp=options.board_warp)
+    views = Views(
+        board_points=board,
+        pixels=seen,
+        size=observations.image_size,
+        free_warp=options.board_warp,
+        rules=rules,
+    )
+    if rules.priors:
+        views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), _LEAST_NOISE))
     minimum = climb(views, first, cold, ladder, solver, progress)
     spent += minimum.iterations
 
@@ -72,6 +84,16 @@ def solve(observations: Observations, options: CalibrationOptions, progress: Pro
         if flipped:
             result = minimise(problem, state, solver)
             spent += int(result.iterations)
+    if rules.priors:
+        # The noise, against which priors count, is that of this solution.
+        for _ in range(_NOISE_ROUNDS):
+            views = dataclasses.replace(views, prior_noise=max(views.noise(result.state, model), _LEAST_NOISE))
+            problem = views.problem(model, terms=minimum.terms)
+            result = minimise(problem, result.state, solver)
+            spent += int(result.iterations)
+        rivals = tuple((float(views.problem(model).cost(state)), state) for _, state in minimum.rivals)
+        terms = (*minimum.terms, *rules.terms(model, views.prior_noise))
+        minimum = dataclasses.replace(minimum, rivals=rivals, terms=terms)
     plain_cost = float(result.cost)
     covariances = observations.covariances() if options.weighted else None
     # The residuals of the plain solution tell how much there is beyond the corners' own noise.
@@ -100,7 +122,7 @@ def corner_problem(
         observations.board.points,
         observations.pixels()[:, None],
         [model],
-        [free_parameters(model)],
+        [options.rules(observations.image_size).parameters(model)],
         free_warp=options.board_warp,
         whitening=weights,
         loss=loss,
@@ -108,7 +130,7 @@ def corner_problem(
     )
 
 
-def _check(observations: Observations, pixels: Tensor, model: LensModel, warp: bool) -> None:
+def _check(observations: Observations, pixels: Tensor, count: int, warp: bool) -> None:
     seen = torch.isfinite(pixels).all(-1).sum(-1)
     if len(pixels) < _MINIMUM_VIEWS:
         raise DegenerateError(
@@ -134,7 +156,7 @@ def _check(observations: Observations, pixels: Tensor, model: LensModel, warp: b
         raise InputError(
             f"view {observations.names[thin[0]]!r}: its corners coincide or the board is seen edge-on; remove the view"
         )
-    unknowns = 4 + model.size + 2 * warp + 6 * len(pixels)
+    unknowns = count + 2 * warp + 6 * len(pixels)
     if 2 * int(seen.sum()) <= unknowns:
         raise DegenerateError(
             f"{int(seen.sum())} corners cannot determine {unknowns} parameters: add views or choose a smaller model"
@@ -149,17 +171,22 @@ def _first(
     spent = 0
     best: tuple[float, State, State] | None = None
     candidates = intrinsics_candidates(homography, size)
-    if options.focal is not None:
+    rules, focal = options.rules(size), options.start_focal(size)
+    if focal is not None:
         centre = [(size[0] - 1) / 2, (size[1] - 1) / 2]
-        candidates.insert(0, torch.tensor([options.focal, options.focal, *centre], dtype=torch.float64))
-    for intrinsics in candidates:
-        rotation, translation = poses_from_homographies(homography, intrinsics)
+        candidates.insert(0, torch.tensor([focal, focal, *centre], dtype=torch.float64))
+    views = Views(board_points=board, pixels=pixels[:, None], size=size, free_warp=options.board_warp, rules=rules)
+    for candidate in candidates:
         zero = torch.zeros(len(INTRINSICS) + model.size, dtype=torch.float64)
-        zero[:4] = intrinsics
+        zero[:4] = candidate
+        zero = rules.impose(zero, model)
+        intrinsics = zero[:4]
+        rotation, translation = poses_from_homographies(homography, intrinsics)
         lens = zero.clone()
         if model.numerator >= 2:
             k1, k2 = (len(INTRINSICS) + i for i in model.numerator_index[:2])
             lens[[k1, k2]] = radial_start(board, pixels, intrinsics, rotation, translation)
+        lens = rules.impose(lens, model)
         rest = (
             torch.zeros(2, dtype=torch.float64),
             torch.zeros(0, 3, 3, dtype=torch.float64),
@@ -167,7 +194,7 @@ def _first(
             rotation,
             translation,
         )
-        problem = BoardProblem(board, pixels[:, None], [model], [free_parameters(model)], free_warp=options.board_warp)
+        problem = views.problem(model)
         cold: State = (zero, *rest)
         for start in ((lens, *rest), cold):
             result = minimise(problem, start, options.solver)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
@@ -22,9 +22,14 @@ _CLOSE_RIVAL = 25.0
 _GROSS = 2.0
 
 
-def check_focal(uncertainty: Spread, parameters: Tensor) -> None:
-    """Raise `DegenerateError` where the focal length is hardly known: that is no calibration."""
-    worst = float((uncertainty.sigma[:2] / parameters[:2]).max())
+def check_focal(sigma: Mapping[str, float], parameters: Tensor) -> None:
+    """Raise `DegenerateError` where the focal length is hardly known: that is no calibration.
+
+    Args:
+        sigma: standard deviations of the free parameters by name, infinite where not determined.
+        parameters: (5 + P,).
+    """
+    worst = max((sigma.get(name, 0.0) / float(parameters[i]) for i, name in enumerate(("fx", "fy"))), default=0.0)
     if not worst <= _MAX_FOCAL_SIGMA:
         known = "not at all" if worst == float("inf") else f"only to ±{100 * worst:.1f} %"
         raise DegenerateError(
@@ -46,7 +51,7 @@ def rival_warnings(
         apart = {
             name: there[name] - here[name]
             for name in ("fx", "fy", "cx", "cy")
-            if abs(there[name] - here[name]) > max(1.0, 4.0 * (sigma[name] or 0.0))
+            if abs(there[name] - here[name]) > max(1.0, 4.0 * (sigma.get(name) or 0.0))
         }
         if apart:
             rms = (2.0 * variance * other / cost) ** 0.5

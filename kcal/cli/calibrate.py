@@ -28,6 +28,21 @@ def calibrate(
     focal: Annotated[
         float | None, typer.Option(help="Roughly known focal length in pixels (EXIF, field of view), as a start.")
     ] = None,
+    fov: Annotated[
+        float | None, typer.Option(help="Roughly known horizontal field of view in degrees, as a start.")
+    ] = None,
+    fix: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[=VALUE]", help="Hold a parameter; without a value cx, cy in the middle, else 0."),
+    ] = None,
+    tie: Annotated[list[str] | None, typer.Option(metavar="NAME=NAME", help="Keep parameters equal, as fx=fy.")] = None,
+    free: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Estimate what is held otherwise: skew.")
+    ] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE±SIGMA", help="Gaussian knowledge of a parameter; +- will do for ±."),
+    ] = None,
     loss: Annotated[
         str | None,
         typer.Option(metavar="KIND", help="Robust loss against wrong corners: huber, cauchy or tukey."),
@@ -75,7 +90,18 @@ def calibrate(
     # An unknown kind is refused by the loss itself.
     robust = None if loss is None else RobustLoss(kind=loss, scale=loss_scale)  # type: ignore[arg-type]
     rejection = OutlierRejection(limit=reject_limit) if reject else None
-    options = CalibrationOptions(model=lens, board_warp=board_warp, focal=focal, loss=robust, reject=rejection)
+    options = CalibrationOptions(
+        model=lens,
+        board_warp=board_warp,
+        focal=focal,
+        field_of_view=fov,
+        fixed=_fixed(fix or []),
+        tied=tuple(tuple(name.strip() for name in text.split("=")) for text in tie or []),
+        free=tuple(free or []),
+        priors=_priors(prior or []),
+        loss=robust,
+        reject=rejection,
+    )
     seen = Observations.load(observations)
     with steps("calibrating", 1 + max(1, len(steps_to(lens)) - 1)) as advance:
         result = calibrate_camera(seen, options, advance)
@@ -104,6 +130,44 @@ def calibrate(
     for path in (output, picture):
         if path is not None:
             out.print(f"wrote {path}", markup=False)
+
+
+def _number(text: str, option: str) -> float:
+    from kcal.errors import InputError
+
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"{option}: {text.strip()!r} is not a number") from None
+
+
+def _fixed(texts: list[str]) -> dict[str, float | None]:
+    """`--fix` NAME or NAME=VALUE."""
+    from kcal.errors import InputError
+
+    found: dict[str, float | None] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if name.strip() in found:
+            raise InputError(f"--fix {text}: {name.strip()} is fixed twice")
+        found[name.strip()] = _number(value, f"--fix {text}") if equals else None
+    return found
+
+
+def _priors(texts: list[str]) -> dict[str, tuple[float, float]]:
+    """`--prior` NAME=VALUE±SIGMA."""
+    from kcal.errors import InputError
+
+    found: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        name, equals, rest = text.partition("=")
+        mean, sign, sigma = rest.replace("+-", "±").partition("±")
+        if not equals or not sign:
+            raise InputError(f"--prior {text}: NAME=VALUE±SIGMA is needed, as fx=1600±5")
+        if name.strip() in found:
+            raise InputError(f"--prior {text}: {name.strip()} has a prior already")
+        found[name.strip()] = _number(mean, f"--prior {text}"), _number(sigma, f"--prior {text}")
+    return found
 
 
 def record(result: CameraCalibrationResult, seen: Observations, name: str, source: str) -> CameraFile:
@@ -152,6 +216,7 @@ def _table(result: CameraCalibrationResult) -> Table:
     values = dict(zip(result.camera.names, result.camera.parameters_vector.tolist(), strict=True))
     for name, sigma in result.sigma.items():
         digits = 3 if name in ("fx", "fy", "cx", "cy") else 6
-        spread = "not determined" if sigma is None else f"{sigma:.{digits}f}"
+        unknown = "fixed" if name in result.fixed else "not determined"
+        spread = unknown if sigma is None else f"{sigma:.{digits}f}"
         table.add_row(name, f"{values[name]:.{digits}f}", spread)
     return table
