@@ -21,7 +21,7 @@ from torch import Tensor
 
 from kcal.calibrate.reduced import ReducedProblem, fold
 from kcal.calibrate.terms import RadialBound, Term
-from kcal.calibrate.views import Views, free_parameters
+from kcal.calibrate.views import Views
 from kcal.calibrate.wide import wide_starts
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
@@ -172,7 +172,9 @@ def _climb_folded(
         starts = [embed(parameters, small, large) for parameters in kept]
         if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
             starts += [near_cancelling(starts[0], large, observed**2, place) for place in _BUMPS]
-        search = ReducedProblem(folded, large, free_parameters(large), terms, (len(starts),))
+        starts = [views.rules.impose(parameters, large) for parameters in starts]
+        known = (*terms, *views.rules.terms(large, views.prior_noise))
+        search = ReducedProblem(folded, large, views.rules.parameters(large), known, (len(starts),))
         found = minimise(search, search.start(torch.stack(starts)), _SEARCH)
         kept = [found.state[0][i] for i in _distinct(found)]
         ends = [search.unfold(pick(found.state, i)) for i in _distinct(found)]
@@ -300,6 +302,7 @@ def _scout(
             starts += wide_starts(views, large)
         largest = float(views.observed_radius(carried[0])) ** 2
         starts += [(near_cancelling(carried[0][0], large, largest, b), *carried[0][1:]) for b in _BUMPS]
+    starts = [(views.rules.impose(state[0], large), *state[1:]) for state in starts]
     limited = dataclasses.replace(_SCOUT, max_iterations=min(_SCOUT.max_iterations, options.max_iterations))
     return minimise(views.problem(large, (len(starts),)), stack(starts), limited)
 

@@ -8,97 +8,37 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.covariance import spread
-from kcal.calibrate.init import (
-    homographies,
-    intrinsics_candidates,
-    poses_from_homographies,
-    radial_start,
-    spread_out,
+from kcal.calibrate.ladder import Progress
+from kcal.calibrate.options import CalibrationOptions, CameraCalibrationResult
+from kcal.calibrate.outliers import (
+    OutlierRejection,
+    RejectedCorner,
+    RejectedView,
+    check_share,
+    corner_limits,
+    corners_beyond,
+    noise_scale,
+    view_rms,
+    views_beyond,
+    without,
 )
-from kcal.calibrate.ladder import Progress, climb, steps_to
-from kcal.calibrate.poses import unflip
 from kcal.calibrate.problem import BoardProblem
-from kcal.calibrate.verdict import check_focal, rival_warnings, warnings_of
-from kcal.calibrate.views import Views, free_parameters
-from kcal.calibrate.weights import whitening
+from kcal.calibrate.single import Solved, corner_problem, solve
+from kcal.calibrate.verdict import check_focal, rival_warnings, standing_out, warnings_of
 from kcal.corners.observations import Observations
-from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
-from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import LMOptions, minimise
-from kcal.solve.result import Result, State, Status
+from kcal.solve.result import State, Status
 from kcal.solve.robust import RobustLoss
 
-_MINIMUM_VIEWS = 3
-_MINIMUM_CORNERS = 6
-# RMS distance in pixels of a view's corners from the line that fits them best, below which they show no plane.
-_MINIMUM_WIDTH = 0.5
-# A first fit worse than this many pixels is retried from other focal lengths.
-_SUSPICIOUS_RMS = 2.0
+__all__ = ["CalibrationOptions", "CameraCalibrationResult", "calibrate_camera"]
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CalibrationOptions:
-    """Options of `calibrate_camera`.
-
-    Args:
-        model: lens model, by name or as a `LensModel`.
-        board_warp: estimate how the board bends (two more parameters).
-        weighted: let corners count by their covariances where all views have them (`kcal.calibrate.weights`);
-            False minimises the plain RMS, as OpenCV does.
-        loss: a robust loss of each corner's residual in pixels, for data with wrong corners, or None. It is used after
-            a plain solution has been found; a scale of some three times the noise is good.
-        focal: roughly known focal length in pixels (from EXIF or the field of view), tried first as a start, or None.
-        solver: options of the Levenberg-Marquardt solver.
-    """
-
-    model: LensModel | str = "opencv5"
-    board_warp: bool = False
-    weighted: bool = True
-    loss: RobustLoss | None = None
-    focal: float | None = None
-    solver: LMOptions = dataclasses.field(
-        default_factory=lambda: LMOptions(max_iterations=1000, tolerance=1e-12, flatness=2e-6)
-    )
-
-    def __post_init__(self) -> None:
-        if self.focal is not None and not 0 < self.focal < float("inf"):
-            raise InputError(f"CalibrationOptions: focal must be positive pixels, got {self.focal}")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CameraCalibrationResult:
-    """A calibrated camera and what it rests on.
-
-    Args:
-        camera: the camera.
-        rms: sqrt(mean ‖r‖²) over all corners, pixels (Eq. 5), plain also where the corners were weighted.
-        weighted_rms: likewise of what was minimised, by the corners' weights and under the robust loss; None where all
-            corners counted alike.
-        per_view_rms: (V,) likewise for each view, in the order of the observations.
-        residuals: (V, N, 2) projected minus observed, pixels; NaN where a corner was not seen.
-        cam_from_board_rotation: (V, 3, 3).
-        cam_from_board_translation: (V, 3) metres.
-        board_warp: (2,) metres of bend along x and y, or None if not estimated.
-        sigma: name -> standard deviation of each free parameter; None where the data do not determine it.
-        status: why the solver stopped.
-        iterations: trial steps of the solver, all starts and models together.
-        warnings: sentences about what the user should doubt.
-    """
-
-    camera: Camera
-    rms: float
-    weighted_rms: float | None
-    per_view_rms: Tensor
-    residuals: Tensor
-    cam_from_board_rotation: Tensor
-    cam_from_board_translation: Tensor
-    board_warp: Tensor | None
-    sigma: dict[str, float | None]
-    status: Status
-    iterations: int
-    warnings: tuple[str, ...]
+# To tell which corners are wrong: a loss that a few of them cannot pull, whose scale in units of the noise follows it.
+_ROUGH = LMOptions(max_iterations=40, tolerance=1e-8)
+_CAUCHY_SCALE, _CAUCHY_ROUNDS = 3.0, 4
+# Rounds of leaving out and calibrating again; two are the rule.
+_ROUNDS = 5
 
 
 def _silent(_: str) -> None:
@@ -121,7 +61,7 @@ def calibrate_camera(
         progress: told what has just been finished.
 
     Returns:
-        the camera with its residuals and error bars. Skew stays 0.
+        the camera with its residuals and error bars. Skew stays 0 unless `free` or `fixed` name it.
 
     Raises:
         DegenerateError: fewer than three views, too few corners for the model, or views that do not determine the
@@ -145,139 +85,118 @@ def calibrate_camera(
         (800.0, True)
     """
     options = options or CalibrationOptions()
-    model = LensModel.named(options.model)
-    board = observations.board.points
-    pixels = observations.pixels()
-    _check(observations, pixels, model, options.board_warp)
-
-    solver = options.solver
-    ladder = steps_to(model)
-    first, cold, spent = _first(board, pixels, observations.image_size, ladder[0], options)
-    progress(f"start ({ladder[0]})")
-    seen = pixels[:, None]
-    views = Views(board_points=board, pixels=seen, size=observations.image_size, free_warp=options.board_warp)
-    minimum = climb(views, first, cold, ladder, solver, progress)
-    spent += minimum.iterations
-
-    # The first model's poses were looked at; look once more under another lens.
-    result = minimum.result
-    problem = views.problem(model, terms=minimum.terms)
-    if len(ladder) > 1:
-        state, flipped = unflip(board, seen, [model], result.state)
-        if flipped:
-            result = minimise(problem, state, solver)
-            spent += int(result.iterations)
-    plain_cost = float(result.cost)
-    covariances = observations.covariances() if options.weighted else None
-    weights = None
-    if covariances is not None:
-        # The residuals of the plain solution tell how much there is beyond the corners' own noise.
-        weights = whitening(covariances, 2.0 * plain_cost / problem.residual_count)[:, None]
-    if weights is not None or options.loss is not None:
-        problem = BoardProblem(
-            board,
-            seen,
-            [model],
-            problem.free,
-            free_warp=options.board_warp,
-            whitening=weights,
-            loss=options.loss,
-            terms=minimum.terms,
-        )
-        result = minimise(problem, result.state, solver)
-        spent += int(result.iterations)
-    solved = _result(observations, problem, result, spent, model)
-    doubts = rival_warnings(solved.camera, solved.sigma, minimum, plain_cost, problem.residual_count)
-    return dataclasses.replace(solved, warnings=(*solved.warnings, *doubts))
+    if options.reject is not None:
+        return _calibrate_rejecting(observations, options, options.reject, progress)
+    solved = solve(observations, options, progress)
+    return _judge(observations, solved, options)
 
 
-def _check(observations: Observations, pixels: Tensor, model: LensModel, warp: bool) -> None:
-    seen = torch.isfinite(pixels).all(-1).sum(-1)
-    if len(pixels) < _MINIMUM_VIEWS:
-        raise DegenerateError(
-            f"{len(pixels)} view(s) of the board: at least {_MINIMUM_VIEWS} at different tilts are needed, "
-            "10 to 40 are good"
-        )
-    poor = (seen < _MINIMUM_CORNERS).nonzero()[:, 0].tolist()
-    if poor:
-        raise InputError(
-            f"view {observations.names[poor[0]]!r} has {int(seen[poor[0]])} corners; at least {_MINIMUM_CORNERS} are "
-            "needed: remove the view"
-        )
-    on_line = (~spread_out(observations.board.points, pixels)).nonzero()[:, 0].tolist()
-    if on_line:
-        raise InputError(
-            f"view {observations.names[on_line[0]]!r}: all its corners, or all but one, lie on one line: that leaves "
-            "the board's pose open; remove the view"
-        )
-    centred = torch.nan_to_num(pixels - pixels.nanmean(1, keepdim=True))
-    width = torch.linalg.svdvals(centred)[:, 1] / seen.sqrt()
-    thin = (width < _MINIMUM_WIDTH).nonzero()[:, 0].tolist()
-    if thin:
-        raise InputError(
-            f"view {observations.names[thin[0]]!r}: its corners coincide or the board is seen edge-on; remove the view"
-        )
-    unknowns = 4 + model.size + 2 * warp + 6 * len(pixels)
-    if 2 * int(seen.sum()) <= unknowns:
-        raise DegenerateError(
-            f"{int(seen.sum())} corners cannot determine {unknowns} parameters: add views or choose a smaller model"
-        )
+def _judge(observations: Observations, solved: Solved, options: CalibrationOptions) -> CameraCalibrationResult:
+    found = _result(observations, solved, options)
+    doubts = rival_warnings(found.camera, found.sigma, solved.minimum, solved.plain_cost, solved.problem.residual_count)
+    doubts += standing_out(observations.names, _weighted_residuals(solved.problem, solved.result.state))
+    return dataclasses.replace(found, warnings=(*found.warnings, *doubts))
 
 
-def _first(
-    board: Tensor, pixels: Tensor, size: tuple[int, int], model: LensModel, options: CalibrationOptions
-) -> tuple[State, State, int]:
-    """The first model's solution, a start without distortion, both from the closed forms, and the trials spent."""
-    homography = homographies(board, pixels)
-    spent = 0
-    best: tuple[float, State, State] | None = None
-    candidates = intrinsics_candidates(homography, size)
-    if options.focal is not None:
-        centre = [(size[0] - 1) / 2, (size[1] - 1) / 2]
-        candidates.insert(0, torch.tensor([options.focal, options.focal, *centre], dtype=torch.float64))
-    for intrinsics in candidates:
-        rotation, translation = poses_from_homographies(homography, intrinsics)
-        zero = torch.zeros(len(INTRINSICS) + model.size, dtype=torch.float64)
-        zero[:4] = intrinsics
-        lens = zero.clone()
-        if model.numerator >= 2:
-            k1, k2 = (len(INTRINSICS) + i for i in model.numerator_index[:2])
-            lens[[k1, k2]] = radial_start(board, pixels, intrinsics, rotation, translation)
-        rest = (
-            torch.zeros(2, dtype=torch.float64),
-            torch.zeros(0, 3, 3, dtype=torch.float64),
-            torch.zeros(0, 3, dtype=torch.float64),
-            rotation,
-            translation,
-        )
-        problem = BoardProblem(board, pixels[:, None], [model], [free_parameters(model)], free_warp=options.board_warp)
-        cold: State = (zero, *rest)
-        for start in ((lens, *rest), cold):
-            result = minimise(problem, start, options.solver)
-            spent += int(result.iterations)
-            if result.status != Status.BAD_START:
-                break
-        state, flipped = unflip(board, pixels[:, None], [model], result.state)
-        if flipped:
-            result = minimise(problem, state, options.solver)
-            spent += int(result.iterations)
-        cost = float(result.cost)
-        if cost == cost and (best is None or cost < best[0]):
-            best = (cost, result.state, cold)
-        if best is not None and _rms(best[0], pixels) < _SUSPICIOUS_RMS:
-            break
-    if best is None:
-        raise InputError("no start explains the corners: are all views of this board and from this camera?")
-    return best[1], best[2], spent
+def _weighted_residuals(problem: BoardProblem, state: State) -> Tensor:
+    """(V, N, 2) of one camera, by the corners' weights; NaN where not seen."""
+    residuals = problem.residuals(state).unflatten(-1, (2, -1)).transpose(-1, -2)
+    return torch.where(problem.seen[:, 0, :, None], residuals, torch.nan)
 
 
-def _rms(cost: float, pixels: Tensor) -> float:
-    return float((2.0 * cost / int(torch.isfinite(pixels).all(-1).sum())) ** 0.5)
-
-
-def _result(
-    observations: Observations, problem: BoardProblem, solved: Result, spent: int, model: LensModel
+def _calibrate_rejecting(
+    observations: Observations, options: CalibrationOptions, rejection: OutlierRejection, progress: Progress
 ) -> CameraCalibrationResult:
+    """Calibrate, leave out what stands out, and calibrate again until nothing changes.
+
+    Corners of the views that are left are judged anew in every round, so that one that was thrown out beside a worse
+    one can come back. The result is that of `calibrate_camera` on what is left, bit for bit.
+    """
+    total = int(torch.isfinite(observations.pixels()).all(-1).sum())
+    left = list(range(len(observations.views)))
+    rejected = torch.zeros(len(left), observations.board.corners, dtype=torch.bool)
+    gone: list[RejectedView] = []
+    spent = 0
+    for last in (*[False] * (_ROUNDS - 1), True):
+        used = without(observations, left, rejected)
+        solved = solve(used, options, progress)
+        spent += solved.spent
+        every = without(observations, left, torch.zeros_like(rejected))
+        if last:
+            break
+        residuals, steps = _robust_residuals(every, solved, options)
+        spent += steps
+        beyond = corners_beyond(residuals)
+        views = views_beyond(observations.board.points, residuals, every.pixels(), beyond)
+        if not views and bool((beyond == rejected).all()):
+            break
+        seen, rms = torch.isfinite(every.pixels()).all(-1), view_rms(residuals, beyond)
+        for i, reason in views.items():
+            corners = int(seen[i].sum())
+            gone.append(RejectedView(view=every.names[i], corners=corners, residual=float(rms[i]), reason=reason))
+        kept = [i for i in range(len(left)) if i not in views]
+        left, rejected = [left[i] for i in kept], beyond[kept]
+        check_share(int(rejected.sum()) + sum(view.corners for view in gone), total, gone, rejection.limit)
+        progress(f"{int(rejected.sum())} corners and {len(gone)} views left out")
+    found = _judge(used, dataclasses.replace(solved, spent=spent), options)
+    problem = corner_problem(every, options, solved.minimum, solved.variance, None)
+    plain = problem.pixel_errors(solved.result.state)[:, 0].norm(dim=-2)
+    weighted = _weighted_residuals(problem, solved.result.state)
+    limits = corner_limits(torch.where(rejected[..., None], torch.nan, weighted))
+    corners_out = tuple(
+        RejectedCorner(
+            view=every.names[i],
+            corner=n,
+            residual=float(plain[i, n]),
+            reason=f"{float(weighted[i, n].norm()):.2f} px off, noise explains {float(limits[i]):.2f} px"
+            if bool(torch.isfinite(plain[i, n]))
+            else "the lens model does not reach it",
+        )
+        for i, n in rejected.nonzero().tolist()
+    )
+
+    def spread_over(values: Tensor) -> Tensor:
+        out = values.new_full((len(observations.views), *values.shape[1:]), torch.nan)
+        out[left] = values
+        return out
+
+    return dataclasses.replace(
+        found,
+        per_view_rms=spread_over(found.per_view_rms),
+        residuals=spread_over(found.residuals),
+        cam_from_board_rotation=spread_over(found.cam_from_board_rotation),
+        cam_from_board_translation=spread_over(found.cam_from_board_translation),
+        rejected_corners=corners_out,
+        rejected_views=tuple(gone),
+    )
+
+
+def _robust_residuals(observations: Observations, solved: Solved, options: CalibrationOptions) -> tuple[Tensor, int]:
+    """Weighted residuals (V, N, 2) of all corners at a solution that a few wrong ones do not pull, and its trials.
+
+    Infinite where the lens does not reach a corner at all.
+    """
+    # Poses of the views that are left, in their order.
+    state, spent = solved.result.state, 0
+    whole = corner_problem(observations, options, solved.minimum, solved.variance, None)
+    for _ in range(_CAUCHY_ROUNDS):
+        residuals = _weighted_residuals(whole, state)
+        reached = torch.isfinite(residuals).all(-1)
+        some = without(observations, range(len(observations.views)), whole.seen[:, 0] & ~reached)
+        scale = max(_CAUCHY_SCALE * float(noise_scale(residuals.flatten(0, 1))), 1e-3)
+        loss = RobustLoss(kind="cauchy", scale=scale)
+        result = minimise(corner_problem(some, options, solved.minimum, solved.variance, loss), state, _ROUGH)
+        spent += int(result.iterations)
+        if result.status == Status.BAD_START:
+            break
+        state = result.state
+    residuals = _weighted_residuals(whole, state)
+    unreached = whole.seen[:, 0] & ~torch.isfinite(residuals).all(-1)
+    return torch.where(unreached[..., None], torch.inf, residuals), spent
+
+
+def _result(observations: Observations, found: Solved, options: CalibrationOptions) -> CameraCalibrationResult:
+    problem, solved, model = found.problem, found.result, LensModel.named(options.model)
     state = problem.tidy(solved.state)
     s = problem.unpack(state)
     pixels = observations.pixels()
@@ -288,9 +207,12 @@ def _result(
     per_view = torch.sqrt(squared.sum(-1) / seen.sum(-1))
     rms = float(torch.sqrt(squared.sum() / seen.sum()))
     count = problem.shared_size + 6 * len(pixels)
-    uncertainty = spread(problem.linearise(state), problem.residual_count, count)
-    names = [name for name in camera.names if name != "skew"]
-    check_focal(uncertainty, s.parameters[0])
+    uncertainty = spread(problem.linearise(state), problem.residual_count + len(options.priors), count)
+    free = problem.free[0]
+    slot = {camera.names[i]: k for i, k in zip(free.indices, free.slots, strict=True)}
+    names = [" = ".join(name for name in slot if slot[name] == k) for k in range(len(free))]
+    check_focal({name: float(uncertainty.sigma[k]) for name, k in slot.items()}, s.parameters[0])
+    known = uncertainty.determined.tolist()
     status = Status(int(solved.status))
     return CameraCalibrationResult(
         camera=camera,
@@ -302,9 +224,12 @@ def _result(
         cam_from_board_translation=s.first_from_board_translation,
         board_warp=s.warp if problem.free_warp else None,
         sigma={
-            name: float(sigma) if bool(known) else None for name, sigma, known in zip(names, *uncertainty, strict=False)
+            name: float(uncertainty.sigma[slot[name]]) if name in slot and known[slot[name]] else None
+            for name in camera.names
+            if name in slot or name in options.fixed
         },
+        fixed=tuple(name for name in camera.names if name in options.fixed),
         status=status,
-        iterations=spent,
+        iterations=found.spent,
         warnings=tuple(warnings_of(observations, camera, rms, per_view, uncertainty, names, status)),
     )

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.motion import screw
+from kcal.calibrate.rules import Free
 from kcal.calibrate.terms import Term
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
@@ -87,7 +88,7 @@ class BoardProblem(SchurProblem):
         board_points: (N, 3) metres, z = 0.
         pixels: (..., V, C, N, 2) observed corners; NaN where not seen. Leading dimensions broadcast with `batch`.
         models: one lens model a camera.
-        free: for each camera the indices of its free parameters.
+        free: for each camera the indices of its free parameters, or which of them move together.
         free_warp: whether the board's warp is estimated.
         whitening: (..., V, C, N, 2, 2) by which each corner's residual is multiplied (`kcal.calibrate.weights`), or
             None: all corners count alike.
@@ -103,7 +104,7 @@ class BoardProblem(SchurProblem):
         board_points: Tensor,
         pixels: Tensor,
         models: Sequence[LensModel],
-        free: Sequence[Sequence[int]],
+        free: Sequence[Sequence[int] | Free],
         *,
         free_warp: bool = False,
         whitening: Tensor | None = None,
@@ -112,7 +113,7 @@ class BoardProblem(SchurProblem):
         batch: tuple[int, ...] = (),
     ) -> None:
         self.models = tuple(models)
-        self.free = tuple(tuple(indices) for indices in free)
+        self.free = tuple(Free.of(indices) for indices in free)
         self.free_warp = free_warp
         self.batch = batch
         self._terms = tuple(terms)
@@ -243,7 +244,7 @@ class BoardProblem(SchurProblem):
         rows = points.new_empty(shape) if len(self.models) == 1 else points.new_zeros(shape)
         shared = rows[..., 6:-1, :, :, :]
         for c, rotated, moved, parameters in self._views(s):
-            projected = project_components(moved, parameters, self.models[c], self.free[c])
+            projected = project_components(moved, parameters, self.models[c], self.free[c].indices)
             by_first = projected.by_point
             if c > 0:
                 turn = s.cam_from_first_rotation[..., c - 1, :, :]
@@ -251,7 +252,7 @@ class BoardProblem(SchurProblem):
                 by_first = torch.einsum("...vkun,...kj->...vjun", projected.by_point, turn)
             _turn_rows(by_first, rotated_board, rows[..., :3, c, :, :])
             rows[..., 3:6, c, :, :] = by_first
-            shared[..., self._camera_slots[c], c, :, :] = projected.by_camera
+            shared[..., self._camera_slots[c], c, :, :] = self.free[c].collapse(projected.by_camera, -3)
             if self.free_warp:
                 normal = s.first_from_board_rotation[..., 2]
                 along = torch.einsum("...vkun,...vk->...vun", by_first, normal)
@@ -280,7 +281,7 @@ class BoardProblem(SchurProblem):
         if not found.shape[-1]:
             return None
         rows = found.new_zeros((*found.shape[:-2], self.shared_size + 1, found.shape[-1]))
-        rows[..., self._camera_slots[0], :] = found[..., list(self.free[0]), :]
+        rows[..., self._camera_slots[0], :] = self.free[0].collapse(found[..., list(self.free[0]), :], -2)
         rows[..., self._warp_slot, :] = found[..., -3 : -3 + 2 * self.free_warp, :]
         rows[..., -1, :] = found[..., -1, :]
         return rows
@@ -292,7 +293,7 @@ class BoardProblem(SchurProblem):
         parameters = []
         for before, indices, slot in zip(s.parameters, self.free, self._camera_slots, strict=True):
             after = before.clone()
-            after[..., list(indices)] += shared[..., slot]
+            after[..., list(indices)] += indices.expand(shared[..., slot])
             parameters.append(after)
         rotation, translation = s.cam_from_first_rotation, s.cam_from_first_translation
         if self._pose_slots:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from kcal.calibrate.motion import screw
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.rules import Free
 from kcal.calibrate.terms import Term
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector, step_rows
@@ -209,13 +210,13 @@ class ReducedProblem:
         self,
         folded: Folded,
         model: LensModel,
-        free: Sequence[int],
+        free: Sequence[int] | Free,
         terms: Sequence[Term] = (),
         batch: tuple[int, ...] = (),
     ) -> None:
         self.batch = batch
         self.residual_count = len(folded.offset)
-        self._folded, self._model, self._free, self._terms = folded, model, list(free), tuple(terms)
+        self._folded, self._model, self._free, self._terms = folded, model, Free.of(free), tuple(terms)
         self._nodes = 2 * folded.points.shape[-1]
         self._warps = len(folded.matrix) - self._nodes
 
@@ -234,11 +235,11 @@ class ReducedProblem:
         parameters, warp, rotation = state
         folded = self._folded
         points = rotation @ folded.points
-        seen = project_components(points, parameters, self._model, self._free)
+        seen = project_components(points, parameters, self._model, self._free.indices)
         turn = step_rows(seen.by_point, points)[..., :3, :, :]
         matrix = folded.matrix[: self._nodes]
         residuals = (seen.pixels - folded.pixels).flatten(-2) @ matrix + folded.offset
-        jacobian = torch.cat([seen.by_camera, turn], -3).flatten(-2) @ matrix
+        jacobian = torch.cat([self._free.collapse(seen.by_camera, -3), turn], -3).flatten(-2) @ matrix
         if self._warps:
             by_warp = folded.matrix[self._nodes :]
             residuals = residuals + (warp - folded.state[1]) @ by_warp
@@ -250,7 +251,11 @@ class ReducedProblem:
             if found.shape[-1]:
                 residuals = torch.cat([residuals, found[..., -1, :]], -1)
                 none = found.new_zeros((*found.shape[:-2], 3, found.shape[-1]))
-                by_value = [found[..., self._free, :], none, found[..., -3 : -3 + self._warps, :]]
+                by_value = [
+                    self._free.collapse(found[..., list(self._free), :], -2),
+                    none,
+                    found[..., -3 : -3 + self._warps, :],
+                ]
                 jacobian = torch.cat([jacobian, torch.cat(by_value, -2)], -1)
         return DenseLinearisation(residuals, jacobian.transpose(-1, -2))
 
@@ -259,7 +264,7 @@ class ReducedProblem:
         parameters, warp, rotation = state
         lens, turn, bend = step[0].split([len(self._free), 3, self._warps], -1)
         parameters = parameters.clone()
-        parameters[..., self._free] += lens
+        parameters[..., list(self._free)] += self._free.expand(lens)
         return parameters, warp + bend if self._warps else warp, rotation_from_vector(turn) @ rotation
 
     def unfold(self, state: State) -> State:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from torch import Tensor
 
 from kcal.calibrate.covariance import Spread
 from kcal.calibrate.ladder import Minimum
+from kcal.calibrate.outliers import corners_beyond
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
@@ -15,11 +18,18 @@ from kcal.solve.result import Status
 _MAX_FOCAL_SIGMA = 0.05
 # A rival that is worse by less χ² than this cannot be ruled out: the gain that chance gives 14 more parameters.
 _CLOSE_RIVAL = 25.0
+# A corner this many times farther off than noise explains is told of.
+_GROSS = 2.0
 
 
-def check_focal(uncertainty: Spread, parameters: Tensor) -> None:
-    """Raise `DegenerateError` where the focal length is hardly known: that is no calibration."""
-    worst = float((uncertainty.sigma[:2] / parameters[:2]).max())
+def check_focal(sigma: Mapping[str, float], parameters: Tensor) -> None:
+    """Raise `DegenerateError` where the focal length is hardly known: that is no calibration.
+
+    Args:
+        sigma: standard deviations of the free parameters by name, infinite where not determined.
+        parameters: (5 + P,).
+    """
+    worst = max((sigma.get(name, 0.0) / float(parameters[i]) for i, name in enumerate(("fx", "fy"))), default=0.0)
     if not worst <= _MAX_FOCAL_SIGMA:
         known = "not at all" if worst == float("inf") else f"only to ±{100 * worst:.1f} %"
         raise DegenerateError(
@@ -41,7 +51,7 @@ def rival_warnings(
         apart = {
             name: there[name] - here[name]
             for name in ("fx", "fy", "cx", "cy")
-            if abs(there[name] - here[name]) > max(1.0, 4.0 * (sigma[name] or 0.0))
+            if abs(there[name] - here[name]) > max(1.0, 4.0 * (sigma.get(name) or 0.0))
         }
         if apart:
             rms = (2.0 * variance * other / cost) ** 0.5
@@ -51,6 +61,24 @@ def rival_warnings(
                 "parameters; choose a smaller model or add views"
             ]
     return []
+
+
+def standing_out(names: Sequence[str], residuals: Tensor) -> list[str]:
+    """A warning where a corner is off by twice what noise explains; residuals (V, N, 2), NaN where not seen.
+
+    Those that are off by less are as often the lens model's fault.
+    """
+    beyond = corners_beyond(residuals)
+    if not bool(corners_beyond(residuals, _GROSS).any()):
+        return []
+    count = int(beyond.sum())
+    length = residuals.nan_to_num(0.0).norm(dim=-1)
+    view, corner = divmod(int(length.argmax()), length.shape[1])
+    return [
+        f"{count} of {int(residuals.isfinite().all(-1).sum())} corners are farther off than noise explains, corner "
+        f"{corner} of view {names[view]} by {float(length.max()):.2f} px: look at them, choose a richer model, or "
+        "leave them out (reject)"
+    ]
 
 
 def warnings_of(

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.rules import Free, Rules
 from kcal.calibrate.terms import Term
 from kcal.lens.camera import Camera
 from kcal.lens.inverse import valid_radius
@@ -30,18 +31,23 @@ class Views:
         pixels: (V, 1, N, 2) of one camera, NaN where not seen.
         size: (width, height) of the image.
         free_warp: whether the board's warp is estimated.
+        rules: what is known of the camera's parameters.
+        prior_noise: pixels of a corner's noise, against which priors count.
     """
 
     board_points: Tensor
     pixels: Tensor
     size: tuple[int, int]
     free_warp: bool
+    rules: Rules = dataclasses.field(default_factory=Rules)
+    prior_noise: float = 0.3
 
     def problem(
         self, model: LensModel, batch: tuple[int, ...] = (), terms: Sequence[Term] = (), *, poses_only: bool = False
     ) -> BoardProblem:
         """The least-squares problem of one lens model, or of the poses (and the warp) under a given lens."""
-        free = [] if poses_only else free_parameters(model)
+        free = Free((), ()) if poses_only else self.rules.parameters(model)
+        terms = (*terms, *self.rules.terms(model, self.prior_noise))
         return BoardProblem(
             self.board_points, self.pixels, [model], [free], free_warp=self.free_warp, terms=terms, batch=batch
         )
@@ -57,7 +63,7 @@ class Views:
 
     def noise(self, state: State, model: LensModel) -> float:
         """Standard deviation (pixels) of the residuals along an axis."""
-        problem = self.problem(model)
+        problem = BoardProblem(self.board_points, self.pixels, [model], [()])
         return math.sqrt(2.0 * float(problem.cost(state)) / problem.residual_count)
 
     @property

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from kcal.calibrate.mono import CameraCalibrationResult
     from kcal.corners.observations import Observations
-    from kcal.io.camera_file import CameraFile
+    from kcal.io.camera_file import CameraFile, Exclusion
 
 
 def calibrate(
@@ -28,11 +28,32 @@ def calibrate(
     focal: Annotated[
         float | None, typer.Option(help="Roughly known focal length in pixels (EXIF, field of view), as a start.")
     ] = None,
+    fov: Annotated[
+        float | None, typer.Option(help="Roughly known horizontal field of view in degrees, as a start.")
+    ] = None,
+    fix: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[=VALUE]", help="Hold a parameter; without a value cx, cy in the middle, else 0."),
+    ] = None,
+    tie: Annotated[list[str] | None, typer.Option(metavar="NAME=NAME", help="Keep parameters equal, as fx=fy.")] = None,
+    free: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Estimate what is held otherwise: skew.")
+    ] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE±SIGMA", help="Gaussian knowledge of a parameter; +- will do for ±."),
+    ] = None,
     loss: Annotated[
         str | None,
         typer.Option(metavar="KIND", help="Robust loss against wrong corners: huber, cauchy or tukey."),
     ] = None,
     loss_scale: Annotated[float, typer.Option(help="Where the robust loss sets in, pixels.")] = 1.0,
+    reject: Annotated[
+        bool, typer.Option("--reject", help="Leave out corners and views that noise cannot explain, and list them.")
+    ] = False,
+    reject_limit: Annotated[
+        float, typer.Option(help="Greatest share of the corners that --reject may leave out.")
+    ] = 0.1,
     name: Annotated[str, typer.Option(help="Name of the camera; the observations' file name if not given.")] = "",
     picture: Annotated[Path | None, typer.Option(help="A .png file: coverage, residuals and views.")] = None,
 ) -> None:
@@ -62,12 +83,25 @@ def calibrate(
 
     from kcal.calibrate.ladder import steps_to
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
+    from kcal.calibrate.outliers import OutlierRejection
     from kcal.corners.observations import Observations
     from kcal.solve.robust import RobustLoss
 
     # An unknown kind is refused by the loss itself.
     robust = None if loss is None else RobustLoss(kind=loss, scale=loss_scale)  # type: ignore[arg-type]
-    options = CalibrationOptions(model=lens, board_warp=board_warp, focal=focal, loss=robust)
+    rejection = OutlierRejection(limit=reject_limit) if reject else None
+    options = CalibrationOptions(
+        model=lens,
+        board_warp=board_warp,
+        focal=focal,
+        field_of_view=fov,
+        fixed=_fixed(fix or []),
+        tied=tuple(tuple(name.strip() for name in text.split("=")) for text in tie or []),
+        free=tuple(free or []),
+        priors=_priors(prior or []),
+        loss=robust,
+        reject=rejection,
+    )
     seen = Observations.load(observations)
     with steps("calibrating", 1 + max(1, len(steps_to(lens)) - 1)) as advance:
         result = calibrate_camera(seen, options, advance)
@@ -80,17 +114,60 @@ def calibrate(
 
     width, height = seen.image_size
     corners = int((result.residuals[..., 0] == result.residuals[..., 0]).sum())
-    out.print(f"{len(seen.views)} views, {corners} corners, {width}x{height} px, model {lens}")
+    used = len(seen.views) - len(result.rejected_views)
+    out.print(f"{used} views, {corners} corners, {width}x{height} px, model {lens}")
     out.print(f"RMS [bold]{result.rms:.4f} px[/]; {result.status.message} ({result.iterations} steps)")
     out.print(_table(result))
     if result.board_warp is not None:
         x, y = (1e3 * result.board_warp).tolist()
         out.print(f"board warp: {x:+.3f} mm along its rows, {y:+.3f} mm along its columns")
+    if reject:
+        out.print(f"left out: {100 * result.rejected_share:.2f} % of the corners")
+    for entry in _excluded(result):
+        out.print(f"  {entry.name}: {entry.reason}", markup=False, highlight=False)
     for text in result.warnings:
         err.print("[yellow]warning:[/]", text, markup=True)
     for path in (output, picture):
         if path is not None:
             out.print(f"wrote {path}", markup=False)
+
+
+def _number(text: str, option: str) -> float:
+    from kcal.errors import InputError
+
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"{option}: {text.strip()!r} is not a number") from None
+
+
+def _fixed(texts: list[str]) -> dict[str, float | None]:
+    """`--fix` NAME or NAME=VALUE."""
+    from kcal.errors import InputError
+
+    found: dict[str, float | None] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if name.strip() in found:
+            raise InputError(f"--fix {text}: {name.strip()} is fixed twice")
+        found[name.strip()] = _number(value, f"--fix {text}") if equals else None
+    return found
+
+
+def _priors(texts: list[str]) -> dict[str, tuple[float, float]]:
+    """`--prior` NAME=VALUE±SIGMA."""
+    from kcal.errors import InputError
+
+    found: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        name, equals, rest = text.partition("=")
+        mean, sign, sigma = rest.replace("+-", "±").partition("±")
+        if not equals or not sign:
+            raise InputError(f"--prior {text}: NAME=VALUE±SIGMA is needed, as fx=1600±5")
+        if name.strip() in found:
+            raise InputError(f"--prior {text}: {name.strip()} has a prior already")
+        found[name.strip()] = _number(mean, f"--prior {text}"), _number(sigma, f"--prior {text}")
+    return found
 
 
 def record(result: CameraCalibrationResult, seen: Observations, name: str, source: str) -> CameraFile:
@@ -104,9 +181,12 @@ def record(result: CameraCalibrationResult, seen: Observations, name: str, sourc
         standard_deviations=result.sigma,
         calibration=CameraCalibration(
             rms=result.rms,
-            views=len(seen.views),
+            views=len(seen.views) - len(result.rejected_views),
             points=int((result.residuals[..., 0] == result.residuals[..., 0]).sum()),
-            per_view_rms=dict(zip(seen.names, result.per_view_rms.tolist(), strict=True)),
+            per_view_rms={
+                name: rms for name, rms in zip(seen.names, result.per_view_rms.tolist(), strict=True) if rms == rms
+            },
+            excluded=tuple(_excluded(result)),
             board=BoardRecord(columns=seen.board.columns, rows=seen.board.rows, square=seen.board.square),
             board_warp=None if warp is None else (float(warp[0]), float(warp[1])),
             stop_reason=result.status.message,
@@ -115,6 +195,15 @@ def record(result: CameraCalibrationResult, seen: Observations, name: str, sourc
             **provenance(),
         ),
     )
+
+
+def _excluded(result: CameraCalibrationResult) -> list[Exclusion]:
+    """What was left out, views first."""
+    from kcal.io.camera_file import Exclusion
+
+    views = [Exclusion(name=view.view, reason=view.reason) for view in result.rejected_views]
+    corners = [Exclusion(name=f"{c.view} corner {c.corner}", reason=c.reason) for c in result.rejected_corners]
+    return views + corners
 
 
 def _table(result: CameraCalibrationResult) -> Table:
@@ -127,6 +216,7 @@ def _table(result: CameraCalibrationResult) -> Table:
     values = dict(zip(result.camera.names, result.camera.parameters_vector.tolist(), strict=True))
     for name, sigma in result.sigma.items():
         digits = 3 if name in ("fx", "fy", "cx", "cy") else 6
-        spread = "not determined" if sigma is None else f"{sigma:.{digits}f}"
+        unknown = "fixed" if name in result.fixed else "not determined"
+        spread = unknown if sigma is None else f"{sigma:.{digits}f}"
         table.add_row(name, f"{values[name]:.{digits}f}", spread)
     return table

@@ -59,7 +59,7 @@ class Intrinsics(Record):
 
 
 class Exclusion(Record):
-    """A view or a pair that was left out, and why."""
+    """A view, a corner of one, or a pair that was left out, and why."""
 
     name: str
     reason: str
@@ -96,7 +96,7 @@ class CameraCalibration(Record):
         views: how many views were used.
         points: how many corners were used.
         per_view_rms: view name -> RMS in pixels, for the views used.
-        excluded: views left out, with the reason.
+        excluded: views, and corners of the views used, that were left out, with the reason.
         board: the board that was shown.
         board_warp: height of the board's bend in x and y, metres; None if it was not estimated.
         stop_reason: why the solver stopped.

@@ -102,7 +102,7 @@ def _scatter(axes: Axes, result: CameraCalibrationResult) -> None:
 
 def _views(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
     rms = result.per_view_rms.numpy()
-    typical = float(np.median(rms))
+    typical = float(np.nanmedian(rms))
     colours = [_WARN if value > 2 * typical else _ACCENT for value in rms]
     place = np.arange(len(rms))
     axes.bar(place, rms, color=colours, width=0.8)

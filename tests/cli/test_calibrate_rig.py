@@ -123,6 +123,62 @@ class TestCalibrate:
         assert row[1] == f"{float(found.focal[0]):.3f}"
         assert (folder / "left.png").read_bytes().startswith(b"\x89PNG")
 
+    def test_outliers_are_left_out_and_listed(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        content = json.loads((folder / "left.obs.json").read_text())
+        u, v = content["views"][2]["pixels"][5]
+        content["views"][2]["pixels"][5] = [u + 12.0, v]
+        (folder / "one.obs.json").write_text(json.dumps(content))
+        assert run(monkeypatch, "calibrate", "one.obs.json", "-o", "one.json", "--reject") == 0
+        printed = capsys.readouterr()
+        assert "6 views, 251 corners" in printed.out
+        assert "left out: 0.40 % of the corners" in printed.out
+        assert "left02.png corner 5: " in printed.out
+        calibration = CameraFile.load(folder / "one.json").calibration
+        assert calibration is not None
+        assert [entry.name for entry in calibration.excluded] == ["left02.png corner 5"]
+        assert calibration.points == 251
+        assert run(monkeypatch, "calibrate", "one.obs.json", "-o", "one.json") == 0
+        assert "corner 5 of view left02.png" in capsys.readouterr().err
+
+    def test_parameters_by_name(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        arguments = ["calibrate", "left.obs.json", "-o", "named.json", "--fov", "65", "--fix", "cx=321", "--fix", "k3"]
+        arguments += ["--tie", "fx=fy", "--prior", "cy=240+-1", "--free", "skew"]
+        assert run(monkeypatch, *arguments) == 0
+        rows = {words[0]: words[1:] for words in map(str.split, capsys.readouterr().out.splitlines()) if words}
+        assert rows["cx"] == ["321.000", "fixed"]
+        assert rows["k3"] == ["0.000000", "fixed"]
+        assert rows["fx"] == rows["fy"]
+        assert 0 < float(rows["cy"][1]) < 1
+        assert float(rows["skew"][1]) > 0
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["--fix", "cz"], "unknown parameter 'cz'"),
+            (["--fix", "k4"], "opencv5 has no parameter 'k4'"),
+            (["--fix", "cx=a"], "'a' is not a number"),
+            (["--fix", "cx", "--fix", "cx=3"], "fixed twice"),
+            (["--prior", "cx=3"], "NAME=VALUE±SIGMA"),
+            (["--prior", "cx=3±0"], "positive standard deviation"),
+            (["--fix", "cx", "--prior", "cx=3±1"], "fixed and given a prior"),
+            (["--tie", "fx"], "two parameters"),
+        ],
+    )
+    def test_names_that_do_not_fit(
+        self,
+        folder: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+        arguments: list[str],
+        message: str,
+    ) -> None:
+        text = refuse(folder, monkeypatch, capsys, "calibrate", "left.obs.json", "-o", "a.json", *arguments)
+        assert message in text
+
     def test_board_warp_and_a_warning(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:

@@ -1,0 +1,219 @@
+"""One camera's minimum: closed forms, first model, ladder, weights. What to think of it is told elsewhere."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.init import (
+    homographies,
+    intrinsics_candidates,
+    poses_from_homographies,
+    radial_start,
+    spread_out,
+)
+from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
+from kcal.calibrate.options import CalibrationOptions
+from kcal.calibrate.poses import unflip
+from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.views import Views
+from kcal.calibrate.weights import whitening
+from kcal.corners.observations import Observations
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.model import LensModel
+from kcal.lens.projection import INTRINSICS
+from kcal.solve.lm import minimise
+from kcal.solve.result import Result, State, Status
+from kcal.solve.robust import RobustLoss
+
+_MINIMUM_VIEWS = 3
+_MINIMUM_CORNERS = 6
+# RMS distance in pixels of a view's corners from the line that fits them best, below which they show no plane.
+_MINIMUM_WIDTH = 0.5
+# A first fit worse than this many pixels is retried from other focal lengths.
+_SUSPICIOUS_RMS = 2.0
+
+# Of a corner, pixels; and how often it is measured anew beside priors.
+_LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Solved:
+    """A solution for one set of corners, before it is judged."""
+
+    problem: BoardProblem
+    result: Result
+    minimum: Minimum
+    plain_cost: float
+    spent: int
+    variance: float | None
+
+
+def solve(observations: Observations, options: CalibrationOptions, progress: Progress) -> Solved:
+    """Find the minimum for all corners given, as `calibrate_camera` describes it; its errors are raised here."""
+    model = LensModel.named(options.model)
+    board = observations.board.points
+    pixels = observations.pixels()
+    rules = options.rules(observations.image_size)
+    _check(observations, pixels, len(rules.parameters(model)), options.board_warp)
+
+    solver = options.solver
+    ladder = [step for step in steps_to(model) if rules.allows(step)]
+    first, cold, spent = _first(board, pixels, observations.image_size, ladder[0], options)
+    progress(f"start ({ladder[0]})")
+    seen = pixels[:, None]
+    views = Views(
+        board_points=board,
+        pixels=seen,
+        size=observations.image_size,
+        free_warp=options.board_warp,
+        rules=rules,
+    )
+    if rules.priors:
+        views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), _LEAST_NOISE))
+    minimum = climb(views, first, cold, ladder, solver, progress)
+    spent += minimum.iterations
+
+    # The first model's poses were looked at; look once more under another lens.
+    result = minimum.result
+    problem = views.problem(model, terms=minimum.terms)
+    if len(ladder) > 1:
+        state, flipped = unflip(board, seen, [model], result.state)
+        if flipped:
+            result = minimise(problem, state, solver)
+            spent += int(result.iterations)
+    if rules.priors:
+        # The noise, against which priors count, is that of this solution.
+        for _ in range(_NOISE_ROUNDS):
+            views = dataclasses.replace(views, prior_noise=max(views.noise(result.state, model), _LEAST_NOISE))
+            problem = views.problem(model, terms=minimum.terms)
+            result = minimise(problem, result.state, solver)
+            spent += int(result.iterations)
+        rivals = tuple((float(views.problem(model).cost(state)), state) for _, state in minimum.rivals)
+        terms = (*minimum.terms, *rules.terms(model, views.prior_noise))
+        minimum = dataclasses.replace(minimum, rivals=rivals, terms=terms)
+    plain_cost = float(result.cost)
+    covariances = observations.covariances() if options.weighted else None
+    # The residuals of the plain solution tell how much there is beyond the corners' own noise.
+    variance = None if covariances is None else 2.0 * plain_cost / problem.residual_count
+    if variance is not None or options.loss is not None:
+        problem = corner_problem(observations, options, minimum, variance, options.loss)
+        result = minimise(problem, result.state, solver)
+        spent += int(result.iterations)
+    return Solved(
+        problem=problem, result=result, minimum=minimum, plain_cost=plain_cost, spent=spent, variance=variance
+    )
+
+
+def corner_problem(
+    observations: Observations,
+    options: CalibrationOptions,
+    minimum: Minimum,
+    variance: float | None,
+    loss: RobustLoss | None,
+) -> BoardProblem:
+    """All corners with their weights, and a robust loss."""
+    model = LensModel.named(options.model)
+    covariances = None if variance is None else observations.covariances()
+    weights = None if covariances is None or variance is None else whitening(covariances, variance)[:, None]
+    return BoardProblem(
+        observations.board.points,
+        observations.pixels()[:, None],
+        [model],
+        [options.rules(observations.image_size).parameters(model)],
+        free_warp=options.board_warp,
+        whitening=weights,
+        loss=loss,
+        terms=minimum.terms,
+    )
+
+
+def _check(observations: Observations, pixels: Tensor, count: int, warp: bool) -> None:
+    seen = torch.isfinite(pixels).all(-1).sum(-1)
+    if len(pixels) < _MINIMUM_VIEWS:
+        raise DegenerateError(
+            f"{len(pixels)} view(s) of the board: at least {_MINIMUM_VIEWS} at different tilts are needed, "
+            "10 to 40 are good"
+        )
+    poor = (seen < _MINIMUM_CORNERS).nonzero()[:, 0].tolist()
+    if poor:
+        raise InputError(
+            f"view {observations.names[poor[0]]!r} has {int(seen[poor[0]])} corners; at least {_MINIMUM_CORNERS} are "
+            "needed: remove the view"
+        )
+    on_line = (~spread_out(observations.board.points, pixels)).nonzero()[:, 0].tolist()
+    if on_line:
+        raise InputError(
+            f"view {observations.names[on_line[0]]!r}: all its corners, or all but one, lie on one line: that leaves "
+            "the board's pose open; remove the view"
+        )
+    centred = torch.nan_to_num(pixels - pixels.nanmean(1, keepdim=True))
+    width = torch.linalg.svdvals(centred)[:, 1] / seen.sqrt()
+    thin = (width < _MINIMUM_WIDTH).nonzero()[:, 0].tolist()
+    if thin:
+        raise InputError(
+            f"view {observations.names[thin[0]]!r}: its corners coincide or the board is seen edge-on; remove the view"
+        )
+    unknowns = count + 2 * warp + 6 * len(pixels)
+    if 2 * int(seen.sum()) <= unknowns:
+        raise DegenerateError(
+            f"{int(seen.sum())} corners cannot determine {unknowns} parameters: add views or choose a smaller model"
+        )
+
+
+def _first(
+    board: Tensor, pixels: Tensor, size: tuple[int, int], model: LensModel, options: CalibrationOptions
+) -> tuple[State, State, int]:
+    """The first model's solution, a start without distortion, both from the closed forms, and the trials spent."""
+    homography = homographies(board, pixels)
+    spent = 0
+    best: tuple[float, State, State] | None = None
+    candidates = intrinsics_candidates(homography, size)
+    rules, focal = options.rules(size), options.start_focal(size)
+    if focal is not None:
+        centre = [(size[0] - 1) / 2, (size[1] - 1) / 2]
+        candidates.insert(0, torch.tensor([focal, focal, *centre], dtype=torch.float64))
+    views = Views(board_points=board, pixels=pixels[:, None], size=size, free_warp=options.board_warp, rules=rules)
+    for candidate in candidates:
+        zero = torch.zeros(len(INTRINSICS) + model.size, dtype=torch.float64)
+        zero[:4] = candidate
+        zero = rules.impose(zero, model)
+        intrinsics = zero[:4]
+        rotation, translation = poses_from_homographies(homography, intrinsics)
+        lens = zero.clone()
+        if model.numerator >= 2:
+            k1, k2 = (len(INTRINSICS) + i for i in model.numerator_index[:2])
+            lens[[k1, k2]] = radial_start(board, pixels, intrinsics, rotation, translation)
+        lens = rules.impose(lens, model)
+        rest = (
+            torch.zeros(2, dtype=torch.float64),
+            torch.zeros(0, 3, 3, dtype=torch.float64),
+            torch.zeros(0, 3, dtype=torch.float64),
+            rotation,
+            translation,
+        )
+        problem = views.problem(model)
+        cold: State = (zero, *rest)
+        for start in ((lens, *rest), cold):
+            result = minimise(problem, start, options.solver)
+            spent += int(result.iterations)
+            if result.status != Status.BAD_START:
+                break
+        state, flipped = unflip(board, pixels[:, None], [model], result.state)
+        if flipped:
+            result = minimise(problem, state, options.solver)
+            spent += int(result.iterations)
+        cost = float(result.cost)
+        if cost == cost and (best is None or cost < best[0]):
+            best = (cost, result.state, cold)
+        if best is not None and _rms(best[0], pixels) < _SUSPICIOUS_RMS:
+            break
+    if best is None:
+        raise InputError("no start explains the corners: are all views of this board and from this camera?")
+    return best[1], best[2], spent
+
+
+def _rms(cost: float, pixels: Tensor) -> float:
+    return float((2.0 * cost / int(torch.isfinite(pixels).all(-1).sum())) ** 0.5)
