@@ -7,7 +7,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from kcal.calibrate.covariance import spread
+from kcal.calibrate.covariance import Spread, spread
 from kcal.calibrate.ladder import Progress
 from kcal.calibrate.options import CalibrationOptions, CameraCalibrationResult
 from kcal.calibrate.outliers import (
@@ -27,7 +27,6 @@ from kcal.calibrate.single import Solved, corner_problem, solve
 from kcal.calibrate.verdict import check_focal, rival_warnings, standing_out, warnings_of
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
-from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import State, Status
 from kcal.solve.robust import RobustLoss
@@ -196,7 +195,7 @@ def _robust_residuals(observations: Observations, solved: Solved, options: Calib
 
 
 def _result(observations: Observations, found: Solved, options: CalibrationOptions) -> CameraCalibrationResult:
-    problem, solved, model = found.problem, found.result, LensModel.named(options.model)
+    problem, solved, model = found.problem, found.result, options.lens
     state = problem.tidy(solved.state)
     s = problem.unpack(state)
     pixels = observations.pixels()
@@ -207,8 +206,16 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
     per_view = torch.sqrt(squared.sum(-1) / seen.sum(-1))
     rms = float(torch.sqrt(squared.sum() / seen.sum()))
     count = problem.shared_size + 6 * len(pixels)
-    uncertainty = spread(problem.linearise(state), problem.residual_count + len(options.priors), count)
+    # Under a known camera and a flat board nothing is shared by the views.
+    none = Spread(s.warp.new_zeros(0), torch.zeros(0, dtype=torch.bool))
+    uncertainty = (
+        none
+        if not problem.shared_size
+        else spread(problem.linearise(state), problem.residual_count + len(options.priors), count)
+    )
     free = problem.free[0]
+    rules = options.rules(observations.image_size)
+    held = tuple(name for name in camera.names if name in rules.fixed)
     slot = {camera.names[i]: k for i, k in zip(free.indices, free.slots, strict=True)}
     names = [" = ".join(name for name in slot if slot[name] == k) for k in range(len(free))]
     check_focal({name: float(uncertainty.sigma[k]) for name, k in slot.items()}, s.parameters[0])
@@ -226,9 +233,9 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
         sigma={
             name: float(uncertainty.sigma[slot[name]]) if name in slot and known[slot[name]] else None
             for name in camera.names
-            if name in slot or name in options.fixed
+            if name in slot or name in held
         },
-        fixed=tuple(name for name in camera.names if name in options.fixed),
+        fixed=held,
         status=status,
         iterations=found.spent,
         warnings=tuple(warnings_of(observations, camera, rms, per_view, uncertainty, names, status)),

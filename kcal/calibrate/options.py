@@ -42,6 +42,8 @@ class CalibrationOptions:
         free: names that are estimated although they are held by default: "skew".
         priors: Gaussian knowledge by name, as {"fx": (1600, 5)}: mean and standard deviation. It counts against the
             corners by their noise, which is taken from the residuals.
+        camera: a known camera: all its parameters are held but those that `free` names, and only the board's poses (and
+            its warp) are found, from one view on. Its lens model takes the place of `model`.
         solver: options of the Levenberg-Marquardt solver.
     """
 
@@ -56,6 +58,7 @@ class CalibrationOptions:
     tied: tuple[tuple[str, ...], ...] = ()
     free: tuple[str, ...] = ()
     priors: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    camera: Camera | None = None
     solver: LMOptions = dataclasses.field(
         default_factory=lambda: LMOptions(max_iterations=1000, tolerance=1e-12, flatness=2e-6)
     )
@@ -67,12 +70,28 @@ class CalibrationOptions:
             raise InputError(f"CalibrationOptions: field_of_view must be in (0, 180) degrees, got {self.field_of_view}")
         if self.focal is not None and self.field_of_view is not None:
             raise InputError("CalibrationOptions: focal and field_of_view say the same; give one")
-        fixed = {name: 1.0 if value is None else value for name, value in self.fixed.items()}
-        Rules(fixed=fixed, tied=self.tied, free=self.free, priors=self.priors).check(LensModel.named(self.model))
+        if self.camera is not None and (self.fixed or self.focal is not None or self.field_of_view is not None):
+            raise InputError("CalibrationOptions: a known camera fixes all parameters; name those to free instead")
+        fixed = self._of_camera() or {name: 1.0 if value is None else value for name, value in self.fixed.items()}
+        Rules(fixed=fixed, tied=self.tied, free=self.free, priors=self.priors).check(self.lens)
+
+    @property
+    def lens(self) -> LensModel:
+        """The lens model to solve for."""
+        return LensModel.named(self.model) if self.camera is None else self.camera.model
+
+    def _of_camera(self) -> dict[str, float]:
+        """What the known camera fixes."""
+        if self.camera is None:
+            return {}
+        values = self.camera.parameters_vector.detach().tolist()
+        return {n: value for n, value in zip(self.camera.names, values, strict=True) if n not in self.free}
 
     def rules(self, size: tuple[int, int]) -> Rules:
         """What is said of the parameters, for an image of (width, height)."""
-        values = {n: natural_value(n, size) if value is None else float(value) for n, value in self.fixed.items()}
+        values = self._of_camera() or {
+            n: natural_value(n, size) if value is None else float(value) for n, value in self.fixed.items()
+        }
         return Rules(fixed=values, tied=self.tied, free=self.free, priors=self.priors)
 
     def start_focal(self, size: tuple[int, int]) -> float | None:

@@ -16,15 +16,16 @@ from kcal.calibrate.init import (
 )
 from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
 from kcal.calibrate.options import CalibrationOptions
-from kcal.calibrate.poses import unflip
+from kcal.calibrate.poses import refine_poses, unflip
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.views import Views
 from kcal.calibrate.weights import whitening
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
-from kcal.solve.lm import minimise
+from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import Result, State, Status
 from kcal.solve.robust import RobustLoss
 
@@ -53,15 +54,20 @@ class Solved:
 
 def solve(observations: Observations, options: CalibrationOptions, progress: Progress) -> Solved:
     """Find the minimum for all corners given, as `calibrate_camera` describes it; its errors are raised here."""
-    model = LensModel.named(options.model)
+    model = options.lens
     board = observations.board.points
     pixels = observations.pixels()
     rules = options.rules(observations.image_size)
-    _check(observations, pixels, len(rules.parameters(model)), options.board_warp)
+    fewest = _MINIMUM_VIEWS if options.camera is None else 1
+    _check(observations, pixels, len(rules.parameters(model)), options.board_warp, fewest)
 
     solver = options.solver
-    ladder = [step for step in steps_to(model) if rules.allows(step)]
-    first, cold, spent = _first(board, pixels, observations.image_size, ladder[0], options)
+    ladder = [step for step in steps_to(model) if rules.allows(step)] if options.camera is None else [model]
+    if options.camera is None:
+        first, cold, spent = _first(board, pixels, observations.image_size, ladder[0], options)
+    else:
+        first = cold = _known(observations, pixels, options.camera)
+        spent = 0
     progress(f"start ({ladder[0]})")
     seen = pixels[:, None]
     views = Views(
@@ -78,6 +84,10 @@ def solve(observations: Observations, options: CalibrationOptions, progress: Pro
 
     # The first model's poses were looked at; look once more under another lens.
     result = minimum.result
+    if result.status == Status.BAD_START:
+        raise InputError(
+            "the lens cannot show all corners where they are: are all views of this board and this camera?"
+        )
     problem = views.problem(model, terms=minimum.terms)
     if len(ladder) > 1:
         state, flipped = unflip(board, seen, [model], result.state)
@@ -115,7 +125,7 @@ def corner_problem(
     loss: RobustLoss | None,
 ) -> BoardProblem:
     """All corners with their weights, and a robust loss."""
-    model = LensModel.named(options.model)
+    model = options.lens
     covariances = None if variance is None else observations.covariances()
     weights = None if covariances is None or variance is None else whitening(covariances, variance)[:, None]
     return BoardProblem(
@@ -130,12 +140,11 @@ def corner_problem(
     )
 
 
-def _check(observations: Observations, pixels: Tensor, count: int, warp: bool) -> None:
+def _check(observations: Observations, pixels: Tensor, count: int, warp: bool, fewest: int) -> None:
     seen = torch.isfinite(pixels).all(-1).sum(-1)
-    if len(pixels) < _MINIMUM_VIEWS:
+    if len(pixels) < fewest:
         raise DegenerateError(
-            f"{len(pixels)} view(s) of the board: at least {_MINIMUM_VIEWS} at different tilts are needed, "
-            "10 to 40 are good"
+            f"{len(pixels)} view(s) of the board: at least {fewest} at different tilts are needed, 10 to 40 are good"
         )
     poor = (seen < _MINIMUM_CORNERS).nonzero()[:, 0].tolist()
     if poor:
@@ -213,6 +222,27 @@ def _first(
     if best is None:
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
     return best[1], best[2], spent
+
+
+def _known(observations: Observations, pixels: Tensor, camera: Camera) -> State:
+    """Board poses under a known camera, refined one by one, both tilts of each tried."""
+    if camera.size != observations.image_size:
+        raise InputError(f"the known camera is of {camera.size} px, the observations of {observations.image_size} px")
+    board, seen = observations.board.points, torch.isfinite(pixels).all(-1)
+    camera = Camera(camera.parameters_vector.detach().double().cpu(), size=camera.size, model=camera.model)
+    rays, valid = camera.unproject(torch.nan_to_num(pixels))
+    used = seen & valid & (rays[..., 2] > 0)
+    ideal = torch.where(used[..., None], rays[..., :2] / rays[..., 2:], torch.nan)
+    poor = (~spread_out(board, ideal)).nonzero()[:, 0].tolist()
+    if poor:
+        raise InputError(f"view {observations.names[poor[0]]!r}: the known camera gives its corners too few rays")
+    pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
+    poses = poses_from_homographies(homographies(board, ideal), pinhole)
+    empty = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
+    state: State = (camera.parameters_vector, torch.zeros(2, dtype=torch.float64), *empty, *poses)
+    views = pixels[:, None]
+    state, _ = refine_poses(board, views, [camera.model], state, LMOptions(max_iterations=30))
+    return unflip(board, views, [camera.model], state)[0]
 
 
 def _rms(cost: float, pixels: Tensor) -> float:

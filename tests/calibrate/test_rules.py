@@ -139,3 +139,53 @@ def test_refusals(options: dict[str, Any], message: str) -> None:
 def test_a_focal_length_has_no_natural_value() -> None:
     with pytest.raises(InputError, match="fx has no natural value"):
         calibrate_camera(observe(scene()), CalibrationOptions(fixed={"fx": None}))
+
+
+@pytest.mark.parametrize("views", [1, 6])
+def test_a_known_camera_leaves_only_the_poses(views: int) -> None:
+    """Each pose is the dense optimum of its own view, and nothing of the camera moves."""
+    truth = camera("opencv14")
+    rotation, translation = motions(truth, views, 5)
+    pixels = pixels_of(truth, (rotation, translation), noise=0.1, seed=2)
+    result = calibrate_camera(observe(pixels), CalibrationOptions(camera=truth))
+    assert torch.equal(result.camera.parameters_vector, truth.parameters_vector)
+    assert set(result.sigma.values()) == {None}
+    assert set(result.fixed) == set(truth.names)
+    assert result.rms == pytest.approx(0.1 * math.sqrt(2.0), rel=0.2)
+    for i in range(views):
+
+        def residuals(pose: Tensor, i: int = i) -> Tensor:
+            turned = rotation_from_vector(pose[:3]) @ result.cam_from_board_rotation[i] @ BOARD.points.T
+            points = turned + (result.cam_from_board_translation[i] + pose[3:])[:, None]
+            found = project_components(points, truth.parameters_vector, truth.model).pixels
+            return (found.T - pixels[i]).flatten()
+
+        zero = torch.zeros(6, dtype=torch.float64)
+        jacobian = torch.autograd.functional.jacobian(residuals, zero)
+        step = torch.linalg.lstsq(jacobian, -residuals(zero)[:, None]).solution[:, 0]
+        sigma = 0.1 * torch.linalg.inv(jacobian.T @ jacobian).diagonal().sqrt()
+        assert bool((step.abs() < 1e-3 * sigma).all())
+
+
+def test_a_known_camera_with_a_bent_board_and_a_freed_focal_length() -> None:
+    truth = camera()
+    poses = motions(truth, 8, 5)
+    pixels = pixels_of(truth, poses, noise=0.05, seed=2)
+    result = calibrate_camera(observe(pixels), CalibrationOptions(camera=truth, free=("fx", "fy"), board_warp=True))
+    sigma = result.sigma["fx"]
+    assert sigma is not None
+    assert 0 < abs(values(result)["fx"] - float(truth.focal[0])) < 4 * sigma
+    assert values(result)["cx"] == float(truth.center[0])
+    assert result.board_warp is not None
+    assert float(result.board_warp.abs().max()) < 1e-3
+
+
+def test_a_known_camera_refuses_what_contradicts_it() -> None:
+    truth = camera()
+    for options in ({"fixed": {"cx": 3.0}}, {"focal": 500.0}, {"field_of_view": 60.0}):
+        with pytest.raises(InputError, match="a known camera fixes all"):
+            CalibrationOptions(camera=truth, **options)
+    with pytest.raises(InputError, match="fx is fixed and tied"):
+        CalibrationOptions(camera=truth, tied=(("fx", "fy"),))
+    with pytest.raises(InputError, match="known camera is of"):
+        calibrate_camera(observe(scene(), size=(641, 480)), CalibrationOptions(camera=truth))
