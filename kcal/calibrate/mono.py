@@ -109,7 +109,7 @@ def _calibrate_rejecting(
     """Calibrate, leave out what stands out, and calibrate again until nothing changes.
 
     Corners of the views that are left are judged anew in every round, so that one that was thrown out beside a worse
-    one can come back. The result is that of `calibrate_camera` on what is left, bit for bit.
+    one can come back. The result is that of `calibrate_camera` on what is left.
     """
     total = int(torch.isfinite(observations.pixels()).all(-1).sum())
     left = list(range(len(observations.views)))
