@@ -21,7 +21,7 @@ import kornia
 import numpy as np
 import torch
 from kornia.geometry.calibration import distort_points, undistort_points
-from timing import ratios, show, spread, times
+from timing import ratios, row, show, spread, times
 from torch import Tensor
 
 import kcal
@@ -100,7 +100,7 @@ def throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
             found = times(calls, rounds)
             rate = [spread([1e-6 * count / s for s in side]) for side in found]
             faster = [ratios(found[own], found[other]) for own, other in itertools.product((0, 1), (2, 3))]
-            lines += show([_row(direction, len(MODELS[model]), f"{count:.0e}", threads, *rate, *faster)])
+            lines += show([row(direction, len(MODELS[model]), f"{count:.0e}", threads, *rate, *faster)])
     return lines
 
 
@@ -113,20 +113,20 @@ def accuracy(count: int = 100_000) -> list[str]:
     pixels, _ = camera.project(points)
     forward = [torch.as_tensor(np.asarray(call())).reshape(-1, 2) for call in peers_project(camera, points)]
     differences = [f"{float((other - pixels).abs().max()):.1e}" for other in forward]
-    lines += show([_row("project, largest difference to kcal, px", "", *differences)])
+    lines += show([row("project, largest difference to kcal, px", "", *differences)])
     rays, valid = camera.unproject(pixels)
     found = [rays / rays[:, 2:]]
-    for call in peers_unproject(camera, pixels):
-        flat = torch.as_tensor(np.asarray(call())).reshape(-1, 2)
-        found.append(torch.cat([_kornia_normalized(flat, camera), torch.ones(count, 1)], -1))
+    for normalized in normalized_by_peers(camera, pixels):
+        found.append(torch.cat([normalized, torch.ones(count, 1)], -1))
     errors = [float((camera.project(ray)[0] - pixels).norm(dim=-1).max()) for ray in found]
     assert bool(valid.all())
-    return lines + show([_row("unproject, largest round trip, px", *(f"{e:.1e}" for e in errors))])
+    return lines + show([row("unproject, largest round trip, px", *(f"{e:.1e}" for e in errors))])
 
 
-def _kornia_normalized(flat: Tensor, camera: Camera) -> Tensor:
-    """Kornia answers in pixels of an undistorted camera, OpenCV on the plane z = 1."""
-    return (flat - camera.center) / camera.focal if float(flat.abs().max()) > 50 else flat
+def normalized_by_peers(camera: Camera, pixels: Tensor) -> list[Tensor]:
+    """Answers of OpenCV and kornia on the plane z = 1; kornia's own are pixels of an undistorted camera."""
+    opencv, kornias = (torch.as_tensor(np.asarray(call())) for call in peers_unproject(camera, pixels))
+    return [opencv, (kornias - camera.center) / camera.focal]
 
 
 @torch.no_grad()
@@ -153,10 +153,8 @@ def honesty() -> list[str]:
         pixels = torch.tensor([pixel], dtype=torch.float64)
         rays, valid = camera.unproject(pixels)
         cells = [_answer(rays[0, :2] / rays[0, 2], camera, pixels)] if bool(valid) else [("**invalid**", "–")]
-        opencv, kornias = (torch.as_tensor(np.asarray(call())) for call in peers_unproject(camera, pixels))
-        cells.append(_answer(opencv[0], camera, pixels))
-        cells.append(_answer((kornias[0] - camera.center) / camera.focal, camera, pixels))
-        lines += show([_row(name, *itertools.chain(*cells))])
+        cells += [_answer(normalized[0], camera, pixels) for normalized in normalized_by_peers(camera, pixels)]
+        lines += show([row(name, *itertools.chain(*cells))])
     return lines
 
 
@@ -174,10 +172,6 @@ def _points(camera: Camera, count: int) -> Tensor:
     depth = 1 + 49 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
     rays, _ = camera.unproject(pixels)
     return rays / rays[:, 2:] * depth
-
-
-def _row(*cells: object) -> str:
-    return f"| {' | '.join(map(str, cells))} |"
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ import numpy as np
 import pyproj
 import torch
 from kornia.geometry.epipolar import triangulate_points
-from timing import ratios, show, spread, times
+from timing import ratios, row, show, spread, times
 from torch import Tensor
 
 import kcal
@@ -109,7 +109,7 @@ def throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
             found = times(calls, rounds)
             rate = [spread([1e-6 * count / s for s in side], 2) for side in found]
             faster = [ratios(found[own], found[other]) for own, other in ((0, 3), (0, 4), (0, 5), (1, 3), (1, 5))]
-            lines += show([_row(f"{count:.0e}", threads, *rate, *faster)])
+            lines += show([row(f"{count:.0e}", threads, *rate, *faster)])
     return lines
 
 
@@ -138,7 +138,7 @@ def accuracy(count: int = 100_000) -> list[str]:
         ]
         errors = [torch.linalg.vector_norm(each - point, dim=-1) for each in found]
         cells = [f"{float(e.square().mean().sqrt()):.4f}" if sigma else f"{float(e.max()):.1e}" for e in errors]
-        lines += show([_row(name, *cells)])
+        lines += show([row(name, *cells)])
     return lines
 
 
@@ -170,7 +170,7 @@ def localizer(rounds: int, counts: tuple[int, ...]) -> list[str]:
                 rounds,
             )
             rate = [spread([1e-6 * count / s for s in side], 3) for side in found]
-            lines += show([_row(f"{count:.0e}", threads, *rate)])
+            lines += show([row(f"{count:.0e}", threads, *rate)])
     return lines
 
 
@@ -214,7 +214,7 @@ def coverage(draws: int) -> list[str]:
         weak = (found.status == int(Status.BEARING_ONLY)).double().mean().item()
         lines += show(
             [
-                _row(
+                row(
                     f"{distance:.0f}", f"{100 * inside.double().mean().item():.2f} %",
                     *(f"{100 * share:.1f} %" for share in circles), f"{range_rms / bound:.3f}",
                     *(f"{100 * share:.2f} %" for share in shares), f"{100 * weak:.2f} %",
@@ -254,7 +254,7 @@ def table_2() -> list[str]:
             f"{float(value[i]):+.1f} m" for i in (0, 1) for value in (found.first_order, found.nearer, found.farther)
         ]
         lines += show(
-            [_row(f"{disparity:g}", *(cell.lstrip("+") if j % 3 == 0 else cell for j, cell in enumerate(cells)))]
+            [row(f"{disparity:g}", *(cell.lstrip("+") if j % 3 == 0 else cell for j, cell in enumerate(cells)))]
         )
     return lines
 
@@ -280,10 +280,6 @@ def geodesy() -> list[str]:
             f"{worst:.1e} m (0 to 10 km, 360 azimuths, -85° to 85°, at and beside the antimeridian)."
         ]
     )
-
-
-def _row(*cells: object) -> str:
-    return f"| {' | '.join(map(str, cells))} |"
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import torch
 from kornia.geometry.calibration import undistort_image
-from timing import ratios, show, spread, times
+from timing import ratios, row, show, spread, times
 
 from kcal.lens.camera import Camera
 from kcal.lens.images import Undistort, undistort_maps
@@ -91,7 +91,7 @@ def _row(name: str, threads: int, camera: Camera, undistort: Undistort, image: t
     difference = float((undistort(image)[0][0].double() - theirs.permute(2, 0, 1).double()).abs().max())
     cells = [name, str(threads), *(_milliseconds(t) for t in found), *["–"] * (3 - len(found))]
     cells += [*faster, *["–"] * (2 - len(faster)), f"{difference:.3f}"]
-    return f"| {' | '.join(cells)} |"
+    return row(*cells)
 
 
 def _milliseconds(seconds: list[float]) -> str:

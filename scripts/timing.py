@@ -39,6 +39,11 @@ def ratios(own: Sequence[float], other: Sequence[float], digits: int = 2) -> str
     return spread([b / a for a, b in zip(own, other, strict=True)], digits)
 
 
+def row(*cells: object) -> str:
+    """A row of a Markdown table."""
+    return f"| {' | '.join(map(str, cells))} |"
+
+
 def show(lines: list[str]) -> list[str]:
     """Print lines and return them."""
     print("\n".join(lines), flush=True)

@@ -82,13 +82,12 @@ def solve_hard(
         distances = (inner_x[c] - goal_x.reshape(-1, 1)) ** 2 + (inner_y[c] - goal_y.reshape(-1, 1)) ** 2
         nearest = distances.argmin(-1)
         start_x, start_y = (value[c, nearest].reshape(tail) for value in (sample_x, sample_y))
-        part = _damped(start_x, start_y, goal_x, goal_y, enough, lens, model, here)
+        part: tuple[Tensor, ...] = _damped(start_x, start_y, goal_x, goal_y, enough, lens, model, here)
         if not known_true(part[2] | (outward[c, n] > _AGAIN).reshape(tail)):
             start_x, start_y = _led(goal_x, goal_y, lens, model)
             led = _damped(start_x, start_y, goal_x, goal_y, enough, lens, model, here)
-            found.append(tuple(torch.where(part[2], old, new) for old, new in zip(part, led, strict=True)))
-        else:
-            found.append(part)
+            part = tuple(torch.where(part[2], old, new) for old, new in zip(part, led, strict=True))
+        found.append(part)
     solved = [torch.cat([part[i].reshape(-1) for part in found]) for i in range(3)]
     x, y, valid = (
         old.index_put((camera, place), new).reshape(shape) for old, new in zip((x, y, valid), solved, strict=True)
