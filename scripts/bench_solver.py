@@ -77,6 +77,12 @@ def simulate(
     }
 
 
+def flipped_views(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Which of V boards, rotations (V, 3, 3), are more than 8 degrees from the truth."""
+    turn = np.einsum("vij,vij->v", found, truth)
+    return np.degrees(np.arccos(np.clip((turn - 1) / 2, -1, 1))) > 8
+
+
 # Solvers: data, number of coefficients -> (fx fy cx cy, coefficients, rotations, translations, seconds).
 def with_kcal(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...]:
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
@@ -185,8 +191,7 @@ def judge(data: dict[str, np.ndarray], solution: dict[str, np.ndarray], coeffici
     points = rotation @ torch.tensor(data["board"]).T + translation[..., None]
     seen = project_components(points, parameters, model)
     error = seen.pixels.transpose(-1, -2) - torch.tensor(data["pixels"])
-    turn = np.einsum("vij,vij->v", solution["rotation"], data["rotation"])
-    flipped = np.degrees(np.arccos(np.clip((turn - 1) / 2, -1, 1))) > 8
+    flipped = flipped_views(solution["rotation"], data["rotation"])
     # A pole or fold shows on the way from the axis to the outermost corner.
     radius = float((points[:, :2] / points[:, 2:]).norm(dim=1).max())
     r, turns = torch.linspace(0, radius, 400).double(), torch.linspace(0, 2 * np.pi, 25).double()[:-1]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from bench_solver import COLUMNS, MODELS, ROWS, SIZE, SQUARE, simulate
+from bench_solver import COLUMNS, MODELS, ROWS, SIZE, SQUARE, flipped_views, simulate
 from page import write_section
 from timing import show
 
@@ -107,7 +107,6 @@ def judge(seed: int, views: int, model: LensModel) -> Outcome:
     poses = torch.from_numpy(data["rotation"]), torch.from_numpy(data["translation"])
     start = (truth.parameters_vector.detach(), torch.zeros(2).double(), *none, *poses)
     best = minimise(problem, start, LMOptions(max_iterations=1000, tolerance=1e-12))
-    turn = np.einsum("vij,vij->v", result.cam_from_board_rotation.numpy(), data["rotation"])
     sigma = result.sigma["fx"]
     return Outcome(
         seed=seed,
@@ -116,7 +115,7 @@ def judge(seed: int, views: int, model: LensModel) -> Outcome:
         rms=result.rms,
         yardstick=float(torch.sqrt(4.0 * best.cost / problem.residual_count)),
         yardstick_folds=not bool(Camera(best.state[0], size=SIZE, model=model).covers_image()),
-        flipped=int((np.degrees(np.arccos(np.clip((turn - 1) / 2, -1, 1))) > 8).sum()),
+        flipped=int(flipped_views(result.cam_from_board_rotation.numpy(), data["rotation"]).sum()),
         focal_error=abs(float(result.camera.focal[0] - truth.focal[0])) / (np.inf if sigma is None else sigma),
         image_error=image_error(result.camera, truth),
         status=result.status,
