@@ -10,7 +10,6 @@ from torch import Tensor
 from kcal.calibrate.mono import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.outliers import OutlierRejection, corners_beyond
 from kcal.errors import InputError
-from kcal.lens.camera import Camera
 
 REJECT = CalibrationOptions(reject=OutlierRejection())
 NOISE = 0.1
@@ -43,9 +42,12 @@ def test_normal_noise_loses_one_corner_in_a_hundred_calibrations() -> None:
     assert sum(int(corners_beyond(NOISE * draw).sum()) for draw in draws) < 7
 
 
-def assert_same_solution(one: Camera, other: Camera) -> None:
-    """The same to what rounding leaves: vector kernels round by where memory lies, and iterations stop accordingly."""
-    torch.testing.assert_close(one.parameters_vector, other.parameters_vector, rtol=1e-8, atol=1e-9)
+def assert_same_solution(one: CameraCalibrationResult, other: CameraCalibrationResult) -> None:
+    """Within a ten-thousandth of each σ: vector kernels round by where memory lies, and iterations stop accordingly."""
+    moved = (one.camera.parameters_vector - other.camera.parameters_vector).abs()
+    for name, change in zip(one.camera.names, moved.tolist(), strict=True):
+        assert change <= 1e-4 * (one.sigma.get(name) or 0.0), name
+    assert one.rms == pytest.approx(other.rms, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -55,7 +57,7 @@ def test_clean_data_keep_all_corners_and_the_same_result(seed: int) -> None:
     assert result.rejected_corners == ()
     assert result.rejected_views == ()
     assert result.rejected_share == 0.0
-    assert_same_solution(result.camera, plain.camera)
+    assert_same_solution(result, plain)
     assert plain.warnings == ()
 
 
@@ -89,9 +91,8 @@ def test_the_result_is_that_of_the_data_that_are_left() -> None:
     for i, n in wrong:
         pixels[i, n] = torch.nan
     again = calibrate_camera(observe(pixels))
-    assert_same_solution(result.camera, again.camera)
-    assert result.rms == again.rms
-    assert result.sigma == again.sigma
+    assert_same_solution(result, again)
+    assert result.sigma == pytest.approx(again.sigma, rel=1e-5)
 
 
 def test_a_view_of_another_board_is_left_out_whole() -> None:
