@@ -164,6 +164,12 @@ class BoardProblem(SchurProblem):
         board = tuple(self.board_points.flatten().tolist())
         return board, self.models, self.free, self.free_warp, self.whitened, self.loss, terms
 
+    def repeated(self, count: int) -> BoardProblem:
+        """A batch of this problem, which is none yet."""
+        batch = copy.copy(self)
+        batch.batch = (count,)
+        return batch
+
     def select(self, elements: Tensor) -> BoardProblem | None:
         """See `SchurProblem.select`."""
         if len(self.batch) != 1:
