@@ -14,6 +14,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.inverse_net import InverseNet
 from kcal.lens.plane import plane_from_points, rays_from_plane
 from kcal.lens.projection import from_pixels
+from kcal.lens.residual import undo_components
 from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import Status
 
@@ -137,8 +138,9 @@ def _chebyshev(camera: Camera, counts: tuple[int, int]) -> Tensor:
 
 
 def _distorted(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Distorted coordinates x, y (N,) of pixels (N, 2)."""
-    return from_pixels(pixels[:, 0], pixels[:, 1], camera.parameters_vector)
+    """Distorted coordinates x, y (N,) of pixels (N, 2); of a hybrid camera, before its residual field."""
+    x, y = from_pixels(pixels[:, 0], pixels[:, 1], camera.parameters_vector)
+    return (x, y) if camera.field is None else undo_components(x, y, camera.field)[:2]
 
 
 def _errors(camera: Camera, pixels: Tensor, x: Tensor, y: Tensor) -> Tensor:

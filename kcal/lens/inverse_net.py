@@ -15,9 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points
+from kcal.checks import as_points, keep_float64
 from kcal.errors import InputError
-from kcal.lens.camera import Camera, keep_float64
+from kcal.lens.camera import Camera
 from kcal.lens.net import Widths, evaluate, initial_weights
 from kcal.lens.start import start_from, without_tilt
 
@@ -28,7 +28,8 @@ _RIM = 1.0 - math.tan(math.radians(89.9 / 2)) ** 2
 class InverseNet(nn.Module):
     """Distorted to undistorted coordinates by a network of three layers (Eq. 12 of the paper).
 
-    Convention: both on the plane of the lens: z = 1, for a fisheye the plane of angles. The network works on a chart
+    Convention: both on the plane of the lens: z = 1, for a fisheye the plane of angles. Distorted positions of a hybrid
+    camera are those before its residual field, which is undone by Newton steps of its own. The network works on a chart
     where wide angles take no more room than in an image: of the plane z = 1 the stereographic one,
     p = 2 x / (1 + √(1 + |x|²)), where 90° is |p| = 2; the plane of angles is such a chart itself. With p0 the guess in
     closed form, p = p0 + a · net(p0 / r): r and a (`reach`, `amplitude`) bring inputs and outputs to the order of one.
