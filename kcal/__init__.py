@@ -10,6 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from kcal.calibrate.layer import CalibrationLayer
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
     from kcal.calibrate.stereo import RigOptions, calibrate_rig
     from kcal.corners.board import Board
@@ -35,6 +36,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Board",
+    "CalibrationLayer",
     "CalibrationOptions",
     "Camera",
     "KcalError",
@@ -64,6 +66,7 @@ __all__ = [
 
 _HOME = {
     "Board": "kcal.corners.board",
+    "CalibrationLayer": "kcal.calibrate.layer",
     "CalibrationOptions": "kcal.calibrate.mono",
     "Camera": "kcal.lens.camera",
     "KcalError": "kcal.errors",

@@ -160,7 +160,7 @@ class BoardProblem(SchurProblem):
         """Board points rotated into the first camera (..., V, 3, N), and moved there."""
         flat = self._board
         if self.free_warp or bool(s.warp.any()):
-            height = (s.warp[..., None, :] @ self._shape)[..., None, :, :]
+            height = flat[2] + (s.warp[..., None, :] @ self._shape)[..., None, :, :]
             plane = flat[:2].expand(*height.shape[:-2], -1, -1)
             flat = torch.cat([plane, height], -2)
         rotated = s.first_from_board_rotation @ flat

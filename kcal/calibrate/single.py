@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -20,7 +21,6 @@ from kcal.calibrate.poses import refine_poses, unflip
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.views import Views
 from kcal.calibrate.weights import whitening
-from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -40,6 +40,42 @@ _SUSPICIOUS_RMS = 2.0
 _LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
 
 
+class BoardPoints(Protocol):
+    """A board: where its corners lie."""
+
+    @property
+    def points(self) -> Tensor:
+        """(N, 3) metres."""
+        ...
+
+
+class Corners(Protocol):
+    """What is calibrated from: `kcal.corners.observations.Observations`, or tensors."""
+
+    @property
+    def board(self) -> BoardPoints:
+        """The board that was shown."""
+        ...
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height) pixels."""
+        ...
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the views."""
+        ...
+
+    def pixels(self) -> Tensor:
+        """(V, N, 2), NaN where not seen."""
+        ...
+
+    def covariances(self) -> Tensor | None:
+        """(V, N, 2, 2) px², or None."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Solved:
     """A solution for one set of corners, before it is judged."""
@@ -52,7 +88,7 @@ class Solved:
     variance: float | None
 
 
-def solve(observations: Observations, options: CalibrationOptions, progress: Progress) -> Solved:
+def solve(observations: Corners, options: CalibrationOptions, progress: Progress) -> Solved:
     """Find the minimum for all corners given, as `calibrate_camera` describes it; its errors are raised here."""
     model = options.lens
     board = observations.board.points
@@ -118,7 +154,7 @@ def solve(observations: Observations, options: CalibrationOptions, progress: Pro
 
 
 def corner_problem(
-    observations: Observations,
+    observations: Corners,
     options: CalibrationOptions,
     minimum: Minimum,
     variance: float | None,
@@ -140,7 +176,7 @@ def corner_problem(
     )
 
 
-def _check(observations: Observations, pixels: Tensor, count: int, warp: bool, fewest: int) -> None:
+def _check(observations: Corners, pixels: Tensor, count: int, warp: bool, fewest: int) -> None:
     seen = torch.isfinite(pixels).all(-1).sum(-1)
     if len(pixels) < fewest:
         raise DegenerateError(
@@ -224,7 +260,7 @@ def _first(
     return best[1], best[2], spent
 
 
-def _known(observations: Observations, pixels: Tensor, camera: Camera) -> State:
+def _known(observations: Corners, pixels: Tensor, camera: Camera) -> State:
     """Board poses under a known camera, refined one by one, both tilts of each tried."""
     if camera.size != observations.image_size:
         raise InputError(f"the known camera is of {camera.size} px, the observations of {observations.image_size} px")
