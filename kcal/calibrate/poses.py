@@ -6,8 +6,9 @@ from torch import Tensor
 
 from kcal.calibrate.init import flipped_poses
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.together import Solve, Steps, alone
 from kcal.lens.model import LensModel
-from kcal.solve.lm import LMOptions, minimise
+from kcal.solve.lm import LMOptions
 from kcal.solve.result import State
 
 # Enough to tell which of two tilts fits; what is chosen is refined with everything else afterwards.
@@ -32,11 +33,18 @@ def refine_poses(
     Returns:
         the state with refined board poses, and the cost of each view (V,); NaN where a start had none.
     """
+    return alone(refining(board_points, pixels, models, state, options))
+
+
+def refining(
+    board_points: Tensor, pixels: Tensor, models: list[LensModel], state: State, options: LMOptions
+) -> Steps[tuple[State, Tensor]]:
+    """`refine_poses` as steps of a calibration."""
     views = len(pixels)
     problem = BoardProblem(board_points, pixels[:, None], models, [() for _ in models], batch=(views,))
     *shared, rotation, translation = state
     start = (*(t.expand(views, *t.shape) for t in shared), rotation[:, None], translation[:, None])
-    result = minimise(problem, start, options)
+    result = yield Solve(problem, start, options)
     *_, rotation, translation = result.state
     return (*shared, rotation[:, 0], translation[:, 0]), result.cost
 
@@ -57,15 +65,22 @@ def unflip(board_points: Tensor, pixels: Tensor, models: list[LensModel], state:
     Returns:
         the state with the better poses, roughly refined, and the indices of the views that changed.
     """
+    return alone(unflipping(board_points, pixels, models, state))
+
+
+def unflipping(
+    board_points: Tensor, pixels: Tensor, models: list[LensModel], state: State
+) -> Steps[tuple[State, list[int]]]:
+    """`unflip` as steps of a calibration."""
     problem = BoardProblem(board_points, pixels, models, [() for _ in models])
     cost = 0.5 * (problem.residuals(state) ** 2).sum(-1)
-    twin, cost_twin = refine_poses(board_points, pixels, models, flipped_poses(board_points, state), _GLANCE)
+    twin, cost_twin = yield from refining(board_points, pixels, models, flipped_poses(board_points, state), _GLANCE)
     near = (cost_twin < _HOPELESS * cost).nonzero()[:, 0]
     *shared, rotation, translation = state
     if not len(near):
         return state, []
     start = (*shared, twin[-2][near], twin[-1][near])
-    twin, cost_twin = refine_poses(board_points, pixels[near], models, start, _ROUGH)
+    twin, cost_twin = yield from refining(board_points, pixels[near], models, start, _ROUGH)
     better = cost_twin < 0.999 * cost[near]
     changed = near[better]
     rotation, translation = rotation.clone(), translation.clone()
