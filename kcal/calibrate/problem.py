@@ -21,6 +21,7 @@ from kcal.calibrate.terms import Term
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, project_components
+from kcal.lens.residual import Field
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import SchurLinearisation, SchurProblem
@@ -95,6 +96,7 @@ class BoardProblem(SchurProblem):
             None: all corners count alike.
         loss: of the length of each corner's residual (after whitening), or None for plain least squares.
         terms: priors and bounds on the first camera's parameters and the warp, beside the corners.
+        fields: for each camera what corrects its lens, held as it is, or None; nothing given: no camera has any.
         batch: leading shape of the states, () for one solve.
     """
 
@@ -111,9 +113,11 @@ class BoardProblem(SchurProblem):
         whitening: Tensor | None = None,
         loss: RobustLoss | None = None,
         terms: Sequence[Term] = (),
+        fields: Sequence[Field | None] = (),
         batch: tuple[int, ...] = (),
     ) -> None:
         self.models = tuple(models)
+        self.fields = tuple(fields) or (None,) * len(self.models)
         self.free = tuple(Free.of(indices) for indices in free)
         self.free_warp = free_warp
         self.batch = batch
@@ -160,7 +164,9 @@ class BoardProblem(SchurProblem):
         """Problems that agree in this can be joined into one of a batch."""
         terms = tuple(term.alike for term in self.terms)
         board = tuple(self.board_points.flatten().tolist())
-        return board, self.models, self.free, self.free_warp, self.whitened, self.loss, terms
+        # A field is held by all of a batch, so that only those of the same one go together.
+        fields = tuple(id(field) for field in self.fields if field is not None)
+        return board, self.models, self.free, self.free_warp, self.whitened, self.loss, terms, fields
 
     def select(self, elements: Tensor) -> BoardProblem | None:
         """See `SchurProblem.select`."""
@@ -248,7 +254,7 @@ class BoardProblem(SchurProblem):
         """Projected minus observed, (..., V, C, 2, N) pixels, not weighted; 0 where not seen."""
         out = []
         for c, _, points, parameters in self._views(self.unpack(state)):
-            projected = project_components(points, parameters, self.models[c])
+            projected = project_components(points, parameters, self.models[c], None, self.fields[c])
             error = projected.pixels - self._target[..., c, :, :]
             seen = self.seen[..., c, None, :]
             bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
@@ -282,7 +288,7 @@ class BoardProblem(SchurProblem):
         rows = points.new_empty(shape) if len(self.models) == 1 else points.new_zeros(shape)
         shared = rows[..., 6:-1, :, :, :]
         for c, rotated, moved, parameters in self._views(s):
-            projected = project_components(moved, parameters, self.models[c], self.free[c].indices)
+            projected = project_components(moved, parameters, self.models[c], self.free[c].indices, self.fields[c])
             by_first = projected.by_point
             if c > 0:
                 turn = s.cam_from_first_rotation[..., c - 1, :, :]
