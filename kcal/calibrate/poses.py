@@ -8,9 +8,10 @@ from torch import Tensor
 
 from kcal.calibrate.init import flipped_poses
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.together import Solve, Steps, alone
 from kcal.lens.model import LensModel
 from kcal.lens.residual import Field
-from kcal.solve.lm import LMOptions, minimise
+from kcal.solve.lm import LMOptions
 from kcal.solve.result import State
 
 # Enough to tell which of two tilts fits; what is chosen is refined with everything else afterwards.
@@ -41,11 +42,23 @@ def refine_poses(
     Returns:
         the state with refined board poses, and the cost of each view (V,); NaN where a start had none.
     """
+    return alone(refining(board_points, pixels, models, state, options, fields))
+
+
+def refining(
+    board_points: Tensor,
+    pixels: Tensor,
+    models: list[LensModel],
+    state: State,
+    options: LMOptions,
+    fields: Sequence[Field | None] = (),
+) -> Steps[tuple[State, Tensor]]:
+    """`refine_poses` as steps of a calibration."""
     views = len(pixels)
     problem = BoardProblem(board_points, pixels[:, None], models, [() for _ in models], fields=fields, batch=(views,))
     *shared, rotation, translation = state
     start = (*(t.expand(views, *t.shape) for t in shared), rotation[:, None], translation[:, None])
-    result = minimise(problem, start, options)
+    result = yield Solve(problem, start, options)
     *_, rotation, translation = result.state
     return (*shared, rotation[:, 0], translation[:, 0]), result.cost
 
@@ -73,15 +86,27 @@ def unflip(
     Returns:
         the state with the better poses, roughly refined, and the indices of the views that changed.
     """
+    return alone(unflipping(board_points, pixels, models, state, fields))
+
+
+def unflipping(
+    board_points: Tensor,
+    pixels: Tensor,
+    models: list[LensModel],
+    state: State,
+    fields: Sequence[Field | None] = (),
+) -> Steps[tuple[State, list[int]]]:
+    """`unflip` as steps of a calibration."""
     problem = BoardProblem(board_points, pixels, models, [() for _ in models], fields=fields)
     cost = 0.5 * (problem.residuals(state) ** 2).sum(-1)
-    twin, cost_twin = refine_poses(board_points, pixels, models, flipped_poses(board_points, state), _GLANCE, fields)
+    flipped = flipped_poses(board_points, state)
+    twin, cost_twin = yield from refining(board_points, pixels, models, flipped, _GLANCE, fields)
     near = (cost_twin < _HOPELESS * cost).nonzero()[:, 0]
     *shared, rotation, translation = state
     if not len(near):
         return state, []
     start = (*shared, twin[-2][near], twin[-1][near])
-    twin, cost_twin = refine_poses(board_points, pixels[near], models, start, _ROUGH, fields)
+    twin, cost_twin = yield from refining(board_points, pixels[near], models, start, _ROUGH, fields)
     better = cost_twin < 0.999 * cost[near]
     changed = near[better]
     rotation, translation = rotation.clone(), translation.clone()
