@@ -40,3 +40,7 @@ class NetProblem:
     def retract(self, state: State, step: State) -> State:
         """Plain addition."""
         return (torch.add(state[0], step[0]),)
+
+    def select(self, elements: Tensor) -> NetProblem:
+        """There is one problem only, and nothing to select from."""
+        return self
