@@ -21,22 +21,29 @@ class SchurLinearisation:
         gram: (..., V, L + S + 1, L + S + 1): for each view the products of its rows, see `SchurProblem.rows`.
         local_size: L.
         shared_rows: (..., S + 1, Q): likewise of Q residuals that depend on the shared parameters alone, or None.
+        slopes: (S, W), if the S shared parameters are functions of W others, over which the problem is solved: their
+            derivatives. All above stays in terms of the S.
     """
 
-    def __init__(self, gram: Tensor, local_size: int, shared_rows: Tensor | None = None) -> None:
+    def __init__(
+        self, gram: Tensor, local_size: int, shared_rows: Tensor | None = None, slopes: Tensor | None = None
+    ) -> None:
         L = local_size
         total = gram[..., L:, L:].sum(-3)
         if shared_rows is not None:
             total = total + shared_rows @ shared_rows.transpose(-1, -2)
         self.cost = 0.5 * total[..., -1, -1]
         local, coupling, shared = gram[..., :L, :L], gram[..., :L, L:-1], total[..., :-1, :-1]
+        gradient = total[..., :-1, -1]
+        if slopes is not None:
+            coupling, shared, gradient = coupling @ slopes, slopes.T @ shared @ slopes, gradient @ slopes
         self._local_scale = _inverse_root(local.diagonal(dim1=-2, dim2=-1))
         self._shared_scale = _inverse_root(shared.diagonal(dim1=-2, dim2=-1))
         self._local = local * self._local_scale[..., :, None] * self._local_scale[..., None, :]
         self._coupling = coupling * self._local_scale[..., :, None] * self._shared_scale[..., None, None, :]
         self._shared = shared * self._shared_scale[..., :, None] * self._shared_scale[..., None, :]
         self._local_gradient = gram[..., :L, -1] * self._local_scale
-        self._shared_gradient = total[..., :-1, -1] * self._shared_scale
+        self._shared_gradient = gradient * self._shared_scale
 
     def _reduce(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Eliminate the local blocks: reduced matrix, reduced gradient, D⁻¹[B, g] of the views, failures."""
