@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig_adjust import Adjustment, Intrinsics, chi2_quantile
+from kcal.calibrate.rig_adjust import Adjustment, Intrinsics, chi2_quantile, typical_excess
 from kcal.calibrate.rig_problem import RigProblem
 from kcal.calibrate.rig_records import item_records, source_records
 from kcal.calibrate.rig_result import RigSolution, check_determined
@@ -28,7 +28,12 @@ _LOSS = RobustLoss(kind="cauchy", scale=3.0)
 _CORNER_SIGMA = 0.2
 # More than this share of a source is not a few wrong ones.
 _MOST_WRONG = 0.4
+# A source whose typical item is off by this many times its sigma has no wrong items but is wrong.
+_WHOLE = 20.0
 _ROUNDS = 30
+# Robust solutions only sort out what is wrong; rival starts are told apart after some steps.
+_SCREENING = LMOptions(max_iterations=25, tolerance=1e-6, residual_floor=1e-8)
+_ROUGHLY = LMOptions(max_iterations=100, tolerance=1e-6, residual_floor=1e-8)
 _KINDS = ("boards", "landmarks", "features")
 
 
@@ -159,15 +164,15 @@ def _robust(begun: Begun, masks: list[Tensor], options: JointOptions) -> Adjustm
         for mask, squares in zip(here, work.squares(here), strict=True):
             # Behind a camera, or beyond what its lens shows: no number says how wrong it is.
             mask &= torch.isfinite(squares)
-        work.fit_corners(here)
-        _, result = work.solve(here, options.solver, _LOSS)
+        work.fit_corners(here, robust=True)
+        _, result = work.solve(here, _SCREENING, _LOSS)
         cost = float(result.cost) + 1e6 * sum(int((a & ~b).sum()) for a, b in zip(masks, here, strict=True))
         if best is None or cost < best[0]:
             best = (cost, work, here)
     assert best is not None
     work, here = best[1:]
-    work.fit_corners(here)
-    work.solve(here, options.solver, _LOSS)
+    work.fit_corners(here, robust=True)
+    work.solve(here, _ROUGHLY, _LOSS)
     return work
 
 
@@ -175,6 +180,12 @@ def _reject(work: Adjustment, masks: list[Tensor], reasons: list[dict[int, str]]
     """Take out of the masks what contradicts the rest, worst first, and back in what does not after all."""
     possible = [mask.clone() for mask in masks]
     squares, freedom = work.squares(possible), work.freedom(possible)
+    for word, square, dof in zip(_KINDS, squares, freedom, strict=True):
+        if (times := math.sqrt(typical_excess(square, dof))) > _WHOLE:
+            raise InputError(
+                f"the {word} contradict each other or the rest: typically they are {times:.0f} times as far off as "
+                "their sigmas say; check names, units, heights, sigmas and that the cameras are these"
+            )
     for mask, square, limit in zip(masks, squares, work.limits(squares, freedom), strict=True):
         mask &= ~(square > limit)
     _refuse_many(work, masks, possible)

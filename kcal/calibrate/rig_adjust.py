@@ -24,6 +24,8 @@ from kcal.solve.robust import RobustLoss
 Intrinsics = Literal["fixed", "prior", "free"]
 # Chance that any good item at all is taken for a wrong one.
 _FALSE_ALARM = 1e-3
+# px; of a corner.
+_LEAST_SIGMA = 1e-3
 # Tensors of each group's local state: boards, landmarks, features.
 TENSORS = (2, 1, 2)
 
@@ -125,26 +127,34 @@ class Adjustment:
     def limits(self, squares: Sequence[Tensor], freedom: Sequence[Tensor]) -> list[Tensor]:
         """χ² beyond which items do not belong: where all of a kind fit worse than stated, they are judged by that."""
         total = sum(int((f > 0).sum()) for f in freedom)
-        found = []
-        for square, dof in zip(squares, freedom, strict=True):
-            known = (dof > 0) & torch.isfinite(square)
-            worse = 1.0
-            if int(known.sum()) >= 4:
-                typical = (square / chi2_quantile(dof.double(), 0.5))[known].median()
-                worse = max(1.0, float(typical))
-            found.append(worse * chi2_quantile(dof.double(), 1.0 - _FALSE_ALARM / max(total, 1)))
-        return found
+        level = 1.0 - _FALSE_ALARM / max(total, 1)
+        each = zip(squares, freedom, strict=True)
+        return [max(1.0, typical_excess(s, dof)) * chi2_quantile(dof.double(), level) for s, dof in each]
 
-    def fit_corners(self, masks: Sequence[Tensor]) -> None:
-        """Set the corners' sigma from the boards' residuals, unless it was given."""
+    def fit_corners(self, masks: Sequence[Tensor], *, robust: bool = False) -> None:
+        """Set the corners' sigma from the boards' residuals, unless it was given.
+
+        Args:
+            masks: the items that take part.
+            robust: by the median board, so that some wrong ones do not matter.
+        """
         boards = self.data.boards
         if boards is None or boards.sigma is not None or not bool(masks[0].any()):
             return
         squares, freedom = self.squares(masks)[0][masks[0]], self.freedom(masks)[0][masks[0]]
         dof = int(freedom.sum())
-        if dof > 0 and bool(torch.isfinite(squares).all()):
+        excess = typical_excess(squares, freedom) if robust else float(squares.sum()) / max(dof, 1)
+        if dof > 0 and 0 < excess < math.inf:
             # Noise-free corners would otherwise weigh infinitely much.
-            self.sigma_corner = max(self.sigma_corner * math.sqrt(float(squares.sum()) / dof), 1e-3)
+            self.sigma_corner = max(self.sigma_corner * math.sqrt(excess), _LEAST_SIGMA)
+
+
+def typical_excess(squares: Tensor, freedom: Tensor) -> float:
+    """Median of χ² over what its median should be; 1 for fewer than four items."""
+    known = (freedom > 0) & torch.isfinite(squares)
+    if int(known.sum()) < 4:
+        return 1.0
+    return float((squares[known] / chi2_quantile(freedom[known].double(), 0.5)).median())
 
 
 def _free(data: RigData, camera: int, intrinsics: Intrinsics) -> Free:

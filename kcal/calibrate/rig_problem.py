@@ -163,7 +163,10 @@ class RigProblem:
         """For each group (V,) the sum of squares of each block."""
         sights = self.sights(state)
         each = zip(self.groups, self.locals(state), strict=True)
-        return [group.residuals(sights, local).square().sum(-1) for group, local in each]
+        return [
+            group.residuals(sights, local).square().sum(-1) if len(group) else local[0].new_zeros(0)
+            for group, local in each
+        ]
 
     def term_rows(self, state: State) -> Tensor:
         """(S + 1, Q) of what was measured of the cameras besides."""
@@ -186,6 +189,8 @@ class RigProblem:
         """See `Problem.linearise`."""
         sights, grams = self.sights(state), []
         for group, local in zip(self.groups, self.locals(state), strict=True):
+            if not len(group):
+                continue
             rows = group.rows(sights, local, self.shared_size)
             if self.loss is not None:
                 count = group.counts.clamp_min(1)
@@ -196,7 +201,10 @@ class RigProblem:
             gram[:, range(missing), range(missing)] = 1.0
             gram[:, missing:, missing:] = rows @ rows.transpose(-1, -2)
             grams.append(gram)
-        linear = SchurLinearisation(torch.cat(grams), LOCAL_SIZE, self.term_rows(state))
+        size = LOCAL_SIZE + self.shared_size + 1
+        linear = SchurLinearisation(
+            torch.cat([state[0].new_zeros(0, size, size), *grams]), LOCAL_SIZE, self.term_rows(state)
+        )
         if self.loss is not None:
             linear.cost = self.cost(state)
         return linear

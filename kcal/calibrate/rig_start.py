@@ -93,7 +93,8 @@ def first_poses(data: RigData, solver: LMOptions) -> Begun:
     if not placed:
         known.put(0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
     open_ends: list[int] = []
-    while len(known.ready) < count:
+    headings = None if placed else _measured_starts(data)
+    while headings is None and len(known.ready) < count:
         waiting = [c for c in range(count) if c not in known.ready]
         if views.link(known, waiting):
             continue
@@ -104,13 +105,41 @@ def first_poses(data: RigData, solver: LMOptions) -> Begun:
                 "better four landmarks, or features together with its position or the baseline"
             )
     views.settle(known)
-    starts = _starts(data, known, open_ends)
-    if data.absolute and not placed:
+    starts = headings or _starts(data, known, open_ends)
+    if data.absolute and not placed and headings is None:
         for start in starts:
             _into_frame(data, start)
     for start in starts:
         start.board_rotation, start.board_translation = views.world(start)
     return Begun(data=views.data, starts=starts, flipped=views.flipped, foreign=views.foreign, usable=views.usable)
+
+
+def _measured_starts(data: RigData) -> list[Start] | None:
+    """Starts for cameras whose positions are all measured and that only features tie: level, in eight headings."""
+    if (
+        data.features is None
+        or data.boards is not None
+        or {p.camera for p in data.positions} != {*range(len(data.cameras))}
+    ):
+        return None
+    known = _Known(len(data.cameras))
+    known.put(0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    for _ in data.cameras:
+        for camera in range(len(data.cameras)):
+            if camera not in known.ready:
+                _from_features(data, camera, known, [], False)
+    if len(known.ready) < len(data.cameras):
+        return None
+    relative = torch.stack([known.poses(c).rotation for c in range(len(data.cameras))])
+    centre = torch.stack([place for c in range(len(data.cameras)) if (place := _position(data, c)) is not None])
+    nothing, starts = torch.empty(0, dtype=torch.float64), []
+    for eighth in range(8):
+        sine, cosine = math.sin(math.pi * eighth / 4), math.cos(math.pi * eighth / 4)
+        level = torch.tensor([[cosine, -sine, 0.0], [0.0, 0.0, -1.0], [sine, cosine, 0.0]], dtype=torch.float64)
+        starts.append(
+            Start(rotation=relative @ level, centre=centre, board_rotation=nothing, board_translation=nothing)
+        )
+    return starts
 
 
 def _position(data: RigData, camera: int) -> Tensor | None:

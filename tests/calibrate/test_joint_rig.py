@@ -179,7 +179,11 @@ SOURCES = {
     "landmarks": lambda n: {"landmarks": landmarks(cameras=n)},
     "boards": lambda n: {"boards": boards(cameras=n)},
     "features and positions": lambda n: {"features": features(cameras=n, known=0.01), "positions": positions(n)},
-    "boards and positions": lambda n: {"boards": boards(cameras=n), "positions": positions(n)},
+    # With a stated sigma: beside corners that seem exact to 0.001 px a position of 2 cm is rounding.
+    "boards and positions": lambda n: {
+        "boards": dataclasses.replace(boards(cameras=n), sigma=0.1),
+        "positions": positions(n),
+    },
     "all": lambda n: {
         "landmarks": landmarks(cameras=n), "features": features(cameras=n), "boards": boards(cameras=n),
         "baselines": BASELINE, "positions": positions(n)[:1],
@@ -274,9 +278,9 @@ class TestIntrinsics:
 
 class TestCovariance:
     def test_is_the_spread(self) -> None:
-        """60 rigs: the sum of squared errors in sigmas is χ² with 360 degrees of freedom, ± 4 of its deviations."""
+        """30 rigs: the sum of squared errors in sigmas is χ² with 180 degrees of freedom, ± 4 of its deviations."""
         total = [0.0, 0.0]
-        for seed in range(0, 60_000, 1000):
+        for seed in range(0, 30_000, 1000):
             found = solve_rig(data(landmarks=landmarks(noise=0.1, error=0.02, seed=seed), baselines=BASELINE))
             assert found.left_out == ()
             turn = vector_from_rotation(found.rotation[0].T @ ROTATION[0])
@@ -285,8 +289,8 @@ class TestCovariance:
             for k, (error, covariance) in enumerate(zip(errors, covariances, strict=True)):
                 total[k] += float(error @ torch.linalg.solve(covariance, error))
         # Of the baseline's length the truth is given here, not a draw: at most one degree of freedom in six is smaller.
-        assert 300 - 4 * (2 * 300) ** 0.5 < total[0] < 360 + 4 * (2 * 360) ** 0.5
-        assert 360 - 4 * (2 * 360) ** 0.5 < total[1] < 360 + 4 * (2 * 360) ** 0.5
+        assert 150 - 4 * (2 * 150) ** 0.5 < total[0] < 180 + 4 * (2 * 180) ** 0.5
+        assert 180 - 4 * (2 * 180) ** 0.5 < total[1] < 180 + 4 * (2 * 180) ** 0.5
 
     def test_joint_covariance_has_the_order_of_the_rig(self) -> None:
         found = solve_rig(data(landmarks=landmarks(noise=0.1)), JointOptions(intrinsics="fixed"))
@@ -344,7 +348,7 @@ class TestWrong:
 
     def test_names_mixed_up_are_refused_as_a_whole(self) -> None:
         marks = landmarks(noise=0.1, error=0.02)
-        with pytest.raises(InputError, match="landmarks contradict the rest"):
+        with pytest.raises(InputError, match="landmarks contradict"):
             solve_rig(data(landmarks=dataclasses.replace(marks, points=marks.points.roll(5, 0)), boards=boards()))
 
     def test_what_was_not_rejected_widens_the_covariance(self) -> None:
