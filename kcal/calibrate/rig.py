@@ -9,9 +9,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig_adjust import Adjustment, Intrinsics, chi2_quantile, typical_excess
+from kcal.calibrate.rig_adjust import KINDS, Adjustment, Intrinsics, chi2_quantile
 from kcal.calibrate.rig_problem import RigProblem
-from kcal.calibrate.rig_records import item_records, source_records
+from kcal.calibrate.rig_records import item_records, places, source_records
+from kcal.calibrate.rig_reject import LOSS, ROUGHLY, reject_wrong
 from kcal.calibrate.rig_result import RigSolution, check_determined
 from kcal.calibrate.rig_sources import RigData
 from kcal.calibrate.rig_spread import SharedSpread
@@ -20,21 +21,11 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, Status
-from kcal.solve.robust import RobustLoss
 
-# Of the root of an item's mean square: what is three times worse than stated counts half.
-_LOSS = RobustLoss(kind="cauchy", scale=3.0)
 # Guess of a corner's noise before the boards themselves tell it, px.
 _CORNER_SIGMA = 0.2
-# More than this share of a source is not a few wrong ones.
-_MOST_WRONG = 0.4
-# A source whose typical item is off by this many times its sigma has no wrong items but is wrong.
-_WHOLE = 20.0
-_ROUNDS = 30
-# Robust solutions only sort out what is wrong; rival starts are told apart after some steps.
+# Rival starts are told apart after some steps.
 _SCREENING = LMOptions(max_iterations=25, tolerance=1e-6, residual_floor=1e-8)
-_ROUGHLY = LMOptions(max_iterations=100, tolerance=1e-6, residual_floor=1e-8)
-_KINDS = ("boards", "landmarks", "features")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -94,7 +85,7 @@ def solve_rig(data: RigData, options: JointOptions | None = None) -> RigSolution
     reasons = _initial_reasons(begun, masks)
     work = _robust(begun, masks, options)
     if options.reject:
-        _reject(work, masks, reasons, options)
+        reject_wrong(work, masks, reasons, options.solver)
     for _ in range(3):
         problem, result = work.solve(masks, options.solver)
         before = work.sigma_corner
@@ -114,7 +105,7 @@ def _check(data: RigData) -> None:
 def _without_rayless(data: RigData) -> tuple[RigData, list[str]]:
     """The data with pixels at which a lens model has no ray taken as unseen."""
     warnings, changed = [], {}
-    for kind in _KINDS:
+    for kind in KINDS:
         source = getattr(data, kind)
         if source is None:
             continue
@@ -165,69 +156,15 @@ def _robust(begun: Begun, masks: list[Tensor], options: JointOptions) -> Adjustm
             # Behind a camera, or beyond what its lens shows: no number says how wrong it is.
             mask &= torch.isfinite(squares)
         work.fit_corners(here, robust=True)
-        _, result = work.solve(here, _SCREENING, _LOSS)
+        _, result = work.solve(here, _SCREENING, LOSS)
         cost = float(result.cost) + 1e6 * sum(int((a & ~b).sum()) for a, b in zip(masks, here, strict=True))
         if best is None or cost < best[0]:
             best = (cost, work, here)
     assert best is not None
     work, here = best[1:]
     work.fit_corners(here, robust=True)
-    work.solve(here, _ROUGHLY, _LOSS)
+    work.solve(here, ROUGHLY, LOSS)
     return work
-
-
-def _reject(work: Adjustment, masks: list[Tensor], reasons: list[dict[int, str]], options: JointOptions) -> None:
-    """Take out of the masks what contradicts the rest, worst first, and back in what does not after all."""
-    possible = [mask.clone() for mask in masks]
-    squares, freedom = work.squares(possible), work.freedom(possible)
-    for word, square, dof in zip(_KINDS, squares, freedom, strict=True):
-        if (times := math.sqrt(typical_excess(square, dof))) > _WHOLE:
-            raise InputError(
-                f"the {word} contradict each other or the rest: typically they are {times:.0f} times as far off as "
-                "their sigmas say; check names, units, heights, sigmas and that the cameras are these"
-            )
-    for mask, square, limit in zip(masks, squares, work.limits(squares, freedom), strict=True):
-        mask &= ~(square > limit)
-    _refuse_many(work, masks, possible)
-    returned: set[tuple[int, int]] = set()
-    for _ in range(_ROUNDS):
-        work.solve(masks, options.solver)
-        work.fit_corners(masks)
-        squares, freedom = work.squares(masks), work.freedom(masks)
-        limits = work.limits(squares, freedom)
-        excess = [torch.where(m, s / lim, 0.0) for m, s, lim in zip(masks, squares, limits, strict=True)]
-        kind = max(range(3), key=lambda k: float(excess[k].max()) if len(excess[k]) else 0.0)
-        if len(excess[kind]) and float(excess[kind].max()) > 1.0:
-            masks[kind][int(excess[kind].argmax())] = False
-            _refuse_many(work, masks, possible)
-            continue
-        # Cameras stay where they are now; what was left out is asked again.
-        outside = [p & ~m for p, m in zip(possible, masks, strict=True)]
-        work.solve(outside, options.solver, held=True)
-        again = False
-        squares, freedom = work.squares(outside), work.freedom(outside)
-        for k, (square, limit) in enumerate(zip(squares, work.limits(squares, freedom), strict=True)):
-            limit = chi2_quantile(freedom[k].double(), 0.999) if len(limit) else limit
-            for i in (outside[k] & (square < limit)).nonzero()[:, 0].tolist():
-                if (k, i) not in returned:
-                    returned.add((k, i))
-                    masks[k][i] = again = True
-        if not again:
-            break
-    for k, (before, after) in enumerate(zip(possible, masks, strict=True)):
-        for i in (before & ~after).nonzero()[:, 0].tolist():
-            reasons[k].setdefault(i, "")
-
-
-def _refuse_many(work: Adjustment, masks: Sequence[Tensor], possible: Sequence[Tensor]) -> None:
-    for kind, mask, before in zip(_KINDS, masks, possible, strict=True):
-        gone, total = int((before & ~mask).sum()), int(before.sum())
-        if gone > max(1, _MOST_WRONG * total):
-            names = [getattr(work.data, kind).names[i] for i in (before & ~mask).nonzero()[:, 0].tolist()]
-            raise InputError(
-                f"{gone} of {total} {kind} contradict the rest ({', '.join(names[:6])}{' ...' if gone > 6 else ''}): "
-                "these are not a few wrong ones; check names, units, heights, sigmas and that the cameras are these"
-            )
 
 
 def _solution(
@@ -291,4 +228,5 @@ def _solution(
         _problem=problem,
         _state=state,
         _spread=spread,
+        _places=places(work),
     )

@@ -22,10 +22,13 @@ from kcal.solve.result import Result, State
 from kcal.solve.robust import RobustLoss
 
 Intrinsics = Literal["fixed", "prior", "free"]
+Source = Literal["boards", "landmarks", "features", "baselines", "positions"]
 # Chance that any good item at all is taken for a wrong one.
 _FALSE_ALARM = 1e-3
 # px; of a corner.
 _LEAST_SIGMA = 1e-3
+# The kinds of items, in the order of masks.
+KINDS: tuple[Source, ...] = ("boards", "landmarks", "features")
 # Tensors of each group's local state: boards, landmarks, features.
 TENSORS = (2, 1, 2)
 
@@ -49,10 +52,23 @@ class Adjustment:
         start: poses to begin with.
         intrinsics: whether parameters are held, solved with priors, or free.
         sigma_corner: of a board's corner, px.
+        turning: which cameras' rotations are unknown; all but one that holds the frame if left out.
+        moving: likewise their centres.
     """
 
-    def __init__(self, data: RigData, start: Start, intrinsics: Intrinsics, sigma_corner: float) -> None:
+    def __init__(
+        self,
+        data: RigData,
+        start: Start,
+        intrinsics: Intrinsics,
+        sigma_corner: float,
+        *,
+        turning: Sequence[bool] | None = None,
+        moving: Sequence[bool] | None = None,
+    ) -> None:
         self.data, self.sigma_corner = data, sigma_corner
+        loose = [data.absolute or c > 0 for c in range(len(data.cameras))]
+        self._turning, self._moving = turning or loose, moving or loose
         self.anchor = start.centre.mean(0)
         self.free = [_free(data, c, intrinsics) for c in range(len(data.cameras))]
         self.terms = _terms(data, self.free if intrinsics == "prior" else None)
@@ -74,11 +90,10 @@ class Adjustment:
             for build, mask, count in zip(self._groups, masks, TENSORS, strict=True)
         ]
         count = len(self.data.cameras)
-        moves = [not held and (self.data.absolute or c > 0) for c in range(count)]
         free = [Free((), ())] * count if held else self.free
-        return RigProblem(
-            [c.model for c in self.data.cameras], groups, () if held else self.terms, free, moves, moves, loss
-        )
+        turning, moving = ([not held and one for one in each] for each in (self._turning, self._moving))
+        models = [c.model for c in self.data.cameras]
+        return RigProblem(models, groups, () if held else self.terms, free, turning, moving, loss)
 
     def part(self, masks: Sequence[Tensor]) -> State:
         """The state of the cameras and of the items in the masks."""

@@ -9,11 +9,12 @@ from typing import get_args
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig_adjust import Adjustment
-from kcal.calibrate.rig_result import ItemResidual, Source, SourceResidual
+from kcal.calibrate.rig_adjust import KINDS, Adjustment, Source
+from kcal.calibrate.rig_result import ItemResidual, SourceResidual
 from kcal.solve.lm import LMOptions
 
-_KINDS: tuple[Source, ...] = ("boards", "landmarks", "features")
+# One over metres: features are drawn no farther away.
+_FARTHEST = 1e-5
 
 
 def item_records(
@@ -25,13 +26,13 @@ def item_records(
     the place that suits it best.
     """
     items: list[ItemResidual] = []
-    outside = [~mask & _seen(work, kind, mask) for kind, mask in zip(_KINDS, masks, strict=True)]
+    outside = [~mask & _seen(work, kind, mask) for kind, mask in zip(KINDS, masks, strict=True)]
     if any(bool(mask.any()) for mask in outside):
         work.solve(outside, LMOptions(residual_floor=1e-8), held=True)
     for used, chosen in ((True, list(masks)), (False, outside)):
         squares, freedom = work.squares(chosen), work.freedom(chosen)
         pixels = _pixels(work, chosen, surveyed=not used)
-        for k, kind in enumerate(_KINDS):
+        for k, kind in enumerate(KINDS):
             names = () if len(chosen[k]) == 0 else getattr(work.data, kind).names
             for i in chosen[k].nonzero()[:, 0].tolist():
                 sigmas = math.sqrt(float(squares[k][i]) / max(int(freedom[k][i]), 1))
@@ -46,7 +47,7 @@ def item_records(
                         reason="" if used else reasons[k].get(i) or _reason(work, kind, pixels[k][i], sigmas),
                     )
                 )
-    for k, kind in enumerate(_KINDS):
+    for k, kind in enumerate(KINDS):
         for i in (~masks[k] & ~outside[k]).nonzero()[:, 0].tolist():
             name = getattr(work.data, kind).names[i]
             items.append(ItemResidual(source=kind, name=name, sigmas=math.inf, used=False, reason=reasons[k][i]))
@@ -62,7 +63,7 @@ def source_records(
     squares, freedom = work.squares(masks), work.freedom(masks)
     problem, state = work.problem(masks), work.part(masks)
     sights, found = problem.sights(state), []
-    for k, (kind, group, local) in enumerate(zip(_KINDS, problem.groups, problem.locals(state), strict=True)):
+    for k, (kind, group, local) in enumerate(zip(KINDS, problem.groups, problem.locals(state), strict=True)):
         own = [item for item in items if item.source == kind]
         if not own:
             continue
@@ -108,7 +109,7 @@ def _pixels(work: Adjustment, masks: Sequence[Tensor], *, surveyed: bool) -> lis
     """RMS distance of each item in each camera; landmarks from their surveyed place if asked."""
     problem, state = work.problem(masks), work.part(masks)
     sights, found = problem.sights(state), []
-    for kind, mask, group, local in zip(_KINDS, masks, problem.groups, problem.locals(state), strict=True):
+    for kind, mask, group, local in zip(KINDS, masks, problem.groups, problem.locals(state), strict=True):
         if surveyed and kind == "landmarks" and work.data.landmarks is not None:
             local = (work.data.landmarks.points[mask],)
         squared, count = group.errors(sights, local).square().sum((2, 3)), group.seen.sum(-1)
@@ -150,3 +151,18 @@ def _measured(work: Adjustment) -> list[ItemResidual]:
         length = float(torch.linalg.vector_norm(error3))
         out.append(ItemResidual(source="positions", name=data.names[p.camera], metres=length, sigmas=sigmas))
     return out
+
+
+def places(work: Adjustment) -> dict[Source, tuple[tuple[str, ...], Tensor]]:
+    """Names and positions (N, 3) of boards (their middle), landmarks and features in the local frame."""
+    found: dict[Source, tuple[tuple[str, ...], Tensor]] = {}
+    _, _, _, rotation, translation, points, direction, inverse = work.state
+    if work.data.boards is not None:
+        middle = work.data.boards.board.points.mean(0)
+        found["boards"] = work.data.boards.names, rotation @ middle + translation
+    if work.data.landmarks is not None:
+        found["landmarks"] = work.data.landmarks.names, points
+    if work.data.features is not None:
+        far = direction / inverse.clamp_min(_FARTHEST)[:, None]
+        found["features"] = work.data.features.names, work.anchor + far
+    return found

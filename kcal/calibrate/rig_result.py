@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
 
 import torch
 from torch import Tensor
 
+from kcal.calibrate.rig_adjust import Source
 from kcal.calibrate.rig_problem import RigProblem
 from kcal.calibrate.rig_spread import SharedSpread, mounting_rows, parameter_rows, relative_rows
 from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.solve.result import State, Status
-
-Source = Literal["boards", "landmarks", "features", "baselines", "positions"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,6 +107,7 @@ class RigSolution:
     _problem: RigProblem
     _state: State
     _spread: SharedSpread
+    _places: dict[Source, tuple[tuple[str, ...], Tensor]]
 
     @property
     def left_out(self) -> tuple[ItemResidual, ...]:
@@ -120,6 +119,13 @@ class RigSolution:
         rotation = self.rotation[second] @ self.rotation[first].T
         translation = self.rotation[second] @ (self.centre[first] - self.centre[second])
         return StereoRig(self.cameras[first], self.cameras[second], rotation, translation)
+
+    def places(self) -> dict[Source, dict[str, Tensor]]:
+        """Where boards (their middle), landmarks and features stand: (3,) metres in the local frame, by name.
+
+        Features as far away as their inverse range says, at most 100 km.
+        """
+        return {source: dict(zip(names, points, strict=True)) for source, (names, points) in self._places.items()}
 
     def relative_covariance(self, first: int = 0, second: int = 1) -> Tensor:
         """(6, 6) of second_from_first: rotation vector about the second camera's axes, translation along them."""
