@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.sim.board import BoardLike, BoardPose, board_points
+from kcal.sim.board import BoardLike, BoardPose, LensLike, board_points
 
 _DRAWS = 4096
 
@@ -51,7 +50,7 @@ class PoseOptions:
 
 
 def sample_board_poses(
-    camera: Camera,
+    camera: LensLike,
     board: BoardLike,
     count: int,
     generator: torch.Generator,
@@ -62,7 +61,7 @@ def sample_board_poses(
     """Poses for the calibration of one camera: over the whole image, at several distances, tilted in all directions.
 
     Args:
-        camera: a single camera.
+        camera: a single camera, or a true lens.
         board: its size.
         count: how many poses.
         generator: source of the draws; the same state gives the same poses.
@@ -76,6 +75,7 @@ def sample_board_poses(
         InputError: fewer than `count` of 4096 drawn boards are completely seen, or an argument out of range.
 
     Example:
+        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
         >>> from kcal.sim.board import BoardSize, project_board
         >>> board = BoardSize(9, 6, 0.025)
@@ -120,6 +120,7 @@ def sample_pair_poses(
         InputError: fewer than `count` of 4096 drawn boards are completely seen by both, or an argument out of range.
 
     Example:
+        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> from kcal.sim.board import BoardSize, project_board
@@ -160,7 +161,7 @@ class _Drawn:
 
 
 def _draw(
-    camera: Camera,
+    camera: LensLike,
     board: BoardLike,
     distance: tuple[float, float],
     eye: Tensor | None,
@@ -195,7 +196,7 @@ def _draw(
 
 
 def _choose(
-    drawn: _Drawn, cameras: list[tuple[Camera, Tensor, Tensor]], board: BoardLike, count: int, options: PoseOptions
+    drawn: _Drawn, cameras: list[tuple[LensLike, Tensor, Tensor]], board: BoardLike, count: int, options: PoseOptions
 ) -> list[BoardPose]:
     points = board_points(board, options.border)
     points_rig = points @ drawn.rotation.transpose(-1, -2) + drawn.translation[:, None]
