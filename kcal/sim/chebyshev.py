@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kcal.sim.window import Window
+from kcal.sim.rectangle import Window
 
 
 def nodes(degree: int) -> Tensor:

@@ -21,7 +21,7 @@ from kcal.sim.chebyshev import tabulate
 from kcal.sim.chief import ChiefRays, Lines, solve_2x2
 from kcal.sim.prescription import PRESCRIPTIONS, Prescription
 from kcal.sim.raytrace import Misalignment
-from kcal.sim.window import Window
+from kcal.sim.rectangle import Window
 
 _MARGIN = 64  # pixels around the image that are tabulated too: blurred images look past the edge
 _DEGREES = (20, 28, 36, 48)
@@ -52,6 +52,9 @@ class TruthLens:
             with all of it the surveillance lens moves corners at 1 m by 0.09 px RMS against those at infinity.
 
     Attributes:
+        size: (width, height) in pixels.
+        low: (2,) first pixel of the margin around the image for which the lens is known as well.
+        high: (2,) the last one.
         table_error: largest difference between the table and tracing, pixels, at 256 places that are no nodes.
 
     Raises:
@@ -104,7 +107,7 @@ class TruthLens:
         self._window = Window(-_MARGIN, -_MARGIN, self.size[0] + 2 * _MARGIN, self.size[1] + 2 * _MARGIN)
         low = torch.tensor([self._window.left, self._window.top], dtype=torch.float64)
         extent = torch.tensor([self._window.width - 1, self._window.height - 1], dtype=torch.float64)
-        self._low, self._high = low, low + extent
+        self.low, self.high = low, low + extent
         for degree in _DEGREES:
             self._table = tabulate(lambda pixels: torch.cat(self.trace(pixels), -1), self._window, degree)
             self.table_error = self._measure()
@@ -131,7 +134,7 @@ class TruthLens:
     def covers(self, pixels: Tensor) -> Tensor:
         """Whether pixels (..., N, 2) lie on the image or in the margin for which the lens is known."""
         pixels = as_points("pixels", pixels, 2)
-        return ((pixels >= self._low) & (pixels <= self._high)).all(-1)
+        return ((pixels >= self.low) & (pixels <= self.high)).all(-1)
 
     def trace(self, pixels: Tensor) -> Lines:
         """Lines of sight of pixels (N, 2) by tracing, without the table; raises `InputError` where there are none."""
@@ -174,12 +177,12 @@ class TruthLens:
         nearness, target = 1.0 / safe[:, 2:], safe[:, :2] / safe[:, 2:]
         weights, scale = self._start
         # Far outside the image the polynomial says nothing; clamped, its place is the image's edge.
-        pixels = (_monomials((target / scale).clamp(-1.2, 1.2)) @ weights).clamp(self._low, self._high)
+        pixels = (_monomials((target / scale).clamp(-1.2, 1.2)) @ weights).clamp(self.low, self.high)
         for _ in range(_NEWTON):
             sums = self._table.with_slopes(pixels)
             value, across, down = (part[:, 2:] + nearness * part[:, :2] for part in sums)
             error = value - target
-            moved = (pixels - solve_2x2(across, down, error)).clamp(self._low, self._high)
+            moved = (pixels - solve_2x2(across, down, error)).clamp(self.low, self.high)
             settled = (moved - pixels).abs().amax() < _SETTLED
             pixels = moved
             if bool(settled):
@@ -195,7 +198,7 @@ class TruthLens:
 
     def _measure(self) -> float:
         share = torch.quasirandom.SobolEngine(2).draw(256, dtype=torch.float64)
-        pixels = self._low + share * (self._high - self._low)
+        pixels = self.low + share * (self.high - self.low)
         # Slopes and, as at a distance of one metre, places.
         off = self._table.values(pixels) - torch.cat(self.trace(pixels), -1)
         return float(off.abs().max() * self._focal)
@@ -203,7 +206,7 @@ class TruthLens:
     def _fit_start(self) -> tuple[Tensor, Tensor]:
         """A polynomial from slopes to pixels, to begin Newton's method with, and the scale of its slopes."""
         share = torch.stack(torch.meshgrid(*(torch.linspace(0, 1, 33, dtype=torch.float64),) * 2, indexing="xy"), -1)
-        pixels = self._low + share.reshape(-1, 2) * (self._high - self._low)
+        pixels = self.low + share.reshape(-1, 2) * (self.high - self.low)
         slopes = self.lines(pixels).slopes
         scale = slopes.abs().amax(0)
         return torch.linalg.lstsq(_monomials(slopes / scale), pixels).solution, scale
