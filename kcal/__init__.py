@@ -10,7 +10,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
+    from kcal.calibrate.layer import CalibrationLayer
+    from kcal.calibrate.mono import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.stereo import RigOptions, calibrate_rig
     from kcal.corners.board import Board
     from kcal.corners.detect import detect_images
@@ -35,6 +36,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Board",
+    "CalibrationLayer",
     "CalibrationOptions",
     "Camera",
     "KcalError",
@@ -52,6 +54,7 @@ __all__ = [
     "Undistort",
     "Unproject",
     "calibrate_camera",
+    "calibrate_cameras",
     "calibrate_rig",
     "detect_images",
     "load_camera",
@@ -64,6 +67,7 @@ __all__ = [
 
 _HOME = {
     "Board": "kcal.corners.board",
+    "CalibrationLayer": "kcal.calibrate.layer",
     "CalibrationOptions": "kcal.calibrate.mono",
     "Camera": "kcal.lens.camera",
     "KcalError": "kcal.errors",
@@ -81,6 +85,7 @@ _HOME = {
     "Undistort": "kcal.lens.images",
     "Unproject": "kcal.lens.modules",
     "calibrate_camera": "kcal.calibrate.mono",
+    "calibrate_cameras": "kcal.calibrate.mono",
     "calibrate_rig": "kcal.calibrate.stereo",
     "detect_images": "kcal.corners.detect",
     "load_camera": "kcal.io.camera_file",

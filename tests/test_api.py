@@ -17,6 +17,7 @@ import kcal
 # Taking a name away breaks users; adding one is a promise. Either is a line here and one in CHANGELOG.md.
 PUBLIC = {
     "Board",
+    "CalibrationLayer",
     "CalibrationOptions",
     "Camera",
     "KcalError",
@@ -34,6 +35,7 @@ PUBLIC = {
     "Undistort",
     "Unproject",
     "calibrate_camera",
+    "calibrate_cameras",
     "calibrate_rig",
     "detect_images",
     "load_camera",

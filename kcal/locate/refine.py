@@ -172,7 +172,9 @@ def _evaluate(setting: _Setting, theta: Tensor) -> _At:
         if not known_true(good):
             # The axis is a harmless stand-in: no NaN in values or gradients.
             seen = torch.where(good[..., None, :], seen, seen.new_tensor([[0.0], [0.0], [1.0]]))
-        projection = project_components(seen, sight.camera.values, sight.camera.model, setting.wanted[number])
+        projection = project_components(
+            seen, sight.camera.values, sight.camera.model, setting.wanted[number], sight.camera.field
+        )
         columns = torch.stack([along, across, shift[:, None].expand_as(along)], -3)
         # (..., 3 unknowns, 3 of the point, 2, N) summed over the point.
         rows.append((columns[..., None, :] * projection.by_point[..., None, :, :, :]).sum(-3))
