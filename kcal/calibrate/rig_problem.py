@@ -209,6 +209,10 @@ class RigProblem:
             linear.cost = self.cost(state)
         return linear
 
+    def select(self, elements: Tensor) -> None:
+        """See `Problem.select`: there is one element only."""
+        return None
+
     def retract(self, state: State, step: State) -> State:
         """See `Problem.retract`."""
         shared, local = step
