@@ -39,7 +39,7 @@ class NetProblem:
 
     def select(self, elements: Tensor) -> None:
         """See `Problem.select`: there is one element only."""
-        return None
+        return
 
     def retract(self, state: State, step: State) -> State:
         """Plain addition."""

@@ -211,7 +211,7 @@ class RigProblem:
 
     def select(self, elements: Tensor) -> None:
         """See `Problem.select`: there is one element only."""
-        return None
+        return
 
     def retract(self, state: State, step: State) -> State:
         """See `Problem.retract`."""
