@@ -37,10 +37,10 @@ class NetProblem:
         # Contiguous with the weights last: what the normal equations read.
         return DenseLinearisation(residuals, net.by_weights.flatten(-2).T.contiguous())
 
+    def select(self, elements: Tensor) -> None:
+        """See `Problem.select`: there is one element only."""
+        return
+
     def retract(self, state: State, step: State) -> State:
         """Plain addition."""
         return (torch.add(state[0], step[0]),)
-
-    def select(self, elements: Tensor) -> NetProblem:
-        """There is one problem only, and nothing to select from."""
-        return self
