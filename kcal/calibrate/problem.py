@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kcal.calibrate.motion import screw
 from kcal.calibrate.rules import Free
-from kcal.calibrate.terms import Term
+from kcal.calibrate.terms import Prior, Term
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, project_components
@@ -116,7 +116,7 @@ class BoardProblem(SchurProblem):
         self.free = tuple(Free.of(indices) for indices in free)
         self.free_warp = free_warp
         self.batch = batch
-        self._terms = tuple(terms)
+        self.terms = tuple(terms)
         self._loss = loss
         self._board = board_points.T.contiguous()
         self._shape = warp_shape(board_points)
@@ -147,6 +147,11 @@ class BoardProblem(SchurProblem):
     def robust(self) -> bool:
         """Whether a robust loss is minimised."""
         return self._loss is not None
+
+    @property
+    def prior_count(self) -> int:
+        """Number of scalar residuals that are priors."""
+        return sum(len(term.index) for term in self.terms if isinstance(term, Prior))
 
     def unpack(self, state: State) -> BoardState:
         """The solver's tuple as named tensors."""
@@ -273,11 +278,11 @@ class BoardProblem(SchurProblem):
 
     def shared_rows(self, state: State) -> Tensor | None:
         """See `SchurProblem.shared_rows`."""
-        if not self._terms:
+        if not self.terms:
             return None
         s = self.unpack(state)
         values = torch.cat([s.parameters[0], s.warp], -1)
-        found = torch.cat([term.rows(values) for term in self._terms], -1)
+        found = torch.cat([term.rows(values) for term in self.terms], -1)
         if not found.shape[-1]:
             return None
         rows = found.new_zeros((*found.shape[:-2], self.shared_size + 1, found.shape[-1]))

@@ -16,6 +16,7 @@ from kcal.calibrate.init import (
     spread_out,
 )
 from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
+from kcal.calibrate.mild import Mild
 from kcal.calibrate.options import CalibrationOptions
 from kcal.calibrate.poses import refine_poses, unflip
 from kcal.calibrate.problem import BoardProblem
@@ -37,7 +38,7 @@ _MINIMUM_WIDTH = 0.5
 _SUSPICIOUS_RMS = 2.0
 
 # Of a corner, pixels; and how often it is measured anew beside priors.
-_LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
+LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
 
 
 class BoardPoints(Protocol):
@@ -80,6 +81,7 @@ class Corners(Protocol):
 class Solved:
     """A solution for one set of corners, before it is judged."""
 
+    views: Views
     problem: BoardProblem
     result: Result
     minimum: Minimum
@@ -113,8 +115,12 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
         free_warp=options.board_warp,
         rules=rules,
     )
-    if rules.priors:
-        views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), _LEAST_NOISE))
+    reach = float(views.observed_radius(first))
+    if options.weak_prior is not None:
+        rules = dataclasses.replace(rules, mild=Mild(options.weak_prior, reach))
+        views = dataclasses.replace(views, rules=rules)
+    if rules.informed:
+        views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), LEAST_NOISE))
     minimum = climb(views, first, cold, ladder, solver, progress)
     spent += minimum.iterations
 
@@ -130,10 +136,10 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
         if flipped:
             result = minimise(problem, state, solver)
             spent += int(result.iterations)
-    if rules.priors:
+    if rules.informed:
         # The noise, against which priors count, is that of this solution.
         for _ in range(_NOISE_ROUNDS):
-            views = dataclasses.replace(views, prior_noise=max(views.noise(result.state, model), _LEAST_NOISE))
+            views = dataclasses.replace(views, prior_noise=max(views.noise(result.state, model), LEAST_NOISE))
             problem = views.problem(model, terms=minimum.terms)
             result = minimise(problem, result.state, solver)
             spent += int(result.iterations)
@@ -149,7 +155,13 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
         result = minimise(problem, result.state, solver)
         spent += int(result.iterations)
     return Solved(
-        problem=problem, result=result, minimum=minimum, plain_cost=plain_cost, spent=spent, variance=variance
+        views=views,
+        problem=problem,
+        result=result,
+        minimum=minimum,
+        plain_cost=plain_cost,
+        spent=spent,
+        variance=variance,
     )
 
 
