@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from kcal.calibrate.layer import CalibrationLayer
-    from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
+    from kcal.calibrate.mono import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.stereo import RigOptions, calibrate_rig
     from kcal.corners.board import Board
     from kcal.corners.detect import detect_images
@@ -54,6 +54,7 @@ __all__ = [
     "Undistort",
     "Unproject",
     "calibrate_camera",
+    "calibrate_cameras",
     "calibrate_rig",
     "detect_images",
     "load_camera",
@@ -84,6 +85,7 @@ _HOME = {
     "Undistort": "kcal.lens.images",
     "Unproject": "kcal.lens.modules",
     "calibrate_camera": "kcal.calibrate.mono",
+    "calibrate_cameras": "kcal.calibrate.mono",
     "calibrate_rig": "kcal.calibrate.stereo",
     "detect_images": "kcal.corners.detect",
     "load_camera": "kcal.io.camera_file",

@@ -35,6 +35,7 @@ PUBLIC = {
     "Undistort",
     "Unproject",
     "calibrate_camera",
+    "calibrate_cameras",
     "calibrate_rig",
     "detect_images",
     "load_camera",

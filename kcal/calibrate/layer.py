@@ -14,6 +14,7 @@ from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.settle import RecordedProblem, settle
 from kcal.calibrate.single import solve
 from kcal.calibrate.terms import Prior, Term
+from kcal.calibrate.together import alone
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -178,7 +179,7 @@ def calibrate_views(
     if start is None:
         corners = _Corners(_Board(fixed[1]), size, fixed[0])
         priors = {n: (float(m), s) for (n, (_, s)), m in zip(options.priors.items(), fixed[2], strict=True)}
-        begin = solve(corners, dataclasses.replace(options, priors=priors), lambda _: None).result.state
+        begin = alone(solve(corners, dataclasses.replace(options, priors=priors), lambda _: None)).result.state
     else:
         begin = start.state()
         if start.model != options.lens or len(begin[-1]) != len(pixels):

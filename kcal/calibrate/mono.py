@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -27,14 +28,16 @@ from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.rules import Free
 from kcal.calibrate.single import LEAST_NOISE, Solved, corner_problem, solve
 from kcal.calibrate.terms import Prior, Term
+from kcal.calibrate.together import Solve, Steps, alone, together
 from kcal.calibrate.verdict import check_focal, opinion_warnings, rival_warnings, standing_out, warnings_of
 from kcal.corners.observations import Observations
+from kcal.errors import KcalError
 from kcal.lens.camera import Camera
-from kcal.solve.lm import LMOptions, minimise
+from kcal.solve.lm import LMOptions
 from kcal.solve.result import State, Status
 from kcal.solve.robust import RobustLoss
 
-__all__ = ["CalibrationOptions", "CameraCalibrationResult", "calibrate_camera"]
+__all__ = ["CalibrationOptions", "CameraCalibrationResult", "calibrate_camera", "calibrate_cameras"]
 
 # To tell which corners are wrong: a loss that a few of them cannot pull, whose scale in units of the noise follows it.
 _ROUGH = LMOptions(max_iterations=40, tolerance=1e-8)
@@ -86,10 +89,55 @@ def calibrate_camera(
         >>> round(float(result.camera.focal[0]), 6), result.rms < 1e-6
         (800.0, True)
     """
+    return alone(_calibrating(observations, options or CalibrationOptions(), progress))
+
+
+def calibrate_cameras(
+    observations: Sequence[Observations],
+    options: CalibrationOptions | None = None,
+    progress: Progress = _silent,
+    *,
+    device: torch.device | str = "cpu",
+) -> list[CameraCalibrationResult | KcalError]:
+    """Calibrate many cameras with the same options, as `calibrate_camera` calibrates one.
+
+    Whatever several cameras must have minimised next is minimised as one batch (`kcal.calibrate.together`): cameras of
+    few views, whose time goes into starting operations on small tensors, take a fraction of the time that one call
+    after the other takes. Boards of one batch must be equal; sets with other boards are calibrated beside them.
+
+    Args:
+        observations: the views of each camera; numbers of views, image sizes and missing corners may differ.
+        options: of all of them.
+        progress: told how many are finished.
+        device: where batches are minimised. Results are on the CPU.
+
+    Returns:
+        for each camera what `calibrate_camera` returns, within the solver's tolerance, or the error that it would have
+        raised: one bad set does not spoil the others.
+
+    Example:
+        >>> from kcal.corners.board import Board
+        >>> from kcal.corners.observations import View
+        >>> board = Board(columns=3, rows=3, square=0.1)
+        >>> view = View(name="a", pixels=[(100.0 * x, 100.0 * y) for y in range(1, 4) for x in range(1, 4)])
+        >>> calibrate_cameras([Observations(board=board, image_size=(640, 480), views=[view])])
+        [DegenerateError('1 view(s) of the board: at least 3 at different tilts are needed, 10 to 40 are good')]
+    """
     options = options or CalibrationOptions()
+    count = len(observations)
+    return together(
+        [_calibrating(seen, options, _silent) for seen in observations],
+        torch.device(device),
+        lambda done: progress(f"{done} of {count} cameras"),
+    )
+
+
+def _calibrating(
+    observations: Observations, options: CalibrationOptions, progress: Progress
+) -> Steps[CameraCalibrationResult]:
     if options.reject is not None:
-        return _calibrate_rejecting(observations, options, options.reject, progress)
-    solved = solve(observations, options, progress)
+        return (yield from _calibrate_rejecting(observations, options, options.reject, progress))
+    solved = yield from solve(observations, options, progress)
     return _judge(observations, solved, options)
 
 
@@ -108,7 +156,7 @@ def _weighted_residuals(problem: BoardProblem, state: State) -> Tensor:
 
 def _calibrate_rejecting(
     observations: Observations, options: CalibrationOptions, rejection: OutlierRejection, progress: Progress
-) -> CameraCalibrationResult:
+) -> Steps[CameraCalibrationResult]:
     """Calibrate, leave out what stands out, and calibrate again until nothing changes.
 
     Corners of the views that are left are judged anew in every round, so that one that was thrown out beside a worse
@@ -121,12 +169,12 @@ def _calibrate_rejecting(
     spent = 0
     for last in (*[False] * (_ROUNDS - 1), True):
         used = without(observations, left, rejected)
-        solved = solve(used, options, progress)
+        solved = yield from solve(used, options, progress)
         spent += solved.spent
         every = without(observations, left, torch.zeros_like(rejected))
         if last:
             break
-        residuals, steps = _robust_residuals(every, solved, options)
+        residuals, steps = yield from _robust_residuals(every, solved, options)
         spent += steps
         beyond = corners_beyond(residuals)
         views = views_beyond(observations.board.points, residuals, every.pixels(), beyond)
@@ -173,7 +221,9 @@ def _calibrate_rejecting(
     )
 
 
-def _robust_residuals(observations: Observations, solved: Solved, options: CalibrationOptions) -> tuple[Tensor, int]:
+def _robust_residuals(
+    observations: Observations, solved: Solved, options: CalibrationOptions
+) -> Steps[tuple[Tensor, int]]:
     """Weighted residuals (V, N, 2) of all corners at a solution that a few wrong ones do not pull, and its trials.
 
     Infinite where the lens does not reach a corner at all.
@@ -187,7 +237,7 @@ def _robust_residuals(observations: Observations, solved: Solved, options: Calib
         some = without(observations, range(len(observations.views)), whole.seen[:, 0] & ~reached)
         scale = max(_CAUCHY_SCALE * float(noise_scale(residuals.flatten(0, 1))), 1e-3)
         loss = RobustLoss(kind="cauchy", scale=scale)
-        result = minimise(corner_problem(some, options, solved.minimum, solved.variance, loss), state, _ROUGH)
+        result = yield Solve(corner_problem(some, options, solved.minimum, solved.variance, loss), state, _ROUGH)
         spent += int(result.iterations)
         if result.status == Status.BAD_START:
             break

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import torch
 from torch import Tensor
@@ -85,8 +85,12 @@ class Folded:
 
     c are the shifts (pixels) of the nodes' images, then the change of the board's warp.
 
+    Those of several cameras (`kcal.calibrate.join`) have leading dimensions (C, 1), `matrix` (C,); such a one is only
+    searched, not unfolded.
+
     Args:
         state: where the views were folded.
+        warp: (2,) of this state.
         points: (3, K) directions of the nodes.
         pixels: (2, K) images of the nodes at `state`.
         matrix: (2 K + W, R), A transposed.
@@ -96,6 +100,7 @@ class Folded:
     """
 
     state: State
+    warp: Tensor
     points: Tensor
     pixels: Tensor
     matrix: Tensor
@@ -155,6 +160,7 @@ def fold(problem: BoardProblem, state: State, radius: float) -> Folded:
     zero = matrix.new_zeros(len(matrix), 1)
     return Folded(
         state=state,
+        warp=s.warp,
         points=nodes,
         pixels=project_components(nodes, s.parameters[0], problem.models[0]).pixels,
         matrix=torch.cat([matrix, zero, rough], 1),
@@ -215,16 +221,38 @@ class ReducedProblem:
         batch: tuple[int, ...] = (),
     ) -> None:
         self.batch = batch
-        self.residual_count = len(folded.offset)
-        self._folded, self._model, self._free, self._terms = folded, model, Free.of(free), tuple(terms)
+        self.residual_count = folded.offset.shape[-1]
+        self.folded, self.model, self.free, self.terms = folded, model, Free.of(free), tuple(terms)
         self._nodes = 2 * folded.points.shape[-1]
-        self._warps = len(folded.matrix) - self._nodes
+        self._warps = folded.matrix.shape[-2] - self._nodes
+
+    @property
+    def elements(self) -> int:
+        """How many states are solved side by side."""
+        return math.prod(self.batch)
+
+    @property
+    def corner_slots(self) -> int:
+        """Places for corners in each of them; here of nodes, and of their share in the quadratic form."""
+        return 2 * self._nodes
+
+    @property
+    def alike(self) -> Hashable:
+        """Problems that agree in this can be joined into one of a batch."""
+        return self.model, self.free, self._warps, len(self.batch), tuple(term.alike for term in self.terms)
+
+    def select(self, elements: Tensor) -> ReducedProblem | None:
+        """See `Problem.select`."""
+        if len(self.batch) != 1:
+            return None
+        terms = [term.select(elements) for term in self.terms]
+        return ReducedProblem(self.folded, self.model, self.free, terms, (len(elements),))
 
     def start(self, parameters: Tensor) -> State:
         """The state of folding with other parameters (..., 5 + P)."""
         shape = parameters.shape[:-1]
         identity = torch.eye(3, dtype=parameters.dtype, device=parameters.device)
-        return parameters, self._folded.state[1].expand(*shape, 2), identity.expand(*shape, 3, 3)
+        return parameters, self.folded.warp.expand(*shape, 2), identity.expand(*shape, 3, 3)
 
     def cost(self, state: State) -> Tensor:
         """See `Problem.cost`."""
@@ -233,26 +261,33 @@ class ReducedProblem:
     def linearise(self, state: State) -> DenseLinearisation:
         """See `Problem.linearise`."""
         parameters, warp, rotation = state
-        folded = self._folded
+        folded = self.folded
         points = rotation @ folded.points
-        seen = project_components(points, parameters, self._model, self._free.indices)
+        seen = project_components(points, parameters, self.model, self.free.indices)
         turn = step_rows(seen.by_point, points)[..., :3, :, :]
-        matrix = folded.matrix[: self._nodes]
+        matrix = folded.matrix[..., : self._nodes, :]
         residuals = (seen.pixels - folded.pixels).flatten(-2) @ matrix + folded.offset
-        jacobian = torch.cat([self._free.collapse(seen.by_camera, -3), turn], -3).flatten(-2) @ matrix
+        jacobian = torch.cat([self.free.collapse(seen.by_camera, -3), turn], -3).flatten(-2)
+        if matrix.ndim == 2:
+            jacobian = jacobian @ matrix
+        else:
+            # The starts of a camera share its matrix: one product for all.
+            jacobian = (jacobian.flatten(-3, -2) @ matrix).unflatten(-2, jacobian.shape[-3:-1])
         if self._warps:
-            by_warp = folded.matrix[self._nodes :]
-            residuals = residuals + (warp - folded.state[1]) @ by_warp
+            by_warp = folded.matrix[..., self._nodes :, :]
+            residuals = residuals + (warp - folded.warp) @ by_warp
+            if matrix.ndim > 2:
+                by_warp = by_warp[:, None]
             jacobian = torch.cat([jacobian, by_warp.expand(*self.batch, -1, -1)], -2)
         residuals = torch.where(seen.regular.all(-1, keepdim=True), residuals, torch.nan)
-        if self._terms:
+        if self.terms:
             values = torch.cat([parameters, warp], -1)
-            found = torch.cat([term.rows(values) for term in self._terms], -1)
+            found = torch.cat([term.rows(values) for term in self.terms], -1)
             if found.shape[-1]:
                 residuals = torch.cat([residuals, found[..., -1, :]], -1)
                 none = found.new_zeros((*found.shape[:-2], 3, found.shape[-1]))
                 by_value = [
-                    self._free.collapse(found[..., list(self._free), :], -2),
+                    self.free.collapse(found[..., list(self.free), :], -2),
                     none,
                     found[..., -3 : -3 + self._warps, :],
                 ]
@@ -262,19 +297,19 @@ class ReducedProblem:
     def retract(self, state: State, step: State) -> State:
         """See `Problem.retract`."""
         parameters, warp, rotation = state
-        lens, turn, bend = step[0].split([len(self._free), 3, self._warps], -1)
+        lens, turn, bend = step[0].split([len(self.free), 3, self._warps], -1)
         parameters = parameters.clone()
-        parameters[..., list(self._free)] += self._free.expand(lens)
+        parameters[..., list(self.free)] += self.free.expand(lens)
         return parameters, warp + bend if self._warps else warp, rotation_from_vector(turn) @ rotation
 
     def unfold(self, state: State) -> State:
         """One solution (no batch) with the poses that answer it, as a state of `BoardProblem`."""
         parameters, warp, rotation = state
-        folded = self._folded
-        pixels = project_components(rotation @ folded.points, parameters, self._model).pixels
+        folded = self.folded
+        pixels = project_components(rotation @ folded.points, parameters, self.model).pixels
         change = [
             (pixels - folded.pixels).flatten(),
-            (warp - folded.state[1])[: self._warps],
+            (warp - folded.warp)[: self._warps],
             torch.ones_like(warp[:1]),
         ]
         seen = (folded.answer @ torch.cat(change)).unflatten(0, (-1, 6))

@@ -38,8 +38,8 @@ class RecordedProblem(BoardProblem):
             parts.append(along[:, None] * self._shape[:, None])
         parts.append((seen.pixels - self._target[:, 0])[:, None])
         rows = torch.where(self.seen[:, 0, None, None], torch.cat(parts, 1), 0.0)
-        if self._loss is not None:
-            rows = rows * self._loss.weight(rows[:, -1].square().sum(-2)).sqrt()[:, None, None]
+        if self.loss is not None:
+            rows = rows * self.loss.weight(rows[:, -1].square().sum(-2)).sqrt()[:, None, None]
         return rows.flatten(-2)
 
 

@@ -150,12 +150,12 @@ def calibrate_rig(
         first_from_board_translation=views[0].translation,
     ).pack()
     free = [free_parameters(camera.model) if options.refine_cameras else [] for camera in cameras]
-    models = [camera.model for camera in cameras]
+    models, fields = [camera.model for camera in cameras], [camera.field for camera in cameras]
     while True:
         if not bool(keep.any()):
             raise DegenerateError("no pair is left: do the views of a pair show the same board at the same moment?")
         *shared, rotation, translation = start
-        problem = BoardProblem(board, pixels[keep], models, free, free_warp=options.board_warp)
+        problem = BoardProblem(board, pixels[keep], models, free, free_warp=options.board_warp, fields=fields)
         result = minimise(problem, (*shared, rotation[keep], translation[keep]), options.solver)
         rms = pair_rms(problem, result.state, pixels[keep])
         # The worst alone: it has spoilt the others.
@@ -236,10 +236,7 @@ def _result(
     used: list[Pair],
 ) -> RigCalibrationResult:
     s = problem.unpack(state)
-    solved = [
-        Camera(parameters, size=camera.size, model=camera.model)
-        for parameters, camera in zip(s.parameters, cameras, strict=True)
-    ]
+    solved = [camera.with_parameters(parameters) for parameters, camera in zip(s.parameters, cameras, strict=True)]
     rig = StereoRig(
         solved[0], solved[1], nearest_rotation(s.cam_from_first_rotation[0]), s.cam_from_first_translation[0]
     )

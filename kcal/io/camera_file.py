@@ -241,6 +241,8 @@ def camera_to_file(
     values = camera.parameters_vector.detach()
     if values.ndim != 1:
         raise InputError(f"a camera file holds one camera, got a batch of shape {tuple(values.shape[:-1])}")
+    if camera.field is not None:
+        raise InputError("this camera has a residual field, which this file cannot hold")
     if standard_deviations is not None:
         unknown = [key for key in standard_deviations if key not in camera.names]
         if unknown:

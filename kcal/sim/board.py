@@ -10,7 +10,25 @@ from torch import Tensor
 
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
-from kcal.lens.camera import Camera
+
+
+class LensLike(Protocol):
+    """Anything that sees: a `Camera`, or a `TruthLens`."""
+
+    size: tuple[int, int]
+
+    @property
+    def focal(self) -> Tensor:
+        """(2,) focal lengths in pixels, at least roughly."""
+
+    def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (..., N, 2) of points (..., N, 3), and valid (..., N)."""
+
+    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Rays (..., N, 3) of pixels (..., N, 2), at infinity, and valid (..., N)."""
+
+    def inside(self, pixels: Tensor) -> Tensor:
+        """Whether pixels lie on the image."""
 
 
 class BoardLike(Protocol):
@@ -94,11 +112,11 @@ def board_points(board: BoardLike, border: int = 0) -> Tensor:
     return torch.stack([x.reshape(-1), y.reshape(-1), torch.zeros(x.numel(), dtype=torch.float64)], -1) * board.square
 
 
-def project_board(camera: Camera, cam_from_board: tuple[Tensor, Tensor], board: BoardLike) -> tuple[Tensor, Tensor]:
+def project_board(camera: LensLike, cam_from_board: tuple[Tensor, Tensor], board: BoardLike) -> tuple[Tensor, Tensor]:
     """True pixels of the inner corners.
 
     Args:
-        camera: a single camera.
+        camera: a single camera, or a true lens.
         cam_from_board: rotation (3, 3) and translation (3,).
         board: its size.
 
@@ -109,6 +127,7 @@ def project_board(camera: Camera, cam_from_board: tuple[Tensor, Tensor], board: 
         InputError: a board or pose that cannot be.
 
     Example:
+        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
         >>> pose = BoardPose(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
         >>> pixels, visible = project_board(camera, pose, BoardSize(9, 6, 0.05))

@@ -39,7 +39,7 @@ class DenseProblem:
 
     def __init__(self, residual: Callable[..., Tensor], batch: tuple[int, ...], data: tuple[Tensor, ...] = ()) -> None:
         self.batch = tuple(batch)
-        self._data = tuple(data)
+        self._residual, self._data = residual, tuple(data)
         value, jacobian = residual, torch.func.jacfwd(residual)
         for _ in self.batch:
             value, jacobian = torch.func.vmap(value), torch.func.vmap(jacobian)
@@ -69,3 +69,7 @@ class DenseProblem:
     def retract(self, state: State, step: State) -> State:
         """Plain addition."""
         return (state[0] + step[0],)
+
+    def select(self, elements: Tensor) -> DenseProblem:
+        """See `Problem.select`."""
+        return DenseProblem(self._residual, (len(elements),), tuple(tensor[elements] for tensor in self._data))

@@ -61,3 +61,10 @@ class Problem(Protocol):
     def retract(self, state: State, step: State) -> State:
         """Apply a step: plain addition, or a move on a manifold."""
         ...
+
+    def select(self, elements: Tensor) -> Problem | None:
+        """The problem of some elements (K,) of a batch of one dimension; None where it cannot be taken apart.
+
+        By it a solver leaves out what has converged.
+        """
+        ...

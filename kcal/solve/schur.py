@@ -124,6 +124,10 @@ class SchurProblem(ABC):
     def retract(self, state: State, step: State) -> State:
         """Apply a step (shared (..., S), local (..., V, L))."""
 
+    def select(self, elements: Tensor) -> SchurProblem | None:
+        """See `Problem.select`; None unless a subclass knows how."""
+        return None
+
     def shared_rows(self, state: State) -> Tensor | None:
         """(..., S + 1, Q), see `SchurLinearisation`: priors and bounds; None where there are none."""
         return None
