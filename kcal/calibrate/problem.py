@@ -18,7 +18,7 @@ from torch import Tensor
 from kcal.calibrate.host_rows import board_rows, on_host
 from kcal.calibrate.motion import screw
 from kcal.calibrate.rules import Free
-from kcal.calibrate.terms import Term
+from kcal.calibrate.terms import Prior, Term
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, project_components
@@ -193,6 +193,11 @@ class BoardProblem(SchurProblem):
     def robust(self) -> bool:
         """Whether a robust loss is minimised."""
         return self.loss is not None
+
+    @property
+    def prior_count(self) -> int:
+        """Number of scalar residuals that are priors."""
+        return sum(len(term.index) for term in self.terms if isinstance(term, Prior))
 
     def unpack(self, state: State) -> BoardState:
         """The solver's tuple as named tensors."""
