@@ -14,7 +14,7 @@ from kcal.checks import as_points, keep_float64, require_finite
 from kcal.errors import InputError
 from kcal.lens.distortion import distort_components
 from kcal.lens.eager import finite_or, in_chunks, is_differentiated, known_true, separate
-from kcal.lens.inverse import Inverse, prepare_inverse, undistort_components
+from kcal.lens.inverse import Inverse, InverseStart, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
 from kcal.lens.outline import area, image_outline
 from kcal.lens.plane import plane_from_points, rays_from_plane
@@ -197,8 +197,8 @@ class Camera(nn.Module):
             width, height = self.size
             corners = values.new_tensor([[-0.5, -0.5], [width, -0.5], [-0.5, height], [width, height]])
             x, y = from_pixels(corners[:, 0], corners[:, 1], values)
-            region, start = prepare_inverse(values[..., 5:], self.model, torch.hypot(x, y).amax(-1))
-        return {"valid_radius": region.radius, "valid_edge": region.edge, "inverse_start": start}
+            ready = prepare_inverse(values[..., 5:], self.model, torch.hypot(x, y).amax(-1))
+        return {"valid_radius": ready.region.radius, "valid_edge": ready.region.edge, "inverse_start": ready.start}
 
     def update_valid_region(self) -> None:
         """Measure the valid region again; call it after changing parameters in place."""
@@ -267,7 +267,7 @@ class Camera(nn.Module):
         differentiated = is_differentiated(points, *self.parameters())
         return in_chunks(function, points, self.valid_radius.numel(), differentiated=differentiated)
 
-    def _to_plane(self, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _to_plane(self, pixels: Tensor, start: InverseStart | None) -> tuple[Tensor, Tensor, Tensor]:
         """Pixels (..., N, 2) to x, y on the plane of the lens, and valid; every one is (..., N)."""
         values = self.values
         cx, cy = values[..., 2, None], values[..., 3, None]
@@ -275,18 +275,19 @@ class Camera(nn.Module):
         u, v, finite = finite_or(u, v, cx, cy)
         x, y, settled = self._from_sensor(u, v, values)
         usable = finite if settled is None else finite & settled
-        ready = Inverse(self.valid_region, self.inverse_start)
+        ready = Inverse(self.valid_region, self.inverse_start, start)
         return undistort_components(x, y, usable, values[..., 5:], self.model, ready)
 
-    def normalize(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def normalize(self, pixels: Tensor, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
         """Map pixels to undistorted coordinates on the plane z = 1: (normalized (..., N, 2), valid (..., N)).
 
-        Pixels of a fisheye that look 89° or more off axis have no such coordinates and are not valid.
+        Pixels of a fisheye that look 89° or more off axis have no such coordinates and are not valid. `start` as in
+        `unproject`.
         """
         pixels = as_points("pixels", pixels, 2)
 
         def one(pixels: Tensor) -> tuple[Tensor, Tensor]:
-            x, y, valid = self._to_plane(pixels)
+            x, y, valid = self._to_plane(pixels, start)
             if self.model.fisheye:
                 X, Y, Z = rays_from_plane(x, y, self.model)
                 valid = valid & (math.cos(math.radians(89.0)) < Z)
@@ -295,11 +296,13 @@ class Camera(nn.Module):
 
         return self._in_chunks(one, pixels)
 
-    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def unproject(self, pixels: Tensor, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
         """Map pixels to rays.
 
         Args:
             pixels: (..., N, 2); any real position, also outside the image.
+            start: where Newton's method begins, instead of the start in closed form (`InverseNet.guess`). It decides
+                about time only, never about rays and mask.
 
         Returns:
             rays (..., N, 3) of length one, and valid (..., N). A pixel that the lens model cannot have produced, or
@@ -309,7 +312,7 @@ class Camera(nn.Module):
         pixels = as_points("pixels", pixels, 2)
 
         def one(pixels: Tensor) -> tuple[Tensor, Tensor]:
-            x, y, valid = self._to_plane(pixels)
+            x, y, valid = self._to_plane(pixels, start)
             return torch.stack(rays_from_plane(x, y, self.model), -1), valid
 
         return self._in_chunks(one, pixels)

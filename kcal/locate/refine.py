@@ -23,9 +23,8 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.eager import known_true
-from kcal.lens.pose import step_rows
+from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection, project_components
-from kcal.locate.angular import side_axes
 
 _STEPS = 5
 # The derivative of the optimum comes from this many steps with a fixed matrix; each leaves a share of about the
