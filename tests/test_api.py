@@ -20,10 +20,12 @@ PUBLIC = {
     "CalibrationLayer",
     "CalibrationOptions",
     "Camera",
+    "InverseNet",
     "KcalError",
     "LMOptions",
     "LensModel",
     "LevenbergMarquardt",
+    "LookupCamera",
     "Observations",
     "Origin",
     "RigCovariance",
@@ -34,6 +36,7 @@ PUBLIC = {
     "TriangulateViews",
     "Undistort",
     "Unproject",
+    "bake",
     "calibrate_camera",
     "calibrate_cameras",
     "calibrate_rig",
@@ -43,6 +46,7 @@ PUBLIC = {
     "new_pinhole",
     "save_camera",
     "save_rig",
+    "train_inverse",
     "undistort_maps",
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,16 @@ from kcal.calibrate.inverse_fit import InverseFit, InverseNetOptions, train_inve
 from kcal.calibrate.net_problem import NetProblem
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
+from kcal.lens.hybrid import HybridCamera
 from kcal.lens.inverse_net import InverseNet
 from kcal.lens.modules import Unproject
 from kcal.lens.net import evaluate, initial_weights
+from kcal.lens.residual import FieldGrid, FieldResidual
 
 _BARREL = [-0.28, 0.1, 5e-4, -3e-4, 0.02, 0.05, 0.02, 0.01, 4e-4, -2e-4, -3e-4, 1e-4, 0.004, -0.006]
 _WIDE = [0.4749, 0.02579, 3e-5, -9e-6, 8.2e-5, 0.7623, 0.09433, 1.329e-3, 3.1e-5, -2e-7, -2.6e-5, 3e-8, 1.1e-3, 1e-3]
 _HD: dict[str, Any] = {"focal": (1600, 1605), "center": (957, 541), "size": (1920, 1080)}
-CAMERAS = {
+CAMERAS: dict[str, Callable[[], Camera]] = {
     "opencv5": lambda: Camera.build(**_HD, coefficients=_BARREL[:5], model="opencv5"),
     "opencv14": lambda: Camera.build(**_HD, coefficients=_BARREL, model="opencv14"),
     "ext20": lambda: Camera.build(
@@ -47,7 +50,15 @@ CAMERAS = {
     "fisheye": lambda: Camera.build(
         focal=(400, 402), center=(637, 481), size=(1280, 960), coefficients=[0.02, -0.01, 0.003], model="fisheye4"
     ),
+    "hybrid": lambda: _hybrid(),
 }
+
+
+def _hybrid() -> HybridCamera:
+    grid = FieldGrid.covering((-0.6, -0.34), (0.6, 0.34), widths=[0.2])
+    generator = torch.Generator().manual_seed(0)
+    weights = 5e-4 * torch.randn(2, grid.count, generator=generator, dtype=torch.float64)
+    return HybridCamera.of(CAMERAS["opencv14"](), FieldResidual(grid, weights))
 
 
 @functools.cache
