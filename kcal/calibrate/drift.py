@@ -84,7 +84,8 @@ def measure_drift(
     """Find how the cameras of a rig have turned.
 
     From static features that were matched when the rig was good and are matched again (what they are and how far away
-    does not matter), from surveyed landmarks, or from far features of known range. Features that moved are left out.
+    does not matter), from surveyed landmarks, or from far features of known range; the last tell only how the right
+    camera has turned if the left one has not. Features that moved are left out.
 
     Args:
         rig: as it was solved.

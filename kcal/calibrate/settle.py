@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.covariance import spread
+from kcal.calibrate.covariance import uncertainty_of
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.verdict import check_focal
 from kcal.errors import DegenerateError
@@ -74,7 +74,7 @@ def settle(problem: BoardProblem, state: State) -> tuple[State, Curvature]:
     if problem.shared_size:
         linear = found.beside(*zero)
         linear.cost = problem.cost(state)
-        known = spread(linear, problem.residual_count, problem.shared_size + zero[1].numel())
+        known = uncertainty_of(linear, problem.residual_count, problem.shared_size + zero[1].numel())
         groups = _unknowns(problem)
         names = [*(" = ".join(group) for group in groups), *(["the board's warp"] * 2)]
         lost = [name for name, sure in zip(names, known.determined.tolist(), strict=False) if not sure]

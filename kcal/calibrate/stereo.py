@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.align import MINIMUM_CORNERS, check_fit, consensus, pair_rms, pose_alone
-from kcal.calibrate.covariance import spread
+from kcal.calibrate.covariance import uncertainty_of
 from kcal.calibrate.init import spread_out
 from kcal.calibrate.pairs import Pair
 from kcal.calibrate.problem import BoardProblem, BoardState
@@ -243,7 +243,9 @@ def _result(
     squared = problem.residuals(state).unflatten(-1, (2, 2, -1)).pow(2).sum(-2)
     seen = torch.isfinite(pixels).all(-1)
     each = torch.sqrt(squared.sum((0, 2)) / seen.sum((0, 2)))
-    uncertainty = spread(problem.linearise(state), problem.residual_count, problem.shared_size + 6 * len(pixels))
+    uncertainty = uncertainty_of(
+        problem.linearise(state), problem.residual_count, problem.shared_size + 6 * len(pixels)
+    )
     pose = uncertainty.sigma[sum(len(f) for f in problem.free) :][:6]
     warnings = []
     if len(used) < 3:
