@@ -36,7 +36,7 @@ def alone_squares(
     total, freedom = torch.zeros(len(pixels), dtype=torch.float64), 0
     nothing = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
     for c, (camera, poses) in enumerate(zip(cameras, views, strict=True)):
-        problem = BoardProblem(board, pixels[:, c : c + 1], [camera.model], [()])
+        problem = BoardProblem(board, pixels[:, c : c + 1], [camera.model], [()], fields=[camera.field])
         warp = torch.zeros(2, dtype=torch.float64)
         state = (camera.parameters_vector.detach(), warp, *nothing, poses.rotation, poses.translation)
         total = total + 2.0 * problem.view_cost(state)

@@ -21,11 +21,12 @@ from torch import Tensor
 
 from kcal.calibrate.reduced import ReducedProblem, fold
 from kcal.calibrate.terms import RadialBound, Term
+from kcal.calibrate.together import Solve, Steps
 from kcal.calibrate.views import Views
 from kcal.calibrate.wide import wide_starts
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
-from kcal.solve.lm import LMOptions, minimise
+from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, State, Status
 
 # For each start of a batch; the best one is then taken to convergence.
@@ -132,7 +133,7 @@ def pick(state: State, index: int) -> State:
 
 def climb(
     views: Views, first: State, cold: State, models: Sequence[LensModel], options: LMOptions, progress: Progress
-) -> Minimum:
+) -> Steps[Minimum]:
     """Solve a ladder of models for one camera.
 
     Args:
@@ -149,15 +150,16 @@ def climb(
     """
     small = models[0]
     if len(models) == 1:
-        return Minimum(result=minimise(views.problem(small), first, options), iterations=0)
+        result = yield Solve(views.problem(small), first, options)
+        return Minimum(result=result, iterations=0)
     if views.corner_count <= _FEW_CORNERS or views.rms(first, small) > _SUSPICIOUS_RMS:
-        return _climb_wholly(views, first, cold, models, options, progress)
-    return _climb_folded(views, first, models, options, progress)
+        return (yield from _climb_wholly(views, first, cold, models, options, progress))
+    return (yield from _climb_folded(views, first, models, options, progress))
 
 
 def _climb_folded(
     views: Views, first: State, models: Sequence[LensModel], options: LMOptions, progress: Progress
-) -> Minimum:
+) -> Steps[Minimum]:
     """Search each model's minima on folded views (`kcal.calibrate.reduced`), and solve from the best one on all views.
 
     Where that ends above the solution of the model before, it is solved again from there: a richer model never ends
@@ -170,22 +172,23 @@ def _climb_folded(
     for large in [model for model in models[1:-1] if str(model) in _LANDINGS] + [models[-1]]:
         terms = (RadialBound(large, radius, _WALL * noise),)
         starts = [embed(parameters, small, large) for parameters in kept]
-        if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
+        bumpy = large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2
+        if bumpy and views.rules.mild is None:
             starts += [near_cancelling(starts[0], large, observed**2, place) for place in _BUMPS]
         starts = [views.rules.impose(parameters, large) for parameters in starts]
         known = (*terms, *views.rules.terms(large, views.prior_noise))
         search = ReducedProblem(folded, large, views.rules.parameters(large), known, (len(starts),))
-        found = minimise(search, search.start(torch.stack(starts)), _SEARCH)
+        found = yield Solve(search, search.start(torch.stack(starts)), _SEARCH)
         kept = [found.state[0][i] for i in _distinct(found)]
         ends = [search.unfold(pick(found.state, i)) for i in _distinct(found)]
 
         problem = views.problem(large, terms=terms)
         enough = options if large == models[-1] else _LANDING
-        result = minimise(problem, ends[0], enough)
+        result = yield Solve(problem, ends[0], enough)
         nested = (embed(reached[0], small, large), *reached[1:])
         spent += int(found.iterations.max()) + int(result.iterations)
         if not float(result.cost) <= float(problem.cost(nested)):
-            result = minimise(problem, nested, enough)
+            result = yield Solve(problem, nested, enough)
             spent += int(result.iterations)
         reached, small = result.state, large
         progress(str(large))
@@ -219,16 +222,16 @@ def _distinct(found: Result) -> list[int]:
 
 def _climb_wholly(
     views: Views, first: State, cold: State, models: Sequence[LensModel], options: LMOptions, progress: Progress
-) -> Minimum:
+) -> Steps[Minimum]:
     """As `climb`, all starts solved on all views: for poses that are not settled yet, and few views of many minima."""
     small = models[0]
     kept, spent = [first], 0
     for large in models[1:]:
         plain = (embed(cold[0], models[0], large), *cold[1:])
         carried = [(embed(state[0], small, large), *state[1:]) for state in kept]
-        found = _scout(views, carried, plain, small, large, options)
+        found = yield from _scout(views, carried, plain, small, large, options)
         kept = _rank(views, found, carried[0], large)
-        result, terms = _finish(views, kept[0], large, options)
+        result, terms = yield from _finish(views, kept[0], large, options)
         spent += int(found.iterations.max()) + int(result.iterations)
         kept[0] = result.state
         small = large
@@ -248,7 +251,7 @@ def _walls(views: Views, state: State, model: LensModel, radius: float) -> tuple
     return (wall,) if bool(torch.isfinite(wall.rows(torch.cat([state[0], state[1]]))).all()) else ()
 
 
-def _finish(views: Views, start: State, model: LensModel, options: LMOptions) -> tuple[Result, tuple[Term, ...]]:
+def _finish(views: Views, start: State, model: LensModel, options: LMOptions) -> Steps[tuple[Result, tuple[Term, ...]]]:
     """Solve to convergence behind a wall: around the corners seen, or around the image where that is not enough.
 
     Among the ends and the start itself the best is chosen, folds in the image at their price. The plain cost never
@@ -261,7 +264,7 @@ def _finish(views: Views, start: State, model: LensModel, options: LMOptions) ->
     for radius in (views.seen_radius(start), views.regular_radius(start, model)):
         terms = _walls(views, start, model, radius)
         problem = views.problem(model, terms=terms)
-        result = minimise(problem, start, options)
+        result = yield Solve(problem, start, options)
         trouble, cost = views.trouble(result.state, model), float(plain.cost(result.state))
         if trouble > limit:
             ends.append((cost + price * trouble, result, terms))
@@ -273,7 +276,7 @@ def _finish(views: Views, start: State, model: LensModel, options: LMOptions) ->
         # A tilted lens folds elsewhere than the wall knows: in short stretches, until just before.
         state = start
         for _ in range(_STRETCHES):
-            result = minimise(problem, state, dataclasses.replace(options, max_iterations=_STRETCH))
+            result = yield Solve(problem, state, dataclasses.replace(options, max_iterations=_STRETCH))
             if views.trouble(result.state, model) > limit:
                 break
             state = result.state
@@ -294,7 +297,7 @@ def _scout(
     small: LensModel,
     large: LensModel,
     options: LMOptions,
-) -> Result:
+) -> Steps[Result]:
     """Solve for `large` from all starts side by side, with a limited number of steps."""
     starts = [*carried, plain]
     if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
@@ -304,7 +307,8 @@ def _scout(
         starts += [(near_cancelling(carried[0][0], large, largest, b), *carried[0][1:]) for b in _BUMPS]
     starts = [(views.rules.impose(state[0], large), *state[1:]) for state in starts]
     limited = dataclasses.replace(_SCOUT, max_iterations=min(_SCOUT.max_iterations, options.max_iterations))
-    return minimise(views.problem(large, (len(starts),)), stack(starts), limited)
+    result = yield Solve(views.problem(large, (len(starts),)), stack(starts), limited)
+    return result
 
 
 def _rank(views: Views, found: Result, carried: State, model: LensModel) -> list[State]:

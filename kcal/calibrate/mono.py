@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.covariance import Spread, spread
+from kcal.calibrate.covariance import Uncertainty, uncertainty_of
 from kcal.calibrate.ladder import Progress
+from kcal.calibrate.opinion import is_rich, mild_term, second_opinion
 from kcal.calibrate.options import CalibrationOptions, CameraCalibrationResult
 from kcal.calibrate.outliers import (
     OutlierRejection,
@@ -23,15 +25,19 @@ from kcal.calibrate.outliers import (
     without,
 )
 from kcal.calibrate.problem import BoardProblem
-from kcal.calibrate.single import Solved, corner_problem, solve
-from kcal.calibrate.verdict import check_focal, rival_warnings, standing_out, warnings_of
+from kcal.calibrate.rules import Free
+from kcal.calibrate.single import LEAST_NOISE, Solved, corner_problem, solve
+from kcal.calibrate.terms import Prior, Term
+from kcal.calibrate.together import Solve, Steps, alone, together
+from kcal.calibrate.verdict import check_focal, opinion_warnings, rival_warnings, standing_out, warnings_of
 from kcal.corners.observations import Observations
+from kcal.errors import KcalError
 from kcal.lens.camera import Camera
-from kcal.solve.lm import LMOptions, minimise
+from kcal.solve.lm import LMOptions
 from kcal.solve.result import State, Status
 from kcal.solve.robust import RobustLoss
 
-__all__ = ["CalibrationOptions", "CameraCalibrationResult", "calibrate_camera"]
+__all__ = ["CalibrationOptions", "CameraCalibrationResult", "calibrate_camera", "calibrate_cameras"]
 
 # To tell which corners are wrong: a loss that a few of them cannot pull, whose scale in units of the noise follows it.
 _ROUGH = LMOptions(max_iterations=40, tolerance=1e-8)
@@ -83,10 +89,55 @@ def calibrate_camera(
         >>> round(float(result.camera.focal[0]), 6), result.rms < 1e-6
         (800.0, True)
     """
+    return alone(_calibrating(observations, options or CalibrationOptions(), progress))
+
+
+def calibrate_cameras(
+    observations: Sequence[Observations],
+    options: CalibrationOptions | None = None,
+    progress: Progress = _silent,
+    *,
+    device: torch.device | str = "cpu",
+) -> list[CameraCalibrationResult | KcalError]:
+    """Calibrate many cameras with the same options, as `calibrate_camera` calibrates one.
+
+    Whatever several cameras must have minimised next is minimised as one batch (`kcal.calibrate.together`): cameras of
+    few views, whose time goes into starting operations on small tensors, take a fraction of the time that one call
+    after the other takes. Boards of one batch must be equal; sets with other boards are calibrated beside them.
+
+    Args:
+        observations: the views of each camera; numbers of views, image sizes and missing corners may differ.
+        options: of all of them.
+        progress: told how many are finished.
+        device: where batches are minimised. Results are on the CPU.
+
+    Returns:
+        for each camera what `calibrate_camera` returns, within the solver's tolerance, or the error that it would have
+        raised: one bad set does not spoil the others.
+
+    Example:
+        >>> from kcal.corners.board import Board
+        >>> from kcal.corners.observations import View
+        >>> board = Board(columns=3, rows=3, square=0.1)
+        >>> view = View(name="a", pixels=[(100.0 * x, 100.0 * y) for y in range(1, 4) for x in range(1, 4)])
+        >>> calibrate_cameras([Observations(board=board, image_size=(640, 480), views=[view])])
+        [DegenerateError('1 view(s) of the board: at least 3 at different tilts are needed, 10 to 40 are good')]
+    """
     options = options or CalibrationOptions()
+    count = len(observations)
+    return together(
+        [_calibrating(seen, options, _silent) for seen in observations],
+        torch.device(device),
+        lambda done: progress(f"{done} of {count} cameras"),
+    )
+
+
+def _calibrating(
+    observations: Observations, options: CalibrationOptions, progress: Progress
+) -> Steps[CameraCalibrationResult]:
     if options.reject is not None:
-        return _calibrate_rejecting(observations, options, options.reject, progress)
-    solved = solve(observations, options, progress)
+        return (yield from _calibrate_rejecting(observations, options, options.reject, progress))
+    solved = yield from solve(observations, options, progress)
     return _judge(observations, solved, options)
 
 
@@ -105,7 +156,7 @@ def _weighted_residuals(problem: BoardProblem, state: State) -> Tensor:
 
 def _calibrate_rejecting(
     observations: Observations, options: CalibrationOptions, rejection: OutlierRejection, progress: Progress
-) -> CameraCalibrationResult:
+) -> Steps[CameraCalibrationResult]:
     """Calibrate, leave out what stands out, and calibrate again until nothing changes.
 
     Corners of the views that are left are judged anew in every round, so that one that was thrown out beside a worse
@@ -118,12 +169,12 @@ def _calibrate_rejecting(
     spent = 0
     for last in (*[False] * (_ROUNDS - 1), True):
         used = without(observations, left, rejected)
-        solved = solve(used, options, progress)
+        solved = yield from solve(used, options, progress)
         spent += solved.spent
         every = without(observations, left, torch.zeros_like(rejected))
         if last:
             break
-        residuals, steps = _robust_residuals(every, solved, options)
+        residuals, steps = yield from _robust_residuals(every, solved, options)
         spent += steps
         beyond = corners_beyond(residuals)
         views = views_beyond(observations.board.points, residuals, every.pixels(), beyond)
@@ -170,7 +221,9 @@ def _calibrate_rejecting(
     )
 
 
-def _robust_residuals(observations: Observations, solved: Solved, options: CalibrationOptions) -> tuple[Tensor, int]:
+def _robust_residuals(
+    observations: Observations, solved: Solved, options: CalibrationOptions
+) -> Steps[tuple[Tensor, int]]:
     """Weighted residuals (V, N, 2) of all corners at a solution that a few wrong ones do not pull, and its trials.
 
     Infinite where the lens does not reach a corner at all.
@@ -184,7 +237,7 @@ def _robust_residuals(observations: Observations, solved: Solved, options: Calib
         some = without(observations, range(len(observations.views)), whole.seen[:, 0] & ~reached)
         scale = max(_CAUCHY_SCALE * float(noise_scale(residuals.flatten(0, 1))), 1e-3)
         loss = RobustLoss(kind="cauchy", scale=scale)
-        result = minimise(corner_problem(some, options, solved.minimum, solved.variance, loss), state, _ROUGH)
+        result = yield Solve(corner_problem(some, options, solved.minimum, solved.variance, loss), state, _ROUGH)
         spent += int(result.iterations)
         if result.status == Status.BAD_START:
             break
@@ -197,6 +250,9 @@ def _robust_residuals(observations: Observations, solved: Solved, options: Calib
 def _result(observations: Observations, found: Solved, options: CalibrationOptions) -> CameraCalibrationResult:
     problem, solved, model = found.problem, found.result, options.lens
     state = problem.tidy(solved.state)
+    # A lens may fold just where a corner is: there rounding decides whether it has an image.
+    if not bool(torch.isfinite(problem.cost(state))):
+        state = solved.state
     s = problem.unpack(state)
     pixels = observations.pixels()
     camera = Camera(s.parameters[0], size=observations.image_size, model=model)
@@ -205,14 +261,7 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
     squared = (residuals**2).sum(-1)
     per_view = torch.sqrt(squared.sum(-1) / seen.sum(-1))
     rms = float(torch.sqrt(squared.sum() / seen.sum()))
-    count = problem.shared_size + 6 * len(pixels)
-    # Under a known camera and a flat board nothing is shared by the views.
-    none = Spread(s.warp.new_zeros(0), torch.zeros(0, dtype=torch.bool))
-    uncertainty = (
-        none
-        if not problem.shared_size
-        else spread(problem.linearise(state), problem.residual_count + len(options.priors), count)
-    )
+    uncertainty, doubts = _uncertainty(observations, found, options, state)
     free = problem.free[0]
     rules = options.rules(observations.image_size)
     held = tuple(name for name in camera.names if name in rules.fixed)
@@ -238,5 +287,41 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
         fixed=held,
         status=status,
         iterations=found.spent,
-        warnings=tuple(warnings_of(observations, camera, rms, per_view, uncertainty, names, status)),
+        covariance=_by_parameter(uncertainty, free, len(camera.names)),
+        warnings=(*warnings_of(observations, camera, rms, per_view, uncertainty.determined, names, status), *doubts),
     )
+
+
+def _uncertainty(
+    observations: Observations, found: Solved, options: CalibrationOptions, state: State
+) -> tuple[Uncertainty, list[str]]:
+    """Covariance of the unknowns, and what a second opinion says of a rich model."""
+    minimum, model = found.minimum, options.lens
+    if not found.problem.shared_size:
+        # Under a known camera and a flat board nothing is shared by the views.
+        return Uncertainty(state[0].new_zeros(0, 0), torch.zeros(0, dtype=torch.bool)), []
+
+    def problem_with(*terms: Term) -> BoardProblem:
+        changed = dataclasses.replace(minimum, terms=terms)
+        return corner_problem(observations, options, changed, found.variance, options.loss)
+
+    # Walls before folds are no information about the lens.
+    known = [term for term in minimum.terms if isinstance(term, Prior)]
+    plain = problem_with(*known)
+    linear, count = plain.linearise(state), plain.shared_size + 6 * len(state[-1])
+    own = uncertainty_of(linear, plain.residual_count + plain.prior_count, count)
+    if not is_rich(model) or options.weak_prior is not None or options.camera is not None or not minimum.rivals:
+        return own, []
+    noise = max((2.0 * float(linear.cost) / plain.residual_count) ** 0.5, LEAST_NOISE)
+    start = minimum.rivals[0][1]
+    mild = problem_with(*known, mild_term(found.views, start, model, noise))
+    opinion = second_opinion(found.views, mild, plain, start, state, own)
+    return (own, []) if opinion is None else (opinion.uncertainty, opinion_warnings(opinion))
+
+
+def _by_parameter(uncertainty: Uncertainty, free: Free, count: int) -> Tensor:
+    """(5 + P, 5 + P) from that of the unknowns: tied parameters alike, held ones exact."""
+    out = uncertainty.covariance.new_zeros(count, count)
+    slots, indices = torch.tensor(free.slots, dtype=torch.long), torch.tensor(free.indices, dtype=torch.long)
+    out[indices[:, None], indices] = uncertainty.covariance[slots[:, None], slots]
+    return out

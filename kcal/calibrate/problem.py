@@ -6,20 +6,23 @@ the pose of the board in each view. Everything is in the frame of the first came
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 
 import torch
 from torch import Tensor
 
+from kcal.calibrate.host_rows import board_rows, on_host
 from kcal.calibrate.motion import screw
 from kcal.calibrate.rules import Free
-from kcal.calibrate.terms import Term
+from kcal.calibrate.terms import Prior, Term
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, project_components
+from kcal.lens.residual import Field
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import SchurLinearisation, SchurProblem
@@ -94,10 +97,12 @@ class BoardProblem(SchurProblem):
             None: all corners count alike.
         loss: of the length of each corner's residual (after whitening), or None for plain least squares.
         terms: priors and bounds on the first camera's parameters and the warp, beside the corners.
+        fields: for each camera what corrects its lens, held as it is, or None; nothing given: no camera has any.
         batch: leading shape of the states, () for one solve.
     """
 
     local_size = 6
+    joint = True
 
     def __init__(
         self,
@@ -110,23 +115,26 @@ class BoardProblem(SchurProblem):
         whitening: Tensor | None = None,
         loss: RobustLoss | None = None,
         terms: Sequence[Term] = (),
+        fields: Sequence[Field | None] = (),
         batch: tuple[int, ...] = (),
     ) -> None:
         self.models = tuple(models)
+        self.fields = tuple(fields) or (None,) * len(self.models)
         self.free = tuple(Free.of(indices) for indices in free)
         self.free_warp = free_warp
         self.batch = batch
-        self._terms = tuple(terms)
-        self._loss = loss
+        self.terms = tuple(terms)
+        self.loss = loss
+        self.board_points = board_points
         self._board = board_points.T.contiguous()
         self._shape = warp_shape(board_points)
         self.seen = torch.isfinite(pixels).all(-1)
         self._all_seen = bool(self.seen.all())
         self._target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
-        self._whitening: Tensor | None = None
+        self.whitening: Tensor | None = None
         if whitening is not None:
             seen = self.seen[..., None, None]
-            self._whitening = torch.where(seen, whitening, 0.0).movedim(-3, -1).contiguous()  # (..., V, C, 2, 2, N)
+            self.whitening = torch.where(seen, whitening, 0.0).movedim(-3, -1).contiguous()  # (..., V, C, 2, 2, N)
         self.residual_count = 2 * int(self.seen.sum((-3, -2, -1)).max())
         self._sizes = [len(INTRINSICS) + model.size for model in self.models]
         # Where each block of shared parameters stands in a step: cameras, poses of the further cameras, warp.
@@ -139,14 +147,57 @@ class BoardProblem(SchurProblem):
         self.shared_size = ends[-1]
 
     @property
+    def pixels(self) -> Tensor:
+        """(..., V, C, N, 2) observed corners; NaN where not seen."""
+        return torch.where(self.seen[..., None], self._target.transpose(-1, -2), torch.nan)
+
+    @property
+    def elements(self) -> int:
+        """How many states are solved side by side."""
+        return math.prod(self.batch)
+
+    @property
+    def corner_slots(self) -> int:
+        """Places for corners in each of them."""
+        return math.prod(self.seen.shape[-3:])
+
+    @property
+    def alike(self) -> Hashable:
+        """Problems that agree in this can be joined into one of a batch."""
+        terms = tuple(term.alike for term in self.terms)
+        board = tuple(self.board_points.flatten().tolist())
+        # A field is held by all of a batch, so that only those of the same one go together.
+        fields = tuple(id(field) for field in self.fields if field is not None)
+        return board, self.models, self.free, self.free_warp, self.whitened, self.loss, terms, fields
+
+    def select(self, elements: Tensor) -> BoardProblem | None:
+        """See `SchurProblem.select`."""
+        if len(self.batch) != 1:
+            return None
+        part = copy.copy(self)
+        part.batch = (len(elements),)
+        part.terms = tuple(term.select(elements) for term in self.terms)
+        if self.seen.ndim > 3:
+            part.seen, part._target = self.seen[elements], self._target[elements]
+            part._all_seen = bool(part.seen.all())
+        if self.whitening is not None and self.whitening.ndim > 5:
+            part.whitening = self.whitening[elements]
+        return part
+
+    @property
     def whitened(self) -> bool:
         """Whether corners count by their own weights."""
-        return self._whitening is not None
+        return self.whitening is not None
 
     @property
     def robust(self) -> bool:
         """Whether a robust loss is minimised."""
-        return self._loss is not None
+        return self.loss is not None
+
+    @property
+    def prior_count(self) -> int:
+        """Number of scalar residuals that are priors."""
+        return sum(len(term.index) for term in self.terms if isinstance(term, Prior))
 
     def unpack(self, state: State) -> BoardState:
         """The solver's tuple as named tensors."""
@@ -160,7 +211,7 @@ class BoardProblem(SchurProblem):
         """Board points rotated into the first camera (..., V, 3, N), and moved there."""
         flat = self._board
         if self.free_warp or bool(s.warp.any()):
-            height = (s.warp[..., None, :] @ self._shape)[..., None, :, :]
+            height = flat[2] + (s.warp[..., None, :] @ self._shape)[..., None, :, :]
             plane = flat[:2].expand(*height.shape[:-2], -1, -1)
             flat = torch.cat([plane, height], -2)
         rotated = s.first_from_board_rotation @ flat
@@ -180,20 +231,20 @@ class BoardProblem(SchurProblem):
     def residuals(self, state: State) -> Tensor:
         """See `SchurProblem.residuals`; NaN where a seen corner lies behind a camera, beyond a pole or a fold."""
         errors = self.pixel_errors(state)
-        if self._whitening is not None:
-            errors = torch.einsum("...uwn,...wn->...un", self._whitening, errors)
+        if self.whitening is not None:
+            errors = torch.einsum("...uwn,...wn->...un", self.whitening, errors)
         return errors.flatten(-3)
 
     def view_cost(self, state: State) -> Tensor:
         """See `SchurProblem.view_cost`."""
-        if self._loss is None:
+        if self.loss is None:
             return super().view_cost(state)
-        return 0.5 * self._loss.value(self._squared(self.residuals(state))).sum((-2, -1))
+        return 0.5 * self.loss.value(self._squared(self.residuals(state))).sum((-2, -1))
 
     def corner_weights(self, state: State) -> Tensor:
         """(..., V, C, N) by which the robust loss lets each corner's squared residual count; 1 without a loss."""
         squared = self._squared(self.residuals(state))
-        return torch.ones_like(squared) if self._loss is None else self._loss.weight(squared)
+        return torch.ones_like(squared) if self.loss is None else self.loss.weight(squared)
 
     def _squared(self, residuals: Tensor) -> Tensor:
         """Squared lengths (..., V, C, N) of residuals (..., V, C 2 N)."""
@@ -202,7 +253,7 @@ class BoardProblem(SchurProblem):
     def linearise(self, state: State) -> SchurLinearisation:
         """See `Problem.linearise`."""
         linear = super().linearise(state)
-        if self._loss is not None:
+        if self.loss is not None:
             linear.cost = self.cost(state)
         return linear
 
@@ -210,7 +261,7 @@ class BoardProblem(SchurProblem):
         """Projected minus observed, (..., V, C, 2, N) pixels, not weighted; 0 where not seen."""
         out = []
         for c, _, points, parameters in self._views(self.unpack(state)):
-            projected = project_components(points, parameters, self.models[c])
+            projected = project_components(points, parameters, self.models[c], None, self.fields[c])
             error = projected.pixels - self._target[..., c, :, :]
             seen = self.seen[..., c, None, :]
             bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
@@ -239,12 +290,20 @@ class BoardProblem(SchurProblem):
         s = self.unpack(state)
         seen, target = self.seen[..., views, :, :], self._target[..., views, :, :, :]
         rotated_board, points = self.points(s)
+        if on_host(self.models, points, s.parameters[0]):
+            bend = None
+            if self.free_warp:
+                bend = s.first_from_board_rotation[..., None, :, 2, None] * self._shape[:, None]
+            model, free = self.models[0], self.free[0]
+            both = rotated_board, points
+            rows = board_rows(both, s.parameters[0], model, free, target[..., 0, :, :], bend)[..., None, :, :]
+            return self._masked(rows, seen, views)
         shape = (*points.shape[:-2], 6 + self.shared_size + 1, len(self.models), 2, points.shape[-1])
         # What a camera's rows do not depend on is zero: the parameters of the others.
         rows = points.new_empty(shape) if len(self.models) == 1 else points.new_zeros(shape)
         shared = rows[..., 6:-1, :, :, :]
         for c, rotated, moved, parameters in self._views(s):
-            projected = project_components(moved, parameters, self.models[c], self.free[c].indices)
+            projected = project_components(moved, parameters, self.models[c], self.free[c].indices, self.fields[c])
             by_first = projected.by_point
             if c > 0:
                 turn = s.cam_from_first_rotation[..., c - 1, :, :]
@@ -262,22 +321,26 @@ class BoardProblem(SchurProblem):
             # As in `residuals`, so that a start that is no projection is told from one that is.
             if not bool(projected.regular.all()):
                 error += torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
+        return self._masked(rows, seen, views)
+
+    def _masked(self, rows: Tensor, seen: Tensor, views: slice) -> Tensor:
+        """Rows (..., V, L + S + 1, C, 2, N) of the corners that were seen, weighted: (..., V, L + S + 1, R)."""
         if not self._all_seen:
             rows = torch.where(seen[..., None, :, None, :], rows, 0.0)
-        if self._whitening is not None:
-            rows = torch.einsum("...cuwn,...pcwn->...pcun", self._whitening[..., views, :, :, :, :], rows)
-        if self._loss is not None:
+        if self.whitening is not None:
+            rows = torch.einsum("...cuwn,...pcwn->...pcun", self.whitening[..., views, :, :, :, :], rows)
+        if self.loss is not None:
             squared = rows[..., -1, :, :, :].square().sum(-2)
-            rows = rows * self._loss.weight(squared).sqrt()[..., None, :, None, :]
+            rows = rows * self.loss.weight(squared).sqrt()[..., None, :, None, :]
         return rows.flatten(-3)
 
     def shared_rows(self, state: State) -> Tensor | None:
         """See `SchurProblem.shared_rows`."""
-        if not self._terms:
+        if not self.terms:
             return None
         s = self.unpack(state)
         values = torch.cat([s.parameters[0], s.warp], -1)
-        found = torch.cat([term.rows(values) for term in self._terms], -1)
+        found = torch.cat([term.rows(values) for term in self.terms], -1)
         if not found.shape[-1]:
             return None
         rows = found.new_zeros((*found.shape[:-2], self.shared_size + 1, found.shape[-1]))

@@ -12,17 +12,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import torch
 from torch import Tensor
 
+from kcal.calibrate.host_rows import node_rows, on_host
 from kcal.calibrate.motion import screw
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.rules import Free
 from kcal.calibrate.terms import Term
 from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector, step_rows
+from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from kcal.solve.dense import DenseLinearisation
 from kcal.solve.result import State
@@ -85,8 +86,12 @@ class Folded:
 
     c are the shifts (pixels) of the nodes' images, then the change of the board's warp.
 
+    Those of several cameras (`kcal.calibrate.join`) have leading dimensions (C, 1), `matrix` (C,); such a one is only
+    searched, not unfolded.
+
     Args:
         state: where the views were folded.
+        warp: (2,) of this state.
         points: (3, K) directions of the nodes.
         pixels: (2, K) images of the nodes at `state`.
         matrix: (2 K + W, R), A transposed.
@@ -96,6 +101,7 @@ class Folded:
     """
 
     state: State
+    warp: Tensor
     points: Tensor
     pixels: Tensor
     matrix: Tensor
@@ -155,6 +161,7 @@ def fold(problem: BoardProblem, state: State, radius: float) -> Folded:
     zero = matrix.new_zeros(len(matrix), 1)
     return Folded(
         state=state,
+        warp=s.warp,
         points=nodes,
         pixels=project_components(nodes, s.parameters[0], problem.models[0]).pixels,
         matrix=torch.cat([matrix, zero, rough], 1),
@@ -215,16 +222,38 @@ class ReducedProblem:
         batch: tuple[int, ...] = (),
     ) -> None:
         self.batch = batch
-        self.residual_count = len(folded.offset)
-        self._folded, self._model, self._free, self._terms = folded, model, Free.of(free), tuple(terms)
+        self.residual_count = folded.offset.shape[-1]
+        self.folded, self.model, self.free, self.terms = folded, model, Free.of(free), tuple(terms)
         self._nodes = 2 * folded.points.shape[-1]
-        self._warps = len(folded.matrix) - self._nodes
+        self._warps = folded.matrix.shape[-2] - self._nodes
+
+    @property
+    def elements(self) -> int:
+        """How many states are solved side by side."""
+        return math.prod(self.batch)
+
+    @property
+    def corner_slots(self) -> int:
+        """Places for corners in each of them; here of nodes, and of their share in the quadratic form."""
+        return 2 * self._nodes
+
+    @property
+    def alike(self) -> Hashable:
+        """Problems that agree in this can be joined into one of a batch."""
+        return self.model, self.free, self._warps, len(self.batch), tuple(term.alike for term in self.terms)
+
+    def select(self, elements: Tensor) -> ReducedProblem | None:
+        """See `Problem.select`."""
+        if len(self.batch) != 1:
+            return None
+        terms = [term.select(elements) for term in self.terms]
+        return ReducedProblem(self.folded, self.model, self.free, terms, (len(elements),))
 
     def start(self, parameters: Tensor) -> State:
         """The state of folding with other parameters (..., 5 + P)."""
         shape = parameters.shape[:-1]
         identity = torch.eye(3, dtype=parameters.dtype, device=parameters.device)
-        return parameters, self._folded.state[1].expand(*shape, 2), identity.expand(*shape, 3, 3)
+        return parameters, self.folded.warp.expand(*shape, 2), identity.expand(*shape, 3, 3)
 
     def cost(self, state: State) -> Tensor:
         """See `Problem.cost`."""
@@ -233,48 +262,58 @@ class ReducedProblem:
     def linearise(self, state: State) -> DenseLinearisation:
         """See `Problem.linearise`."""
         parameters, warp, rotation = state
-        folded = self._folded
+        folded = self.folded
         points = rotation @ folded.points
-        seen = project_components(points, parameters, self._model, self._free.indices)
-        turn = step_rows(seen.by_point, points)[..., :3, :, :]
-        matrix = folded.matrix[: self._nodes]
-        residuals = (seen.pixels - folded.pixels).flatten(-2) @ matrix + folded.offset
-        jacobian = torch.cat([self._free.collapse(seen.by_camera, -3), turn], -3).flatten(-2) @ matrix
+        matrix = folded.matrix[..., : self._nodes, :]
+        rows = self._rows(points, parameters).flatten(-2)
+        # The starts of a camera share its matrix: one product for all.
+        rows = rows @ matrix if matrix.ndim == 2 else (rows.flatten(-3, -2) @ matrix).unflatten(-2, rows.shape[-3:-1])
+        rows[..., -1, :] += folded.offset
         if self._warps:
-            by_warp = folded.matrix[self._nodes :]
-            residuals = residuals + (warp - folded.state[1]) @ by_warp
-            jacobian = torch.cat([jacobian, by_warp.expand(*self.batch, -1, -1)], -2)
-        residuals = torch.where(seen.regular.all(-1, keepdim=True), residuals, torch.nan)
-        if self._terms:
+            by_warp = folded.matrix[..., self._nodes :, :]
+            rows[..., -1, :] += (warp - folded.warp) @ by_warp
+            by_warp = by_warp[:, None] if matrix.ndim > 2 else by_warp
+            by_warp = by_warp.expand(*self.batch, -1, -1)
+            rows = torch.cat([rows[..., :-1, :], by_warp, rows[..., -1:, :]], -2)
+        if self.terms:
             values = torch.cat([parameters, warp], -1)
-            found = torch.cat([term.rows(values) for term in self._terms], -1)
+            found = torch.cat([term.rows(values) for term in self.terms], -1)
             if found.shape[-1]:
-                residuals = torch.cat([residuals, found[..., -1, :]], -1)
-                none = found.new_zeros((*found.shape[:-2], 3, found.shape[-1]))
                 by_value = [
-                    self._free.collapse(found[..., list(self._free), :], -2),
-                    none,
+                    self.free.collapse(found[..., list(self.free), :], -2),
+                    found.new_zeros((*found.shape[:-2], 3, found.shape[-1])),
                     found[..., -3 : -3 + self._warps, :],
+                    found[..., -1:, :],
                 ]
-                jacobian = torch.cat([jacobian, torch.cat(by_value, -2)], -1)
-        return DenseLinearisation(residuals, jacobian.transpose(-1, -2))
+                rows = torch.cat([rows, torch.cat(by_value, -2)], -1)
+        return DenseLinearisation.of_rows(rows)
+
+    def _rows(self, points: Tensor, parameters: Tensor) -> Tensor:
+        """(..., U + 3 + 1, 2, K): the shifts of the nodes' images, last, and their derivatives by lens and rotation."""
+        if on_host((self.model,), points, parameters):
+            return node_rows(points, parameters, self.model, self.free, self.folded.pixels)
+        seen = project_components(points, parameters, self.model, self.free.indices)
+        turn = step_rows(seen.by_point, points)[..., :3, :, :]
+        shift = torch.where(seen.regular[..., None, :], seen.pixels - self.folded.pixels, torch.nan)
+        return torch.cat([self.free.collapse(seen.by_camera, -3), turn, shift[..., None, :, :]], -3)
 
     def retract(self, state: State, step: State) -> State:
         """See `Problem.retract`."""
         parameters, warp, rotation = state
-        lens, turn, bend = step[0].split([len(self._free), 3, self._warps], -1)
+        lens, turn, bend = step[0].split([len(self.free), 3, self._warps], -1)
         parameters = parameters.clone()
-        parameters[..., list(self._free)] += self._free.expand(lens)
-        return parameters, warp + bend if self._warps else warp, rotation_from_vector(turn) @ rotation
+        parameters[..., list(self.free)] += self.free.expand(lens)
+        rotation, _ = screw(rotation, torch.zeros_like(turn), torch.cat([turn, torch.zeros_like(turn)], -1))
+        return parameters, warp + bend if self._warps else warp, rotation
 
     def unfold(self, state: State) -> State:
         """One solution (no batch) with the poses that answer it, as a state of `BoardProblem`."""
         parameters, warp, rotation = state
-        folded = self._folded
-        pixels = project_components(rotation @ folded.points, parameters, self._model).pixels
+        folded = self.folded
+        pixels = project_components(rotation @ folded.points, parameters, self.model).pixels
         change = [
             (pixels - folded.pixels).flatten(),
-            (warp - folded.state[1])[: self._warps],
+            (warp - folded.warp)[: self._warps],
             torch.ones_like(warp[:1]),
         ]
         seen = (folded.answer @ torch.cat(change)).unflatten(0, (-1, 6))

@@ -92,8 +92,8 @@ class Adjustment:
         count = len(self.data.cameras)
         free = [Free((), ())] * count if held else self.free
         turning, moving = ([not held and one for one in each] for each in (self._turning, self._moving))
-        models = [c.model for c in self.data.cameras]
-        return RigProblem(models, groups, () if held else self.terms, free, turning, moving, loss)
+        models, fields = [c.model for c in self.data.cameras], [c.field for c in self.data.cameras]
+        return RigProblem(models, fields, groups, () if held else self.terms, free, turning, moving, loss)
 
     def part(self, masks: Sequence[Tensor]) -> State:
         """The state of the cameras and of the items in the masks."""

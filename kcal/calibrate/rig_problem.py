@@ -18,6 +18,7 @@ from kcal.calibrate.rules import Free
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, rotation_from_vector
 from kcal.lens.projection import INTRINSICS
+from kcal.lens.residual import Field
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import SchurLinearisation
@@ -100,6 +101,7 @@ class RigProblem:
 
     Args:
         models: one a camera.
+        fields: for each camera what corrects its lens, held as it is, or None.
         groups: what is seen, and how many tensors each group's local state has.
         terms: what was measured of the cameras besides.
         free: free parameters of each camera.
@@ -114,6 +116,7 @@ class RigProblem:
     def __init__(
         self,
         models: Sequence[LensModel],
+        fields: Sequence[Field | None],
         groups: Sequence[tuple[Group, int]],
         terms: Sequence[SharedTerm],
         free: Sequence[Free],
@@ -121,7 +124,7 @@ class RigProblem:
         moving: Sequence[bool],
         loss: RobustLoss | None = None,
     ) -> None:
-        self.models, self.free, self.loss = tuple(models), tuple(free), loss
+        self.models, self.fields, self.free, self.loss = tuple(models), tuple(fields), tuple(free), loss
         self.groups = tuple(group for group, _ in groups)
         self._tensors = [count for _, count in groups]
         self._terms = tuple(terms)
@@ -153,9 +156,18 @@ class RigProblem:
         """The cameras with their places in a step."""
         parameters, rotation, centre = self.cameras(state)
         return [
-            Sight(values, model, turn, place, *slots)
-            for values, model, turn, place, *slots in zip(
-                parameters, self.models, rotation, centre, self.free, self.inner, self.turn, self.shift, strict=True
+            Sight(values, model, field, turn, place, *slots)
+            for values, model, field, turn, place, *slots in zip(
+                parameters,
+                self.models,
+                self.fields,
+                rotation,
+                centre,
+                self.free,
+                self.inner,
+                self.turn,
+                self.shift,
+                strict=True,
             )
         ]
 
@@ -208,6 +220,10 @@ class RigProblem:
         if self.loss is not None:
             linear.cost = self.cost(state)
         return linear
+
+    def select(self, elements: Tensor) -> None:
+        """See `Problem.select`: there is one element only."""
+        return
 
     def retract(self, state: State, step: State) -> State:
         """See `Problem.retract`."""

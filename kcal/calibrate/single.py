@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -15,17 +16,18 @@ from kcal.calibrate.init import (
     spread_out,
 )
 from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
+from kcal.calibrate.mild import Mild
 from kcal.calibrate.options import CalibrationOptions
-from kcal.calibrate.poses import refine_poses, unflip
+from kcal.calibrate.poses import refining, unflipping
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.together import Solve, Steps
 from kcal.calibrate.views import Views
 from kcal.calibrate.weights import whitening
-from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
-from kcal.solve.lm import LMOptions, minimise
+from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, State, Status
 from kcal.solve.robust import RobustLoss
 
@@ -37,13 +39,50 @@ _MINIMUM_WIDTH = 0.5
 _SUSPICIOUS_RMS = 2.0
 
 # Of a corner, pixels; and how often it is measured anew beside priors.
-_LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
+LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
+
+
+class BoardPoints(Protocol):
+    """A board: where its corners lie."""
+
+    @property
+    def points(self) -> Tensor:
+        """(N, 3) metres."""
+        ...
+
+
+class Corners(Protocol):
+    """What is calibrated from: `kcal.corners.observations.Observations`, or tensors."""
+
+    @property
+    def board(self) -> BoardPoints:
+        """The board that was shown."""
+        ...
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height) pixels."""
+        ...
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the views."""
+        ...
+
+    def pixels(self) -> Tensor:
+        """(V, N, 2), NaN where not seen."""
+        ...
+
+    def covariances(self) -> Tensor | None:
+        """(V, N, 2, 2) px², or None."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Solved:
     """A solution for one set of corners, before it is judged."""
 
+    views: Views
     problem: BoardProblem
     result: Result
     minimum: Minimum
@@ -52,7 +91,7 @@ class Solved:
     variance: float | None
 
 
-def solve(observations: Observations, options: CalibrationOptions, progress: Progress) -> Solved:
+def solve(observations: Corners, options: CalibrationOptions, progress: Progress) -> Steps[Solved]:
     """Find the minimum for all corners given, as `calibrate_camera` describes it; its errors are raised here."""
     model = options.lens
     board = observations.board.points
@@ -64,9 +103,9 @@ def solve(observations: Observations, options: CalibrationOptions, progress: Pro
     solver = options.solver
     ladder = [step for step in steps_to(model) if rules.allows(step)] if options.camera is None else [model]
     if options.camera is None:
-        first, cold, spent = _first(board, pixels, observations.image_size, ladder[0], options)
+        first, cold, spent = yield from _first(board, pixels, observations.image_size, ladder[0], options)
     else:
-        first = cold = _known(observations, pixels, options.camera)
+        first = cold = yield from _known(observations, pixels, options.camera)
         spent = 0
     progress(f"start ({ladder[0]})")
     seen = pixels[:, None]
@@ -77,9 +116,13 @@ def solve(observations: Observations, options: CalibrationOptions, progress: Pro
         free_warp=options.board_warp,
         rules=rules,
     )
-    if rules.priors:
-        views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), _LEAST_NOISE))
-    minimum = climb(views, first, cold, ladder, solver, progress)
+    reach = float(views.observed_radius(first))
+    if options.weak_prior is not None:
+        rules = dataclasses.replace(rules, mild=Mild(options.weak_prior, reach))
+        views = dataclasses.replace(views, rules=rules)
+    if rules.informed:
+        views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), LEAST_NOISE))
+    minimum = yield from climb(views, first, cold, ladder, solver, progress)
     spent += minimum.iterations
 
     # The first model's poses were looked at; look once more under another lens.
@@ -90,16 +133,16 @@ def solve(observations: Observations, options: CalibrationOptions, progress: Pro
         )
     problem = views.problem(model, terms=minimum.terms)
     if len(ladder) > 1:
-        state, flipped = unflip(board, seen, [model], result.state)
+        state, flipped = yield from unflipping(board, seen, [model], result.state)
         if flipped:
-            result = minimise(problem, state, solver)
+            result = yield Solve(problem, state, solver)
             spent += int(result.iterations)
-    if rules.priors:
+    if rules.informed:
         # The noise, against which priors count, is that of this solution.
         for _ in range(_NOISE_ROUNDS):
-            views = dataclasses.replace(views, prior_noise=max(views.noise(result.state, model), _LEAST_NOISE))
+            views = dataclasses.replace(views, prior_noise=max(views.noise(result.state, model), LEAST_NOISE))
             problem = views.problem(model, terms=minimum.terms)
-            result = minimise(problem, result.state, solver)
+            result = yield Solve(problem, result.state, solver)
             spent += int(result.iterations)
         rivals = tuple((float(views.problem(model).cost(state)), state) for _, state in minimum.rivals)
         terms = (*minimum.terms, *rules.terms(model, views.prior_noise))
@@ -110,15 +153,21 @@ def solve(observations: Observations, options: CalibrationOptions, progress: Pro
     variance = None if covariances is None else 2.0 * plain_cost / problem.residual_count
     if variance is not None or options.loss is not None:
         problem = corner_problem(observations, options, minimum, variance, options.loss)
-        result = minimise(problem, result.state, solver)
+        result = yield Solve(problem, result.state, solver)
         spent += int(result.iterations)
     return Solved(
-        problem=problem, result=result, minimum=minimum, plain_cost=plain_cost, spent=spent, variance=variance
+        views=views,
+        problem=problem,
+        result=result,
+        minimum=minimum,
+        plain_cost=plain_cost,
+        spent=spent,
+        variance=variance,
     )
 
 
 def corner_problem(
-    observations: Observations,
+    observations: Corners,
     options: CalibrationOptions,
     minimum: Minimum,
     variance: float | None,
@@ -140,7 +189,7 @@ def corner_problem(
     )
 
 
-def _check(observations: Observations, pixels: Tensor, count: int, warp: bool, fewest: int) -> None:
+def _check(observations: Corners, pixels: Tensor, count: int, warp: bool, fewest: int) -> None:
     seen = torch.isfinite(pixels).all(-1).sum(-1)
     if len(pixels) < fewest:
         raise DegenerateError(
@@ -174,7 +223,7 @@ def _check(observations: Observations, pixels: Tensor, count: int, warp: bool, f
 
 def _first(
     board: Tensor, pixels: Tensor, size: tuple[int, int], model: LensModel, options: CalibrationOptions
-) -> tuple[State, State, int]:
+) -> Steps[tuple[State, State, int]]:
     """The first model's solution, a start without distortion, both from the closed forms, and the trials spent."""
     homography = homographies(board, pixels)
     spent = 0
@@ -206,13 +255,13 @@ def _first(
         problem = views.problem(model)
         cold: State = (zero, *rest)
         for start in ((lens, *rest), cold):
-            result = minimise(problem, start, options.solver)
+            result = yield Solve(problem, start, options.solver)
             spent += int(result.iterations)
             if result.status != Status.BAD_START:
                 break
-        state, flipped = unflip(board, pixels[:, None], [model], result.state)
+        state, flipped = yield from unflipping(board, pixels[:, None], [model], result.state)
         if flipped:
-            result = minimise(problem, state, options.solver)
+            result = yield Solve(problem, state, options.solver)
             spent += int(result.iterations)
         cost = float(result.cost)
         if cost == cost and (best is None or cost < best[0]):
@@ -224,7 +273,7 @@ def _first(
     return best[1], best[2], spent
 
 
-def _known(observations: Observations, pixels: Tensor, camera: Camera) -> State:
+def _known(observations: Corners, pixels: Tensor, camera: Camera) -> Steps[State]:
     """Board poses under a known camera, refined one by one, both tilts of each tried."""
     if camera.size != observations.image_size:
         raise InputError(f"the known camera is of {camera.size} px, the observations of {observations.image_size} px")
@@ -241,8 +290,9 @@ def _known(observations: Observations, pixels: Tensor, camera: Camera) -> State:
     empty = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
     state: State = (camera.parameters_vector, torch.zeros(2, dtype=torch.float64), *empty, *poses)
     views = pixels[:, None]
-    state, _ = refine_poses(board, views, [camera.model], state, LMOptions(max_iterations=30))
-    return unflip(board, views, [camera.model], state)[0]
+    state, _ = yield from refining(board, views, [camera.model], state, LMOptions(max_iterations=30))
+    state, _ = yield from unflipping(board, views, [camera.model], state)
+    return state
 
 
 def _rms(cost: float, pixels: Tensor) -> float:

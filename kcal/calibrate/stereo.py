@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.align import MINIMUM_CORNERS, check_fit, consensus, pair_rms, pose_alone
-from kcal.calibrate.covariance import covariance, spread
+from kcal.calibrate.covariance import uncertainty_of
 from kcal.calibrate.init import spread_out
 from kcal.calibrate.joined import FEWEST, alone_squares, disagreement
 from kcal.calibrate.pairs import Pair
@@ -167,14 +167,14 @@ def calibrate_rig(
         first_from_board_translation=views[0].translation,
     ).pack()
     free = [free_parameters(camera.model) if options.refine_cameras else [] for camera in cameras]
-    models = [camera.model for camera in cameras]
+    models, fields = [camera.model for camera in cameras], [camera.field for camera in cameras]
     settled = False
     suspects: list[tuple[int, str]] = []
     while True:
         if not bool(keep.any()):
             raise DegenerateError("no pair is left: do the views of a pair show the same board at the same moment?")
         *shared, rotation, translation = start
-        problem = BoardProblem(board, pixels[keep], models, free, free_warp=options.board_warp)
+        problem = BoardProblem(board, pixels[keep], models, free, free_warp=options.board_warp, fields=fields)
         result = minimise(problem, (*shared, rotation[keep], translation[keep]), options.solver)
         rms = pair_rms(problem, result.state, pixels[keep])
         joined = 2.0 * problem.view_cost(result.state)
@@ -204,7 +204,7 @@ def calibrate_rig(
         spread_left = 2.0 * float(result.cost) / problem.residual_count
         weights = whitening(covariances[keep], spread_left)
         problem = BoardProblem(
-            board, pixels[keep], models, free, free_warp=options.board_warp, whitening=weights
+            board, pixels[keep], models, free, free_warp=options.board_warp, whitening=weights, fields=fields
         )  # fmt: skip
         result = minimise(problem, result.state, options.solver)
     used = [names[i] for i in keep.nonzero()[:, 0].tolist()]
@@ -284,10 +284,7 @@ def _result(
     used: list[Pair],
 ) -> RigCalibrationResult:
     s = problem.unpack(state)
-    solved = [
-        Camera(parameters, size=camera.size, model=camera.model)
-        for parameters, camera in zip(s.parameters, cameras, strict=True)
-    ]
+    solved = [camera.with_parameters(parameters) for parameters, camera in zip(s.parameters, cameras, strict=True)]
     rig = StereoRig(
         solved[0], solved[1], nearest_rotation(s.cam_from_first_rotation[0]), s.cam_from_first_translation[0]
     )
@@ -295,8 +292,10 @@ def _result(
     squared = problem.pixel_errors(state).pow(2).sum(-2)
     seen = torch.isfinite(pixels).all(-1)
     each = torch.sqrt(squared.sum((0, 2)) / seen.sum((0, 2)))
-    known = problem.linearise(state), problem.residual_count, problem.shared_size + 6 * len(pixels)
-    pose = spread(*known).sigma[sum(len(f) for f in problem.free) :][:6]
+    uncertainty = uncertainty_of(
+        problem.linearise(state), problem.residual_count, problem.shared_size + 6 * len(pixels)
+    )
+    pose = uncertainty.sigma[sum(len(f) for f in problem.free) :][:6]
     warnings = []
     if len(used) < 3:
         warnings.append(f"{len(used)} pair(s) only: a wrong one could not be noticed; 5 or more are good")
@@ -316,7 +315,7 @@ def _result(
         excluded=(),
         sigma_rotation=pose[:3],
         sigma_translation=pose[3:],
-        covariance=_joint(covariance(*known).shared, problem),
+        covariance=_joint(uncertainty.covariance, problem),
         disagreement=torch.zeros(len(pixels), dtype=torch.float64),
         pixels=pixels,
         status=status,

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.files import NativeFile
-from kcal.io.camera_file import CameraFile, Exclusion, Record, camera_to_file
+from kcal.io.camera_file import CameraFile, Exclusion, camera_to_file
+from kcal.io.record import Record
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.rig import StereoRig
 

@@ -15,7 +15,7 @@ from kcal.errors import InputError
 from kcal.solve.dense import DenseProblem
 from kcal.solve.implicit import attach_implicit_gradient
 from kcal.solve.problem import Problem
-from kcal.solve.result import Result, State, Status
+from kcal.solve.result import Result, State, Status, blend
 
 # Called after each trial step with (trial, cost (...)); returning True stops.
 Callback = Callable[[int, Tensor], bool | None]
@@ -24,6 +24,8 @@ _LOWEST_DAMPING, _HIGHEST_DAMPING = 1e-14, 1e10
 _LITTLE_DAMPING = 1e-3
 # Trial steps over which `LMOptions.flatness` is judged.
 _PATIENCE = 20
+# Fewest elements of a batch from which on those that have stopped are left out of the work.
+_FEW = 4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,12 +54,6 @@ class LMOptions:
             raise InputError("LMOptions: flatness must be in [0, 1)")
         if not self.initial_damping > 0 or not self.residual_floor >= 0:
             raise InputError("LMOptions: initial_damping must be positive, residual_floor not negative")
-
-
-def _where(mask: Tensor, new: State, old: State) -> State:
-    return tuple(
-        torch.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b) for a, b in zip(new, old, strict=True)
-    )
 
 
 def minimise(
@@ -109,11 +105,25 @@ def _minimise(problem: Problem, start: State, options: LMOptions, callback: Call
     floor = 0.5 * problem.residual_count * options.residual_floor**2
     status = np.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
     history = [cost]
+    whole: _Whole | None = None
 
     for trial in range(1, options.max_iterations + 1):
         running = status == Status.RUNNING
         if not running.any():
             break
+        if _worth_leaving_out(running) and not torch.is_grad_enabled():
+            kept = np.flatnonzero(running)
+            smaller = problem.select(on_device(kept))
+            if smaller is not None:
+                whole = whole or _Whole(state, status, iterations)
+                whole.put(state, status, iterations)
+                whole.index, problem = whole.index[kept], smaller
+                state = tuple(tensor[on_device(kept)] for tensor in state)
+                cost, damping, growth, status, iterations = (
+                    values[kept] for values in (cost, damping, growth, status, iterations)
+                )
+                running = running[kept]
+                linear = problem.linearise(state)
         step, decrease = linear.step(on_device(damping))
         candidate = problem.retract(state, step)
         joint = problem.linearise(candidate) if problem.joint else None
@@ -135,9 +145,9 @@ def _minimise(problem: Problem, start: State, options: LMOptions, callback: Call
         if accept.all():
             state = candidate
         elif accept.any():
-            state = _where(on_device(accept), candidate, state)
+            state = blend(on_device(accept), state, candidate)
         cost = np.where(accept, new_cost, cost)
-        history.append(cost)
+        history.append(cost if whole is None else whole.costs(history[-1], cost))
 
         status = np.where(flat, int(Status.CONVERGED), status)
         status = np.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
@@ -150,21 +160,55 @@ def _minimise(problem: Problem, start: State, options: LMOptions, callback: Call
             status = np.where(at_minimum, int(Status.CONVERGED), status)
             status = np.where(stalled & ~at_minimum, int(Status.STALLED), status)
         if options.flatness and trial >= _PATIENCE:
-            slow = history[-1 - _PATIENCE] - cost <= options.flatness * cost
+            before = history[-1 - _PATIENCE]
+            slow = (before if whole is None else before[whole.index]) - cost <= options.flatness * cost
             status = np.where((status == 0) & slow, int(Status.FLAT), status)
-        if callback is not None and callback(trial, on_device(cost)):
+        if callback is not None and callback(trial, on_device(history[-1])):
             status = np.where(status == 0, int(Status.INTERRUPTED), status)
         if (accept & (status == 0)).any():
-            linear = problem.linearise(state) if joint is None or not accept.all() else joint
+            if joint is None:
+                linear = problem.linearise(state)
+            else:
+                linear = joint if accept.all() else linear.blend(on_device(accept), joint)
 
     status = np.where(status == 0, int(Status.ITERATION_LIMIT), status)
+    if whole is not None:
+        whole.put(state, status, iterations)
+        state, status, iterations = whole.state, whole.status, whole.iterations
     return Result(
         state=state,
-        cost=on_device(cost),
+        cost=on_device(history[-1]),
         status=on_device(status),
         iterations=on_device(iterations),
         history=on_device(np.stack(history)),
     )
+
+
+def _worth_leaving_out(running: np.ndarray) -> bool:
+    """Whether so few elements of a batch are still running that a smaller problem saves work."""
+    return running.ndim == 1 and len(running) >= _FEW and 2 * int(running.sum()) <= len(running)
+
+
+class _Whole:
+    """All elements of a batch while only those of `index` are being worked on."""
+
+    def __init__(self, state: State, status: np.ndarray, iterations: np.ndarray) -> None:
+        self.state = tuple(tensor.clone() for tensor in state)
+        self.status, self.iterations = status.copy(), iterations.copy()
+        self.index = np.arange(len(status))
+
+    def put(self, state: State, status: np.ndarray, iterations: np.ndarray) -> None:
+        """Store what the elements of `index` have come to."""
+        place = torch.from_numpy(self.index).to(state[0].device)
+        for tensor, part in zip(self.state, state, strict=True):
+            tensor[place] = part
+        self.status[self.index], self.iterations[self.index] = status, iterations
+
+    def costs(self, before: np.ndarray, cost: np.ndarray) -> np.ndarray:
+        """All costs, of which those of `index` have changed."""
+        out = before.copy()
+        out[self.index] = cost
+        return out
 
 
 class LevenbergMarquardt(nn.Module):

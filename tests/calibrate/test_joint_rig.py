@@ -93,6 +93,7 @@ def mixed_problem() -> tuple[RigProblem, State]:
     ]
     problem = RigProblem(
         [camera.model for camera in CAMERAS],
+        [None] * 3,
         groups,
         terms,
         [Free((0, 1, 7), (0, 0, 1)), Free.of(index), Free((), ())],
