@@ -130,6 +130,15 @@ class Adjustment:
             found.append(whole)
         return found
 
+    def deletions(self, masks: Sequence[Tensor]) -> list[Tensor]:
+        """By how much χ² would fall without each item (`RigProblem.deletions`); NaN outside the masks."""
+        found = []
+        for mask, part in zip(masks, self.problem(masks).deletions(self.part(masks)), strict=True):
+            whole = torch.full(mask.shape, math.nan, dtype=torch.float64)
+            whole[mask] = part.nan_to_num(math.inf, math.inf)
+            found.append(whole)
+        return found
+
     def freedom(self, masks: Sequence[Tensor]) -> list[Tensor]:
         """Degrees of freedom of every item beyond its own unknowns; 0 outside the masks."""
         found = []
