@@ -10,6 +10,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from kcal.calibrate.inverse_fit import train_inverse
+    from kcal.calibrate.layer import CalibrationLayer
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.stereo import RigOptions, calibrate_rig
     from kcal.corners.board import Board
@@ -18,8 +20,11 @@ if TYPE_CHECKING:
     from kcal.errors import KcalError
     from kcal.io.camera_file import load_camera, save_camera
     from kcal.io.rig_file import load_rig, save_rig
+    from kcal.lens.bake import bake
     from kcal.lens.camera import Camera
     from kcal.lens.images import Undistort, undistort_maps
+    from kcal.lens.inverse_net import InverseNet
+    from kcal.lens.lookup import LookupCamera
     from kcal.lens.model import LensModel
     from kcal.lens.modules import Unproject
     from kcal.lens.pinhole import new_pinhole
@@ -35,12 +40,15 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Board",
+    "CalibrationLayer",
     "CalibrationOptions",
     "Camera",
+    "InverseNet",
     "KcalError",
     "LMOptions",
     "LensModel",
     "LevenbergMarquardt",
+    "LookupCamera",
     "Observations",
     "Origin",
     "RigCovariance",
@@ -51,6 +59,7 @@ __all__ = [
     "TriangulateViews",
     "Undistort",
     "Unproject",
+    "bake",
     "calibrate_camera",
     "calibrate_cameras",
     "calibrate_rig",
@@ -60,17 +69,21 @@ __all__ = [
     "new_pinhole",
     "save_camera",
     "save_rig",
+    "train_inverse",
     "undistort_maps",
 ]
 
 _HOME = {
     "Board": "kcal.corners.board",
+    "CalibrationLayer": "kcal.calibrate.layer",
     "CalibrationOptions": "kcal.calibrate.mono",
     "Camera": "kcal.lens.camera",
+    "InverseNet": "kcal.lens.inverse_net",
     "KcalError": "kcal.errors",
     "LMOptions": "kcal.solve.lm",
     "LensModel": "kcal.lens.model",
     "LevenbergMarquardt": "kcal.solve.lm",
+    "LookupCamera": "kcal.lens.lookup",
     "Observations": "kcal.corners.observations",
     "Origin": "kcal.locate.geodesy",
     "RigCovariance": "kcal.locate.errors",
@@ -81,6 +94,7 @@ _HOME = {
     "TriangulateViews": "kcal.locate.views",
     "Undistort": "kcal.lens.images",
     "Unproject": "kcal.lens.modules",
+    "bake": "kcal.lens.bake",
     "calibrate_camera": "kcal.calibrate.mono",
     "calibrate_cameras": "kcal.calibrate.mono",
     "calibrate_rig": "kcal.calibrate.stereo",
@@ -90,6 +104,7 @@ _HOME = {
     "new_pinhole": "kcal.lens.pinhole",
     "save_camera": "kcal.io.camera_file",
     "save_rig": "kcal.io.rig_file",
+    "train_inverse": "kcal.calibrate.inverse_fit",
     "undistort_maps": "kcal.lens.images",
 }
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -32,3 +34,13 @@ def require_finite(name: str, value: Tensor) -> None:
     if bool(bad.any()):
         where = tuple(int(i) for i in bad.nonzero()[0])
         raise InputError(f"{name}: {int(bad.sum())} of {value.numel()} values are not finite, first at {where}")
+
+
+def keep_float64(fn: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    """Let `.to`, `.half`, `.float` move float64 tensors between devices without rounding them."""
+
+    def moved(tensor: Tensor) -> Tensor:
+        result = fn(tensor)
+        return tensor.to(result.device) if tensor.dtype == torch.float64 else result
+
+    return moved

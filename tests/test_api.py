@@ -17,12 +17,15 @@ import kcal
 # Taking a name away breaks users; adding one is a promise. Either is a line here and one in CHANGELOG.md.
 PUBLIC = {
     "Board",
+    "CalibrationLayer",
     "CalibrationOptions",
     "Camera",
+    "InverseNet",
     "KcalError",
     "LMOptions",
     "LensModel",
     "LevenbergMarquardt",
+    "LookupCamera",
     "Observations",
     "Origin",
     "RigCovariance",
@@ -33,6 +36,7 @@ PUBLIC = {
     "TriangulateViews",
     "Undistort",
     "Unproject",
+    "bake",
     "calibrate_camera",
     "calibrate_cameras",
     "calibrate_rig",
@@ -42,6 +46,7 @@ PUBLIC = {
     "new_pinhole",
     "save_camera",
     "save_rig",
+    "train_inverse",
     "undistort_maps",
 }
 

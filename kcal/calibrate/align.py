@@ -60,11 +60,11 @@ def pose_alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions)
     parameters = camera.parameters_vector.detach()
     state: State = (parameters, torch.zeros(2, dtype=torch.float64), *nothing, rotation, translation)
     view = pixels[:, None]
-    state, _ = refine_poses(board, view, [camera.model], state, solver)
-    state, flipped = unflip(board, view, [camera.model], state)
+    state, _ = refine_poses(board, view, [camera.model], state, solver, [camera.field])
+    state, flipped = unflip(board, view, [camera.model], state, [camera.field])
     if flipped:
-        state, _ = refine_poses(board, view, [camera.model], state, solver)
-    problem = BoardProblem(board, pixels[:, None], [camera.model], [()])
+        state, _ = refine_poses(board, view, [camera.model], state, solver, [camera.field])
+    problem = BoardProblem(board, pixels[:, None], [camera.model], [()], fields=[camera.field])
     rms = float(pair_rms(problem, state, pixels[:, None]).median())
     return Poses(state[-2], state[-1]), rms if math.isfinite(rms) else math.inf
 

@@ -36,6 +36,7 @@ def join_boards(
         free_warp=first.free_warp,
         whitening=whitening,
         loss=first.loss,
+        fields=first.fields,
         terms=[term.to(device) for term in _terms([problem.terms for problem in problems], counts, (sum(counts),))],
         batch=(sum(counts),),
     )

@@ -18,10 +18,11 @@ from torch import Tensor
 from kcal.calibrate.host_rows import board_rows, on_host
 from kcal.calibrate.motion import screw
 from kcal.calibrate.rules import Free
-from kcal.calibrate.terms import Term
+from kcal.calibrate.terms import Prior, Term
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, project_components
+from kcal.lens.residual import Field
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import SchurLinearisation, SchurProblem
@@ -96,6 +97,7 @@ class BoardProblem(SchurProblem):
             None: all corners count alike.
         loss: of the length of each corner's residual (after whitening), or None for plain least squares.
         terms: priors and bounds on the first camera's parameters and the warp, beside the corners.
+        fields: for each camera what corrects its lens, held as it is, or None; nothing given: no camera has any.
         batch: leading shape of the states, () for one solve.
     """
 
@@ -113,9 +115,11 @@ class BoardProblem(SchurProblem):
         whitening: Tensor | None = None,
         loss: RobustLoss | None = None,
         terms: Sequence[Term] = (),
+        fields: Sequence[Field | None] = (),
         batch: tuple[int, ...] = (),
     ) -> None:
         self.models = tuple(models)
+        self.fields = tuple(fields) or (None,) * len(self.models)
         self.free = tuple(Free.of(indices) for indices in free)
         self.free_warp = free_warp
         self.batch = batch
@@ -162,7 +166,9 @@ class BoardProblem(SchurProblem):
         """Problems that agree in this can be joined into one of a batch."""
         terms = tuple(term.alike for term in self.terms)
         board = tuple(self.board_points.flatten().tolist())
-        return board, self.models, self.free, self.free_warp, self.whitened, self.loss, terms
+        # A field is held by all of a batch, so that only those of the same one go together.
+        fields = tuple(id(field) for field in self.fields if field is not None)
+        return board, self.models, self.free, self.free_warp, self.whitened, self.loss, terms, fields
 
     def repeated(self, count: int) -> BoardProblem:
         """A batch of this problem, which is none yet."""
@@ -194,6 +200,11 @@ class BoardProblem(SchurProblem):
         """Whether a robust loss is minimised."""
         return self.loss is not None
 
+    @property
+    def prior_count(self) -> int:
+        """Number of scalar residuals that are priors."""
+        return sum(len(term.index) for term in self.terms if isinstance(term, Prior))
+
     def unpack(self, state: State) -> BoardState:
         """The solver's tuple as named tensors."""
         parameters, *rest = state
@@ -206,7 +217,7 @@ class BoardProblem(SchurProblem):
         """Board points rotated into the first camera (..., V, 3, N), and moved there."""
         flat = self._board
         if self.free_warp or bool(s.warp.any()):
-            height = (s.warp[..., None, :] @ self._shape)[..., None, :, :]
+            height = flat[2] + (s.warp[..., None, :] @ self._shape)[..., None, :, :]
             plane = flat[:2].expand(*height.shape[:-2], -1, -1)
             flat = torch.cat([plane, height], -2)
         rotated = s.first_from_board_rotation @ flat
@@ -256,7 +267,7 @@ class BoardProblem(SchurProblem):
         """Projected minus observed, (..., V, C, 2, N) pixels, not weighted; 0 where not seen."""
         out = []
         for c, _, points, parameters in self._views(self.unpack(state)):
-            projected = project_components(points, parameters, self.models[c])
+            projected = project_components(points, parameters, self.models[c], None, self.fields[c])
             error = projected.pixels - self._target[..., c, :, :]
             seen = self.seen[..., c, None, :]
             bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
@@ -280,12 +291,18 @@ class BoardProblem(SchurProblem):
             out.append(rows @ rows.transpose(-1, -2))
         return torch.cat(out, -3)
 
+    def whiten(self, vectors: Tensor, views: slice = _ALL) -> Tensor:
+        """Vectors (V, Q, 2, N) of the first camera's pixels by the corners' weights, like its residuals."""
+        if self.whitening is None:
+            return vectors
+        return torch.einsum("vuwn,vqwn->vqun", self.whitening[views, 0], vectors)
+
     def rows(self, state: State, views: slice = _ALL) -> Tensor:
         """See `SchurProblem.rows`; of a state that holds the poses of some views only, if these are given."""
         s = self.unpack(state)
         seen, target = self.seen[..., views, :, :], self._target[..., views, :, :, :]
         rotated_board, points = self.points(s)
-        if on_host(self.models, points, s.parameters[0]):
+        if self.fields == (None,) and on_host(self.models, points, s.parameters[0]):
             bend = None
             if self.free_warp:
                 bend = s.first_from_board_rotation[..., None, :, 2, None] * self._shape[:, None]
@@ -298,7 +315,7 @@ class BoardProblem(SchurProblem):
         rows = points.new_empty(shape) if len(self.models) == 1 else points.new_zeros(shape)
         shared = rows[..., 6:-1, :, :, :]
         for c, rotated, moved, parameters in self._views(s):
-            projected = project_components(moved, parameters, self.models[c], self.free[c].indices)
+            projected = project_components(moved, parameters, self.models[c], self.free[c].indices, self.fields[c])
             by_first = projected.by_point
             if c > 0:
                 turn = s.cam_from_first_rotation[..., c - 1, :, :]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -15,13 +16,13 @@ from kcal.calibrate.init import (
     spread_out,
 )
 from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
+from kcal.calibrate.mild import Mild
 from kcal.calibrate.options import CalibrationOptions
 from kcal.calibrate.poses import refining, unflipping
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.together import Solve, Steps
 from kcal.calibrate.views import Views
 from kcal.calibrate.weights import whitening
-from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -38,13 +39,50 @@ _MINIMUM_WIDTH = 0.5
 _SUSPICIOUS_RMS = 2.0
 
 # Of a corner, pixels; and how often it is measured anew beside priors.
-_LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
+LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
+
+
+class BoardPoints(Protocol):
+    """A board: where its corners lie."""
+
+    @property
+    def points(self) -> Tensor:
+        """(N, 3) metres."""
+        ...
+
+
+class Corners(Protocol):
+    """What is calibrated from: `kcal.corners.observations.Observations`, or tensors."""
+
+    @property
+    def board(self) -> BoardPoints:
+        """The board that was shown."""
+        ...
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height) pixels."""
+        ...
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the views."""
+        ...
+
+    def pixels(self) -> Tensor:
+        """(V, N, 2), NaN where not seen."""
+        ...
+
+    def covariances(self) -> Tensor | None:
+        """(V, N, 2, 2) px², or None."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Solved:
     """A solution for one set of corners, before it is judged."""
 
+    views: Views
     problem: BoardProblem
     result: Result
     minimum: Minimum
@@ -53,7 +91,7 @@ class Solved:
     variance: float | None
 
 
-def solve(observations: Observations, options: CalibrationOptions, progress: Progress) -> Steps[Solved]:
+def solve(observations: Corners, options: CalibrationOptions, progress: Progress) -> Steps[Solved]:
     """Find the minimum for all corners given, as `calibrate_camera` describes it; its errors are raised here."""
     model = options.lens
     board = observations.board.points
@@ -78,8 +116,12 @@ def solve(observations: Observations, options: CalibrationOptions, progress: Pro
         free_warp=options.board_warp,
         rules=rules,
     )
-    if rules.priors:
-        views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), _LEAST_NOISE))
+    reach = float(views.observed_radius(first))
+    if options.weak_prior is not None:
+        rules = dataclasses.replace(rules, mild=Mild(options.weak_prior, reach))
+        views = dataclasses.replace(views, rules=rules)
+    if rules.informed:
+        views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), LEAST_NOISE))
     minimum = yield from climb(views, first, cold, ladder, solver, progress)
     spent += minimum.iterations
 
@@ -95,10 +137,10 @@ def solve(observations: Observations, options: CalibrationOptions, progress: Pro
         if flipped:
             result = yield Solve(problem, state, solver)
             spent += int(result.iterations)
-    if rules.priors:
+    if rules.informed:
         # The noise, against which priors count, is that of this solution.
         for _ in range(_NOISE_ROUNDS):
-            views = dataclasses.replace(views, prior_noise=max(views.noise(result.state, model), _LEAST_NOISE))
+            views = dataclasses.replace(views, prior_noise=max(views.noise(result.state, model), LEAST_NOISE))
             problem = views.problem(model, terms=minimum.terms)
             result = yield Solve(problem, result.state, solver)
             spent += int(result.iterations)
@@ -114,12 +156,18 @@ def solve(observations: Observations, options: CalibrationOptions, progress: Pro
         result = yield Solve(problem, result.state, solver)
         spent += int(result.iterations)
     return Solved(
-        problem=problem, result=result, minimum=minimum, plain_cost=plain_cost, spent=spent, variance=variance
+        views=views,
+        problem=problem,
+        result=result,
+        minimum=minimum,
+        plain_cost=plain_cost,
+        spent=spent,
+        variance=variance,
     )
 
 
 def corner_problem(
-    observations: Observations,
+    observations: Corners,
     options: CalibrationOptions,
     minimum: Minimum,
     variance: float | None,
@@ -141,7 +189,7 @@ def corner_problem(
     )
 
 
-def _check(observations: Observations, pixels: Tensor, count: int, warp: bool, fewest: int) -> None:
+def _check(observations: Corners, pixels: Tensor, count: int, warp: bool, fewest: int) -> None:
     seen = torch.isfinite(pixels).all(-1).sum(-1)
     if len(pixels) < fewest:
         raise DegenerateError(
@@ -225,7 +273,7 @@ def _first(
     return best[1], best[2], spent
 
 
-def _known(observations: Observations, pixels: Tensor, camera: Camera) -> Steps[State]:
+def _known(observations: Corners, pixels: Tensor, camera: Camera) -> Steps[State]:
     """Board poses under a known camera, refined one by one, both tilts of each tried."""
     if camera.size != observations.image_size:
         raise InputError(f"the known camera is of {camera.size} px, the observations of {observations.image_size} px")

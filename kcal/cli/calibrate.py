@@ -21,7 +21,8 @@ def calibrate(
     model: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="Lens model: pinhole, opencv4, opencv5, opencv8, opencv12, opencv14, ext16 ... ext24."
+            metavar="NAME",
+            help="Lens model: pinhole, opencv4, opencv5, opencv8, opencv12, opencv14, ext16 ... ext24, or hybrid.",
         ),
     ] = "opencv5",
     board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
@@ -43,6 +44,14 @@ def calibrate(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE±SIGMA", help="Gaussian knowledge of a parameter; +- will do for ±."),
     ] = None,
+    weak_prior: Annotated[
+        float | None,
+        typer.Option(metavar="SHARE", help="Expect a lens this close to a pinhole: 0.3 keeps rich models tame."),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(help="A known camera: only the board's poses are found, and what --free names."),
+    ] = None,
     loss: Annotated[
         str | None,
         typer.Option(metavar="KIND", help="Robust loss against wrong corners: huber, cauchy or tukey."),
@@ -55,21 +64,31 @@ def calibrate(
         float, typer.Option(help="Greatest share of the corners that --reject may leave out.")
     ] = 0.1,
     name: Annotated[str, typer.Option(help="Name of the camera; the observations' file name if not given.")] = "",
+    groups: Annotated[
+        str,
+        typer.Option(metavar="KIND", help="For a hybrid, what is held out together: blocks of views, or views."),
+    ] = "blocks",
     picture: Annotated[Path | None, typer.Option(help="A .png file: coverage, residuals and views.")] = None,
 ) -> None:
     """Calibrate one camera: intrinsics, lens and error bars.
 
     Minimises the reprojection error of all corners over all parameters. Rich lens models are reached through the
     models nested in them, so that more coefficients never end with a larger RMS. A small RMS is not yet accuracy:
-    look at the σ of the parameters, and prefer the smaller model where they are large.
+    look at the σ of the parameters, and prefer the smaller model, or a weak prior, where they are large.
 
     **Examples**
 
     `kcal calibrate left.obs.json -o left.camera.json`
 
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --board-warp --picture left.png`
+
+    `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --weak-prior 0.3`
+
+    `kcal calibrate left.obs.json -o left.camera.json --model hybrid --board-warp`: a plain lens corrected by a smooth
+    field, kept only where it predicts views that were held out better than every parametric model.
     """
     from kcal.cli.console import err, out, steps
+    from kcal.errors import InputError
     from kcal.files import check_writable
     from kcal.lens.model import LensModel
 
@@ -79,7 +98,26 @@ def calibrate(
 
         check_picture_format(picture)
         check_writable(picture)
+    if model == "hybrid":
+        from kcal.cli.calibrate_hybrid import calibrate_hybrid_file
+
+        for option, given in (
+            ("--fix", fix), ("--tie", tie), ("--free", free), ("--prior", prior), ("--loss", loss),
+            ("--reject", reject), ("--weak-prior", weak_prior), ("--camera", camera),
+        ):  # fmt: skip
+            if given:
+                raise InputError(f"{option} does not go with --model hybrid")
+        calibrate_hybrid_file(
+            observations, output, name, picture, board_warp=board_warp, focal=focal, fov=fov, groups=groups
+        )
+        return
     lens = LensModel.named(model)
+    known = None
+    if camera is not None:
+        from kcal.io.camera_file import load_camera
+
+        known = load_camera(camera)
+        lens = known.model
 
     from kcal.calibrate.ladder import steps_to
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
@@ -99,6 +137,8 @@ def calibrate(
         tied=tuple(tuple(name.strip() for name in text.split("=")) for text in tie or []),
         free=tuple(free or []),
         priors=_priors(prior or []),
+        weak_prior=weak_prior,
+        camera=known,
         loss=robust,
         reject=rejection,
     )
@@ -179,6 +219,7 @@ def record(result: CameraCalibrationResult, seen: Observations, name: str, sourc
         result.camera,
         name=name,
         standard_deviations=result.sigma,
+        covariance=result.covariance,
         calibration=CameraCalibration(
             rms=result.rms,
             views=len(seen.views) - len(result.rejected_views),

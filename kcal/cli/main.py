@@ -9,6 +9,7 @@ import typer
 from rich.markup import escape
 
 import kcal
+from kcal.cli.bake import bake
 from kcal.cli.batch import batch
 from kcal.cli.board import board
 from kcal.cli.budget import budget
@@ -17,7 +18,7 @@ from kcal.cli.console import err
 from kcal.cli.demo import demo
 from kcal.cli.detect import detect
 from kcal.cli.locate import locate
-from kcal.cli.rig import rig
+from kcal.cli.rig import app as rig
 from kcal.cli.undistort import undistort
 from kcal.errors import KcalError
 
@@ -51,10 +52,11 @@ app.command("board")(board)
 app.command("detect")(detect)
 app.command("calibrate")(calibrate)
 app.command("batch")(batch)
-app.command("rig")(rig)
+app.add_typer(rig, name="rig")
 app.command("locate")(locate)
 app.command("budget")(budget)
 app.command("undistort")(undistort)
+app.command("bake")(bake)
 
 
 def main() -> None:

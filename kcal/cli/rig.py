@@ -1,58 +1,184 @@
-"""`kcal rig`: two cameras and the boards both have seen to a rig file."""
+"""`kcal rig`: two cameras and what both have seen to a rig file."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer.core import TyperGroup
+
+from kcal.cli.rig_check import check
+from kcal.errors import InputError
 
 if TYPE_CHECKING:
     from kcal.calibrate.stereo import RigCalibrationResult
+    from kcal.cli.rig_joint import Sources
     from kcal.io.camera_file import CameraFile
     from kcal.io.rig_file import RigFile
 
 
-def rig(
+class _RigGroup(TyperGroup):
+    """`kcal rig LEFT RIGHT ...` solves a rig; `kcal rig check ...` is a command of its own."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args or args[0] not in self.commands:
+            args = ["solve", *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(cls=_RigGroup, rich_markup_mode="markdown", help="Solve a rig, and check it later.")
+
+
+def solve(
     left: Annotated[Path, typer.Argument(help="Camera file of the left camera.")],
     right: Annotated[Path, typer.Argument(help="Camera file of the right camera.")],
-    pairs: Annotated[
-        tuple[Path, Path],
-        typer.Option("--pairs", metavar="LEFT.obs.json RIGHT.obs.json", help="Observations of boards seen by both."),
-    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write.")],
+    pairs: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option("--pairs", metavar="LEFT.obs.json RIGHT.obs.json", help="Observations of boards seen by both."),
+    ] = None,
     match: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="Which views belong together: columns left,right. By name if not given."),
     ] = None,
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(metavar="CSV", help="Surveyed places: name,lat,lon,height,sigma or name,east,north,up,sigma."),
+    ] = None,
+    marks: Annotated[
+        Path | None,
+        typer.Option(metavar="CSV", help="Where they are in the images: name,left_u,left_v,right_u,right_v."),
+    ] = None,
+    features: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CSV",
+            help="Far things matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or "
+            "beyond (metres), if known.",
+        ),
+    ] = None,
+    positions: Annotated[
+        Path | None,
+        typer.Option(metavar="CSV", help="Measured camera positions (GNSS): as --landmarks, names left and right."),
+    ] = None,
+    baseline: Annotated[
+        str | None, typer.Option(metavar="M±SIGMA", help="Measured distance between the cameras, e.g. 10.02±0.005.")
+    ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(metavar="LAT,LON,HEIGHT", help="Of the local frame; the first surveyed place if not given."),
+    ] = None,
+    mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks and matches along each axis.")] = 0.3,
+    intrinsics: Annotated[
+        Literal["fixed", "prior", "free"],
+        typer.Option(help="Cameras as they are, held by their files' sigmas, or free."),
+    ] = "fixed",
+    keep_all: Annotated[bool, typer.Option("--keep-all", help="Leave nothing out; only warn.")] = False,
     refine_cameras: Annotated[
-        bool, typer.Option("--refine-cameras", help="Solve for both cameras' intrinsics and lenses again, jointly.")
+        bool,
+        typer.Option("--refine-cameras", help="Boards only: solve for intrinsics and lenses again, jointly."),
     ] = False,
-    board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
+    board_warp: Annotated[
+        bool, typer.Option("--board-warp", help="Boards only: also estimate how the board bends.")
+    ] = False,
+    reject: Annotated[
+        bool, typer.Option("--reject", help="Boards only: leave out pairs that noise cannot explain.")
+    ] = False,
+    picture: Annotated[
+        Path | None, typer.Option(help="A .png file: residuals by source and a plan. Not for boards only.")
+    ] = None,
 ) -> None:
-    """Solve a stereo rig: where the right camera stands from the left.
+    """Solve a stereo rig: where the right camera stands from the left, and where both stand on the Earth.
 
-    Views are paired by name (left01.jpg with right01.jpg) or by a CSV. A pair whose board was read from the other end
-    is turned and listed; a pair that contradicts the others is left out and listed.
+    From boards seen by both cameras, surveyed landmarks, far features, a measured baseline and measured camera
+    positions: any of them, or all together in one adjustment. What contradicts the rest is left out and named. Boards
+    are paired by name (left01.jpg with right01.jpg) or by a CSV; one that was read from its other end is turned.
 
     The board's accuracy limits long ranges: watch the σ of the yaw. With a baseline of 10 m, 0.01° of yaw is 436 m at
-    5 km.
+    5 km. Landmarks and far features hold it better than boards do.
+
+    `kcal rig check` looks later whether the cameras still stand as they did.
 
     **Examples**
 
     `kcal rig left.camera.json right.camera.json --pairs left.obs.json right.obs.json -o rig.json`
 
-    `kcal rig left.camera.json right.camera.json --pairs l.obs.json r.obs.json --match pairs.csv -o rig.json`
+    `kcal rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv --features far.csv
+    --baseline 10.02±0.005 -o rig.json --picture rig.png`
     """
-    from kcal.cli.console import err, out, steps
+    from kcal.cli.rig_joint import Sources
     from kcal.files import check_writable
+    from kcal.report.figures import check_picture_format
 
-    check_writable(output, left, right, *pairs, *([match] if match else []))
+    sources = Sources(
+        pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
+        baseline=baseline, origin=origin, mark_sigma=mark_sigma,
+    )  # fmt: skip
+    check_writable(output, left, right, *sources.files)
+    if picture is not None:
+        check_picture_format(picture)
+        check_writable(picture)
+    if sources.only_boards and sources.pairs is None:
+        raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
+    if sources.only_boards and sources.pairs is not None and not picture and intrinsics == "fixed":
+        _from_boards(
+            left, right, sources.pairs, match, output, reject, refine_cameras=refine_cameras, board_warp=board_warp
+        )
+        return
+    if refine_cameras or board_warp or reject:
+        raise InputError(
+            "--refine-cameras, --board-warp and --reject are for boards only; use --intrinsics prior or free here"
+        )
+    _from_all(left, right, sources, output, picture, intrinsics, reject=not keep_all)
 
+
+def _from_all(
+    left: Path,
+    right: Path,
+    sources: Sources,
+    output: Path,
+    picture: Path | None,
+    intrinsics: Literal["fixed", "prior", "free"],
+    *,
+    reject: bool,
+) -> None:
+    from kcal.calibrate.rig import JointOptions, solve_rig
+    from kcal.cli.console import out, steps
+    from kcal.cli.rig_joint import gather, mounting, record, show
+    from kcal.io.camera_file import CameraFile
+    from kcal.report.rig import save_rig_picture
+
+    cameras = CameraFile.load(left), CameraFile.load(right)
+    data, origin = gather(cameras, sources, prior=intrinsics == "prior")
+    with steps("solving the rig", 1) as advance:
+        solution = solve_rig(data, JointOptions(intrinsics=intrinsics, reject=reject))
+        advance("done")
+    there = mounting(solution, origin)
+    record(solution, cameras, there, fixed=intrinsics == "fixed").save(output)
+    if picture is not None:
+        save_rig_picture(picture, solution)
+    show(solution, there)
+    for path in (output, *([picture] if picture else [])):
+        out.print(f"wrote {path}", markup=False)
+
+
+def _from_boards(
+    left: Path,
+    right: Path,
+    pairs: tuple[Path, Path],
+    match: Path | None,
+    output: Path,
+    reject: bool,
+    *,
+    refine_cameras: bool,
+    board_warp: bool,
+) -> None:
     import math
 
     from kcal.calibrate.pairs import pair_by_name, read_pairs
     from kcal.calibrate.stereo import RigOptions, calibrate_rig
+    from kcal.cli.console import err, out, steps
     from kcal.corners.observations import Observations
     from kcal.io.camera_file import CameraFile
     from kcal.locate.check import triangulated_sides
@@ -68,7 +194,7 @@ def rig(
             seen[0],
             seen[1],
             matched,
-            RigOptions(refine_cameras=refine_cameras, board_warp=board_warp),
+            RigOptions(refine_cameras=refine_cameras, board_warp=board_warp, reject=reject),
         )
         advance("done")
     rig_record(result, None if refine_cameras else cameras).save(output)
@@ -106,6 +232,7 @@ def rig_record(result: RigCalibrationResult, cameras: tuple[CameraFile, CameraFi
         result.rig,
         left=cameras[0] if cameras else None,
         right=cameras[1] if cameras else None,
+        covariance=result.covariance,
         calibration=RigCalibration(
             rms=result.rms,
             rms_left=result.rms_left,
@@ -130,3 +257,7 @@ def _along(result: RigCalibrationResult) -> float:
     """σ of the baseline's length, metres, from the σ of the translation along it."""
     direction = result.rig.right_from_left_translation / result.rig.baseline
     return float(((direction * result.sigma_translation) ** 2).sum().sqrt())
+
+
+app.command("solve", hidden=True)(solve)
+app.command("check")(check)

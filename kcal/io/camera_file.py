@@ -17,15 +17,12 @@ import torch
 import kcal
 from kcal.errors import InputError
 from kcal.files import NativeFile
+from kcal.io.record import CovarianceRecord, Record
 from kcal.lens.camera import Camera
+from kcal.lens.hybrid import HybridCamera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
-
-
-class Record(pydantic.BaseModel):
-    """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused."""
-
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+from kcal.lens.residual import Field, FieldGrid, FieldResidual, FieldScale
 
 
 class LensOrders(Record):
@@ -46,6 +43,38 @@ class LensOrders(Record):
     def model(self) -> LensModel:
         """The `LensModel` with these orders."""
         return LensModel(**self.model_dump())
+
+
+class FieldScaleRecord(Record):
+    """A grid of Gaussian units of a residual field (`kcal.lens.residual.FieldScale`), and their weights.
+
+    Args:
+        width: of the units, on the distorted plane in focal lengths.
+        left: x of the first column of units.
+        top: y of the first row.
+        columns: how many.
+        rows: likewise.
+        along_x: weights of the correction along x, focal lengths; column after column, each from the top.
+        along_y: likewise along y.
+    """
+
+    width: pydantic.PositiveFloat
+    left: float
+    top: float
+    columns: pydantic.PositiveInt
+    rows: pydantic.PositiveInt
+    along_x: tuple[float, ...]
+    along_y: tuple[float, ...]
+
+    @pydantic.model_validator(mode="after")
+    def _counted(self) -> FieldScaleRecord:
+        if not len(self.along_x) == len(self.along_y) == self.columns * self.rows:
+            raise ValueError(f"{self.columns} x {self.rows} units need as many weights along x and along y")
+        return self
+
+    def scale(self) -> FieldScale:
+        """The units."""
+        return FieldScale(width=self.width, left=self.left, top=self.top, columns=self.columns, rows=self.rows)
 
 
 class Intrinsics(Record):
@@ -139,7 +168,11 @@ class CameraFile(NativeFile):
         intrinsics: fx, fy, cx, cy, skew in pixels.
         coefficients: name -> value, exactly the names of the model.
         standard_deviations: name -> one sigma of the parameter, None where it was held fixed; the whole is None
-            when no covariance was computed.
+            when none was computed.
+        covariance: of all parameters together; None when none was computed.
+        residual: what corrects the lens before the intrinsics are applied, one entry a width; None: nothing. A camera
+            with it is a `HybridCamera`, and means nothing without it: weights and parameters share one file, so that
+            they cannot be mixed up.
         valid_region: where the lens is valid; None if whoever wrote the file did not say.
         calibration: how the camera was calibrated, if it was.
 
@@ -162,6 +195,8 @@ class CameraFile(NativeFile):
     intrinsics: Intrinsics
     coefficients: dict[str, float]
     standard_deviations: dict[str, pydantic.NonNegativeFloat | None] | None = None
+    covariance: CovarianceRecord | None = None
+    residual: tuple[FieldScaleRecord, ...] | None = None
     valid_region: ValidRegion | None = None
     calibration: CameraCalibration | None = None
 
@@ -179,10 +214,68 @@ class CameraFile(NativeFile):
             raise ValueError(f"{what}; the lens model needs exactly {', '.join(names) or 'nothing'}")
         return {name: value[name] for name in names}
 
+    @pydantic.field_validator("covariance")
+    @classmethod
+    def _of_model(cls, value: CovarianceRecord | None, info: pydantic.ValidationInfo) -> CovarianceRecord | None:
+        if value is None or "model" not in info.data:
+            return value
+        names = (*INTRINSICS, *info.data["model"].model().names)
+        unknown = [name for name in value.names if name not in names]
+        if unknown:
+            raise ValueError(f"covariance: {unknown[0]} is unknown; the lens model has {', '.join(names)}")
+        return value
+
+    def covariance_matrix(self) -> torch.Tensor | None:
+        """(5 + P, 5 + P) in the order of `Camera.names`, zero for what is exact; None if the file has no covariance."""
+        if self.covariance is None:
+            return None
+        return self.covariance.expand((*INTRINSICS, *self.coefficients))
+
     def camera(self) -> Camera:
         """The camera, equal to the stored one to the last bit."""
         values = [*(getattr(self.intrinsics, name) for name in INTRINSICS), *self.coefficients.values()]
-        return Camera(torch.tensor(values, dtype=torch.float64), size=self.image_size, model=self.model.model())
+        parameters, model = torch.tensor(values, dtype=torch.float64), self.model.model()
+        if self.residual is None:
+            return Camera(parameters, size=self.image_size, model=model)
+        grid = FieldGrid(scales=tuple(part.scale() for part in self.residual))
+        weights = [[value for part in self.residual for value in getattr(part, way)] for way in ("along_x", "along_y")]
+        residual = FieldResidual(grid, torch.tensor(weights, dtype=torch.float64))
+        return HybridCamera(parameters, size=self.image_size, model=model, residual=residual)
+
+    @pydantic.model_serializer(mode="wrap")
+    def _without_empty_residual(self, plain: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Files of parametric cameras stay as they were before there was a residual.
+        stored: dict[str, Any] = plain(self)
+        if stored["residual"] is None:
+            del stored["residual"]
+        return stored
+
+    @pydantic.model_validator(mode="after")
+    def _invertible(self) -> CameraFile:
+        if self.residual is not None:
+            try:
+                self.camera()
+            except InputError as error:
+                raise ValueError(str(error)) from error
+        return self
+
+
+def _residual(field: Field | None) -> tuple[FieldScaleRecord, ...] | None:
+    """A residual field as it is stored."""
+    if field is None:
+        return None
+    return tuple(
+        FieldScaleRecord(
+            width=scale.width,
+            left=scale.left,
+            top=scale.top,
+            columns=scale.columns,
+            rows=scale.rows,
+            along_x=tuple(weights[0].flatten().tolist()),
+            along_y=tuple(weights[1].flatten().tolist()),
+        )
+        for scale, weights in zip(field.grid.scales, field.grid.scale_weights(field.weights.detach()), strict=True)
+    )
 
 
 def provenance() -> dict[str, Any]:
@@ -203,6 +296,7 @@ def camera_to_file(
     *,
     name: str = "",
     standard_deviations: Mapping[str, float | None] | None = None,
+    covariance: torch.Tensor | None = None,
     calibration: CameraCalibration | None = None,
 ) -> CameraFile:
     """Put a camera in the form in which it is stored.
@@ -211,10 +305,12 @@ def camera_to_file(
         camera: a single camera, not a batch.
         name: free text that tells cameras apart.
         standard_deviations: parameter name -> one sigma; names left out, and None, stand for parameters held fixed.
+        covariance: (5 + P, 5 + P) in the order of `Camera.names`; parameters whose variance is zero are held fixed.
         calibration: how the camera was calibrated.
 
     Raises:
-        InputError: a batch of cameras, a parameter that is not finite, or a name that the camera does not have.
+        InputError: a batch of cameras, a parameter that is not finite, a name that the camera does not have, or a
+            matrix that is no covariance of its parameters.
 
     Example:
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
@@ -229,6 +325,10 @@ def camera_to_file(
         if unknown:
             raise InputError(f"standard deviation of {unknown[0]!r}: the camera has {', '.join(camera.names)}")
         standard_deviations = {key: standard_deviations.get(key) for key in camera.names}
+    if covariance is not None and tuple(covariance.shape) != (len(camera.names),) * 2:
+        raise InputError(
+            f"covariance: this camera has {len(camera.names)} parameters, got shape {tuple(covariance.shape)}"
+        )
     stored = dict(zip(camera.names, values.tolist(), strict=True))
     model = camera.model
     try:
@@ -246,6 +346,8 @@ def camera_to_file(
             intrinsics=Intrinsics(**{key: stored[key] for key in INTRINSICS}),
             coefficients={key: stored[key] for key in model.names},
             standard_deviations=standard_deviations,
+            covariance=None if covariance is None else CovarianceRecord.of(covariance.detach(), camera.names),
+            residual=_residual(camera.field),
             valid_region=ValidRegion(
                 radius=float(camera.valid_radius),
                 polygon=tuple((round(u, 3), round(v, 3)) for u, v in camera.valid_polygon().tolist()),

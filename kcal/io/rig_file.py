@@ -16,7 +16,9 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.files import NativeFile
-from kcal.io.camera_file import CameraFile, Exclusion, Record, camera_to_file
+from kcal.io.camera_file import CameraFile, Exclusion, camera_to_file
+from kcal.io.record import Record
+from kcal.lens.projection import INTRINSICS
 from kcal.lens.rig import StereoRig
 
 Triple = tuple[float, float, float]
@@ -42,6 +44,59 @@ class RigPose(Record):
         return torch.tensor(self.rotation, dtype=torch.float64)
 
 
+Matrix = tuple[tuple[float, ...], ...]
+
+
+def _matrix(value: Matrix, size: int, what: str) -> Tensor:
+    if len(value) != size or any(len(row) != size for row in value):
+        raise ValueError(f"{what} must be {size} x {size}")
+    matrix = torch.tensor(value, dtype=torch.float64)
+    scale = matrix.diagonal().clamp_min(0.0).sqrt()
+    unit = matrix / torch.where(scale > 0, scale, 1.0)[:, None] / torch.where(scale > 0, scale, 1.0)
+    if not torch.allclose(unit, unit.T, atol=1e-9) or float(torch.linalg.eigvalsh(unit)[0]) < -1e-9 * size:
+        raise ValueError(f"{what} is no covariance: it must be symmetric without negative eigenvalues")
+    return matrix
+
+
+class RigMounting(Record):
+    """Where the left camera stands on the Earth and where it looks.
+
+    Args:
+        lat: of its projection centre, degrees (WGS84).
+        lon: degrees.
+        height: metres above the ellipsoid.
+        heading_deg: of its axis, clockwise from true north.
+        pitch_deg: of its axis, positive up.
+        roll_deg: clockwise as seen from behind.
+        covariance: (6, 6) of east, north, up of the centre (metres) and of turns about these axes (radians).
+    """
+
+    lat: float = pydantic.Field(ge=-90, le=90)
+    lon: float = pydantic.Field(ge=-180, le=180)
+    height: float
+    heading_deg: float
+    pitch_deg: float = pydantic.Field(ge=-90, le=90)
+    roll_deg: float
+    covariance: Matrix | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _square(self) -> RigMounting:
+        if self.covariance is not None:
+            _matrix(self.covariance, 6, "the mounting's covariance")
+        return self
+
+
+class RigSource(Record):
+    """One kind of data that a rig was solved from; see `kcal.calibrate.rig_result.SourceResidual`."""
+
+    name: str
+    used: pydantic.NonNegativeInt
+    left_out: pydantic.NonNegativeInt
+    rms_px: pydantic.NonNegativeFloat | None = None
+    rms_m: pydantic.NonNegativeFloat | None = None
+    sigmas: pydantic.NonNegativeFloat | None = None
+
+
 class RigCalibration(Record):
     """How a rig was solved.
 
@@ -52,7 +107,9 @@ class RigCalibration(Record):
         pairs: how many pairs of views were used.
         per_pair_rms: pair name -> RMS in pixels, for the pairs used.
         flipped: pairs in which one camera's corner order had to be turned by 180°.
-        excluded: pairs left out, with the reason.
+        excluded: pairs, landmarks and matches left out, with the reason.
+        sources: what the rig was solved from, where that is more than boards.
+        relocked: when only the cameras' attitudes were solved again, and from what.
         baseline_m: distance between the cameras' centres, metres; must be the length of the translation.
         frame: what the rig's frame is.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
@@ -62,10 +119,12 @@ class RigCalibration(Record):
     rms: pydantic.NonNegativeFloat
     rms_left: pydantic.NonNegativeFloat
     rms_right: pydantic.NonNegativeFloat
-    pairs: pydantic.PositiveInt
+    pairs: pydantic.NonNegativeInt
     per_pair_rms: dict[str, pydantic.NonNegativeFloat]
     flipped: tuple[str, ...] = ()
     excluded: tuple[Exclusion, ...] = ()
+    sources: tuple[RigSource, ...] = ()
+    relocked: str | None = None
     baseline_m: pydantic.PositiveFloat
     frame: Literal["left camera"] = "left camera"
     kcal_version: str
@@ -85,6 +144,9 @@ class RigFile(NativeFile):
         left: the first camera, whole; its frame is the rig's.
         right: the second camera, whole.
         right_from_left: where the right camera stands.
+        covariance: of both cameras' parameters and the relative pose together, in the order of
+            `kcal.locate.errors.RigCovariance`; what was held has zeros.
+        mounting: where the rig stands on the Earth, if that was solved.
         calibration: how the rig was solved, if it was.
 
     Example:
@@ -101,15 +163,24 @@ class RigFile(NativeFile):
     left: CameraFile
     right: CameraFile
     right_from_left: RigPose
+    covariance: Matrix | None = None
+    mounting: RigMounting | None = None
     calibration: RigCalibration | None = None
 
     @pydantic.model_validator(mode="after")
     def _measured(self) -> RigFile:
+        if self.covariance is not None:
+            counts = (len(self.left.coefficients), len(self.right.coefficients))
+            _matrix(self.covariance, sum(counts) + 2 * len(INTRINSICS) + 6, "the rig's covariance")
         length = math.hypot(*self.right_from_left.translation)
         # A thousandth of a millimetre in a metre: more is not rounding but another rig.
         if self.calibration and not math.isclose(self.calibration.baseline_m, length, rel_tol=1e-6):
             raise ValueError(f"baseline_m is {self.calibration.baseline_m:g}, but the translation is {length:g} m long")
         return self
+
+    def joint_covariance(self) -> Tensor | None:
+        """The stored covariance, float64."""
+        return None if self.covariance is None else torch.tensor(self.covariance, dtype=torch.float64)
 
     def rig(self) -> StereoRig:
         """The rig, equal to the stored one to the last bit."""
@@ -123,6 +194,8 @@ def rig_to_file(
     *,
     left: CameraFile | None = None,
     right: CameraFile | None = None,
+    covariance: Tensor | None = None,
+    mounting: RigMounting | None = None,
     calibration: RigCalibration | None = None,
 ) -> RigFile:
     """Put a rig in the form in which it is stored.
@@ -131,6 +204,8 @@ def rig_to_file(
         rig: the rig.
         left: the left camera's file, to keep its name, error bars and record; it must hold the same camera.
         right: likewise for the right camera.
+        covariance: see `RigFile`.
+        mounting: see `RigFile`.
         calibration: how the rig was solved.
 
     Raises:
@@ -156,6 +231,8 @@ def rig_to_file(
                     "translation": rig.right_from_left_translation.tolist(),
                 }
             ),
+            covariance=None if covariance is None else tuple(map(tuple, covariance.tolist())),
+            mounting=mounting,
             calibration=calibration,
         )
     except pydantic.ValidationError as error:

@@ -10,16 +10,17 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, require_finite
+from kcal.checks import as_points, keep_float64, require_finite
 from kcal.errors import InputError
 from kcal.lens.distortion import distort_components
 from kcal.lens.eager import finite_or, in_chunks, is_differentiated, known_true, separate
-from kcal.lens.inverse import Inverse, prepare_inverse, undistort_components
+from kcal.lens.inverse import Inverse, InverseStart, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
 from kcal.lens.outline import area, image_outline
 from kcal.lens.plane import plane_from_points, rays_from_plane
 from kcal.lens.projection import INTRINSICS, from_pixels, parameter_names, to_pixels
 from kcal.lens.region import Region, in_region, surely_in_region
+from kcal.lens.residual import Field
 
 
 class Camera(nn.Module):
@@ -164,6 +165,15 @@ class Camera(nn.Module):
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     @property
+    def field(self) -> Field | None:
+        """What corrects the lens before the intrinsics; None, unless the camera is a `HybridCamera`."""
+        return None
+
+    def with_parameters(self, parameters: Tensor) -> Camera:
+        """A camera of the same kind, size and model with other parameters; nothing is shared."""
+        return Camera(parameters, size=self.size, model=self.model)
+
+    @property
     def valid_region(self) -> Region:
         """Where the lens is valid, on the plane z = 1 (for a fisheye, on the plane of angles)."""
         return Region(self.valid_radius, self.valid_edge)
@@ -179,7 +189,7 @@ class Camera(nn.Module):
         """
         if self.parameters_vector.ndim != 1:
             raise InputError(f"one camera has one polygon, this is a batch of {tuple(self.valid_radius.shape)}")
-        return image_outline(self.parameters_vector.detach(), self.model, self.valid_region, self.size)
+        return image_outline(self._to_sensor, self.parameters_vector.detach(), self.model, self.valid_region, self.size)
 
     def _measure(self) -> dict[str, Tensor]:
         with torch.no_grad():
@@ -187,8 +197,8 @@ class Camera(nn.Module):
             width, height = self.size
             corners = values.new_tensor([[-0.5, -0.5], [width, -0.5], [-0.5, height], [width, height]])
             x, y = from_pixels(corners[:, 0], corners[:, 1], values)
-            region, start = prepare_inverse(values[..., 5:], self.model, torch.hypot(x, y).amax(-1))
-        return {"valid_radius": region.radius, "valid_edge": region.edge, "inverse_start": start}
+            ready = prepare_inverse(values[..., 5:], self.model, torch.hypot(x, y).amax(-1))
+        return {"valid_radius": ready.region.radius, "valid_edge": ready.region.edge, "inverse_start": ready.start}
 
     def update_valid_region(self) -> None:
         """Measure the valid region again; call it after changing parameters in place."""
@@ -227,7 +237,7 @@ class Camera(nn.Module):
                 with torch.no_grad():
                     known = None if differentiated else lens
                     valid = valid & in_region(x, y, coefficients, self.model, self.valid_region, known)
-            pixels = torch.stack(to_pixels(lens.x, lens.y, values), -1)
+            pixels = torch.stack(self._to_sensor(lens.x, lens.y, values), -1)
             return pixels if all_valid and settled else torch.where(valid[..., None], pixels, center), valid
 
         return self._in_chunks(one, points)
@@ -245,29 +255,39 @@ class Camera(nn.Module):
             return sure, True
         return usable & self.valid_region.encloses(x, y), False
 
+    def _to_sensor(self, x: Tensor, y: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Distorted coordinates (..., N) to pixels; a camera that corrects its lens does so here."""
+        return to_pixels(x, y, values)
+
+    def _from_sensor(self, u: Tensor, v: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """The inverse, and (..., N) whether it was found; None: always."""
+        return *from_pixels(u, v, values), None
+
     def _in_chunks(self, function: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor) -> tuple[Tensor, Tensor]:
-        differentiated = is_differentiated(points, self.parameters_vector)
+        differentiated = is_differentiated(points, *self.parameters())
         return in_chunks(function, points, self.valid_radius.numel(), differentiated=differentiated)
 
-    def _to_plane(self, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _to_plane(self, pixels: Tensor, start: InverseStart | None) -> tuple[Tensor, Tensor, Tensor]:
         """Pixels (..., N, 2) to x, y on the plane of the lens, and valid; every one is (..., N)."""
         values = self.values
         cx, cy = values[..., 2, None], values[..., 3, None]
         u, v = separate(pixels)
         u, v, finite = finite_or(u, v, cx, cy)
-        x, y = from_pixels(u, v, values)
-        ready = Inverse(self.valid_region, self.inverse_start)
-        return undistort_components(x, y, finite, values[..., 5:], self.model, ready)
+        x, y, settled = self._from_sensor(u, v, values)
+        usable = finite if settled is None else finite & settled
+        ready = Inverse(self.valid_region, self.inverse_start, start)
+        return undistort_components(x, y, usable, values[..., 5:], self.model, ready)
 
-    def normalize(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def normalize(self, pixels: Tensor, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
         """Map pixels to undistorted coordinates on the plane z = 1: (normalized (..., N, 2), valid (..., N)).
 
-        Pixels of a fisheye that look 89° or more off axis have no such coordinates and are not valid.
+        Pixels of a fisheye that look 89° or more off axis have no such coordinates and are not valid. `start` as in
+        `unproject`.
         """
         pixels = as_points("pixels", pixels, 2)
 
         def one(pixels: Tensor) -> tuple[Tensor, Tensor]:
-            x, y, valid = self._to_plane(pixels)
+            x, y, valid = self._to_plane(pixels, start)
             if self.model.fisheye:
                 X, Y, Z = rays_from_plane(x, y, self.model)
                 valid = valid & (math.cos(math.radians(89.0)) < Z)
@@ -276,11 +296,13 @@ class Camera(nn.Module):
 
         return self._in_chunks(one, pixels)
 
-    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def unproject(self, pixels: Tensor, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
         """Map pixels to rays.
 
         Args:
             pixels: (..., N, 2); any real position, also outside the image.
+            start: where Newton's method begins, instead of the start in closed form (`InverseNet.guess`). It decides
+                about time only, never about rays and mask.
 
         Returns:
             rays (..., N, 3) of length one, and valid (..., N). A pixel that the lens model cannot have produced, or
@@ -290,7 +312,7 @@ class Camera(nn.Module):
         pixels = as_points("pixels", pixels, 2)
 
         def one(pixels: Tensor) -> tuple[Tensor, Tensor]:
-            x, y, valid = self._to_plane(pixels)
+            x, y, valid = self._to_plane(pixels, start)
             return torch.stack(rays_from_plane(x, y, self.model), -1), valid
 
         return self._in_chunks(one, pixels)
@@ -335,13 +357,3 @@ class Camera(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         return super()._apply(keep_float64(fn), recurse)
-
-
-def keep_float64(fn: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-    """Let `.to`, `.half`, `.float` move float64 tensors between devices without rounding them."""
-
-    def moved(tensor: Tensor) -> Tensor:
-        result = fn(tensor)
-        return tensor.to(result.device) if tensor.dtype == torch.float64 else result
-
-    return moved

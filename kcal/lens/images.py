@@ -169,7 +169,7 @@ class Undistort(nn.Module):
 
     def _maps(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         cameras = (self.camera, self.new_camera)
-        live = torch.is_grad_enabled() and any(c.parameters_vector.requires_grad for c in cameras)
+        live = torch.is_grad_enabled() and any(p.requires_grad for c in cameras for p in c.parameters())
         compiling = torch.compiler.is_compiling()
         if live or (compiling and self.grid_x.dtype != precision):
             return self._grid(precision)

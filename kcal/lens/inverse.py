@@ -7,6 +7,7 @@ the same number of steps, and what has not arrived by then is flagged.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -20,7 +21,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.region import Region, in_region, valid_radius, valid_region
 from kcal.lens.start import fit_start, start_from, without_tilt
 
-__all__ = ["Inverse", "prepare_inverse", "undistort", "undistort_components", "valid_radius"]
+__all__ = ["Inverse", "InverseStart", "prepare_inverse", "undistort", "undistort_components", "valid_radius"]
 
 # Residual in normalized coordinates: 1e-13 is 2e-10 px at f = 2000 px, just above rounding.
 TOLERANCE = 1e-13
@@ -32,11 +33,20 @@ _FIXED = 6
 _CLOSE, _LAST = 1e-4, 1e-11
 
 
+# Distorted coordinates x, y (..., N) to a first guess of the undistorted ones.
+InverseStart = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
 class Inverse(NamedTuple):
-    """What is measured once a lens: where it is valid, and where Newton starts."""
+    """What is known of a lens beforehand: where it is valid, and where Newton starts.
+
+    `guess` stands in for the start of `kcal.lens.start`. However bad it is, it costs time and no more: what Newton
+    does not bring home from there is begun anew.
+    """
 
     region: Region
     start: Tensor
+    guess: InverseStart | None = None
 
 
 def prepare_inverse(coefficients: Tensor, model: LensModel, reach: Tensor | None = None) -> Inverse:
@@ -138,7 +148,7 @@ def _solve_eagerly(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Plain Newton for all, and the safeguarded solver for those that it does not bring home."""
     goal_x, goal_y, own, rest = without_tilt(target_x, target_y, coefficients, model)
-    x, y = start_from(goal_x, goal_y, rest, ready.start)
+    x, y = start_from(goal_x, goal_y, rest, ready.start) if ready.guess is None else ready.guess(target_x, target_y)
     lens = distort_components(x, y, own, rest)
     close = last = False
     for _ in range(_MOST):
@@ -168,7 +178,7 @@ def _solve_in_fixed_steps(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The same steps for every point. What strays, beside a fold or without a preimage, fails the last check."""
     goal_x, goal_y, own, rest = without_tilt(target_x, target_y, coefficients, model)
-    x, y = start_from(goal_x, goal_y, rest, ready.start)
+    x, y = start_from(goal_x, goal_y, rest, ready.start) if ready.guess is None else ready.guess(target_x, target_y)
     for _ in range(_FIXED):
         x, y = _newton_step(x, y, goal_x, goal_y, own, rest)
     lens = distort_components(x, y, coefficients, model, slopes=not model.radial)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from kcal.lens.camera import Camera
+from kcal.lens.inverse_net import InverseNet
 
 
 class Unproject(nn.Module):
@@ -16,8 +17,11 @@ class Unproject(nn.Module):
     Compiled and exported graphs take a fixed number of Newton steps for every point: what has not arrived by
     then, beside a fold, is flagged as not valid. An eager call goes on until it knows.
 
+    `kcal.io.onnx_file.save_onnx` writes it, and every other module of points, as ONNX.
+
     Args:
         camera: the camera, kept as a submodule.
+        start: a trained inverse net whose guess Newton's method starts from; it never changes the answer.
 
     Example:
         >>> import torch
@@ -27,10 +31,11 @@ class Unproject(nn.Module):
         ([[0.0, 0.0, 1.0]], [True])
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, start: InverseNet | None = None) -> None:
         super().__init__()
         self.camera = camera
+        self.start = start
 
     def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (..., N, 2) -> rays (..., N, 3) of length one, valid (..., N)."""
-        return self.camera.unproject(pixels)
+        return self.camera.unproject(pixels, start=None if self.start is None else self.start.guess)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from kcal.lens.distortion import distort_components
 from kcal.lens.model import LensModel
-from kcal.lens.projection import INTRINSICS, to_pixels
+from kcal.lens.projection import INTRINSICS
 from kcal.lens.region import Region
 
 _COUNT = 256
@@ -15,11 +17,25 @@ _COUNT = 256
 _INSIDE = 1.0 - 1e-6
 
 
-def image_outline(parameters: Tensor, model: LensModel, region: Region, size: tuple[int, int]) -> Tensor:
-    """The part of the image (width, height) that the region is mapped to: a polygon (V, 2) of pixels."""
+def image_outline(
+    to_sensor: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
+    parameters: Tensor,
+    model: LensModel,
+    region: Region,
+    size: tuple[int, int],
+) -> Tensor:
+    """The part of the image (width, height) that the region is mapped to: a polygon (V, 2) of pixels.
+
+    Args:
+        to_sensor: distorted coordinates x, y (N,) and the parameters to pixels u, v.
+        parameters: (5 + P,) of one camera.
+        model: its lens model.
+        region: where its lens is valid.
+        size: of the image.
+    """
     x, y = (region.outline(_COUNT) * _INSIDE).unbind(-1)
     lens = distort_components(x, y, parameters[len(INTRINSICS) :], model, slopes=False)
-    polygon = torch.stack(to_pixels(lens.x, lens.y, parameters), -1)
+    polygon = torch.stack(to_sensor(lens.x, lens.y, parameters), -1)
     return clip_to_image(polygon, size) if bool(region.radius > 0) else polygon[:0]
 
 

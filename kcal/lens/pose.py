@@ -45,11 +45,6 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
     return u @ vh
 
 
-def move(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
-    """Apply steps (..., 6) to rotations (..., 3, 3) and translations (..., 3)."""
-    return rotation_from_vector(step[..., :3]) @ rotation, translation + step[..., 3:]
-
-
 def step_rows(by_point: Tensor, rotated: Tensor) -> Tensor:
     """Derivatives by the six numbers of a step, from derivatives by the moved point.
 
@@ -64,3 +59,16 @@ def step_rows(by_point: Tensor, rotated: Tensor) -> Tensor:
     by_x, by_y, by_z = by_point.unbind(-3)
     turned = torch.stack([by_z * y - by_y * z, by_x * z - by_z * x, by_y * x - by_x * y], -3)
     return torch.cat([turned, by_point], -3)
+
+
+def side_axes(rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Two directions that make an orthonormal frame with unit rays (..., N, 3), smooth but for a ray turning back.
+
+    Source: Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017).
+    """
+    x, y, z = rays.unbind(-1)
+    sign = torch.where(z >= 0, 1.0, -1.0).to(z.dtype)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = torch.stack([1.0 + sign * x * x * a, sign * b, -sign * x], -1)
+    return first, torch.stack([b, sign + y * y * a, -y], -1)

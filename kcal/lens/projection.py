@@ -4,8 +4,8 @@ Camera parameters are one vector (..., 5 + P): fx, fy, cx, cy, skew, then the le
 
     x = X / Z, y = Y / Z;  (x_D, y_D) = distortion(x, y);  u = fx x_D + skew y_D + cx,  v = fy y_D + cy
 
-(Eq. 1 to 4 of the paper). Skew is γ of Eq. 3; `cv2.fisheye` stores it as alpha = skew / fx. A fisheye replaces the
-first step (`kcal.lens.plane`).
+(Eq. 1 to 4 of the paper). A residual field (`kcal.lens.residual`) moves (x_D, y_D) before the last step. Skew is γ of
+Eq. 3; `cv2.fisheye` stores it as alpha = skew / fx. A fisheye replaces the first step (`kcal.lens.plane`).
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.distortion import distort_components, unbind_last
+from kcal.lens.distortion import Distorted, distort_components, unbind_last
 from kcal.lens.model import LensModel
 from kcal.lens.plane import plane_with_slopes
+from kcal.lens.residual import Field, correct_components
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "skew")
 
@@ -59,7 +60,11 @@ def from_pixels(u: Tensor, v: Tensor, parameters: Tensor) -> tuple[Tensor, Tenso
 
 
 def project_components(
-    points: Tensor, parameters: Tensor, model: LensModel, wanted: Sequence[int] | None = None
+    points: Tensor,
+    parameters: Tensor,
+    model: LensModel,
+    wanted: Sequence[int] | None = None,
+    field: Field | None = None,
 ) -> Projection:
     """Project points given as (..., 3, N), with derivatives by the point and the wanted camera parameters.
 
@@ -69,6 +74,7 @@ def project_components(
         model: the lens model.
         wanted: indices of camera parameters for `by_camera`; None: no derivative at all is formed, and `by_point`
             and `by_camera` are empty.
+        field: what corrects the lens, or None.
     """
     X, Y, Z = points[..., 0, :], points[..., 1, :], points[..., 2, :]
     x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(X, Y, Z, model)
@@ -76,8 +82,11 @@ def project_components(
     lens_wanted = [i - offset for i in wanted or () if i >= offset]
     lens = distort_components(x, y, parameters[..., offset:], model, lens_wanted)
     fx, fy, _, _, skew = unbind_last(parameters[..., :offset])
-    pixels = torch.stack(to_pixels(lens.x, lens.y, parameters), -2)
     regular = lens.positive & (lens.determinant > 0)
+    if field is not None:
+        # One-to-one by itself, so that it neither folds nor mends what is folded.
+        lens = _corrected(lens, field)
+    pixels = torch.stack(to_pixels(lens.x, lens.y, parameters), -2)
     if not model.fisheye:
         regular = regular & (Z > 0)
     if wanted is None:
@@ -111,3 +120,16 @@ def project_components(
     else:
         by_camera = pixels.new_zeros((*pixels.shape[:-2], 0, *pixels.shape[-2:]))
     return Projection(pixels, by_point, by_camera, regular)
+
+
+def _corrected(lens: Distorted, field: Field) -> Distorted:
+    """The lens followed by the residual: positions, and derivatives by the chain rule."""
+    moved = correct_components(lens.x, lens.y, field)
+    p, q, r, t = moved.point
+    a, b, d, e = lens.point
+    return lens._replace(
+        x=moved.x,
+        y=moved.y,
+        point=(p * a + q * d, p * b + q * e, r * a + t * d, r * b + t * e),
+        coefficients=[(p * du + q * dv, r * du + t * dv) for du, dv in lens.coefficients],
+    )

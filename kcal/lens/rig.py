@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, require_finite
+from kcal.checks import as_points, keep_float64, require_finite
 from kcal.errors import InputError
-from kcal.lens.camera import Camera, keep_float64
+from kcal.lens.camera import Camera
 
 
 class StereoRig(nn.Module):

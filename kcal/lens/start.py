@@ -48,7 +48,9 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = DE
         middle = 0.5 * (low + high)
         beyond = distorted(middle) > 1.1 * wanted
         low, high = torch.where(beyond, low, middle), torch.where(beyond, middle, high)
-    radius = high * torch.linspace(1.0 / _NODES, 1.0, _NODES, dtype=torch.float64, device=own.device)
+    # Evenly in angle: of a wide lens, equal steps on the plane would nearly all lie at its rim.
+    steps = torch.linspace(1.0 / _NODES, 1.0, _NODES, dtype=torch.float64, device=own.device)
+    radius = high * steps if model.fisheye else torch.tan(torch.atan(high) * steps)
     values = distorted(radius)
     largest = values[..., -1:] ** 2
     variable = 2.0 * torch.sqrt(torch.clamp(1.0 - values * values / largest, min=0.0)) - 1.0

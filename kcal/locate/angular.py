@@ -19,6 +19,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.eager import CHUNK, is_differentiated, is_traced, known_true
+from kcal.lens.pose import side_axes
 
 # Sine of the angle between a ray and the baseline: below, both rays meet everywhere on the line through the cameras.
 _EPIPOLE = 1e-9
@@ -166,19 +167,6 @@ def checked_views(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]
             f"rays: shape (..., N, {cam_from_world.shape[-3]}, 3) is needed to fit the cameras, got {tuple(rays.shape)}"
         )
     return cam_from_world, rays
-
-
-def side_axes(rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Two directions that make an orthonormal frame with unit rays (..., N, 3), smooth but for a ray turning back.
-
-    Source: Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017).
-    """
-    x, y, z = rays.unbind(-1)
-    sign = torch.where(z >= 0, 1.0, -1.0).to(z.dtype)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    first = torch.stack([1.0 + sign * x * x * a, sign * b, -sign * x], -1)
-    return first, torch.stack([b, sign + y * y * a, -y], -1)
 
 
 def _several(world: list[Tensor], shifts: Tensor) -> tuple[Tensor, Tensor]:

@@ -39,7 +39,7 @@ class RigCovariance:
 
     The order is: the parameters of the left camera as in `Camera.names`, those of the right one, the rotation of
     right_from_left (3 radians: a rotation vector about the right camera's axes, `exp([ω]x) R`), its translation
-    (3 metres), as in `kcal.lens.pose.move` and in `RigCalibrationResult`.
+    (3 metres), as in `kcal.lens.pose` and in `RigCalibrationResult`.
 
     Args:
         matrix: (P, P) float64, P = the two cameras' parameters + 6.

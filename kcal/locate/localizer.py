@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points
+from kcal.checks import as_points, keep_float64
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import keep_float64
 from kcal.lens.eager import CHUNK, is_differentiated, is_traced, known_true
 from kcal.lens.rig import StereoRig
 from kcal.locate.ellipsoid import mean_radius

@@ -23,9 +23,8 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.eager import known_true
-from kcal.lens.pose import step_rows
+from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection, project_components
-from kcal.locate.angular import side_axes
 
 _STEPS = 5
 # The derivative of the optimum comes from this many steps with a fixed matrix; each leaves a share of about the
@@ -172,7 +171,9 @@ def _evaluate(setting: _Setting, theta: Tensor) -> _At:
         if not known_true(good):
             # The axis is a harmless stand-in: no NaN in values or gradients.
             seen = torch.where(good[..., None, :], seen, seen.new_tensor([[0.0], [0.0], [1.0]]))
-        projection = project_components(seen, sight.camera.values, sight.camera.model, setting.wanted[number])
+        projection = project_components(
+            seen, sight.camera.values, sight.camera.model, setting.wanted[number], sight.camera.field
+        )
         columns = torch.stack([along, across, shift[:, None].expand_as(along)], -3)
         # (..., 3 unknowns, 3 of the point, 2, N) summed over the point.
         rows.append((columns[..., None, :] * projection.by_point[..., None, :, :, :]).sum(-3))
@@ -233,7 +234,7 @@ def _finish(at: _At, theta: Tensor, setting: _Setting, usable: Tensor) -> Fit:
 def by_pose(fit: Fit, number: int) -> Tensor:
     """Derivatives (..., 6, 2, N) of the predicted pixels of a camera by a step of its pose: rotation, translation.
 
-    The step is that of `kcal.lens.pose.move`: a rotation vector (radians) from the left and an added translation
+    The step is that of `kcal.lens.pose`: a rotation vector (radians) from the left and an added translation
     (in units of `scale`, as the inverse distance is).
     """
     rows = step_rows(fit.projections[number].by_point, fit.turned[number])

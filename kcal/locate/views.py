@@ -8,9 +8,9 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, require_finite
+from kcal.checks import as_points, keep_float64, require_finite
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera, keep_float64
+from kcal.lens.camera import Camera
 from kcal.lens.eager import is_differentiated
 from kcal.locate.angular import triangulate_angular
 from kcal.locate.refine import Fit, Sight, refine

@@ -10,7 +10,55 @@ from torch import Tensor
 
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
-from kcal.lens.camera import Camera
+
+
+class LensLike(Protocol):
+    """Anything that sees: a `Camera`, or a `TruthLens`."""
+
+    size: tuple[int, int]
+
+    @property
+    def focal(self) -> Tensor:
+        """(2,) focal lengths in pixels, at least roughly."""
+
+    def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (..., N, 2) of points (..., N, 3), and valid (..., N)."""
+
+    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Rays (..., N, 3) of pixels (..., N, 2), at infinity, and valid (..., N)."""
+
+    def inside(self, pixels: Tensor) -> Tensor:
+        """Whether pixels lie on the image."""
+
+
+class RigLike(Protocol):
+    """A `StereoRig`, or a `TrueRig`."""
+
+    @property
+    def left(self) -> LensLike:
+        """The first camera."""
+
+    @property
+    def right(self) -> LensLike:
+        """The second camera."""
+
+    @property
+    def right_from_left_rotation(self) -> Tensor:
+        """(3, 3)."""
+
+    @property
+    def right_from_left_translation(self) -> Tensor:
+        """(3,) metres."""
+
+    @property
+    def baseline(self) -> Tensor:
+        """Distance between the cameras, metres."""
+
+    def right_from_left(self, points_left: Tensor) -> Tensor:
+        """Move points (..., N, 3) from the left camera's frame into the right camera's."""
+
+    def __call__(self, points_left: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Project points (..., N, 3) of the left frame: pixels_left, pixels_right (..., N, 2), valid in both."""
 
 
 class BoardLike(Protocol):
@@ -94,11 +142,11 @@ def board_points(board: BoardLike, border: int = 0) -> Tensor:
     return torch.stack([x.reshape(-1), y.reshape(-1), torch.zeros(x.numel(), dtype=torch.float64)], -1) * board.square
 
 
-def project_board(camera: Camera, cam_from_board: tuple[Tensor, Tensor], board: BoardLike) -> tuple[Tensor, Tensor]:
+def project_board(camera: LensLike, cam_from_board: tuple[Tensor, Tensor], board: BoardLike) -> tuple[Tensor, Tensor]:
     """True pixels of the inner corners.
 
     Args:
-        camera: a single camera.
+        camera: a single camera, or a true lens.
         cam_from_board: rotation (3, 3) and translation (3,).
         board: its size.
 
@@ -109,6 +157,7 @@ def project_board(camera: Camera, cam_from_board: tuple[Tensor, Tensor], board: 
         InputError: a board or pose that cannot be.
 
     Example:
+        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
         >>> pose = BoardPose(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
         >>> pixels, visible = project_board(camera, pose, BoardSize(9, 6, 0.05))

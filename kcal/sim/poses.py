@@ -14,10 +14,8 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
-from kcal.sim.board import BoardLike, BoardPose, board_points
+from kcal.sim.board import BoardLike, BoardPose, LensLike, RigLike, board_points
 
 _DRAWS = 4096
 
@@ -51,7 +49,7 @@ class PoseOptions:
 
 
 def sample_board_poses(
-    camera: Camera,
+    camera: LensLike,
     board: BoardLike,
     count: int,
     generator: torch.Generator,
@@ -62,7 +60,7 @@ def sample_board_poses(
     """Poses for the calibration of one camera: over the whole image, at several distances, tilted in all directions.
 
     Args:
-        camera: a single camera.
+        camera: a single camera, or a true lens.
         board: its size.
         count: how many poses.
         generator: source of the draws; the same state gives the same poses.
@@ -76,6 +74,7 @@ def sample_board_poses(
         InputError: fewer than `count` of 4096 drawn boards are completely seen, or an argument out of range.
 
     Example:
+        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
         >>> from kcal.sim.board import BoardSize, project_board
         >>> board = BoardSize(9, 6, 0.025)
@@ -95,7 +94,7 @@ def sample_board_poses(
 
 
 def sample_pair_poses(
-    rig: StereoRig,
+    rig: RigLike,
     board: BoardLike,
     count: int,
     generator: torch.Generator,
@@ -120,7 +119,9 @@ def sample_pair_poses(
         InputError: fewer than `count` of 4096 drawn boards are completely seen by both, or an argument out of range.
 
     Example:
+        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
+        >>> from kcal.lens.rig import StereoRig
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> from kcal.sim.board import BoardSize, project_board
         >>> board = BoardSize(9, 6, 0.1)
@@ -137,7 +138,7 @@ def sample_pair_poses(
     return _choose(drawn, [(rig.left, *still), (rig.right, rotation, translation)], board, count, options)
 
 
-def rig_pose(rig: StereoRig, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
+def rig_pose(rig: RigLike, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
     """right_from_board of a board whose pose in the left camera is given."""
     rotation, translation = left_from_board
     return BoardPose(rig.right_from_left_rotation @ rotation, rig.right_from_left(translation))
@@ -160,7 +161,7 @@ class _Drawn:
 
 
 def _draw(
-    camera: Camera,
+    camera: LensLike,
     board: BoardLike,
     distance: tuple[float, float],
     eye: Tensor | None,
@@ -195,12 +196,41 @@ def _draw(
 
 
 def _choose(
-    drawn: _Drawn, cameras: list[tuple[Camera, Tensor, Tensor]], board: BoardLike, count: int, options: PoseOptions
+    drawn: _Drawn, cameras: list[tuple[LensLike, Tensor, Tensor]], board: BoardLike, count: int, options: PoseOptions
 ) -> list[BoardPose]:
     points = board_points(board, options.border)
-    points_rig = points @ drawn.rotation.transpose(-1, -2) + drawn.translation[:, None]
-    seen = torch.ones(_DRAWS, dtype=torch.bool)
-    features = [drawn.features]
+    columns = board.columns + 2 * options.border
+    # Most draws end here: the outermost four points are a few percent of the work.
+    seen, _ = _see(drawn, torch.arange(_DRAWS), cameras, points[[0, columns - 1, -columns, -1]], options)
+    index = seen.nonzero()[:, 0]
+    whole, places = _see(drawn, index, cameras, points, options)
+    index, places = index[whole], places[whole]
+    found = len(index)
+    if found < count:
+        raise InputError(
+            f"only {found} of {_DRAWS} drawn boards are completely seen and {count} are needed; "
+            "use a smaller board, another distance, less tilt or a smaller margin"
+        )
+    rotation, translation = drawn.rotation[index], drawn.translation[index]
+    chosen = [int(torch.linalg.vector_norm(places - places.mean(0), dim=-1).argmin())]
+    apart = torch.full((found,), math.inf, dtype=torch.float64)
+    while len(chosen) < count:
+        apart = torch.minimum(apart, torch.linalg.vector_norm(places - places[chosen[-1]], dim=-1))
+        chosen.append(int(apart.argmax()))
+    return [BoardPose(rotation[i].clone(), translation[i].clone()) for i in chosen]
+
+
+def _see(
+    drawn: _Drawn,
+    index: Tensor,
+    cameras: list[tuple[LensLike, Tensor, Tensor]],
+    points: Tensor,
+    options: PoseOptions,
+) -> tuple[Tensor, Tensor]:
+    """Which draws show all points to all cameras (D,), and where the draws lie among the others (D, F)."""
+    points_rig = points @ drawn.rotation[index].transpose(-1, -2) + drawn.translation[index][:, None]
+    seen = torch.ones(len(index), dtype=torch.bool)
+    features = [drawn.features[index]]
     for camera, rotation, translation in cameras:
         with torch.no_grad():
             pixels, valid = camera.project(points_rig @ rotation.T + translation)
@@ -209,20 +239,7 @@ def _choose(
         seen &= (valid & inside.all(-1)).all(-1)
         # The right camera adds nothing to the left one but the parallax.
         features.append(pixels.mean(1) / size / len(cameras))
-    found = int(seen.sum())
-    if found < count:
-        raise InputError(
-            f"only {found} of {_DRAWS} drawn boards are completely seen and {count} are needed; "
-            "use a smaller board, another distance, less tilt or a smaller margin"
-        )
-    rotation, translation = drawn.rotation[seen], drawn.translation[seen]
-    places = torch.cat(features, -1)[seen]
-    chosen = [int(torch.linalg.vector_norm(places - places.mean(0), dim=-1).argmin())]
-    apart = torch.full((found,), math.inf, dtype=torch.float64)
-    while len(chosen) < count:
-        apart = torch.minimum(apart, torch.linalg.vector_norm(places - places[chosen[-1]], dim=-1))
-        chosen.append(int(apart.argmax()))
-    return [BoardPose(rotation[i].clone(), translation[i].clone()) for i in chosen]
+    return seen, torch.cat(features, -1)
 
 
 def _turn_to(sight: Tensor) -> Tensor:

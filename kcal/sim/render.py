@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -17,7 +17,8 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.sim.board import BoardLike, BoardPose, area_colours, board_points, check_board, check_pose
-from kcal.sim.window import Window, grow, invert_window, pixel_axes
+from kcal.sim.rectangle import Window, grow, pixel_axes
+from kcal.sim.window import AnyLens, invert_window
 
 _FAR = 1e9  # squares: nothing is painted there
 _REACH = 0.625  # pixels from a pixel's centre to where its outermost samples end
@@ -36,6 +37,8 @@ class RenderOptions:
             0.13.
         noise: sigma of the sensor's noise in grey levels.
         vignetting: share of light lost in the image's corners.
+        gamma: of the camera: grey levels are 255 times the share of light to the power of 1 / gamma. Blur and
+            vignetting act on light, noise on grey levels.
 
     Raises:
         InputError: a value out of range.
@@ -48,6 +51,7 @@ class RenderOptions:
     blur: float = 0.7
     noise: float = 2.0
     vignetting: float = 0.15
+    gamma: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("black", "white", "background"):
@@ -56,12 +60,14 @@ class RenderOptions:
         for name, high in (("blur", 20.0), ("noise", 255.0), ("vignetting", 1.0)):
             if not 0 <= getattr(self, name) <= high:
                 raise InputError(f"render option {name}: a value from 0 to {high:g} is needed")
+        if not 0.2 <= self.gamma <= 5:
+            raise InputError("render option gamma: a value from 0.2 to 5 is needed")
         if not isinstance(self.margin, int) or not 1 <= self.margin <= 20:
             raise InputError("render option margin: a whole number of squares from 1 to 20 is needed")
 
 
 def render_board(
-    camera: Camera,
+    camera: AnyLens,
     cam_from_board: tuple[Tensor, Tensor],
     board: BoardLike,
     options: RenderOptions | None = None,
@@ -78,7 +84,7 @@ def render_board(
     corners to 0.001 px RMS.
 
     Args:
-        camera: a single camera.
+        camera: a single camera, or a true lens.
         cam_from_board: rotation (3, 3) and translation (3,) in metres.
         board: columns, rows and square.
         options: how the image looks.
@@ -110,7 +116,10 @@ def render_board(
 
 @torch.no_grad()
 def render_light(
-    camera: Camera, cam_from_board: tuple[Tensor, Tensor], board: BoardLike, options: RenderOptions | None = None
+    camera: AnyLens,
+    cam_from_board: tuple[Tensor, Tensor],
+    board: BoardLike,
+    options: RenderOptions | None = None,
 ) -> Tensor:
     """The image as it falls on the sensor, before noise and rounding: (height, width) float64 grey levels.
 
@@ -124,8 +133,8 @@ def render_light(
         >>> [round(value, 6) for value in light[60, 78:82].tolist()]  # an edge half way between columns 79 and 80
         [44.244125, 84.751421, 170.248754, 210.755908]
     """
-    options = options or RenderOptions()
-    if camera.parameters_vector.ndim != 1:
+    options = _in_light(options or RenderOptions())
+    if isinstance(camera, Camera) and camera.parameters_vector.ndim != 1:
         raise InputError("render_board: a single camera is needed, got a batch")
     check_board(board)
     pose = check_pose(cam_from_board)
@@ -141,10 +150,16 @@ def render_light(
     x, y = pixel_axes(Window(0, 0, width, height))
     x, y = x - (width - 1) / 2, y - (height - 1) / 2
     image *= 1 - options.vignetting * (x**2 + y[:, None] ** 2) / (x[-1] ** 2 + y[-1] ** 2)
-    return image
+    return image if options.gamma == 1 else 255 * (image.clamp_min(0) / 255) ** (1 / options.gamma)
 
 
-def _light(camera: Camera, pose: BoardPose, board: BoardLike, window: Window, options: RenderOptions) -> Tensor:
+def _in_light(options: RenderOptions) -> RenderOptions:
+    """The same levels as shares of light, times 255."""
+    levels = {name: 255 * (getattr(options, name) / 255) ** options.gamma for name in ("black", "white", "background")}
+    return options if options.gamma == 1 else replace(options, **levels)
+
+
+def _light(camera: AnyLens, pose: BoardPose, board: BoardLike, window: Window, options: RenderOptions) -> Tensor:
     """The scene in grey levels, before the optics: (2 height, 2 width), four samples in each pixel of a window.
 
     Along x and y, a sample is the average over half a pixel, and of two such averages a quarter of a pixel apart: what
@@ -192,18 +207,24 @@ def _paint(
     return around + (options.white - around) * paper - (options.white - options.black) * black
 
 
-def _board_coordinates(camera: Camera, pose: BoardPose, board: BoardLike, window: Window) -> tuple[Tensor, Tensor]:
+def _board_coordinates(camera: AnyLens, pose: BoardPose, board: BoardLike, window: Window) -> tuple[Tensor, Tensor]:
     """Where each pixel's ray meets the board's plane, x and y in squares; far away where it does not."""
-    normalized, valid = invert_window(camera, window)
-    x, y = normalized.unbind(-1)
+    looks, valid = invert_window(camera, window)
+    x, y, *origins = looks.unbind(-1)
     plane = torch.stack([pose.rotation[:, 0], pose.rotation[:, 1], pose.translation / board.square], -1)
-    a, b, depth = (row[0] * x + row[1] * y + row[2] for row in torch.linalg.inv(plane))
-    # depth is 1 / z of the meeting point: not positive for rays that leave the plane behind.
+    rows = torch.linalg.inv(plane)
+    a, b, depth = (row[0] * x + row[1] * y + row[2] for row in rows)
+    # depth is square / z of the meeting point: not positive for rays that leave the plane behind.
     unseen = ~valid | (depth <= 1e-12)
-    return (a / depth).masked_fill_(unseen, _FAR), (b / depth).masked_fill_(unseen, _FAR)
+    a, b = a / depth, b / depth
+    if origins:
+        # Lines that start beside the camera's origin: by where they start, and by what that takes of the way.
+        start_a, start_b, nearer = ((row[0] * origins[0] + row[1] * origins[1]) / board.square for row in rows)
+        a, b = start_a + a * (1 - nearer), start_b + b * (1 - nearer)
+    return a.masked_fill_(unseen, _FAR), b.masked_fill_(unseen, _FAR)
 
 
-def _paper_window(camera: Camera, pose: BoardPose, board: BoardLike, margin: int, radius: int) -> Window:
+def _paper_window(camera: AnyLens, pose: BoardPose, board: BoardLike, margin: int, radius: int) -> Window:
     """The part of the image that the paper and its blur reach; the whole image where that is uncertain."""
     outline = _outline(board, 1 + margin) @ pose.rotation.T + pose.translation
     if bool((outline[:, 2] <= 0).any()):

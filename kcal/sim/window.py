@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
+from kcal.sim.rectangle import Window, pixel_axes
+from kcal.sim.truth import TruthLens
+
+AnyLens = Camera | TruthLens
 
 _STEP = 8  # pixels at most between the places where the lens is inverted; cubic interpolation between them
 _STEPS = 50  # at least so many of them in a focal length
@@ -15,38 +17,18 @@ _FOLD = 6  # steps around a place without inverse that are inverted pixel by pix
 _CHUNK = 1 << 15  # pixels inverted at a time; more would leave the processor's cache
 
 
-class Window(NamedTuple):
-    """A rectangle of pixels; it may reach beyond the image."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-
-def pixel_axes(window: Window) -> tuple[Tensor, Tensor]:
-    """Positions x of every column (width,) and y of every row (height,), float64."""
-    x = window.left + torch.arange(window.width, dtype=torch.float64)
-    y = window.top + torch.arange(window.height, dtype=torch.float64)
-    return x, y
-
-
-def grow(window: Window, by: int) -> Window:
-    """The window with `by` more pixels on every side."""
-    return Window(window.left - by, window.top - by, window.width + 2 * by, window.height + 2 * by)
-
-
 @torch.no_grad()
-def invert_window(camera: Camera, window: Window) -> tuple[Tensor, Tensor]:
-    """Undistorted coordinates of every pixel of a window.
+def invert_window(lens: AnyLens, window: Window) -> tuple[Tensor, Tensor]:
+    """Where every pixel of a window looks.
 
-    The lens is inverted by `camera.normalize` at every eighth pixel (more densely if the focal length is below 400 px)
+    The lens is inverted at every eighth pixel (more densely if the focal length is below 400 px)
     and interpolated by cubic Lagrange polynomials, which errs by 2e-6 px for the demonstration's lenses and by 5e-4 px
     at most close to a fold (measured by projecting back); around places that the lens cannot have imaged, every pixel
     is inverted.
 
     Returns:
-        normalized (height, width, 2) and valid (height, width).
+        slopes x / z and y / z (height, width, 2), followed for a `TruthLens` by where the line of sight crosses the
+        plane z = 0 in metres (height, width, 4); and valid (height, width).
 
     Example:
         >>> camera = Camera.build(focal=(400, 400), center=(159.5, 119.5), size=(320, 240))
@@ -54,13 +36,13 @@ def invert_window(camera: Camera, window: Window) -> tuple[Tensor, Tensor]:
         >>> [round(value, 9) for value in normalized[0, 0].tolist()], bool(valid.all())
         ([-0.14875, -0.17375], True)
     """
-    step = min(_STEP, max(1, int(float(camera.focal.min()) / _STEPS)))
+    step = min(_STEP, max(1, int(float(lens.focal.min()) / _STEPS)))
     across, nodes_x = _lagrange(window.left, window.width, step)
     down, nodes_y = _lagrange(window.top, window.height, step)
     node_y, node_x = torch.meshgrid(nodes_y, nodes_x, indexing="ij")
-    nodes, valid_nodes = _normalize(camera, torch.stack([node_x, node_y], -1).reshape(-1, 2))
+    nodes, valid_nodes = _look(lens, torch.stack([node_x, node_y], -1).reshape(-1, 2))
     shape = (len(nodes_y), len(nodes_x))
-    normalized = torch.stack([down @ nodes[:, i].reshape(shape) @ across.T for i in (0, 1)], -1)
+    looks = torch.stack([down @ column.reshape(shape) @ across.T for column in nodes.unbind(-1)], -1)
 
     invalid = (~valid_nodes).reshape(1, 1, *shape).double()
     near = torch.nn.functional.max_pool2d(invalid, 2 * _FOLD + 1, stride=1, padding=_FOLD)[0, 0]
@@ -69,12 +51,16 @@ def invert_window(camera: Camera, window: Window) -> tuple[Tensor, Tensor]:
     if bool(exact.any()):
         x, y = pixel_axes(window)
         pixels = torch.stack([x.expand(exact.shape)[exact], y[:, None].expand(exact.shape)[exact]], -1)
-        normalized[exact], valid[exact] = _normalize(camera, pixels)
-    return normalized, valid
+        looks[exact], valid[exact] = _look(lens, pixels)
+    return looks, valid
 
 
-def _normalize(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    parts = [camera.normalize(part) for part in pixels.split(_CHUNK)]
+def _look(lens: AnyLens, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    if isinstance(lens, TruthLens):
+        valid = lens.covers(pixels)
+        lines = lens.lines(pixels.clamp(lens.low, lens.high))
+        return torch.cat([lines.slopes, lines.origins], -1), valid
+    parts = [lens.normalize(part) for part in pixels.split(_CHUNK)]
     return torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
 
 

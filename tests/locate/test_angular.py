@@ -6,7 +6,8 @@ import pytest
 import torch
 from locate_rigs import tensor, turned
 
-from kcal.locate.angular import side_axes, triangulate_angular, triangulate_pairs
+from kcal.lens.pose import side_axes
+from kcal.locate.angular import triangulate_angular, triangulate_pairs
 from kcal.locate.triangulate import triangulate_linear
 
 GENERATOR = torch.Generator().manual_seed(7)

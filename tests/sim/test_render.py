@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -7,8 +8,10 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardPose, BoardSize, board_points, project_board
+from kcal.sim.rectangle import Window, pixel_axes
 from kcal.sim.render import RenderOptions, render_board, render_light
-from kcal.sim.window import Window, invert_window, pixel_axes
+from kcal.sim.truth import TruthLens
+from kcal.sim.window import invert_window
 
 BOARD = BoardSize(9, 6, 0.06)
 CLEAN = RenderOptions(noise=0, vignetting=0, blur=1.0)
@@ -80,6 +83,36 @@ def test_corners_are_where_the_camera_projects_them(name, coefficients):
     assert float(error.square().mean().sqrt()) < 0.0015
     assert float(error.abs().max()) < 0.003
     assert float(error.mean(0).abs().max()) < 0.001
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_corners_are_where_the_true_lens_sees_them(gamma):
+    # All of the pupil's wander, at 45 cm: lines of sight from one point would be wrong by a pixel.
+    lens = TruthLens("surveillance", size=(960, 600), focal=700.0, wander=1.0, focal_mm=8.0)
+    pose = pose_of((0.3, -0.2, 0.1), (-0.02, 0.01, 0.45))
+    image = render_light(lens, pose, BOARD, RenderOptions(noise=0, vignetting=0, blur=1.0, gamma=gamma))
+    pixels, visible = project_board(lens, pose, BOARD)
+    assert visible.all()
+    central = TruthLens("surveillance", size=(960, 600), focal=700.0, wander=0.0, focal_mm=8.0)
+    assert float((project_board(central, pose, BOARD)[0] - pixels).abs().max()) > 0.3
+    some = pixels[::7]
+    error = torch.stack([cubic_saddle((image / 255) ** gamma, pixel) for pixel in some]) - some
+    assert float(error.square().mean().sqrt()) < 0.0015
+
+
+def test_gamma_is_a_curve_of_grey_levels():
+    camera, pose = camera_of(), POSES["tilted"]
+    plain, curved = (
+        render_light(camera, pose, BOARD, replace(CLEAN, black=0, white=255, background=20, gamma=gamma))
+        for gamma in (1.0, 2.0)
+    )
+    assert float(curved.min()) >= 0
+    flat = plain > 254.999
+    assert bool(flat.any())
+    torch.testing.assert_close(curved[flat], plain[flat], atol=0.01, rtol=0)
+    # Half way over an edge half the light arrives, which is more than half the level.
+    edge = (plain - 127.5).abs() < 2
+    assert float(curved[edge].mean()) == pytest.approx(255 * math.sqrt(0.5), abs=4)
 
 
 def test_grey_levels_are_the_blurred_scene_averaged_over_the_pixels():

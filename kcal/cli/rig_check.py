@@ -1,0 +1,165 @@
+"""`kcal rig check`: do the cameras still stand as they did? And `--relock`: a corrected rig in place of the old one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kcal.errors import InputError
+
+if TYPE_CHECKING:
+    from kcal.calibrate.drift import Drift
+    from kcal.calibrate.rig_sources import Features, Landmarks
+    from kcal.io.rig_file import RigFile
+    from kcal.locate.marks import Marks
+
+
+def check(
+    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
+    marks: Annotated[
+        Path, typer.Option(metavar="CSV", help="Marks in new images: name,left_u,left_v,right_u,right_v.")
+    ],
+    reference: Annotated[
+        Path | None,
+        typer.Option(metavar="CSV", help="The same static things marked in images of when the rig was solved."),
+    ] = None,
+    landmarks: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Surveyed places among the marks, as for `kcal rig`.")
+    ] = None,
+    mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks along each axis.")] = 0.3,
+    relock: Annotated[
+        bool, typer.Option("--relock", help="Write the corrected rig in place of the old one, which is kept.")
+    ] = False,
+) -> None:
+    """Check whether the cameras have turned since the rig was solved, and what that does to ranges.
+
+    Needs things that do not move, marked in new images: either the same as in images of then (`--reference`; what they
+    are and how far away does not matter), or surveyed places (`--landmarks`; the rig must have been solved with some).
+    Forty features of 0.1 px tell the yaw to a thousandth of a degree. Things that moved are left out and named.
+
+    With `--relock` the rig file is replaced by one with the attitudes of now; the old one stays beside it.
+
+    **Examples**
+
+    `kcal rig check rig.json --reference then.csv --marks now.csv`
+
+    `kcal rig check rig.json --landmarks survey.csv --marks now.csv --relock`
+    """
+    from kcal.calibrate.drift import measure_drift
+    from kcal.cli.console import err, out
+    from kcal.files import check_writable
+    from kcal.io.rig_file import RigFile
+    from kcal.locate.marks import read_marks
+    from kcal.locate.relock import known_before, standing
+
+    if reference is None and landmarks is None:
+        raise InputError("give --reference (marks of the same things in images of then) or --landmarks (a survey)")
+    if relock:
+        check_writable(rig, marks, *(path for path in (reference, landmarks) if path is not None))
+    file = RigFile.load(rig)
+    now = read_marks(marks, single=True)
+    features = None if reference is None else _features(read_marks(reference, single=True), now, mark_sigma)
+    surveyed = None if landmarks is None else _landmarks(file, landmarks, now, mark_sigma)
+    drift = measure_drift(
+        file.rig(), features=features, landmarks=surveyed, pose=standing(file), before=known_before(file)
+    )
+    for line in _table(file, drift):
+        out.print(line, markup=False)
+    for item in drift.left_out:
+        err.print("[yellow]left out:[/]", f"{item.name}: {item.reason}")
+    if drift.variance > 1:
+        err.print(
+            f"[yellow]warning:[/] residuals are {drift.variance**0.5:.1f} times as large as the marks' noise says; "
+            "sigmas were widened"
+        )
+    out.print(
+        "the relative attitude has [bold]changed[/] beyond chance"
+        if drift.significant
+        else "no change of the relative attitude beyond chance"
+    )
+    if relock:
+        kept = _relock(rig, file, drift, marks)
+        out.print(f"kept the old rig as {kept}", markup=False)
+        out.print(f"wrote {rig}", markup=False)
+
+
+def _features(then: Marks, now: Marks, sigma: float) -> Features:
+    import torch
+
+    from kcal.calibrate.rig_sources import Features
+
+    common = [name for name in then.names if name in now.names]
+    if not common:
+        raise InputError("no name is in both files of marks; the same things must have the same names")
+    before = then.pixels[[then.names.index(name) for name in common]]
+    after = now.pixels[[now.names.index(name) for name in common]]
+    return Features(
+        names=tuple(common),
+        pixels=torch.cat([before, after], 1),
+        inverse_range=torch.zeros(len(common), dtype=torch.float64),
+        inverse_range_sigma=torch.full((len(common),), torch.inf, dtype=torch.float64),
+        pixel_sigma=sigma,
+    )
+
+
+def _landmarks(file: RigFile, path: Path, now: Marks, sigma: float) -> Landmarks:
+    from kcal.locate.geodesy import Origin
+    from kcal.locate.survey import match_landmarks, read_survey
+
+    stands = file.mounting
+    if stands is None:
+        raise InputError("the rig file does not say where the rig stands; solve it with landmarks, or use --reference")
+    here = Origin(lat=stands.lat, lon=stands.lon, height=stands.height)
+    return match_landmarks(read_survey(path, here), now, sigma).landmarks
+
+
+def _table(file: RigFile, drift: Drift) -> list[str]:
+    import math
+
+    from kcal.locate.monitor import drift_effect
+
+    rows = [["turn of", "pitch °", "yaw °", "roll °", "used"]]
+    used = f"{sum(item.used for item in drift.items)} of {len(drift.items)}"
+    parts = [
+        ("left camera", drift.left, drift.left_covariance),
+        ("right camera", drift.right, drift.right_covariance),
+        ("right from left", drift.relative, drift.relative_covariance),
+    ]
+    for name, turn, covariance in parts:
+        if turn is None or covariance is None:
+            continue
+        sigma = covariance.diagonal().sqrt()
+        cells = [
+            f"{math.degrees(value):+.5f} ± {math.degrees(spread):.5f}"
+            for value, spread in zip(turn.tolist(), sigma.tolist(), strict=True)
+        ]
+        rows.append([name, *cells, used])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    effect = drift_effect(file.rig(), drift.rig, drift.relative_covariance)
+    for distance, found, sigma in zip(*(value.tolist() for value in effect), strict=True):
+        shift = "infinity" if math.isinf(found) else f"{found:.1f} m ({found - distance:+.1f} ± {sigma:.1f} m)"
+        lines.append(f"with the old rig a target at {distance:g} m is found at {shift}")
+    return lines
+
+
+def _relock(path: Path, file: RigFile, drift: Drift, marks: Path) -> Path:
+    """Replace the rig file; returns where the old one is now."""
+    import datetime
+
+    from kcal.files import dump_json, write_atomic
+    from kcal.locate.relock import relocked
+
+    stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
+    kept = path.with_name(f"{path.stem}.before-{stamp}{path.suffix}")
+    number = 1
+    while kept.exists():
+        number += 1
+        kept = path.with_name(f"{path.stem}.before-{stamp}-{number}{path.suffix}")
+    new = relocked(file, drift, f"{stamp}, from {marks.name}")
+    # The old one first: whatever happens in between, a good rig is there.
+    write_atomic(kept, dump_json(file.dump()))
+    new.save(path)
+    return kept

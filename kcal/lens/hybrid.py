@@ -1,0 +1,128 @@
+"""`HybridCamera`: a parametric camera whose lens is corrected by a small learned field."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from kcal.checks import as_points
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
+from kcal.lens.projection import from_pixels, to_pixels
+from kcal.lens.residual import Field, FieldGrid, FieldResidual, correct_components, undo_components
+
+# The name by which `HybridCamera.free` knows the field's weights.
+WEIGHTS = "weights"
+
+
+class HybridCamera(Camera):
+    """A camera with a residual field between its lens and its intrinsics (`kcal.lens.residual`).
+
+    It goes wherever a `Camera` goes, with the same contract: `project` and `unproject` with validity, exact round
+    trips, and gradients by the implicit function theorem to pixels, parameters and weights alike. The inverse has two
+    stages, first the field's (always possible), then the lens's; so the valid region is that of the lens. One camera,
+    no batch of them; `vmap` maps over several.
+
+    Its parameters mean nothing without its field: `parameters_vector` alone is not the camera. Formats that know no
+    field refuse it.
+
+    Args:
+        parameters: (5 + P,) as for `Camera`.
+        size: (width, height) in pixels.
+        model: a `LensModel` or a preset's name.
+        residual: the field; none: nothing is corrected.
+
+    Raises:
+        InputError: as `Camera`; a batch of cameras; a field that is no small correction.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.1])
+        >>> grid = FieldGrid.covering((-0.4, -0.3), (0.4, 0.3), widths=[0.2])
+        >>> weights = torch.full((2, grid.count), 1e-3, dtype=torch.float64)
+        >>> hybrid = HybridCamera.of(camera, FieldResidual(grid, weights))
+        >>> point = torch.tensor([[0.1, 0.2, 1.0]], dtype=torch.float64)
+        >>> pixels, valid = hybrid.project(point)
+        >>> [round(value, 2) for value in (pixels - camera.project(point)[0])[0].tolist()]
+        [6.48, 6.48]
+        >>> rays, valid = hybrid.unproject(pixels)
+        >>> bool(torch.allclose(rays / rays[..., 2:], point, rtol=0, atol=1e-14))
+        True
+    """
+
+    def __init__(
+        self,
+        parameters: Tensor,
+        *,
+        size: tuple[int, int],
+        model: LensModel | str = "opencv5",
+        residual: FieldResidual | None = None,
+    ) -> None:
+        super().__init__(parameters, size=size, model=model)
+        if self.parameters_vector.ndim != 1:
+            raise InputError(f"HybridCamera: one camera, not a batch of {tuple(self.valid_radius.shape)}")
+        self.residual = residual or FieldResidual(FieldGrid())
+
+    @classmethod
+    def of(cls, camera: Camera, residual: FieldResidual) -> Self:
+        """A camera whose lens is followed by a field."""
+        return cls(camera.parameters_vector, size=camera.size, model=camera.model, residual=residual)
+
+    @property
+    def parametric(self) -> Camera:
+        """The camera without its field. It is another camera: nothing was fitted with these parameters alone."""
+        return Camera(self.parameters_vector, size=self.size, model=self.model)
+
+    @property
+    def field(self) -> Field | None:
+        """Units and weights, for the functions of `kcal.lens.projection`."""
+        return self.residual.field
+
+    def with_parameters(self, parameters: Tensor) -> HybridCamera:
+        """The same field behind a lens with other parameters; nothing is shared."""
+        residual = FieldResidual(self.residual.grid, self.residual.weights)
+        return HybridCamera(parameters, size=self.size, model=self.model, residual=residual)
+
+    @property
+    def fingerprint(self) -> str:
+        """Twelve hex digits that change with any parameter, weight or unit, the model or the image size."""
+        weights = self.residual.weights.detach().flatten().tolist()
+        text = repr((super().fingerprint, self.residual.grid.scales, weights))
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """As `Camera.free_names`; the field's weights together are called "weights"."""
+        return super().free_names + (WEIGHTS,) * self.residual.weights.requires_grad
+
+    def free(self, *names: str) -> Self:
+        """As `Camera.free`, with "weights" for the field; without names, everything but skew."""
+        own = [name for name in names if name != WEIGHTS]
+        super().free(*own)
+        if names and not own:
+            self.parameters_vector.requires_grad_(False)
+        self.residual.weights.requires_grad_(not names or WEIGHTS in names)
+        return self
+
+    def update_valid_region(self) -> None:
+        """Measure the valid region again, and check the field; call it after changing parameters or weights."""
+        super().update_valid_region()
+        self.residual.check()
+
+    def correction(self, pixels: Tensor) -> Tensor:
+        """By how many pixels (..., N, 2) the field moves what is seen at pixels (..., N, 2)."""
+        values = self.parameters_vector.detach()
+        u, v = as_points("pixels", pixels, 2).unbind(-1)
+        x, y, _ = self._from_sensor(u, v, values)
+        return pixels - torch.stack(to_pixels(x, y, values), -1)
+
+    def _to_sensor(self, x: Tensor, y: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        moved = correct_components(x, y, self.residual.field, slopes=False)
+        return to_pixels(moved.x, moved.y, values)
+
+    def _from_sensor(self, u: Tensor, v: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        x, y = from_pixels(u, v, values)
+        return undo_components(x, y, self.residual.field)

@@ -1,0 +1,193 @@
+"""What was surveyed or is known of the surroundings of a rig, from CSV files into its local frame.
+
+Latitudes and longitudes go through Earth-centred coordinates, so that curvature is in them; heights are above the WGS84
+ellipsoid. Local metres are east, north, up of the same origin.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.rig_sources import Features, Landmarks, MeasuredPosition, inverse_range_beyond
+from kcal.errors import FileError, InputError
+from kcal.locate.geodesy import Origin, geodetic_to_enu
+from kcal.locate.marks import PIXELS, Marks, pixel_of
+from kcal.locate.tables import Row, read_rows
+
+_EARTH, _LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
+_PLACES = ("name", *_EARTH, *_LOCAL, "sigma", "sigma_up", "note")
+# One over metres: the inverse range of a star is known to this.
+_INFINITY_SIGMA = 1e-12
+
+
+class Survey(NamedTuple):
+    """Named places.
+
+    Attributes:
+        names: one each.
+        points: (N, 3) metres east, north, up of `origin`.
+        sigma: (N, 3) metres.
+        origin: where the frame is anchored; None if the file holds local metres and no origin was given.
+    """
+
+    names: tuple[str, ...]
+    points: Tensor
+    sigma: Tensor
+    origin: Origin | None
+
+
+def read_survey(path: str | Path, origin: Origin | None = None, *, measured: bool = True) -> Survey:
+    r"""Read surveyed places: `name,lat,lon,height,sigma` or `name,east,north,up,sigma`, and if need be `sigma_up`.
+
+    Degrees, metres above the WGS84 ellipsoid, metres; `sigma` holds along each axis, `sigma_up` upward where that
+    differs.
+
+    Args:
+        path: of the file.
+        origin: of the frame; the first place if left out and the file has latitudes.
+        measured: whether a sigma is needed; it is zero where it is not and is not given.
+
+    Raises:
+        FileError: see `kcal.locate.tables.read_rows`; a latitude out of range, a sigma that is not positive.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "survey.csv")
+        ...     _ = path.write_text("name,lat,lon,height,sigma\npost,0,180,0,0.02\nmast,0,-179.991,10,0.02\n")
+        ...     survey = read_survey(path)
+        >>> [round(value, 2) for value in survey.points[1].tolist()]  # across the antimeridian
+        [1001.88, 0.0, 9.92]
+    """
+    rows = read_rows(path, "name,lat,lon,height,sigma", _PLACES, ("sigma",) if measured else ())
+    columns = _columns(rows[0], path)
+    values = torch.tensor([[row.number(column) for column in columns] for row in rows], dtype=torch.float64)
+    if columns == _EARTH:
+        for row, (lat, lon, height) in zip(rows, values.tolist(), strict=True):
+            try:
+                place = Origin(lat=lat, lon=lon, height=height)
+            except InputError as error:
+                raise FileError(f"{row.where}: {str(error).removeprefix('origin: ')}") from error
+            origin = origin or place
+        assert origin is not None
+        values = geodetic_to_enu(values, origin)
+    sigma = [_sigma(row) if measured or row.cells.get("sigma") else (0.0, 0.0, 0.0) for row in rows]
+    return Survey(tuple(row.name for row in rows), values, torch.tensor(sigma, dtype=torch.float64), origin)
+
+
+def _columns(row: Row, path: str | Path) -> tuple[str, str, str]:
+    for columns in (_EARTH, _LOCAL):
+        if all(column in row.cells for column in columns):
+            other = _LOCAL if columns == _EARTH else _EARTH
+            if any(column in row.cells for column in other):
+                raise FileError(f"{path}: lat, lon, height or east, north, up are needed, not both")
+            return columns
+    raise FileError(f"{path}: the columns lat, lon, height or east, north, up are needed")
+
+
+def _sigma(row: Row) -> tuple[float, float, float]:
+    level = row.positive("sigma")
+    if level is None or not math.isfinite(level):
+        raise FileError(f"{row.where}: sigma is empty; write how well the place is known, metres")
+    up = row.positive("sigma_up") or level
+    return level, level, up
+
+
+class MarkedLandmarks(NamedTuple):
+    """Landmarks with their marks, and what has only one of the two."""
+
+    landmarks: Landmarks
+    unmarked: tuple[str, ...]
+    unsurveyed: tuple[str, ...]
+
+
+def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float) -> MarkedLandmarks:
+    """Bring survey and marks together by name.
+
+    Raises:
+        InputError: no name is in both.
+    """
+    index = {name: i for i, name in enumerate(marks.names)}
+    common = [name for name in survey.names if name in index]
+    if not common:
+        raise InputError(
+            f"no surveyed place ({', '.join(survey.names[:3])} ...) has a mark ({', '.join(marks.names[:3])} ...): "
+            "the names must be the same in both files"
+        )
+    places = [survey.names.index(name) for name in common]
+    landmarks = Landmarks(
+        names=tuple(common),
+        points=survey.points[places],
+        sigma=survey.sigma[places],
+        pixels=marks.pixels[[index[name] for name in common]],
+        pixel_sigma=pixel_sigma,
+    )
+    unmarked = tuple(name for name in survey.names if name not in index)
+    return MarkedLandmarks(landmarks, unmarked, tuple(name for name in marks.names if name not in common))
+
+
+def read_features(path: str | Path, pixel_sigma: float) -> Features:
+    r"""Read matched far features: `name,left_u,left_v,right_u,right_v` and what is known of their range, if anything.
+
+    `range` and `range_sigma` in metres from the rig, `range` alone `inf` for a star; or `beyond`, a distance that the
+    feature is farther away than; or nothing, and then it only ties the epipolar geometry.
+
+    Raises:
+        FileError: see `kcal.locate.tables.read_rows`; a range without its sigma, or with `beyond`.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "features.csv")
+        ...     _ = path.write_text("left_u,left_v,right_u,right_v,beyond\n960,540,958,540,20000\n1,2,3,4,\n")
+        ...     read_features(path, 0.1).inverse_range.tolist()
+        [2.5e-05, 0.0]
+    """
+    columns = ("name", *PIXELS, "range", "range_sigma", "beyond", "note")
+    rows = read_rows(path, "name,left_u,left_v,right_u,right_v,range,range_sigma", columns, PIXELS)
+    pixels = [[pixel_of(row, side, False) for side in ("left", "right")] for row in rows]
+    known = torch.tensor([_inverse_range(row) for row in rows], dtype=torch.float64)
+    return Features(
+        names=tuple(row.name for row in rows),
+        pixels=torch.tensor(pixels, dtype=torch.float64),
+        inverse_range=known[:, 0],
+        inverse_range_sigma=known[:, 1],
+        pixel_sigma=pixel_sigma,
+    )
+
+
+def _inverse_range(row: Row) -> tuple[float, float]:
+    distance, sigma, beyond = (row.positive(column) for column in ("range", "range_sigma", "beyond"))
+    if beyond is not None and distance is not None:
+        raise FileError(f"{row.where}: range or beyond is needed, not both")
+    if beyond is not None:
+        return (0.0, _INFINITY_SIGMA) if math.isinf(beyond) else inverse_range_beyond(beyond)
+    if distance is None:
+        return 0.0, math.inf
+    if math.isinf(distance):
+        return 0.0, _INFINITY_SIGMA
+    if sigma is None:
+        raise FileError(f"{row.where}: the range needs its range_sigma, metres")
+    return 1.0 / distance, sigma / distance**2
+
+
+def camera_positions(survey: Survey, cameras: Sequence[str]) -> tuple[MeasuredPosition, ...]:
+    """The places whose names are those of cameras, as measured positions of these.
+
+    Raises:
+        InputError: a name that is no camera's.
+    """
+    unknown = [name for name in survey.names if name not in cameras]
+    if unknown:
+        raise InputError(f"camera positions: {unknown[0]!r} is no camera; the names are {', '.join(cameras)}")
+    numbers: Mapping[str, int] = {name: number for number, name in enumerate(cameras)}
+    return tuple(
+        MeasuredPosition(camera=numbers[name], point=point, sigma=sigma)
+        for name, point, sigma in zip(survey.names, survey.points, survey.sigma, strict=True)
+    )

@@ -1,0 +1,117 @@
+"""Corners of a board as a lens sees them in many views, with noise: what a calibration is given, without any images."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.sim.board import BoardLike, BoardSize, LensLike, board_points, project_board
+from kcal.sim.poses import PoseOptions, sample_board_poses
+from kcal.sim.prescription import PRESCRIPTIONS
+from kcal.sim.raytrace import Misalignment
+from kcal.sim.truth import TruthLens
+
+# The board of the paper: 6 x 7 corners, squares of 5 cm.
+PAPER_BOARD = BoardSize(7, 6, 0.05)
+# The sensor goes with the glass: its tilt, and how far the axis misses its middle, in pixels, for a strength of 1.
+_SENSOR_TILT, _AXIS = math.radians(0.2), 8.0
+
+
+class Capture(NamedTuple):
+    """Views of a board and the truth about them.
+
+    Attributes:
+        pixels: (V, N, 2) corners with noise, in the order of `board_points`.
+        true_pixels: (V, N, 2) without.
+        rotation: (V, 3, 3) cam_from_board.
+        translation: (V, 3) metres.
+        points: (N, 3) corners on the board, metres.
+    """
+
+    pixels: Tensor
+    true_pixels: Tensor
+    rotation: Tensor
+    translation: Tensor
+    points: Tensor
+
+
+def drawn_lens(name: str, strength: float, seed: int, *, focal: float | None = None, wander: float = 0.1) -> TruthLens:
+    """A ray-traced lens that was put together as badly as `strength` says: 1 is ordinary, 3 poor, 0 perfect.
+
+    For a strength of 1, one sigma along each axis: glass is decentred by the prescription's tolerance (22 µm of 2.8 mm
+    for the surveillance lens, with 0.2 degrees of tilt), the sensor is tilted by 0.2 degrees, and the axis meets it
+    8 px from its middle.
+
+    Args:
+        name: of a prescription: "surveillance", "machine-vision" or "webcam".
+        strength: of the misalignment.
+        seed: of its draw.
+        focal: in pixels; the prescription's own if left out.
+        wander: see `TruthLens`.
+
+    Example:
+        >>> lens = drawn_lens("machine-vision", 1.0, 7)
+        >>> lens.size, round(float(lens.focal[0]))
+        ((1920, 1080), 1600)
+    """
+    if name not in PRESCRIPTIONS:
+        raise InputError(f"prescription {name!r}: there are {', '.join(PRESCRIPTIONS)}")
+    generator = torch.Generator().manual_seed(seed)
+    misalignment = Misalignment.draw(PRESCRIPTIONS[name], strength, generator)
+    tilt, shift = (strength * torch.randn((2, 2), dtype=torch.float64, generator=generator)).tolist()
+    return TruthLens(
+        name,
+        focal=focal,
+        center=(959.5 + _AXIS * shift[0], 539.5 + _AXIS * shift[1]),
+        misalignment=misalignment,
+        sensor_tilt=(_SENSOR_TILT * tilt[0], _SENSOR_TILT * tilt[1]),
+        wander=wander,
+    )
+
+
+def capture_corners(
+    lens: LensLike,
+    views: int,
+    *,
+    sigma: float,
+    seed: int,
+    board: BoardLike = PAPER_BOARD,
+    fill: tuple[float, float] = (0.25, 0.8),
+    options: PoseOptions | None = None,
+) -> Capture:
+    """Corners of a board in poses that cover the image, with Gaussian noise.
+
+    Args:
+        lens: true lens.
+        views: how many.
+        sigma: noise in pixels, for each axis.
+        seed: of poses and noise; noise of another sigma is the same noise, scaled.
+        board: its size.
+        fill: smallest and largest share of the image's width or height that the board takes.
+        options: limits of tilt, roll and margins.
+
+    Raises:
+        InputError: see `sample_board_poses`; or a sigma that is negative.
+
+    Example:
+        >>> capture = capture_corners(drawn_lens("machine-vision", 1.0, 7), 10, sigma=0.1, seed=3)
+        >>> tuple(capture.pixels.shape)
+        (10, 42, 2)
+    """
+    if not 0 <= sigma < math.inf:
+        raise InputError(f"sigma {sigma}: pixels, not negative, are needed")
+    generator = torch.Generator().manual_seed(seed)
+    poses = sample_board_poses(lens, board, views, generator, fill=fill, options=options)
+    true = torch.stack([project_board(lens, pose, board)[0] for pose in poses])
+    noise = torch.randn(true.shape, dtype=torch.float64, generator=generator)
+    return Capture(
+        true + sigma * noise,
+        true,
+        torch.stack([pose.rotation for pose in poses]),
+        torch.stack([pose.translation for pose in poses]),
+        board_points(board),
+    )

@@ -1,0 +1,112 @@
+"""How far a calibrated camera is from the true lens, where it matters at long range: at infinity."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.lens.pose import rotation_from_vector
+from kcal.sim.board import LensLike
+
+_ROUNDS = 4
+_NUDGE = 1e-6  # radians
+
+
+class InfinityError(NamedTuple):
+    """Difference of a camera from the truth at infinity, after the best rotation.
+
+    Attributes:
+        rms: sqrt(mean ‖e‖²) over the image, pixels.
+        maximum: largest ‖e‖, pixels.
+        rotation: (3, 3) camera_from_truth: the turn of the camera frame that no board can tell, and no rig needs.
+        pixels: (rows, columns, 2) where it was measured.
+        errors: (rows, columns, 2) where the camera sees what the truth sees at `pixels`, minus those; NaN where the
+            camera sees it nowhere.
+        valid: share of `pixels` that the camera sees.
+    """
+
+    rms: float
+    maximum: float
+    rotation: Tensor
+    pixels: Tensor
+    errors: Tensor
+    valid: float
+
+
+@torch.no_grad()
+def error_at_infinity(camera: LensLike, truth: LensLike, *, columns: int = 49, rows: int = 28) -> InfinityError:
+    """Where a camera sees distant points, against where the truth does, all over the image.
+
+    Every pixel of a grid over the whole image looks along a true direction; the camera projects that direction, after
+    the one rotation of all directions that makes the RMS smallest. This is mrcal's projection difference with its
+    implied rotation fitted at infinity (mrcal.secretsauce.org/differencing.html).
+
+    Args:
+        camera: what was calibrated: a `Camera`, or anything that projects.
+        truth: what is true; anything that unprojects.
+        columns: of the grid, whose outermost pixels are the image's.
+        rows: of the grid.
+
+    Raises:
+        InputError: images of different sizes, or a camera that sees none of the directions.
+
+    Example:
+        >>> from kcal.lens.camera import Camera
+        >>> truth = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
+        >>> camera = Camera.build(focal=(800, 800), center=(329.5, 239.5), size=(640, 480))
+        >>> found = error_at_infinity(camera, truth)  # a shifted centre is a rotation, nearly
+        >>> round(found.rms, 2), round(found.maximum, 2), found.valid
+        (0.62, 1.52, 1.0)
+    """
+    if tuple(camera.size) != tuple(truth.size):
+        raise InputError(f"images of {tuple(camera.size)} and {tuple(truth.size)}: the same size is needed")
+    width, height = truth.size
+    x = torch.linspace(0, width - 1, columns, dtype=torch.float64)
+    y = torch.linspace(0, height - 1, rows, dtype=torch.float64)
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+    rays, known = truth.unproject(pixels.reshape(-1, 2))
+    seen_rays, seen = camera.unproject(pixels.reshape(-1, 2))
+    both = known & seen
+    if int(both.sum()) < 3:
+        raise InputError("error_at_infinity: the camera and the truth have no rays in common")
+    rotation = _kabsch(rays[both], seen_rays[both])
+    flat = pixels.reshape(-1, 2)
+    errors, valid = _errors(camera, flat, rays, known, rotation)
+    for _ in range(_ROUNDS):
+        used = valid
+        slopes = []
+        for axis in torch.eye(3, dtype=torch.float64):
+            ends = [
+                _errors(camera, flat, rays, known, rotation_from_vector(s * _NUDGE * axis) @ rotation) for s in (1, -1)
+            ]
+            used = used & ends[0][1] & ends[1][1]
+            slopes.append((ends[0][0] - ends[1][0]) / (2 * _NUDGE))
+        jacobian = torch.stack([slope[used].reshape(-1) for slope in slopes], -1)
+        step = torch.linalg.lstsq(jacobian, -errors[used].reshape(-1, 1)).solution[:, 0]
+        rotation = rotation_from_vector(step) @ rotation
+        errors, valid = _errors(camera, flat, rays, known, rotation)
+    length = torch.linalg.vector_norm(errors[valid], dim=-1)
+    return InfinityError(
+        rms=float(torch.sqrt((length**2).mean())),
+        maximum=float(length.max()),
+        rotation=rotation,
+        pixels=pixels,
+        errors=torch.where(valid[:, None], errors, torch.nan).reshape(pixels.shape),
+        valid=float(valid.double().mean()),
+    )
+
+
+def _errors(camera: LensLike, pixels: Tensor, rays: Tensor, known: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+    found, valid = camera.project((rays @ rotation.T) * 1e9)
+    return found - pixels, valid & known
+
+
+def _kabsch(source: Tensor, target: Tensor) -> Tensor:
+    """The rotation that turns unit vectors (N, 3) into others best (W. Kabsch, Acta Cryst. A32, 1976)."""
+    u, _, vh = torch.linalg.svd(target.T @ source)
+    sign = torch.ones(3, dtype=torch.float64)
+    sign[2] = torch.sign(torch.linalg.det(u @ vh))
+    return u @ torch.diag(sign) @ vh

@@ -1,0 +1,119 @@
+"""Ray tracing obeys the laws it is made of: Snell, reversibility, and the paraxial limit."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kcal.errors import InputError
+from kcal.sim.prescription import PRESCRIPTIONS, Prescription, Surface, back_focus, focal_length
+from kcal.sim.raytrace import Misalignment, meet, normals, place, refract, trace
+
+NAMES = sorted(PRESCRIPTIONS)
+
+
+def unit(values: list[list[float]]) -> torch.Tensor:
+    return torch.nn.functional.normalize(torch.tensor(values, dtype=torch.float64), dim=-1)
+
+
+@given(
+    angle=st.floats(0.0, 1.5), turn=st.floats(-math.pi, math.pi), ratio=st.floats(0.4, 2.5).filter(lambda r: r != 1.0)
+)
+def test_refraction_is_snells_law(angle: float, turn: float, ratio: float) -> None:
+    normal = unit([[0.3, -0.2, 1.0]])
+    across = torch.nn.functional.normalize(torch.linalg.cross(normal, unit([[math.cos(turn), math.sin(turn), 0.1]])))
+    light = math.cos(angle) * normal + math.sin(angle) * across
+    bent, passed = refract(light, normal, ratio)
+    if ratio * math.sin(angle) > 1 + 1e-9:
+        assert not bool(passed)
+    elif ratio * math.sin(angle) < 1 - 1e-9:
+        assert bool(passed)
+        assert float(bent.norm()) == pytest.approx(1.0, abs=1e-14)
+        # n sin(angle) is kept, with its direction: the part across the normal is scaled by the ratio.
+        part = bent - (bent * normal).sum() * normal
+        torch.testing.assert_close(part, ratio * math.sin(angle) * across, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "surface",
+    [
+        Surface(radius=1.3, thickness=0.1),
+        Surface(radius=-2.0, thickness=0.1, conic=0.7),
+        Surface(radius=math.inf, thickness=0.1),
+        Surface(radius=1.67, thickness=0.1, conic=-1.0, even=(-0.1, 0.014, -1.5e-3)),
+    ],
+    ids=["sphere", "ellipsoid", "plane", "asphere"],
+)
+def test_rays_meet_the_surface_and_its_normal_stands_on_it(surface: Surface) -> None:
+    generator = torch.Generator().manual_seed(3)
+    points = torch.rand((50, 3), dtype=torch.float64, generator=generator) - 0.5
+    heading = unit((torch.rand((50, 3), generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 1.5])).tolist())
+    at, met = meet(surface, points, heading)
+    assert bool(met.all())
+
+    def sag(xy: torch.Tensor) -> torch.Tensor:
+        r2, c = (xy**2).sum(-1), surface.curvature
+        height = c * r2 / (1 + torch.sqrt(1 - (1 + surface.conic) * c**2 * r2))
+        return height + sum(value * r2 ** (i + 2) for i, value in enumerate(surface.even))
+
+    torch.testing.assert_close(at[:, 2], sag(at[:, :2]), atol=1e-13, rtol=0)
+    # On the ray, and the one that is met from behind is the same place.
+    assert float(torch.linalg.cross(at - points, heading).abs().max()) < 1e-13
+    torch.testing.assert_close(meet(surface, points, -heading)[0], at, atol=1e-13, rtol=0)
+    xy = at[:, :2].clone().requires_grad_()
+    slope = torch.autograd.grad(sag(xy).sum(), xy)[0]
+    expected = torch.nn.functional.normalize(torch.cat([-slope, torch.ones(50, 1)], -1), dim=-1)
+    torch.testing.assert_close(normals(surface, at), expected, atol=1e-12, rtol=0)
+
+
+def test_a_ray_that_passes_a_sphere_is_not_valid() -> None:
+    _, met = meet(Surface(radius=1.0, thickness=0.1), torch.tensor([[0.0, 1.5, 0.0]]).double(), unit([[0, 0, 1]]))
+    assert not bool(met)
+
+
+def test_total_reflection_is_not_valid() -> None:
+    rays = Prescription(
+        name="block",
+        source="",
+        surfaces=(Surface(radius=math.inf, thickness=1.0), Surface(radius=math.inf, thickness=1.0, index=1.5)),
+        stop=0,
+    )
+    back = trace(place(rays, 1.0, 1.0, Misalignment()), torch.zeros(1, 3).double(), unit([[1, 0, -0.5]]), backward=True)
+    assert not bool(back.valid)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_paraxial_rays_meet_the_matrix_method(name: str) -> None:
+    lens, height = PRESCRIPTIONS[name], 1e-5
+    rays = trace(place(lens, 1.0, 1.0, Misalignment()), torch.tensor([[0, height, 0]]).double(), unit([[0, 0, 1]]))
+    slope = float(rays.directions[0, 1] / rays.directions[0, 2])
+    assert -height / slope == pytest.approx(focal_length(lens), rel=1e-6)
+    assert -float(rays.points[0, 1]) / slope == pytest.approx(back_focus(lens), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_light_comes_back_the_way_it_went(name: str) -> None:
+    lens = PRESCRIPTIONS[name]
+    placed = place(lens, focal_length(lens), 1.0, Misalignment.draw(lens, 3.0, torch.Generator().manual_seed(1)))
+    start = torch.tensor([[0.02, -0.01, -1.0]], dtype=torch.float64) * focal_length(lens)
+    heading = unit([[0.05, 0.1, 1.0]])
+    there = trace(placed, start, heading)
+    back = trace(placed, there.points, -there.directions, backward=True)
+    assert bool(there.valid & back.valid)
+    torch.testing.assert_close(back.directions, -heading, atol=1e-12, rtol=0)
+    assert float(torch.linalg.cross(back.points - start, heading).abs().max()) < 1e-11
+
+
+def test_pieces_of_glass_are_counted_and_checked() -> None:
+    lens = PRESCRIPTIONS["surveillance"]
+    assert lens.elements[1] == (2, 4)  # cemented
+    with pytest.raises(InputError, match="1 entries for 7"):
+        place(lens, 1.0, 1.0, Misalignment(decentre=((0.0, 0.0),)))
+    with pytest.raises(InputError, match="not negative"):
+        Misalignment.draw(lens, -1.0, torch.Generator())
+    with pytest.raises(InputError, match="equal media"):
+        Prescription(name="x", source="", surfaces=(Surface(radius=1.0, thickness=1.0, index=1.5),), stop=0)
