@@ -40,10 +40,11 @@ WIDTH = 0.3
 _EXCLUDED = 40.0
 # The two agree where no parameter differs by more than this share of its σ, and no σ by more than this factor.
 _NEAR, _ALIKE = 0.5, 1.5
-_SEARCH = LMOptions(max_iterations=60, tolerance=1e-6, initial_damping=1e-6)
 # Columns and rows of places where two lenses are compared.
 _GRID = (17, 11)
-_FINISH = LMOptions(max_iterations=30, tolerance=1e-6)
+_ITERATIONS = 60
+# Steps stop where they would gain less χ² than this.
+_ENOUGH = 0.1
 # With fewer corners than this all views are solved at once.
 _FEW_CORNERS = 1000
 
@@ -95,7 +96,7 @@ def second_opinion(
     model = plain.models[0]
     if views.corner_count > _FEW_CORNERS:
         start = _search(views, problem, start, model)
-    mild = minimise(problem, start, _FINISH).state
+    mild = minimise(problem, start, _rough(plain.residual_count)).state
     linear, cost = plain.linearise(mild), float(plain.cost(state))
     count = plain.shared_size + 6 * len(state[-1])
     measured = plain.residual_count + plain.prior_count
@@ -124,7 +125,11 @@ def _search(views: Views, problem: BoardProblem, start: State, model: LensModel)
     """Near the mild lens, by folded views."""
     folded = fold(views.problem(model, poses_only=True), start, float(views.observed_radius(start)))
     search = ReducedProblem(folded, model, problem.free[0], problem.terms)
-    return search.unfold(minimise(search, search.start(start[0]), _SEARCH).state)
+    return search.unfold(minimise(search, search.start(start[0]), _rough(problem.residual_count)).state)
+
+
+def _rough(residual_count: int) -> LMOptions:
+    return LMOptions(max_iterations=_ITERATIONS, tolerance=_ENOUGH / residual_count, initial_damping=1e-6)
 
 
 def _difference(problem: BoardProblem, state: State, other: State) -> Tensor:

@@ -285,6 +285,12 @@ class BoardProblem(SchurProblem):
             out.append(rows @ rows.transpose(-1, -2))
         return torch.cat(out, -3)
 
+    def whiten(self, vectors: Tensor, views: slice = _ALL) -> Tensor:
+        """Vectors (V, Q, 2, N) of the first camera's pixels by the corners' weights, like its residuals."""
+        if self.whitening is None:
+            return vectors
+        return torch.einsum("vuwn,vqwn->vqun", self.whitening[views, 0], vectors)
+
     def rows(self, state: State, views: slice = _ALL) -> Tensor:
         """See `SchurProblem.rows`; of a state that holds the poses of some views only, if these are given."""
         s = self.unpack(state)

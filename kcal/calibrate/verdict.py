@@ -68,10 +68,10 @@ def opinion_warnings(opinion: Opinion) -> list[str]:
     """A warning where a milder lens fits nearly as well and sees the image elsewhere than σ explains."""
     if opinion.explained:
         return []
-    off = f"up to {opinion.shift:.1f} px off" if math.isfinite(opinion.shift) else "without an image in parts of it"
+    off = f"sees the picture up to {opinion.shift:.1f} px off" if math.isfinite(opinion.shift) else "reaches farther"
     return [
-        f"a milder lens fits almost as well (RMS {opinion.rms:.4f} px) and is {off} in this image: the views do not "
-        "determine this model; use a weak prior (0.3), a smaller model or more views"
+        f"a milder lens fits almost as well (RMS {opinion.rms:.4f} px) and {off}: the views do not determine this "
+        "model; use a weak prior (0.3), a smaller model or more views"
     ]
 
 
