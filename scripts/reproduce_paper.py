@@ -12,8 +12,6 @@ its pictures are made. One process, one thread; the page says how long every sta
 from __future__ import annotations
 
 import argparse
-import importlib.util
-import json
 import time
 from pathlib import Path
 
@@ -23,7 +21,7 @@ from page import DOCS
 from paper_figures import write_figures
 from paper_page import page
 from paper_site import EXTRA, KINDS
-from paper_solve import MODELS, run_seed
+from paper_solve import run_seed
 
 
 def main() -> None:
@@ -37,24 +35,14 @@ def main() -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
 
-    models = dict(MODELS)
-    if importlib.util.find_spec("kcal.calibrate.hybrid") is not None:
-        models["hybrid"] = "hybrid"
     results: dict[str, list[dict]] = {}
     # Seed by seed, so that a run that is stopped has something of every kind.
     for seed in range(arguments.seeds):
         for name in arguments.kinds.split(","):
-            folder = arguments.work / f"{name}-{seed}-{arguments.views}"
-            path = folder / "result.json"
-            if path.exists() and set(models) <= set(json.loads(path.read_text())["models"]):
-                print(f"{name}, seed {seed}: there", flush=True)
-            else:
-                start = time.perf_counter()
-                folder.mkdir(parents=True, exist_ok=True)
-                result = run_seed(folder, name, seed, arguments.views, models, before=path)
-                path.write_text(json.dumps(result | {"models": list(models)}))
-                print(f"{name}, seed {seed}: {time.perf_counter() - start:.0f} s", flush=True)
-            results.setdefault(name, []).append(json.loads(path.read_text()))
+            start = time.perf_counter()
+            result = run_seed(arguments.work / f"{name}-{seed}-{arguments.views}", name, seed, arguments.views)
+            results.setdefault(name, []).append(result)
+            print(f"{name}, seed {seed}: {time.perf_counter() - start:.0f} s", flush=True)
     text = page(results, arguments.views)
     print(text)
     if arguments.write:
