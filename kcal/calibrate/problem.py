@@ -296,7 +296,7 @@ class BoardProblem(SchurProblem):
         s = self.unpack(state)
         seen, target = self.seen[..., views, :, :], self._target[..., views, :, :, :]
         rotated_board, points = self.points(s)
-        if on_host(self.models, points, s.parameters[0]):
+        if self.fields == (None,) and on_host(self.models, points, s.parameters[0]):
             bend = None
             if self.free_warp:
                 bend = s.first_from_board_rotation[..., None, :, 2, None] * self._shape[:, None]

@@ -102,8 +102,8 @@ def calibrate(
         from kcal.cli.calibrate_hybrid import calibrate_hybrid_file
 
         for option, given in (
-            ("--fix", fix), ("--tie", tie), ("--free", free), ("--prior", prior), ("--loss", loss), ("--reject", reject),
-            ("--weak-prior", weak_prior), ("--camera", camera),
+            ("--fix", fix), ("--tie", tie), ("--free", free), ("--prior", prior), ("--loss", loss),
+            ("--reject", reject), ("--weak-prior", weak_prior), ("--camera", camera),
         ):  # fmt: skip
             if given:
                 raise InputError(f"{option} does not go with --model hybrid")

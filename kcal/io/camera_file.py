@@ -170,7 +170,6 @@ class CameraFile(NativeFile):
         standard_deviations: name -> one sigma of the parameter, None where it was held fixed; the whole is None
             when none was computed.
         covariance: of all parameters together; None when none was computed.
-            when no covariance was computed.
         residual: what corrects the lens before the intrinsics are applied, one entry a width; None: nothing. A camera
             with it is a `HybridCamera`, and means nothing without it: weights and parameters share one file, so that
             they cannot be mixed up.
