@@ -334,8 +334,8 @@ def main() -> None:
             "",
             f"`kcal rig check`, {draws // 2} repetitions: the right camera has turned by 0.01° of yaw. Static features "
             f"300 m to 8 km away whose places nobody knows, marked then and now with {MARK:g} px along each axis in "
-            "each image; and summits of roughly known range, marked now only. The old rig finds a target at 5 km that far "
-            "off; after `--relock` what remains is the error of the check.",
+            "each image; and summits of roughly known range, marked now only. The old rig finds a target at 5 km that "
+            "far off; after `--relock` what remains is the error of the check.",
             "",
         ]
     )
