@@ -61,7 +61,7 @@ def off(found: RigSolution) -> float:
 
 
 def pose_error(found: RigSolution) -> Tensor:
-    """(6,) of the relative pose, as `kcal.lens.pose.move` counts it."""
+    """(6,) of the relative pose, as `kcal.calibrate.motion.screw` counts it."""
     rotation = ROTATION[1] @ ROTATION[0].T
     rig = found.stereo()
     shift = rig.right_from_left_translation - ROTATION[1] @ (CENTRE[0] - CENTRE[1])
