@@ -14,6 +14,7 @@ from kcal.lens.projection import parameter_names, project_components
 from kcal.solve.implicit import Curvature, curvature
 from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import State
+from kcal.solve.schur import SchurLinearisation
 
 _POLISH = LMOptions(max_iterations=200, tolerance=1e-13)
 # Newton's steps after that: each squares the distance to the minimum.
@@ -41,6 +42,11 @@ class RecordedProblem(BoardProblem):
         if self.loss is not None:
             rows = rows * self.loss.weight(rows[:, -1].square().sum(-2)).sqrt()[:, None, None]
         return rows.flatten(-2)
+
+    def linearise(self, state: State) -> SchurLinearisation:
+        """See `Problem.linearise`."""
+        rows = self.rows(state)
+        return SchurLinearisation(rows @ rows.transpose(-1, -2), self.local_size, self.shared_rows(state))
 
 
 def settle(problem: BoardProblem, state: State) -> tuple[State, Curvature]:
