@@ -10,9 +10,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from kcal.calibrate.drift import measure_drift
     from kcal.calibrate.inverse_fit import train_inverse
     from kcal.calibrate.layer import CalibrationLayer
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera, calibrate_cameras
+    from kcal.calibrate.rig import JointOptions, solve_rig
+    from kcal.calibrate.rig_sources import RigData
     from kcal.calibrate.stereo import RigOptions, calibrate_rig
     from kcal.corners.board import Board
     from kcal.corners.detect import detect_images
@@ -44,6 +47,7 @@ __all__ = [
     "CalibrationOptions",
     "Camera",
     "InverseNet",
+    "JointOptions",
     "KcalError",
     "LMOptions",
     "LensModel",
@@ -52,6 +56,7 @@ __all__ = [
     "Observations",
     "Origin",
     "RigCovariance",
+    "RigData",
     "RigOptions",
     "StereoLocalizer",
     "StereoRig",
@@ -66,9 +71,11 @@ __all__ = [
     "detect_images",
     "load_camera",
     "load_rig",
+    "measure_drift",
     "new_pinhole",
     "save_camera",
     "save_rig",
+    "solve_rig",
     "train_inverse",
     "undistort_maps",
 ]
@@ -79,6 +86,7 @@ _HOME = {
     "CalibrationOptions": "kcal.calibrate.mono",
     "Camera": "kcal.lens.camera",
     "InverseNet": "kcal.lens.inverse_net",
+    "JointOptions": "kcal.calibrate.rig",
     "KcalError": "kcal.errors",
     "LMOptions": "kcal.solve.lm",
     "LensModel": "kcal.lens.model",
@@ -87,6 +95,7 @@ _HOME = {
     "Observations": "kcal.corners.observations",
     "Origin": "kcal.locate.geodesy",
     "RigCovariance": "kcal.locate.errors",
+    "RigData": "kcal.calibrate.rig_sources",
     "RigOptions": "kcal.calibrate.stereo",
     "StereoLocalizer": "kcal.locate.localizer",
     "StereoRig": "kcal.lens.rig",
@@ -101,9 +110,11 @@ _HOME = {
     "detect_images": "kcal.corners.detect",
     "load_camera": "kcal.io.camera_file",
     "load_rig": "kcal.io.rig_file",
+    "measure_drift": "kcal.calibrate.drift",
     "new_pinhole": "kcal.lens.pinhole",
     "save_camera": "kcal.io.camera_file",
     "save_rig": "kcal.io.rig_file",
+    "solve_rig": "kcal.calibrate.rig",
     "train_inverse": "kcal.calibrate.inverse_fit",
     "undistort_maps": "kcal.lens.images",
 }
