@@ -10,6 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from kcal.calibrate.hybrid import HybridOptions, calibrate_hybrid
     from kcal.calibrate.layer import CalibrationLayer
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.stereo import RigOptions, calibrate_rig
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from kcal.io.camera_file import load_camera, save_camera
     from kcal.io.rig_file import load_rig, save_rig
     from kcal.lens.camera import Camera
+    from kcal.lens.hybrid import HybridCamera
     from kcal.lens.images import Undistort, undistort_maps
     from kcal.lens.model import LensModel
     from kcal.lens.modules import Unproject
@@ -39,6 +41,8 @@ __all__ = [
     "CalibrationLayer",
     "CalibrationOptions",
     "Camera",
+    "HybridCamera",
+    "HybridOptions",
     "KcalError",
     "LMOptions",
     "LensModel",
@@ -55,6 +59,7 @@ __all__ = [
     "Unproject",
     "calibrate_camera",
     "calibrate_cameras",
+    "calibrate_hybrid",
     "calibrate_rig",
     "detect_images",
     "load_camera",
@@ -70,6 +75,8 @@ _HOME = {
     "CalibrationLayer": "kcal.calibrate.layer",
     "CalibrationOptions": "kcal.calibrate.mono",
     "Camera": "kcal.lens.camera",
+    "HybridCamera": "kcal.lens.hybrid",
+    "HybridOptions": "kcal.calibrate.hybrid",
     "KcalError": "kcal.errors",
     "LMOptions": "kcal.solve.lm",
     "LensModel": "kcal.lens.model",
@@ -86,6 +93,7 @@ _HOME = {
     "Unproject": "kcal.lens.modules",
     "calibrate_camera": "kcal.calibrate.mono",
     "calibrate_cameras": "kcal.calibrate.mono",
+    "calibrate_hybrid": "kcal.calibrate.hybrid",
     "calibrate_rig": "kcal.calibrate.stereo",
     "detect_images": "kcal.corners.detect",
     "load_camera": "kcal.io.camera_file",
