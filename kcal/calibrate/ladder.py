@@ -49,6 +49,8 @@ _RUNGS = ("opencv8", "opencv12", "opencv14", "ext16", "ext18", "ext20", "ext22")
 _LANDINGS = ("opencv14", "ext20", "ext22")
 # With more corners than this, valleys are not followed from the solution: a batch of starts would take too long.
 _MANY_CORNERS = 4000
+# How far all boards together may be turned against the first model's at a lower minimum, radians.
+_MOST_TURN = math.radians(7.0)
 # Enough to tell the minima apart and to come near the best one.
 _SEARCH = LMOptions(max_iterations=60, tolerance=1e-7, initial_damping=1e-6)
 # Height of the wall before a fold, in units of the noise.
@@ -193,7 +195,7 @@ def _climb_folded(
             result = yield Solve(problem, nested, options)
             spent += int(result.iterations)
         if views.corner_count <= _MANY_CORNERS:
-            result, steps = yield from _lower(views, problem, large, result, options)
+            result, steps = yield from _lower(views, problem, large, first, result, options)
             spent += steps
         reached, landed = result.state, large
         if large != models[-1]:
@@ -206,14 +208,26 @@ def _climb_folded(
 
 
 def _lower(
-    views: Views, problem: BoardProblem, model: LensModel, result: Result, options: LMOptions
+    views: Views, problem: BoardProblem, model: LensModel, first: State, result: Result, options: LMOptions
 ) -> Steps[tuple[Result, int]]:
-    """What lies further along the valleys, if it is lower and no less of a lens; and the trial steps spent."""
-    found = yield from escape(problem, result, options)
-    steps = int(found.iterations)
-    if views.trouble(found.state, model) > views.trouble(result.state, model):
-        return result, steps
-    return found, steps
+    """What lies further along the valleys, and the trial steps spent.
+
+    It must be no less of a lens. Neither may the camera's axis be somewhere else altogether: a tilt can be traded
+    against a turn of the camera, and far along that valley the last bit of RMS is bought with absurd principal points.
+    """
+    limit = views.trouble(result.state, model)
+
+    def turn(state: State) -> float:
+        """By how much all boards together are turned against the first model's, radians."""
+        return math.acos(min(1.0, max(-1.0, 0.5 * (float((state[-2] * first[-2]).sum((-2, -1)).mean()) - 1.0))))
+
+    most = max(_MOST_TURN, turn(result.state))
+
+    def accepts(state: State) -> bool:
+        return turn(state) <= most and views.trouble(state, model) <= limit
+
+    found = yield from escape(problem, result, options, accepts)
+    return found, int(found.iterations)
 
 
 def _minimum(
@@ -257,7 +271,7 @@ def _climb_wholly(
         kept[0] = result.state
         small = large
         if last and terms and views.corner_count <= _MANY_CORNERS:
-            result, steps = yield from _lower(views, views.problem(large, terms=terms), large, result, options)
+            result, steps = yield from _lower(views, views.problem(large, terms=terms), large, first, result, options)
             spent += steps
             kept[0] = result.state
         progress(str(large))

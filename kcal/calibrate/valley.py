@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import torch
 
@@ -29,16 +30,19 @@ _LOWEST = 1e-14
 _SEARCH = LMOptions(max_iterations=100, tolerance=1e-9, flatness=1e-5, initial_damping=1e-5)
 
 
-def escape(problem: BoardProblem, result: Result, options: LMOptions) -> Steps[Result]:
+def escape(
+    problem: BoardProblem, result: Result, options: LMOptions, accepts: Callable[[State], bool]
+) -> Steps[Result]:
     """Follow the valleys from a solution to lower ones, until there is none.
 
     Args:
         problem: not a batch.
         result: its solution.
         options: of the solves from where a search has ended.
+        accepts: whether a lower state is one that may be returned.
 
     Returns:
-        the lowest solution, its iterations those of all searches.
+        the lowest accepted solution, its iterations those of all searches.
     """
     spent = 0
     for _ in range(_ROUNDS if int(result.status) != Status.EXACT else 0):
@@ -47,12 +51,17 @@ def escape(problem: BoardProblem, result: Result, options: LMOptions) -> Steps[R
             break
         found = yield Solve(problem.repeated(len(starts)), stack(starts), _SEARCH)
         spent += int(found.iterations.max())
-        best = int(torch.nan_to_num(found.cost, nan=math.inf).argmin())
         before = float(result.cost)
-        if not float(found.cost[best]) < before:
+        order = torch.argsort(torch.nan_to_num(found.cost, nan=math.inf)).tolist()
+        lower = (pick(found.state, i) for i in order if float(found.cost[i]) < before)
+        best = next((state for state in lower if accepts(state)), None)
+        if best is None:
             break
-        result = yield Solve(problem, pick(found.state, best), options)
-        spent += int(result.iterations)
+        solved = yield Solve(problem, best, options)
+        spent += int(solved.iterations)
+        if not accepts(solved.state):
+            break
+        result = solved
         if not float(result.cost) < (1.0 - _GAIN) * before:
             break
     return dataclasses.replace(result, iterations=torch.full_like(result.iterations, spent))

@@ -23,6 +23,10 @@ def solved(noise: float = 0.2) -> tuple[Views, State]:
     return views, (truth.parameters_vector.detach(), *nothing, *poses)
 
 
+def anything(_: State) -> bool:
+    return True
+
+
 def test_starts_lie_as_far_away_as_they_say() -> None:
     """At 2 standard deviations along any direction the cost is higher by half of 2² noise variances, to first order."""
     views, start = solved()
@@ -41,13 +45,13 @@ def test_never_ends_higher_and_leaves_an_exact_solution_alone() -> None:
     views, start = solved()
     problem = views.problem(camera("opencv8").model)
     end = minimise(problem, start, OPTIONS)
-    found = alone(escape(problem, end, OPTIONS))
+    found = alone(escape(problem, end, OPTIONS, anything))
     assert float(found.cost) <= float(end.cost)
     assert int(found.iterations) > 0
     views, start = solved(noise=0.0)
     problem = views.problem(camera("opencv8").model)
     exact = minimise(problem, start, OPTIONS)
-    assert int(alone(escape(problem, exact, OPTIONS)).iterations) == 0
+    assert int(alone(escape(problem, exact, OPTIONS, anything)).iterations) == 0
 
 
 def test_finds_back_from_a_worse_minimum() -> None:
@@ -57,4 +61,6 @@ def test_finds_back_from_a_worse_minimum() -> None:
     best = minimise(problem, start, OPTIONS)
     early = minimise(problem, (start[0] * 1.01, *start[1:]), LMOptions(max_iterations=3))
     assert float(early.cost) > 1.001 * float(best.cost)
-    assert float(alone(escape(problem, early, OPTIONS)).cost) <= (1.0 + 1e-6) * float(best.cost)
+    assert float(alone(escape(problem, early, OPTIONS, anything)).cost) <= (1.0 + 1e-6) * float(best.cost)
+    refused = alone(escape(problem, early, OPTIONS, lambda _: False))
+    assert float(refused.cost) == float(early.cost)
