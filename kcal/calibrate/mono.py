@@ -113,7 +113,8 @@ def calibrate_cameras(
 
     Returns:
         for each camera what `calibrate_camera` returns, within the solver's tolerance, or the error that it would have
-        raised: one bad set does not spoil the others.
+        raised: one bad set does not spoil the others. Of a rich model with several minima of nearly the same cost
+        rounding may choose another one.
 
     Example:
         >>> from kcal.corners.board import Board
