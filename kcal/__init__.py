@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from kcal.calibrate.drift import measure_drift
+    from kcal.calibrate.hybrid import HybridOptions, calibrate_hybrid
     from kcal.calibrate.inverse_fit import train_inverse
     from kcal.calibrate.layer import CalibrationLayer
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera, calibrate_cameras
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from kcal.io.rig_file import load_rig, save_rig
     from kcal.lens.bake import bake
     from kcal.lens.camera import Camera
+    from kcal.lens.hybrid import HybridCamera
     from kcal.lens.images import Undistort, undistort_maps
     from kcal.lens.inverse_net import InverseNet
     from kcal.lens.lookup import LookupCamera
@@ -46,6 +48,8 @@ __all__ = [
     "CalibrationLayer",
     "CalibrationOptions",
     "Camera",
+    "HybridCamera",
+    "HybridOptions",
     "InverseNet",
     "JointOptions",
     "KcalError",
@@ -67,6 +71,7 @@ __all__ = [
     "bake",
     "calibrate_camera",
     "calibrate_cameras",
+    "calibrate_hybrid",
     "calibrate_rig",
     "detect_images",
     "load_camera",
@@ -85,6 +90,8 @@ _HOME = {
     "CalibrationLayer": "kcal.calibrate.layer",
     "CalibrationOptions": "kcal.calibrate.mono",
     "Camera": "kcal.lens.camera",
+    "HybridCamera": "kcal.lens.hybrid",
+    "HybridOptions": "kcal.calibrate.hybrid",
     "InverseNet": "kcal.lens.inverse_net",
     "JointOptions": "kcal.calibrate.rig",
     "KcalError": "kcal.errors",
@@ -106,6 +113,7 @@ _HOME = {
     "bake": "kcal.lens.bake",
     "calibrate_camera": "kcal.calibrate.mono",
     "calibrate_cameras": "kcal.calibrate.mono",
+    "calibrate_hybrid": "kcal.calibrate.hybrid",
     "calibrate_rig": "kcal.calibrate.stereo",
     "detect_images": "kcal.corners.detect",
     "load_camera": "kcal.io.camera_file",
