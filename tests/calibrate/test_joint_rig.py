@@ -7,6 +7,8 @@ import math
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rig_scenes import (
     BOARD,
     CAMERAS,
@@ -244,6 +246,33 @@ class TestRecovery:
         # Yaw is locked to a thousandth of a degree, while where the baseline points is hardly seen from afar.
         assert math.degrees(float(sigma[1])) < 0.002
         assert float(sigma[4:].max()) > 0.1
+
+
+class TestFrame:
+    @settings(max_examples=6)
+    @given(
+        turn=st.tuples(*[st.floats(-3.0, 3.0)] * 3),
+        shift=st.tuples(*[st.floats(-5e4, 5e4)] * 3),
+    )
+    def test_the_solution_moves_with_the_frame(self, turn: tuple, shift: tuple) -> None:
+        """Landmarks turned and shifted as a whole, up to 50 km: cameras follow, relative pose and sigmas stay."""
+        marks = landmarks(noise=0.1, error=0.02)
+        rotation, offset = rotation_from_vector(tensor(*turn)), tensor(*shift)
+        moved = dataclasses.replace(marks, points=marks.points @ rotation.T + offset)
+        here, there = solve_rig(data(landmarks=marks)), solve_rig(data(landmarks=moved))
+        sigma = here.relative_covariance().diagonal().sqrt()
+        assert bool(((pose_error(there) - pose_error(here)).abs() < 1e-4 * sigma).all())
+        torch.testing.assert_close(there.relative_covariance().diagonal().sqrt(), sigma, rtol=1e-5, atol=0)
+        spread = float(here.mounting_covariance().diagonal()[:3].sqrt().min())
+        assert float((there.centre - (here.centre @ rotation.T + offset)).abs().max()) < 1e-4 * spread + 1e-9
+
+    def test_a_free_lens_that_landmarks_cannot_tell_is_refused_by_name(self) -> None:
+        with pytest.raises(DegenerateError, match=r"how right stands from left: a mixture of .* and more could"):
+            solve_rig(data(landmarks=landmarks(count=4, noise=0.1)), JointOptions(intrinsics="free"))
+
+    def test_three_landmarks_leave_nothing_to_check_with(self) -> None:
+        found = solve_rig(data(landmarks=landmarks(count=3, noise=0.1)))
+        assert any("nothing is left over to check" in text for text in found.warnings)
 
 
 class TestHybrid:
