@@ -28,6 +28,7 @@ def refine_poses(
     state: State,
     options: LMOptions,
     fields: Sequence[Field | None] = (),
+    whitening: Tensor | None = None,
 ) -> tuple[State, Tensor]:
     """Minimise over each view's board pose alone, everything else held.
 
@@ -38,11 +39,12 @@ def refine_poses(
         state: as `BoardState.pack` gives it.
         options: of the solver.
         fields: what corrects each lens, see `BoardProblem`.
+        whitening: (V, C, N, 2, 2) weights of the corners, see `BoardProblem`.
 
     Returns:
         the state with refined board poses, and the cost of each view (V,); NaN where a start had none.
     """
-    return alone(refining(board_points, pixels, models, state, options, fields))
+    return alone(refining(board_points, pixels, models, state, options, fields, whitening))
 
 
 def refining(
@@ -52,10 +54,19 @@ def refining(
     state: State,
     options: LMOptions,
     fields: Sequence[Field | None] = (),
+    whitening: Tensor | None = None,
 ) -> Steps[tuple[State, Tensor]]:
     """`refine_poses` as steps of a calibration."""
     views = len(pixels)
-    problem = BoardProblem(board_points, pixels[:, None], models, [() for _ in models], fields=fields, batch=(views,))
+    problem = BoardProblem(
+        board_points,
+        pixels[:, None],
+        models,
+        [() for _ in models],
+        whitening=None if whitening is None else whitening[:, None],
+        fields=fields,
+        batch=(views,),
+    )
     *shared, rotation, translation = state
     start = (*(t.expand(views, *t.shape) for t in shared), rotation[:, None], translation[:, None])
     result = yield Solve(problem, start, options)

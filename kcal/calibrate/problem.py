@@ -285,12 +285,18 @@ class BoardProblem(SchurProblem):
             out.append(rows @ rows.transpose(-1, -2))
         return torch.cat(out, -3)
 
+    def whiten(self, vectors: Tensor, views: slice = _ALL) -> Tensor:
+        """Vectors (V, Q, 2, N) of the first camera's pixels by the corners' weights, like its residuals."""
+        if self.whitening is None:
+            return vectors
+        return torch.einsum("vuwn,vqwn->vqun", self.whitening[views, 0], vectors)
+
     def rows(self, state: State, views: slice = _ALL) -> Tensor:
         """See `SchurProblem.rows`; of a state that holds the poses of some views only, if these are given."""
         s = self.unpack(state)
         seen, target = self.seen[..., views, :, :], self._target[..., views, :, :, :]
         rotated_board, points = self.points(s)
-        if on_host(self.models, points, s.parameters[0]):
+        if self.fields == (None,) and on_host(self.models, points, s.parameters[0]):
             bend = None
             if self.free_warp:
                 bend = s.first_from_board_rotation[..., None, :, 2, None] * self._shape[:, None]

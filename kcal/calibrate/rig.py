@@ -18,7 +18,6 @@ from kcal.calibrate.rig_sources import RigData
 from kcal.calibrate.rig_spread import SharedSpread
 from kcal.calibrate.rig_start import Begun, first_poses
 from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, Status
 
@@ -200,7 +199,7 @@ def _solution(
     solved = problem.cameras(state)
     kept = all(not len(free) for free in work.free)
     cameras = data.cameras if kept else tuple(
-        Camera(values, size=camera.size, model=camera.model)
+        camera.with_parameters(values)
         for values, camera in zip(solved.parameters, data.cameras, strict=True)
     )  # fmt: skip
     squared, counts = torch.zeros(len(cameras)).double(), torch.zeros(len(cameras)).double()

@@ -21,7 +21,8 @@ def calibrate(
     model: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="Lens model: pinhole, opencv4, opencv5, opencv8, opencv12, opencv14, ext16 ... ext24."
+            metavar="NAME",
+            help="Lens model: pinhole, opencv4, opencv5, opencv8, opencv12, opencv14, ext16 ... ext24, or hybrid.",
         ),
     ] = "opencv5",
     board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
@@ -63,6 +64,10 @@ def calibrate(
         float, typer.Option(help="Greatest share of the corners that --reject may leave out.")
     ] = 0.1,
     name: Annotated[str, typer.Option(help="Name of the camera; the observations' file name if not given.")] = "",
+    groups: Annotated[
+        str,
+        typer.Option(metavar="KIND", help="For a hybrid, what is held out together: blocks of views, or views."),
+    ] = "blocks",
     picture: Annotated[Path | None, typer.Option(help="A .png file: coverage, residuals and views.")] = None,
 ) -> None:
     """Calibrate one camera: intrinsics, lens and error bars.
@@ -78,8 +83,12 @@ def calibrate(
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --board-warp --picture left.png`
 
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --weak-prior 0.3`
+
+    `kcal calibrate left.obs.json -o left.camera.json --model hybrid --board-warp`: a plain lens corrected by a smooth
+    field, kept only where it predicts views that were held out better than every parametric model.
     """
     from kcal.cli.console import err, out, steps
+    from kcal.errors import InputError
     from kcal.files import check_writable
     from kcal.lens.model import LensModel
 
@@ -89,6 +98,19 @@ def calibrate(
 
         check_picture_format(picture)
         check_writable(picture)
+    if model == "hybrid":
+        from kcal.cli.calibrate_hybrid import calibrate_hybrid_file
+
+        for option, given in (
+            ("--fix", fix), ("--tie", tie), ("--free", free), ("--prior", prior), ("--loss", loss),
+            ("--reject", reject), ("--weak-prior", weak_prior), ("--camera", camera),
+        ):  # fmt: skip
+            if given:
+                raise InputError(f"{option} does not go with --model hybrid")
+        calibrate_hybrid_file(
+            observations, output, name, picture, board_warp=board_warp, focal=focal, fov=fov, groups=groups
+        )
+        return
     lens = LensModel.named(model)
     known = None
     if camera is not None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 from typing import Self
 
+import torch
 from torch import Tensor
 
+from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -38,7 +40,6 @@ class HybridCamera(Camera):
         InputError: as `Camera`; a batch of cameras; a field that is no small correction.
 
     Example:
-        >>> import torch
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.1])
         >>> grid = FieldGrid.covering((-0.4, -0.3), (0.4, 0.3), widths=[0.2])
         >>> weights = torch.full((2, grid.count), 1e-3, dtype=torch.float64)
@@ -110,6 +111,13 @@ class HybridCamera(Camera):
         """Measure the valid region again, and check the field; call it after changing parameters or weights."""
         super().update_valid_region()
         self.residual.check()
+
+    def correction(self, pixels: Tensor) -> Tensor:
+        """By how many pixels (..., N, 2) the field moves what is seen at pixels (..., N, 2)."""
+        values = self.parameters_vector.detach()
+        u, v = as_points("pixels", pixels, 2).unbind(-1)
+        x, y, _ = self._from_sensor(u, v, values)
+        return pixels - torch.stack(to_pixels(x, y, values), -1)
 
     def _to_sensor(self, x: Tensor, y: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         moved = correct_components(x, y, self.residual.field, slopes=False)

@@ -93,6 +93,7 @@ def mixed_problem() -> tuple[RigProblem, State]:
     ]
     problem = RigProblem(
         [camera.model for camera in CAMERAS],
+        [None] * 3,
         groups,
         terms,
         [Free((0, 1, 7), (0, 0, 1)), Free.of(index), Free((), ())],
@@ -333,6 +334,25 @@ class TestWrong:
         # The record tells in which image the mark is wrong.
         assert seven.pixels[0] < 1.0 < 3.0 < seven.pixels[1]  # type: ignore[operator]
         assert bool((pose_error(found).abs() < 4.5 * found.relative_covariance().diagonal().sqrt()).all())
+
+    def test_a_wrong_one_that_bends_the_solution_is_found(self) -> None:
+        """The nearest landmark by far decides where the cameras stand: its own residual stays small."""
+        marks = landmarks(noise=0.1, error=0.02)
+        near = int((marks.points - CENTRE[0]).norm(dim=-1).argmin())
+        marks.pixels[near, 1] += tensor(1.5, -1.0)
+        kept = solve_rig(data(landmarks=marks), JointOptions(reject=False))
+        masked = next(item for item in kept.items if item.name == marks.names[near])
+        assert masked.sigmas < 4
+        assert [item.name for item in solve_rig(data(landmarks=marks)).left_out] == [marks.names[near]]
+
+    def test_deletions_are_what_leaving_out_does(self) -> None:
+        marks = landmarks(noise=0.1, error=0.02)
+        whole = solve_rig(data(landmarks=marks, baselines=BASELINE), JointOptions(reject=False))
+        falls = whole._problem.deletions(whole._state)[1]
+        for i in (0, 5, 11):
+            rest = data(landmarks=dataclasses.replace(marks, pixels=_without(marks.pixels, i)), baselines=BASELINE)
+            without = solve_rig(rest, JointOptions(reject=False))
+            assert float(falls[i]) == pytest.approx(whole.chi2 - without.chi2, rel=2e-2)
 
     def test_good_ones_stay(self) -> None:
         for seed in range(5):

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from kcal.errors import DegenerateError, FileError, InputError
 from kcal.io.lookup_file import load_lookup, save_lookup
+from kcal.io.onnx_file import save_onnx
 from kcal.lens.bake import bake
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid import HybridCamera
@@ -187,9 +188,7 @@ def test_graphs(direction: str, tmp_path: Path) -> None:
 
 
 def run_as_onnx(module: torch.nn.Module, inputs: Tensor, path: Path) -> tuple[Tensor, Tensor]:
-    count = torch.export.Dim("count", min=2)
-    torch.onnx.export(module, (inputs,), path, dynamo=True, dynamic_shapes=({0: count},), verbose=False, optimize=False)
-    session = onnxruntime.InferenceSession(path)
+    session = onnxruntime.InferenceSession(save_onnx(module, inputs, path))
     values, valid = session.run(None, {session.get_inputs()[0].name: inputs.numpy()})
     return torch.from_numpy(values), torch.from_numpy(valid)
 

@@ -1,0 +1,439 @@
+"""Calibrating a camera whose lens is corrected by a residual field, where held-out views say that this is better."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Hashable, Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.forms import Forms, linearise_views
+from kcal.calibrate.ladder import Progress
+from kcal.calibrate.mono import calibrate_camera
+from kcal.calibrate.options import CalibrationOptions, CameraCalibrationResult
+from kcal.calibrate.poses import refine_poses
+from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.single import Solved, solve
+from kcal.calibrate.stacking import CANDIDATES, Prior, average_fit, deal, stack_weights
+from kcal.calibrate.terms import Term
+from kcal.calibrate.together import alone
+from kcal.calibrate.weights import whitening
+from kcal.corners.observations import Observations
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.hybrid import HybridCamera
+from kcal.lens.model import LensModel
+from kcal.lens.projection import from_pixels
+from kcal.lens.residual import Field, FieldGrid, FieldResidual
+from kcal.solve.lm import LMOptions, minimise
+from kcal.solve.result import State, Status
+
+_GATE = 5
+_LARGEST_GROUPS, _FEWEST_GROUPS, _RUN = 20, 5, 5
+_POSES = LMOptions(max_iterations=30, tolerance=1e-10)
+_REFIT = LMOptions(max_iterations=100, tolerance=1e-9, flatness=1e-6)
+# Rounds of averaging anew where the last average stands, until a step moves no corner by more than this share of the
+# noise.
+_ROUNDS, _STILL = 6, 0.02
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HybridOptions:
+    """Options of `calibrate_hybrid`.
+
+    Args:
+        model: the lens model that the field corrects. A field does better on a plain lens: on a rich one the two
+            compete for the same residuals.
+        rivals: the parametric models that it has to beat.
+        board_warp: estimate how the board bends.
+        weighted: as in `CalibrationOptions`.
+        groups: which views are held out together. "blocks": runs of views in the order of the observations, for
+            videos and captures in which neighbours are alike; "views": every view for itself; or a label for each view.
+            The claim that a hybrid is better holds for new data that differ from the calibration's as the groups
+            differ from each other.
+        widths: of the field's units, in half widths of the image. The narrowest says what detail the field can show
+            and most of what it costs: units grow with its inverse square.
+        gate: keep the hybrid only where it wins; False returns it in any case, with the same figures.
+        focal: as in `CalibrationOptions`.
+        field_of_view: likewise.
+    """
+
+    model: LensModel | str = "opencv8"
+    rivals: tuple[LensModel | str, ...] = ("opencv5", "opencv8", "opencv12", "opencv14", "ext18", "ext20")
+    board_warp: bool = False
+    weighted: bool = True
+    groups: Literal["blocks", "views"] | Sequence[Hashable] = "blocks"
+    widths: tuple[float, ...] = (1.2, 0.6, 0.3, 0.15)
+    gate: bool = True
+    focal: float | None = None
+    field_of_view: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.widths or not all(0.02 <= width <= 10 for width in self.widths):
+            raise InputError(f"HybridOptions: widths from 0.02 to 10 half widths of the image, got {self.widths}")
+
+    def parametric(self, model: LensModel | str) -> CalibrationOptions:
+        """What a parametric model is calibrated with."""
+        return CalibrationOptions(
+            model=model,
+            board_warp=self.board_warp,
+            weighted=self.weighted,
+            focal=self.focal,
+            field_of_view=self.field_of_view,
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HybridResult:
+    """What `calibrate_hybrid` found, and why it returns what it returns.
+
+    Args:
+        calibration: of the camera that is returned, a `HybridCamera` or the best parametric `Camera`. A hybrid's σ
+            counts what the averaged fits disagree about.
+        kept: whether the hybrid is returned.
+        reason: one sentence that says why.
+        held_out: name -> RMS (pixels, by the corners' weights) on views that were held out in groups, their poses
+            solved again: of each parametric model and of "hybrid". Infinite where a model could not show a corner.
+        groups: how many groups of views there were.
+        shares: how much each prior counts in the average that makes the field.
+        effective: how many of the field's weights the data determine, in effect; `units` x 2 there are.
+        units: of the field.
+        largest: the most that the field moves a point, pixels.
+    """
+
+    calibration: CameraCalibrationResult
+    kept: bool
+    reason: str
+    held_out: dict[str, float]
+    groups: int
+    shares: tuple[tuple[Prior, float], ...]
+    effective: float
+    units: int
+    largest: float
+
+
+@dataclasses.dataclass(frozen=True)
+class _Setting:
+    """All views, with the weights that every model is judged by."""
+
+    observations: Observations
+    options: HybridOptions
+    pixels: Tensor
+    weights: Tensor | None
+    groups: list[list[int]]
+
+    def problem(
+        self, model: LensModel, views: Sequence[int], field: Field | None = None, terms: Sequence[Term] = ()
+    ) -> BoardProblem:
+        """Corners of some views."""
+        chosen = list(views)
+        rules = self.options.parametric(model).rules(self.observations.image_size)
+        return BoardProblem(
+            self.observations.board.points,
+            self.pixels[chosen],
+            [model],
+            [rules.parameters(model)],
+            free_warp=self.options.board_warp,
+            whitening=None if self.weights is None else self.weights[chosen],
+            fields=[field],
+            terms=terms,
+        )
+
+    def held_out(self, model: LensModel, state: State, views: Sequence[int], field: Field | None) -> float:
+        """Sum of squared residuals of views whose poses are solved again, all else held."""
+        chosen = list(views)
+        _, cost = refine_poses(
+            self.observations.board.points,
+            self.pixels[chosen],
+            [model],
+            _some(state, chosen),
+            _POSES,
+            [field],
+            None if self.weights is None else self.weights[chosen],
+        )
+        return float(torch.nan_to_num(2.0 * cost, nan=math.inf).sum())
+
+    @property
+    def count(self) -> int:
+        """Corners seen."""
+        return int(torch.isfinite(self.pixels).all(-1).sum())
+
+
+def _some(state: State, views: Sequence[int]) -> State:
+    *shared, rotation, translation = state
+    return (*shared, rotation[list(views)], translation[list(views)])
+
+
+def group_views(observations: Observations, groups: Literal["blocks", "views"] | Sequence[Hashable]) -> list[list[int]]:
+    """Indices of the views that are held out together, see `HybridOptions.groups`.
+
+    At most twenty groups; runs of five views or more where there are views enough.
+
+    Raises:
+        InputError: labels that do not fit the views.
+        DegenerateError: fewer than five groups.
+    """
+    views = len(observations.views)
+    if groups == "blocks":
+        count = min(_LARGEST_GROUPS, max(views // _RUN, min(views, _FEWEST_GROUPS)))
+        found = [part.tolist() for part in torch.arange(views).tensor_split(count)]
+    elif groups == "views":
+        count = min(_LARGEST_GROUPS, views)
+        found = [list(range(i, views, count)) for i in range(count)]
+    else:
+        labels = list(groups)
+        if isinstance(groups, str) or len(labels) != views:
+            raise InputError(f"groups: 'blocks', 'views' or a label for each of the {views} views, got {groups!r}")
+        found = [[i for i, label in enumerate(labels) if label == one] for one in dict.fromkeys(labels)]
+    if len(found) < _FEWEST_GROUPS:
+        raise DegenerateError(f"{len(found)} groups of views: at least {_FEWEST_GROUPS} are needed to hold some out")
+    return found
+
+
+def calibrate_hybrid(
+    observations: Observations, options: HybridOptions | None = None, progress: Progress = lambda _: None
+) -> HybridResult:
+    """Calibrate a camera with a residual field, and keep the field only where held-out views say so.
+
+    From the parametric solution, the lens, the board's warp, all poses and the weights of a field of several widths
+    are fitted jointly under Gaussian priors of the weights: what the intrinsics or the lens can carry, they do.
+    Fits under thirteen priors, from no field to an almost free one, are averaged so that the average does best on
+    held-out groups of views. The same, done again without each fifth of the groups, is compared on that fifth with
+    every parametric model: only a hybrid that is better than all of them is returned.
+
+    Args:
+        observations: the views of one camera.
+        options: see `HybridOptions`.
+        progress: told what has just been finished.
+
+    Returns:
+        the camera with the evidence.
+
+    Raises:
+        DegenerateError: as `calibrate_camera`, and with too few groups of views.
+        InputError: as `calibrate_camera`.
+    """
+    options = options or HybridOptions()
+    groups = group_views(observations, options.groups)
+    base = LensModel.named(options.model)
+    solved = alone(solve(observations, options.parametric(base), progress))
+    covariances = observations.covariances() if options.weighted else None
+    weights = None
+    if covariances is not None and solved.variance is not None:
+        weights = whitening(covariances, solved.variance)[:, None]
+    setting = _Setting(observations, options, observations.pixels()[:, None], weights, groups)
+    grid, half = _grid(solved, observations.image_size, options.widths)
+    precisions = [prior.precision(grid, half) for prior in CANDIDATES]
+    state = solved.result.state
+    forms = _forms(setting, base, state, grid, torch.zeros(2, grid.count, dtype=torch.float64))
+
+    parts = deal(len(groups), _GATE)
+    held_out = {"hybrid": _judge_hybrid(setting, base, state, forms, grid, precisions, parts)}
+    progress("hybrid judged")
+    for rival in dict.fromkeys(LensModel.named(r) for r in options.rivals):
+        own = solved if rival == base else alone(solve(observations, options.parametric(rival), lambda _: None))
+        held_out[str(rival)] = _judge_parametric(setting, rival, own, parts)
+        progress(f"{rival} judged")
+
+    best = min((name for name in held_out if name != "hybrid"), key=lambda name: held_out[name], default=None)
+    wins = best is None or held_out["hybrid"] < held_out[best]
+    everything = torch.ones(len(groups), dtype=torch.bool)
+    shares = stack_weights(forms, everything, precisions)
+    final, field, last, settled = _settle(setting, base, state, grid, precisions, shares)
+    reason = _reason(held_out, best, wins, settled)
+    kept = settled and (wins or not options.gate)
+    if kept:
+        covariance = _covariance(last, precisions, shares)
+        calibration = _result(setting, base, final, field, solved, covariance)
+    else:
+        calibration = calibrate_camera(observations, options.parametric(best or base))
+    unit = float(final[0][:2].log().mean().exp())
+    form = forms.total(everything)
+    return HybridResult(
+        calibration=calibration,
+        kept=kept,
+        reason=reason,
+        held_out=held_out,
+        groups=len(groups),
+        shares=tuple((prior, share) for prior, share in zip(CANDIDATES, shares.tolist(), strict=True) if share > 1e-3),
+        effective=sum(
+            share * forms.freedom(form, precision)
+            for share, precision in zip(shares.tolist(), precisions, strict=True)
+            if share > 1e-3
+        ),
+        units=grid.count,
+        largest=FieldResidual(grid, field.weights).bounds()[0] * unit if settled else math.nan,
+    )
+
+
+def _reason(held_out: dict[str, float], best: str | None, wins: bool, settled: bool) -> str:
+    if not settled:
+        return "the field did not settle: the parametric camera is returned"
+    if best is None:
+        return "no parametric model was asked to compare with"
+    verb = "better than" if wins else "no better than"
+    return (
+        f"on held-out views the hybrid has {held_out['hybrid']:.4f} px, {verb} {best}, the best parametric model, "
+        f"with {held_out[best]:.4f} px"
+    )
+
+
+def _grid(solved: Solved, size: tuple[int, int], widths: Sequence[float]) -> tuple[FieldGrid, float]:
+    """Units over the image, and half its width, on the distorted plane of a solution."""
+    width, height = size
+    parameters = solved.result.state[0]
+    u = torch.tensor([-0.5, width - 0.5], dtype=torch.float64)
+    v = torch.tensor([-0.5, height - 0.5], dtype=torch.float64)
+    x, y = from_pixels(u, v, parameters)
+    half = 0.5 * float(x[1] - x[0])
+    low, high = (float(x[0]), float(y[0])), (float(x[1]), float(y[1]))
+    return FieldGrid.covering(low, high, [half * value for value in widths]), half
+
+
+def _forms(setting: _Setting, model: LensModel, state: State, grid: FieldGrid, weights: Tensor) -> Forms:
+    order = [view for group in setting.groups for view in group]
+    problem = setting.problem(model, order, Field(grid, weights))
+    return linearise_views(problem, _some(state, order), grid, weights, [len(group) for group in setting.groups])
+
+
+def _moved(problem: BoardProblem, state: State, step: Tensor, grid: FieldGrid, weights: Tensor) -> tuple[State, Field]:
+    """A state and a field after a step of `Forms`; poses stay, to be solved again."""
+    unit = float(state[0][:2].log().mean().exp())
+    shared, rest = step[: problem.shared_size], step[problem.shared_size : -1]
+    still = torch.zeros((len(state[-1]), 6), dtype=torch.float64)
+    after = problem.retract(state, (shared, still))
+    return after, Field(grid, weights + rest.unflatten(0, (2, -1)) / unit)
+
+
+def _judge_hybrid(
+    setting: _Setting,
+    model: LensModel,
+    state: State,
+    forms: Forms,
+    grid: FieldGrid,
+    precisions: Sequence[Tensor],
+    parts: Sequence[Tensor],
+) -> float:
+    """RMS on each part of the groups of a hybrid whose priors and weights come from the other parts alone."""
+    total = 0.0
+    problem = setting.problem(model, range(len(setting.pixels)))
+    zero = torch.zeros(2, grid.count, dtype=torch.float64)
+    for part in parts:
+        chosen = torch.ones(len(forms.counts), dtype=torch.bool)
+        chosen[part] = False
+        step = average_fit(forms, chosen, precisions, stack_weights(forms, chosen, precisions))
+        after, field = _moved(problem, state, step, grid, zero)
+        views = [i for g in part.tolist() for i in setting.groups[g]]
+        total += setting.held_out(model, after, views, field)
+    return math.sqrt(total / setting.count)
+
+
+def _judge_parametric(setting: _Setting, model: LensModel, solved: Solved, parts: Sequence[Tensor]) -> float:
+    """Likewise of a parametric model, solved again without each part from its solution for all views."""
+    total = 0.0
+    start = solved.result.state
+    for part in parts:
+        out = set(part.tolist())
+        train = [i for g, group in enumerate(setting.groups) if g not in out for i in group]
+        problem = setting.problem(model, train, terms=solved.minimum.terms)
+        *shared, _, _ = minimise(problem, _some(start, train), _REFIT).state
+        views = [i for g in out for i in setting.groups[g]]
+        total += setting.held_out(model, (*shared, *start[-2:]), views, None)
+    return math.sqrt(total / setting.count)
+
+
+def _settle(
+    setting: _Setting,
+    model: LensModel,
+    state: State,
+    grid: FieldGrid,
+    precisions: Sequence[Tensor],
+    shares: Tensor,
+) -> tuple[State, Field, Forms, bool]:
+    """The averaged fit of all views: step, poses solved again, forms taken anew, until it stands still.
+
+    Returns the state, its field, the last forms, and whether it settled.
+    """
+    weights = torch.zeros(2, grid.count, dtype=torch.float64)
+    every = torch.ones(len(setting.groups), dtype=torch.bool)
+    before = math.inf
+    for _ in range(_ROUNDS):
+        forms = _forms(setting, model, state, grid, weights)
+        step = average_fit(forms, every, precisions, shares)
+        problem = setting.problem(model, range(len(setting.pixels)), Field(grid, weights))
+        now = forms.total(every)
+        noise = float(now[-1, -1])
+        # Of the squared residuals, how much the step changes their vector.
+        change = step.clone()
+        change[-1] = 0.0
+        moved = float(change @ now @ change)
+        after, field = _moved(problem, state, step, grid, weights)
+        if not (math.isfinite(moved) and moved < 4.0 * before):
+            return state, Field(grid, weights), forms, False
+        after, cost = refine_poses(
+            setting.observations.board.points,
+            setting.pixels,
+            [model],
+            after,
+            _POSES,
+            [field],
+            setting.weights,
+        )
+        if not bool(torch.isfinite(cost).all()):
+            return state, Field(grid, weights), forms, False
+        state, weights, before = after, field.weights, moved
+        if moved <= _STILL**2 * noise / setting.count:
+            break
+    return state, Field(grid, weights), forms, moved <= 1e-4 * noise
+
+
+def _covariance(forms: Forms, precisions: Sequence[Tensor], shares: Tensor) -> Tensor:
+    """(L, L) covariance of lens and warp: within each candidate's fit, and between the fits that are averaged."""
+    form = forms.total(torch.ones(len(forms.counts), dtype=torch.bool))
+    used = [(share, precision) for share, precision in zip(shares.tolist(), precisions, strict=True) if share > 0]
+    fits = torch.stack([forms.fit(form, precision)[: forms.lens] for _, precision in used])
+    share = torch.tensor([share for share, _ in used], dtype=form.dtype)[:, None]
+    within = torch.stack([forms.covariance(form, precision) for _, precision in used])
+    noise = float(form[-1, -1]) / (2.0 * float(forms.counts.sum()))
+    apart = fits - (share * fits).sum(0)
+    between = apart.T @ (share * apart)
+    return (share[..., None] * within).sum(0) * noise + between
+
+
+def _result(
+    setting: _Setting, model: LensModel, state: State, field: Field, solved: Solved, covariance: Tensor
+) -> CameraCalibrationResult:
+    observations = setting.observations
+    problem = setting.problem(model, range(len(setting.pixels)), field)
+    state = problem.tidy(state)
+    s = problem.unpack(state)
+    camera = HybridCamera(
+        s.parameters[0], size=observations.image_size, model=model, residual=FieldResidual(field.grid, field.weights)
+    )
+    residuals = problem.pixel_errors(state)[:, 0].transpose(-1, -2)
+    seen = problem.seen[:, 0]
+    squared = (residuals**2).sum(-1)
+    free = list(problem.free[0])
+    of_all = covariance.new_zeros(len(camera.names), len(camera.names))
+    of_all[torch.tensor(free)[:, None], torch.tensor(free)] = covariance[: len(free), : len(free)]
+    return CameraCalibrationResult(
+        camera=camera,
+        rms=float(torch.sqrt(squared.sum() / seen.sum())),
+        weighted_rms=math.sqrt(2.0 * float(problem.cost(state)) / setting.count) if problem.whitened else None,
+        per_view_rms=torch.sqrt(squared.sum(-1) / seen.sum(-1)),
+        residuals=torch.where(seen[..., None], residuals, torch.nan),
+        cam_from_board_rotation=s.first_from_board_rotation,
+        cam_from_board_translation=s.first_from_board_translation,
+        board_warp=s.warp if problem.free_warp else None,
+        sigma={camera.names[i]: float(of_all[i, i].sqrt()) for i in free},
+        covariance=of_all,
+        status=Status.CONVERGED,
+        iterations=solved.spent,
+        warnings=(),
+    )
+
+
+__all__ = ["Camera", "HybridOptions", "HybridResult", "calibrate_hybrid", "group_views"]

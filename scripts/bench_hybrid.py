@@ -1,0 +1,168 @@
+"""The hybrid on a real wide lens, on views that were held out: which model predicts them, at what cost in time.
+
+    python scripts/bench_hybrid.py --out hybrid.jsonl            # fits that the file holds already are not done again
+    python scripts/bench_hybrid.py --out hybrid.jsonl --write    # the tables in docs/hybrid.md, from the file alone
+
+Data: `wide_lens_corners.npz` in $KCAL_DATA: 93 views of a 10 x 10 board through a lens of some 150 degrees (mrcal's
+tour). A lens is fitted to the training views; on each held-out view only its pose is solved again, lens and board warp
+as fitted. Measure: sqrt(sum w² |r|² / count), w the file's weights, pooled over all folds.
+
+Splits: `blocks20`: 20 contiguous blocks of 4 or 5 views, shuffled with seed 0, dealt to 5 folds; `evenodd`: every
+second view. The hybrid chooses its priors inside each training set alone: `hybrid` on blocks of its views,
+`hybrid-views` on interleaved views.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from page import write_section
+from timing import row, show
+
+from kcal.calibrate.align import Poses, pose_alone
+from kcal.calibrate.hybrid import HybridOptions, calibrate_hybrid
+from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
+from kcal.calibrate.poses import refine_poses
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.lens.camera import Camera
+from kcal.solve.lm import LMOptions
+
+PARAMETRIC = ("opencv5", "opencv8", "opencv12", "opencv14", "ext18", "ext20", "ext24")
+HYBRID = ("hybrid", "hybrid-views")
+RIVALS = ("opencv8", "opencv14", "ext20")
+EXACT = LMOptions(max_iterations=60, tolerance=1e-12)
+Record = dict[str, Any]
+
+
+def load() -> tuple[Observations, np.ndarray]:
+    folder = os.environ.get("KCAL_DATA")
+    if not folder:
+        raise SystemExit("set KCAL_DATA to the folder that holds wide_lens_corners.npz")
+    with np.load(Path(folder, "wide_lens_corners.npz")) as data:
+        corners, weight, size = data["corners"], data["weight"], data["image_size"]
+        columns, rows = (int(n) for n in data["board_size"])
+        board = Board(columns=columns, rows=rows, square=float(data["square_m"]))
+    views = []
+    for i, (points, weights) in enumerate(zip(corners.tolist(), weight.tolist(), strict=True)):
+        pixels = tuple((p[0], p[1]) if w > 0 else None for p, w in zip(points, weights, strict=True))
+        covariance = tuple((1 / w**2, 0.0, 1 / w**2) if w > 0 else None for w in weights)
+        views.append(View(name=f"{i:03d}", pixels=pixels, covariance=covariance))
+    return Observations(board=board, image_size=(int(size[0]), int(size[1])), views=tuple(views)), np.maximum(
+        weight, 0.0
+    )
+
+
+def folds(split: str, views: int) -> list[np.ndarray]:
+    """Views held out, as in the peers' comparison."""
+    if split == "evenodd":
+        return [np.arange(0, views, 2), np.arange(1, views, 2)]
+    blocks = np.array_split(np.arange(views), int(split.removeprefix("blocks")))
+    order = np.random.default_rng(0).permutation(len(blocks))
+    return [np.sort(np.concatenate([blocks[i] for i in order[k::5]])) for k in range(5)]
+
+
+def held_out(camera: Camera, warp: torch.Tensor, seen: Observations, weight: np.ndarray) -> tuple[float, int]:
+    """Sum of w² |r|² over views whose poses are solved again, and how many corners."""
+    pixels = seen.pixels()
+    alone: Poses
+    alone, _ = pose_alone(seen.board.points, pixels, camera, LMOptions(max_iterations=50))
+    parameters = camera.parameters_vector.detach()
+    none = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
+    state = (parameters, warp, *none, alone.rotation, alone.translation)
+    weights = torch.from_numpy(weight)[:, None, :, None, None] * torch.eye(2, dtype=torch.float64)
+    _, cost = refine_poses(seen.board.points, pixels[:, None], [camera.model], state, EXACT, [camera.field], weights)
+    return 2.0 * float(torch.nan_to_num(cost, nan=math.inf).sum()), int((weight > 0).sum())
+
+
+def subset(seen: Observations, index: np.ndarray) -> Observations:
+    return seen.subset([seen.names[i] for i in index])
+
+
+def measure(seen: Observations, weight: np.ndarray, split: str, fold: int, model: str) -> list[Record]:
+    out = folds(split, len(seen.views))[fold] if split != "none" else np.zeros(0, int)
+    train = np.setdiff1d(np.arange(len(seen.views)), out)
+    data, test = subset(seen, train), subset(seen, out) if len(out) else None
+    start, wall = time.process_time(), time.perf_counter()
+    found = []
+    if model in HYBRID:
+        groups: Literal["views", "blocks"] = "views" if model == "hybrid-views" else "blocks"
+        options = HybridOptions(board_warp=True, groups=groups, gate=False, rivals=RIVALS)
+        result = calibrate_hybrid(data, options)
+        best = min((name for name in result.held_out if name != "hybrid"), key=lambda name: result.held_out[name])
+        chosen = "hybrid" if result.held_out["hybrid"] < result.held_out[best] else best
+        note = {
+            "inside": result.held_out,
+            "chosen": chosen,
+            "effective": result.effective,
+            "units": result.units,
+            "largest": result.largest,
+            "shares": [[p.strength if math.isfinite(p.strength) else None, p.smoothness, s] for p, s in result.shares],
+        }
+        solved = result.calibration
+        found.append((model, solved, note))
+    else:
+        solved = calibrate_camera(data, CalibrationOptions(model=model, board_warp=True))
+        found.append((model, solved, {}))
+    cpu, wall = time.process_time() - start, time.perf_counter() - wall
+    records: list[Record] = []
+    for name, solved, note in found:
+        record: Record = {"split": split, "fold": fold, "model": name, "cpu_s": cpu, "wall_s": wall, **note}
+        if test is not None:
+            warp = solved.board_warp
+            assert warp is not None
+            record["sum"], record["count"] = held_out(solved.camera, warp, test, weight[out])
+        records.append(record)
+        print(json.dumps(record)[:300], flush=True)
+    return records
+
+
+def rms(records: list[Record]) -> float:
+    return math.sqrt(sum(r["sum"] for r in records) / sum(r["count"] for r in records))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="JSON lines, one a fit")
+    parser.add_argument("--splits", nargs="*", default=["blocks20", "evenodd"])
+    parser.add_argument("--models", nargs="*", default=[*PARAMETRIC, *HYBRID])
+    parser.add_argument("--write", action="store_true", help="write docs/hybrid.md from the file")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    seen, weight = load()
+    done: list[Record] = []
+    if args.out.exists():
+        done = [json.loads(line) for line in args.out.read_text().splitlines()]
+    have = {(r["split"], r["fold"], r["model"]) for r in done}
+    if not args.write:
+        for split in args.splits:
+            for model in args.models:
+                for fold in range(len(folds(split, len(seen.views)))):
+                    if (split, fold, model) in have:
+                        continue
+                    records = measure(seen, weight, split, fold, model)
+                    done += records
+                    with args.out.open("a") as file:
+                        file.writelines(json.dumps(record) + "\n" for record in records)
+    lines = [row("model", *args.splits), row("---", *["---:"] * len(args.splits))]
+    for model in args.models:
+        cells = []
+        for split in args.splits:
+            of = [r for r in done if r["split"] == split and r["model"] == model]
+            cells.append(f"{rms(of):.4f}" if len(of) == len(folds(split, len(seen.views))) else "")
+        lines.append(row(model, *cells))
+    show(lines)
+    if args.write:
+        write_section("hybrid.md", "held out", "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
