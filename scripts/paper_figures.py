@@ -18,7 +18,7 @@ from kcal.report.figures import new_figure, save_png
 
 COLOURS = {
     "14": "#dd7a1f", "16": "#b7791f", "18": "#8a5a00", "20": "#2b6cb0", "24": "#6b46c1", "hybrid": "#2f855a",
-    "OpenCV": "#6b7280",
+    "field": "#9f1239", "OpenCV": "#6b7280",
 }  # fmt: skip
 TRUE, FOUND, FAINT, INK = "#c02a6b", "#2b6cb0", "#9aa3af", "#111827"
 
@@ -61,7 +61,7 @@ def _turbo(share: float) -> tuple[float, float, float, float]:
 def _models(rigs: Results) -> None:
     figure = new_figure(11.0, 4.2 * len(rigs))
     for line, (name, runs) in enumerate(rigs.items()):
-        models = labels(runs, [*TABLE_3, "hybrid"])
+        models = labels(runs, [*TABLE_3, "hybrid", "field"])
         place = np.arange(len(models))
         for column, (title, value) in enumerate(
             (
@@ -134,7 +134,7 @@ def _map(rigs: Results) -> None:
     """Plan view of the first draw, with a logarithmic range: as the paper's Fig. 6 and 11."""
     figure = new_figure(13.5, 4.3 * len(rigs))
     for line, (name, runs) in enumerate(rigs.items()):
-        last = "hybrid" if "hybrid" in runs[0]["located"] else "24"
+        last = "field" if "field" in runs[0]["located"] else "24"
         panels = [("14", "integer"), ("14", "marked"), ("20", "marked"), (last, "marked")]
         for column, (label, kind) in enumerate(panels):
             axes = figure.add_subplot(len(rigs), 4, 4 * line + column + 1)

@@ -56,7 +56,7 @@ _CHECKS = (
     ("cairn", 2400.0, -16.0, 100.0),
 )
 _NEAR_BOARD, _PAIR_BOARD = BoardSize(9, 6, 0.06), BoardSize(9, 6, 0.4)
-_RENDER = RenderOptions()
+_RENDER = RenderOptions(blur=1.0, noise=4.0, vignetting=0.3, gamma=2.2)
 Places = tuple[tuple[str, float, float, float], ...]
 
 
