@@ -10,9 +10,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from kcal.calibrate.drift import measure_drift
     from kcal.calibrate.hybrid import HybridOptions, calibrate_hybrid
+    from kcal.calibrate.inverse_fit import train_inverse
     from kcal.calibrate.layer import CalibrationLayer
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera, calibrate_cameras
+    from kcal.calibrate.rig import JointOptions, solve_rig
+    from kcal.calibrate.rig_sources import RigData
     from kcal.calibrate.stereo import RigOptions, calibrate_rig
     from kcal.corners.board import Board
     from kcal.corners.detect import detect_images
@@ -20,9 +24,12 @@ if TYPE_CHECKING:
     from kcal.errors import KcalError
     from kcal.io.camera_file import load_camera, save_camera
     from kcal.io.rig_file import load_rig, save_rig
+    from kcal.lens.bake import bake
     from kcal.lens.camera import Camera
     from kcal.lens.hybrid import HybridCamera
     from kcal.lens.images import Undistort, undistort_maps
+    from kcal.lens.inverse_net import InverseNet
+    from kcal.lens.lookup import LookupCamera
     from kcal.lens.model import LensModel
     from kcal.lens.modules import Unproject
     from kcal.lens.pinhole import new_pinhole
@@ -43,13 +50,17 @@ __all__ = [
     "Camera",
     "HybridCamera",
     "HybridOptions",
+    "InverseNet",
+    "JointOptions",
     "KcalError",
     "LMOptions",
     "LensModel",
     "LevenbergMarquardt",
+    "LookupCamera",
     "Observations",
     "Origin",
     "RigCovariance",
+    "RigData",
     "RigOptions",
     "StereoLocalizer",
     "StereoRig",
@@ -57,6 +68,7 @@ __all__ = [
     "TriangulateViews",
     "Undistort",
     "Unproject",
+    "bake",
     "calibrate_camera",
     "calibrate_cameras",
     "calibrate_hybrid",
@@ -64,9 +76,12 @@ __all__ = [
     "detect_images",
     "load_camera",
     "load_rig",
+    "measure_drift",
     "new_pinhole",
     "save_camera",
     "save_rig",
+    "solve_rig",
+    "train_inverse",
     "undistort_maps",
 ]
 
@@ -77,13 +92,17 @@ _HOME = {
     "Camera": "kcal.lens.camera",
     "HybridCamera": "kcal.lens.hybrid",
     "HybridOptions": "kcal.calibrate.hybrid",
+    "InverseNet": "kcal.lens.inverse_net",
+    "JointOptions": "kcal.calibrate.rig",
     "KcalError": "kcal.errors",
     "LMOptions": "kcal.solve.lm",
     "LensModel": "kcal.lens.model",
     "LevenbergMarquardt": "kcal.solve.lm",
+    "LookupCamera": "kcal.lens.lookup",
     "Observations": "kcal.corners.observations",
     "Origin": "kcal.locate.geodesy",
     "RigCovariance": "kcal.locate.errors",
+    "RigData": "kcal.calibrate.rig_sources",
     "RigOptions": "kcal.calibrate.stereo",
     "StereoLocalizer": "kcal.locate.localizer",
     "StereoRig": "kcal.lens.rig",
@@ -91,6 +110,7 @@ _HOME = {
     "TriangulateViews": "kcal.locate.views",
     "Undistort": "kcal.lens.images",
     "Unproject": "kcal.lens.modules",
+    "bake": "kcal.lens.bake",
     "calibrate_camera": "kcal.calibrate.mono",
     "calibrate_cameras": "kcal.calibrate.mono",
     "calibrate_hybrid": "kcal.calibrate.hybrid",
@@ -98,9 +118,12 @@ _HOME = {
     "detect_images": "kcal.corners.detect",
     "load_camera": "kcal.io.camera_file",
     "load_rig": "kcal.io.rig_file",
+    "measure_drift": "kcal.calibrate.drift",
     "new_pinhole": "kcal.lens.pinhole",
     "save_camera": "kcal.io.camera_file",
     "save_rig": "kcal.io.rig_file",
+    "solve_rig": "kcal.calibrate.rig",
+    "train_inverse": "kcal.calibrate.inverse_fit",
     "undistort_maps": "kcal.lens.images",
 }
 

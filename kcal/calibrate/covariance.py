@@ -19,11 +19,16 @@ _RANK_TOLERANCE = 1e-13
 _LOST_SHARE = 1e-2
 
 
-class Spread(NamedTuple):
-    """Standard deviations of the shared parameters (S,), infinite where the data do not determine one."""
+class Uncertainty(NamedTuple):
+    """Covariance of the shared parameters (S, S), and whether the data determine each (S,)."""
 
-    sigma: Tensor
+    covariance: Tensor
     determined: Tensor
+
+    @property
+    def sigma(self) -> Tensor:
+        """(S,) standard deviations, infinite where not determined."""
+        return torch.where(self.determined, self.covariance.diagonal().sqrt(), torch.inf)
 
 
 class Covariance(NamedTuple):
@@ -58,30 +63,27 @@ class Covariance(NamedTuple):
         return across @ self.answer[other].T + alone
 
 
-def spread(linear: SchurLinearisation, residual_count: int, parameter_count: int) -> Spread:
-    """Standard deviations from the information at a minimum, all other parameters free.
+def uncertainty_of(linear: SchurLinearisation, residual_count: int, parameter_count: int) -> Uncertainty:
+    """Covariance of the shared parameters from the information at a minimum, all other parameters free.
 
-    σ² = diag((JᵀJ)⁻¹) ‖r‖² / (residuals - parameters), as `cv2.calibrateCameraExtended` reports them: the noise is
-    estimated from the residuals themselves and assumed independent and equal.
+    (JᵀJ)⁻¹ ‖r‖² / (residuals - parameters), whose diagonal is the square of what `cv2.calibrateCameraExtended` reports:
+    the noise is estimated from the residuals themselves and assumed independent and equal.
 
     Args:
         linear: the linearisation at the minimum, not a batch.
         residual_count: scalar residuals.
         parameter_count: all parameters that were free, poses included.
-
-    Returns:
-        σ of each shared parameter in its own units, and whether it is determined at all.
     """
     inverse, scale, determined = _invert(linear)
-    variance = inverse.diagonal() * _noise(linear, residual_count, parameter_count)
-    return Spread(torch.where(determined, variance.sqrt() * scale, torch.inf), determined)
+    noise = _noise(linear, residual_count, parameter_count)
+    return Uncertainty(inverse * scale[:, None] * scale * noise, determined)
 
 
 def covariance(linear: SchurLinearisation, residual_count: int, parameter_count: int) -> Covariance:
     """Covariance of the shared parameters and the poses at a minimum, by the Schur complement.
 
-    (JᵀJ)⁻¹ ‖r‖² / (residuals - parameters), as `spread`; its blocks follow from the inverse of the reduced normal
-    matrix and the factors of the 6 x 6 blocks, with work that grows linearly with the views.
+    (JᵀJ)⁻¹ ‖r‖² / (residuals - parameters), as `uncertainty_of`; its blocks follow from the inverse of the reduced
+    normal matrix and the factors of the 6 x 6 blocks, with work that grows linearly with the views.
 
     Args:
         linear: the linearisation at the minimum, not a batch.
@@ -94,10 +96,9 @@ def covariance(linear: SchurLinearisation, residual_count: int, parameter_count:
         >>> found.shared.tolist(), round(float(found.poses[0].trace()), 9)
         ([[0.5]], 3.0)
     """
-    inverse, scale, determined = _invert(linear)
-    noise = _noise(linear, residual_count, parameter_count)
+    shared, determined = uncertainty_of(linear, residual_count, parameter_count)
     answer, own = linear.answers()
-    return Covariance(inverse * scale[:, None] * scale * noise, determined, answer, own * noise)
+    return Covariance(shared, determined, answer, own * _noise(linear, residual_count, parameter_count))
 
 
 def projection_covariance(

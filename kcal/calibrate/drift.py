@@ -37,7 +37,7 @@ class Drift:
     Args:
         left: (3,) turn of the left camera; None where only the relative attitude can be told.
         right: (3,) of the right camera; likewise.
-        relative: (3,) of right_from_left about the right camera's axes, as in `kcal.lens.pose.move`.
+        relative: (3,) of right_from_left about the right camera's axes, as in `kcal.calibrate.motion.screw`.
         left_covariance: (3, 3), None as above.
         right_covariance: (3, 3), None as above.
         relative_covariance: (3, 3).
@@ -84,7 +84,8 @@ def measure_drift(
     """Find how the cameras of a rig have turned.
 
     From static features that were matched when the rig was good and are matched again (what they are and how far away
-    does not matter), from surveyed landmarks, or from far features of known range. Features that moved are left out.
+    does not matter), from surveyed landmarks, or from far features of known range; the last tell only how the right
+    camera has turned if the left one has not. Features that moved are left out.
 
     Args:
         rig: as it was solved.

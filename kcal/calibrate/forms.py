@@ -75,8 +75,8 @@ class Forms:
         step[used] = -torch.cholesky_solve((gradient * scale)[:, None], factor)[:, 0] * scale
         return step
 
-    def variance(self, form: Tensor, precision: Tensor) -> Tensor:
-        """(L,) variances of lens and warp under a prior, for residuals of variance one."""
+    def covariance(self, form: Tensor, precision: Tensor) -> Tensor:
+        """(L, L) of lens and warp under a prior, for residuals of variance one."""
         used = torch.cat([torch.ones(self.lens, dtype=torch.bool), torch.isfinite(precision)]).nonzero()[:, 0]
         matrix = form[used][:, used]
         matrix.diagonal()[self.lens :].add_(precision[used[self.lens :] - self.lens])
@@ -85,7 +85,7 @@ class Forms:
         matrix.diagonal().add_(_JITTER)
         first = torch.eye(len(used), self.lens, dtype=form.dtype)
         inverse = torch.cholesky_solve(first, torch.linalg.cholesky(matrix))
-        return inverse.diagonal() * scale[: self.lens] ** 2
+        return inverse[: self.lens] * scale[: self.lens, None] * scale[: self.lens]
 
     def freedom(self, form: Tensor, precision: Tensor) -> float:
         """The effective number of weights that a prior leaves free: the trace of what maps data to fitted weights."""

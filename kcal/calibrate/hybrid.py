@@ -190,8 +190,8 @@ def calibrate_hybrid(
     reason = _reason(held_out, best, wins, settled)
     kept = settled and (wins or not options.gate)
     if kept:
-        variance = _variance(last, precisions, shares)
-        calibration = _result(setting, observations.image_size, base, final, field, solved, variance)
+        covariance = _covariance(last, precisions, shares)
+        calibration = _result(setting, observations.image_size, base, final, field, solved, covariance)
     else:
         calibration = calibrate_camera(observations, options.parametric(best or base))
     unit = _focal(final)
@@ -323,15 +323,17 @@ def _settle(
     return state, field, forms, moved <= _SETTLED * noise
 
 
-def _variance(forms: Forms, precisions: Sequence[Tensor], shares: Tensor) -> Tensor:
-    """(L,) variances of lens and warp: within each candidate's fit, and between the fits that are averaged."""
+def _covariance(forms: Forms, precisions: Sequence[Tensor], shares: Tensor) -> Tensor:
+    """(L, L) covariance of lens and warp: within each candidate's fit, and between the fits that are averaged."""
     form = forms.total(torch.ones(len(forms.counts), dtype=torch.bool))
     used = [(share, precision) for share, precision in zip(shares.tolist(), precisions, strict=True) if share > 0]
     fits = torch.stack([forms.fit(form, precision)[: forms.lens] for _, precision in used])
     share = torch.tensor([share for share, _ in used], dtype=form.dtype)[:, None]
-    within = torch.stack([forms.variance(form, precision) for _, precision in used])
+    within = torch.stack([forms.covariance(form, precision) for _, precision in used])
     noise = float(form[-1, -1]) / (2.0 * float(forms.counts.sum()))
-    return (share * (within * noise + (fits - (share * fits).sum(0)) ** 2)).sum(0)
+    apart = fits - (share * fits).sum(0)
+    between = apart.T @ (share * apart)
+    return (share[..., None] * within).sum(0) * noise + between
 
 
 def _result(
@@ -341,7 +343,7 @@ def _result(
     state: State,
     field: Field,
     solved: Solved,
-    variance: Tensor,
+    covariance: Tensor,
 ) -> CameraCalibrationResult:
     problem = setting.problem(model, range(len(setting.pixels)), field)
     state = problem.tidy(state)
@@ -350,6 +352,9 @@ def _result(
     residuals = problem.pixel_errors(state)[:, 0].transpose(-1, -2)
     seen = problem.seen[:, 0]
     squared = (residuals**2).sum(-1)
+    free = list(problem.free[0])
+    of_all = covariance.new_zeros(len(camera.names), len(camera.names))
+    of_all[torch.tensor(free)[:, None], torch.tensor(free)] = covariance[: len(free), : len(free)]
     return CameraCalibrationResult(
         camera=camera,
         rms=float(torch.sqrt(squared.sum() / seen.sum())),
@@ -359,7 +364,8 @@ def _result(
         cam_from_board_rotation=s.first_from_board_rotation,
         cam_from_board_translation=s.first_from_board_translation,
         board_warp=s.warp if problem.free_warp else None,
-        sigma={camera.names[i]: float(variance[k].sqrt()) for k, i in enumerate(problem.free[0])},
+        sigma={camera.names[i]: float(of_all[i, i].sqrt()) for i in free},
+        covariance=of_all,
         status=Status.CONVERGED,
         iterations=solved.spent,
         warnings=(),

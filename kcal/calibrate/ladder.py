@@ -172,7 +172,8 @@ def _climb_folded(
     for large in [model for model in models[1:-1] if str(model) in _LANDINGS] + [models[-1]]:
         terms = (RadialBound(large, radius, _WALL * noise),)
         starts = [embed(parameters, small, large) for parameters in kept]
-        if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
+        bumpy = large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2
+        if bumpy and views.rules.mild is None:
             starts += [near_cancelling(starts[0], large, observed**2, place) for place in _BUMPS]
         starts = [views.rules.impose(parameters, large) for parameters in starts]
         known = (*terms, *views.rules.terms(large, views.prior_noise))

@@ -9,12 +9,14 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from kcal.calibrate.mild import Mild
 from kcal.calibrate.options import CalibrationOptions
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.settle import RecordedProblem, settle
 from kcal.calibrate.single import solve
 from kcal.calibrate.terms import Prior, Term
 from kcal.calibrate.together import alone
+from kcal.calibrate.views import Views
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -42,6 +44,7 @@ class CalibratedViews:
         residuals: (V, N, 2) projected minus observed, pixels; 0 where a corner was not seen.
         model: the lens model.
         size: (width, height) of the image.
+        reach: radius on the plane z = 1 of the outermost corner, to which a weak prior refers.
     """
 
     parameters: Tensor
@@ -51,6 +54,7 @@ class CalibratedViews:
     residuals: Tensor
     model: LensModel
     size: tuple[int, int]
+    reach: float
 
     def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (..., N, 2) of points (..., N, 3) of the camera's frame, and whether the lens is regular there.
@@ -112,11 +116,12 @@ def calibrate_views(
     """Calibrate one camera, with gradients by the corners, the board's points and the means of the priors.
 
     The solution x minimises c(x) = ½ Σ ρ(‖projected - observed‖²) + ½ Σ (corner_sigma / σ_k)² (x_k - mean_k)², where
-    all corners count alike. "implicit" differentiates the condition ∂c/∂x = 0: dx/dd = -H⁻¹ ∂²c/∂x∂d with the exact
-    Hessian H of c, residuals' curvature and robust loss counted, in the blocks of the Schur complement (work and memory
-    grow linearly with the views; nothing is computed before a gradient is asked for). "unroll" records eight steps of
-    Gauss and Newton at the solution: the same derivatives but for what such steps leave, and of any order. "none"
-    carries no gradient.
+    all corners count alike; a weak prior adds such terms for the coefficients, for the outermost corner that the search
+    found. "implicit" differentiates the condition ∂c/∂x = 0: dx/dd = -H⁻¹ ∂²c/∂x∂d with the exact Hessian H of c,
+    residuals' curvature and robust loss counted, in the blocks of the Schur complement (work and memory grow linearly
+    with the views; nothing is computed before a gradient is asked for). "unroll" records eight steps of Gauss and
+    Newton at the solution: the same derivatives but for what such steps leave, and of any order. "none" carries no
+    gradient.
 
     Args:
         pixels: (V, N, 2) corners; NaN where not seen.
@@ -162,7 +167,10 @@ def calibrate_views(
 
     def problem_of(values: Sequence[Tensor], kind: type[BoardProblem] = BoardProblem) -> BoardProblem:
         corners, board, mean = values
-        terms: tuple[Term, ...] = (Prior(torch.tensor(known), mean, weights),) if known else ()
+        terms: list[Term] = [Prior(torch.tensor(known), mean, weights)] if known else []
+        if options.weak_prior is not None:
+            mild = Mild(options.weak_prior, reach)
+            terms.append(mild.prior(options.lens, corner_sigma, {*options.fixed, *options.priors}))
         return kind(
             board,
             corners[:, None],
@@ -175,15 +183,16 @@ def calibrate_views(
 
     data = (pixels, board_points, means)
     fixed = tuple(tensor.detach() for tensor in data)
-    problem = problem_of(fixed)
     if start is None:
         corners = _Corners(_Board(fixed[1]), size, fixed[0])
         priors = {n: (float(m), s) for (n, (_, s)), m in zip(options.priors.items(), fixed[2], strict=True)}
         begin = alone(solve(corners, dataclasses.replace(options, priors=priors), lambda _: None)).result.state
+        reach = _reach(begin, fixed[1], fixed[0])
     else:
-        begin = start.state()
+        begin, reach = start.state(), start.reach
         if start.model != options.lens or len(begin[-1]) != len(pixels):
             raise InputError("calibrate_views: the start is of another lens model or another number of views")
+    problem = problem_of(fixed)
     state, found = settle(problem, problem.tidy(begin))
 
     if backward == "unroll":
@@ -207,6 +216,7 @@ def calibrate_views(
         residuals=at.pixel_errors(state)[:, 0].transpose(-1, -2),
         model=options.lens,
         size=size,
+        reach=reach,
     )
 
 
@@ -268,6 +278,12 @@ class CalibrationLayer(nn.Module):
     def extra_repr(self) -> str:
         """One line for people."""
         return f"size={self.size}, model={self.options.lens}, backward={self.backward}"
+
+
+def _reach(state: State, board_points: Tensor, pixels: Tensor) -> float:
+    """Largest undistorted radius at which a corner was seen."""
+    no_rules = Views(board_points=board_points, pixels=pixels[:, None], size=(1, 1), free_warp=False)
+    return float(no_rules.observed_radius(state))
 
 
 def _checked(

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.covariance import Spread, spread
+from kcal.calibrate.covariance import Uncertainty, uncertainty_of
 from kcal.calibrate.ladder import Progress
+from kcal.calibrate.opinion import is_rich, mild_term, second_opinion
 from kcal.calibrate.options import CalibrationOptions, CameraCalibrationResult
 from kcal.calibrate.outliers import (
     OutlierRejection,
@@ -24,9 +25,11 @@ from kcal.calibrate.outliers import (
     without,
 )
 from kcal.calibrate.problem import BoardProblem
-from kcal.calibrate.single import Solved, corner_problem, solve
+from kcal.calibrate.rules import Free
+from kcal.calibrate.single import LEAST_NOISE, Solved, corner_problem, solve
+from kcal.calibrate.terms import Prior, Term
 from kcal.calibrate.together import Solve, Steps, alone, together
-from kcal.calibrate.verdict import check_focal, rival_warnings, standing_out, warnings_of
+from kcal.calibrate.verdict import check_focal, opinion_warnings, rival_warnings, standing_out, warnings_of
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
@@ -247,6 +250,9 @@ def _robust_residuals(
 def _result(observations: Observations, found: Solved, options: CalibrationOptions) -> CameraCalibrationResult:
     problem, solved, model = found.problem, found.result, options.lens
     state = problem.tidy(solved.state)
+    # A lens may fold just where a corner is: there rounding decides whether it has an image.
+    if not bool(torch.isfinite(problem.cost(state))):
+        state = solved.state
     s = problem.unpack(state)
     pixels = observations.pixels()
     camera = Camera(s.parameters[0], size=observations.image_size, model=model)
@@ -255,14 +261,7 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
     squared = (residuals**2).sum(-1)
     per_view = torch.sqrt(squared.sum(-1) / seen.sum(-1))
     rms = float(torch.sqrt(squared.sum() / seen.sum()))
-    count = problem.shared_size + 6 * len(pixels)
-    # Under a known camera and a flat board nothing is shared by the views.
-    none = Spread(s.warp.new_zeros(0), torch.zeros(0, dtype=torch.bool))
-    uncertainty = (
-        none
-        if not problem.shared_size
-        else spread(problem.linearise(state), problem.residual_count + len(options.priors), count)
-    )
+    uncertainty, doubts = _uncertainty(observations, found, options, state)
     free = problem.free[0]
     rules = options.rules(observations.image_size)
     held = tuple(name for name in camera.names if name in rules.fixed)
@@ -288,5 +287,41 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
         fixed=held,
         status=status,
         iterations=found.spent,
-        warnings=tuple(warnings_of(observations, camera, rms, per_view, uncertainty, names, status)),
+        covariance=_by_parameter(uncertainty, free, len(camera.names)),
+        warnings=(*warnings_of(observations, camera, rms, per_view, uncertainty.determined, names, status), *doubts),
     )
+
+
+def _uncertainty(
+    observations: Observations, found: Solved, options: CalibrationOptions, state: State
+) -> tuple[Uncertainty, list[str]]:
+    """Covariance of the unknowns, and what a second opinion says of a rich model."""
+    minimum, model = found.minimum, options.lens
+    if not found.problem.shared_size:
+        # Under a known camera and a flat board nothing is shared by the views.
+        return Uncertainty(state[0].new_zeros(0, 0), torch.zeros(0, dtype=torch.bool)), []
+
+    def problem_with(*terms: Term) -> BoardProblem:
+        changed = dataclasses.replace(minimum, terms=terms)
+        return corner_problem(observations, options, changed, found.variance, options.loss)
+
+    # Walls before folds are no information about the lens.
+    known = [term for term in minimum.terms if isinstance(term, Prior)]
+    plain = problem_with(*known)
+    linear, count = plain.linearise(state), plain.shared_size + 6 * len(state[-1])
+    own = uncertainty_of(linear, plain.residual_count + plain.prior_count, count)
+    if not is_rich(model) or options.weak_prior is not None or options.camera is not None or not minimum.rivals:
+        return own, []
+    noise = max((2.0 * float(linear.cost) / plain.residual_count) ** 0.5, LEAST_NOISE)
+    start = minimum.rivals[0][1]
+    mild = problem_with(*known, mild_term(found.views, start, model, noise))
+    opinion = second_opinion(found.views, mild, plain, start, state, own)
+    return (own, []) if opinion is None else (opinion.uncertainty, opinion_warnings(opinion))
+
+
+def _by_parameter(uncertainty: Uncertainty, free: Free, count: int) -> Tensor:
+    """(5 + P, 5 + P) from that of the unknowns: tied parameters alike, held ones exact."""
+    out = uncertainty.covariance.new_zeros(count, count)
+    slots, indices = torch.tensor(free.slots, dtype=torch.long), torch.tensor(free.indices, dtype=torch.long)
+    out[indices[:, None], indices] = uncertainty.covariance[slots[:, None], slots]
+    return out

@@ -42,6 +42,10 @@ class CalibrationOptions:
         free: names that are estimated although they are held by default: "skew".
         priors: Gaussian knowledge by name, as {"fx": (1600, 5)}: mean and standard deviation. It counts against the
             corners by their noise, which is taken from the residuals.
+        weak_prior: how far a lens is expected to be from a pinhole, or None: every coefficient gets the mean zero and
+            the standard deviation with which its term would shift the outermost corner by this share of its radius (by
+            a thirtieth of it for decentring, prism and tilt; `kcal.calibrate.mild`). 0.3 hardly changes what the views
+            tell, and keeps rich models from what they do not tell (docs/solver.md has figures).
         camera: a known camera: all its parameters are held but those that `free` names, and only the board's poses (and
             its warp) are found, from one view on. Its lens model takes the place of `model`.
         solver: options of the Levenberg-Marquardt solver.
@@ -58,6 +62,7 @@ class CalibrationOptions:
     tied: tuple[tuple[str, ...], ...] = ()
     free: tuple[str, ...] = ()
     priors: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    weak_prior: float | None = None
     camera: Camera | None = None
     solver: LMOptions = dataclasses.field(
         default_factory=lambda: LMOptions(max_iterations=1000, tolerance=1e-12, flatness=2e-6)
@@ -70,6 +75,8 @@ class CalibrationOptions:
             raise InputError(f"CalibrationOptions: field_of_view must be in (0, 180) degrees, got {self.field_of_view}")
         if self.focal is not None and self.field_of_view is not None:
             raise InputError("CalibrationOptions: focal and field_of_view say the same; give one")
+        if self.weak_prior is not None and not 0 < self.weak_prior < float("inf"):
+            raise InputError(f"CalibrationOptions: weak_prior must be positive, got {self.weak_prior}")
         if self.camera is not None and self.camera.field is not None:
             raise InputError("CalibrationOptions: a known camera must be parametric, this one has a residual field")
         if self.camera is not None and (self.fixed or self.focal is not None or self.field_of_view is not None):
@@ -119,6 +126,9 @@ class CameraCalibrationResult:
         board_warp: (2,) metres of bend along x and y, or None if not estimated.
         sigma: name -> standard deviation of each parameter, priors counted; None where the data do not determine it and
             where it was fixed. Skew is listed only if the options name it.
+        covariance: (5 + P, 5 + P) of all parameters in the order of `Camera.names`, poses free: of σ, the square in its
+            diagonal. Zero for what was held; what the data leave open has a large variance, which rounding alone limits
+            (σ is None there).
         status: why the solver stopped.
         iterations: trial steps of the solver, all starts and models together.
         warnings: sentences about what the user should doubt.
@@ -136,6 +146,7 @@ class CameraCalibrationResult:
     cam_from_board_translation: Tensor
     board_warp: Tensor | None
     sigma: dict[str, float | None]
+    covariance: Tensor
     status: Status
     iterations: int
     warnings: tuple[str, ...]

@@ -15,9 +15,10 @@ from collections.abc import Hashable, Iterator, Sequence
 import torch
 from torch import Tensor
 
+from kcal.calibrate.host_rows import board_rows, on_host
 from kcal.calibrate.motion import screw
 from kcal.calibrate.rules import Free
-from kcal.calibrate.terms import Term
+from kcal.calibrate.terms import Prior, Term
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, project_components
@@ -101,6 +102,7 @@ class BoardProblem(SchurProblem):
     """
 
     local_size = 6
+    joint = True
 
     def __init__(
         self,
@@ -191,6 +193,11 @@ class BoardProblem(SchurProblem):
     def robust(self) -> bool:
         """Whether a robust loss is minimised."""
         return self.loss is not None
+
+    @property
+    def prior_count(self) -> int:
+        """Number of scalar residuals that are priors."""
+        return sum(len(term.index) for term in self.terms if isinstance(term, Prior))
 
     def unpack(self, state: State) -> BoardState:
         """The solver's tuple as named tensors."""
@@ -289,6 +296,14 @@ class BoardProblem(SchurProblem):
         s = self.unpack(state)
         seen, target = self.seen[..., views, :, :], self._target[..., views, :, :, :]
         rotated_board, points = self.points(s)
+        if self.fields == (None,) and on_host(self.models, points, s.parameters[0]):
+            bend = None
+            if self.free_warp:
+                bend = s.first_from_board_rotation[..., None, :, 2, None] * self._shape[:, None]
+            model, free = self.models[0], self.free[0]
+            both = rotated_board, points
+            rows = board_rows(both, s.parameters[0], model, free, target[..., 0, :, :], bend)[..., None, :, :]
+            return self._masked(rows, seen, views)
         shape = (*points.shape[:-2], 6 + self.shared_size + 1, len(self.models), 2, points.shape[-1])
         # What a camera's rows do not depend on is zero: the parameters of the others.
         rows = points.new_empty(shape) if len(self.models) == 1 else points.new_zeros(shape)
@@ -312,6 +327,10 @@ class BoardProblem(SchurProblem):
             # As in `residuals`, so that a start that is no projection is told from one that is.
             if not bool(projected.regular.all()):
                 error += torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
+        return self._masked(rows, seen, views)
+
+    def _masked(self, rows: Tensor, seen: Tensor, views: slice) -> Tensor:
+        """Rows (..., V, L + S + 1, C, 2, N) of the corners that were seen, weighted: (..., V, L + S + 1, R)."""
         if not self._all_seen:
             rows = torch.where(seen[..., None, :, None, :], rows, 0.0)
         if self.whitening is not None:

@@ -17,12 +17,13 @@ from collections.abc import Hashable, Sequence
 import torch
 from torch import Tensor
 
+from kcal.calibrate.host_rows import node_rows, on_host
 from kcal.calibrate.motion import screw
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.rules import Free
 from kcal.calibrate.terms import Term
 from kcal.lens.model import LensModel
-from kcal.lens.pose import rotation_from_vector, step_rows
+from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from kcal.solve.dense import DenseLinearisation
 from kcal.solve.result import State
@@ -263,36 +264,38 @@ class ReducedProblem:
         parameters, warp, rotation = state
         folded = self.folded
         points = rotation @ folded.points
-        seen = project_components(points, parameters, self.model, self.free.indices)
-        turn = step_rows(seen.by_point, points)[..., :3, :, :]
         matrix = folded.matrix[..., : self._nodes, :]
-        residuals = (seen.pixels - folded.pixels).flatten(-2) @ matrix + folded.offset
-        jacobian = torch.cat([self.free.collapse(seen.by_camera, -3), turn], -3).flatten(-2)
-        if matrix.ndim == 2:
-            jacobian = jacobian @ matrix
-        else:
-            # The starts of a camera share its matrix: one product for all.
-            jacobian = (jacobian.flatten(-3, -2) @ matrix).unflatten(-2, jacobian.shape[-3:-1])
+        rows = self._rows(points, parameters).flatten(-2)
+        # The starts of a camera share its matrix: one product for all.
+        rows = rows @ matrix if matrix.ndim == 2 else (rows.flatten(-3, -2) @ matrix).unflatten(-2, rows.shape[-3:-1])
+        rows[..., -1, :] += folded.offset
         if self._warps:
             by_warp = folded.matrix[..., self._nodes :, :]
-            residuals = residuals + (warp - folded.warp) @ by_warp
-            if matrix.ndim > 2:
-                by_warp = by_warp[:, None]
-            jacobian = torch.cat([jacobian, by_warp.expand(*self.batch, -1, -1)], -2)
-        residuals = torch.where(seen.regular.all(-1, keepdim=True), residuals, torch.nan)
+            rows[..., -1, :] += (warp - folded.warp) @ by_warp
+            by_warp = by_warp[:, None] if matrix.ndim > 2 else by_warp
+            by_warp = by_warp.expand(*self.batch, -1, -1)
+            rows = torch.cat([rows[..., :-1, :], by_warp, rows[..., -1:, :]], -2)
         if self.terms:
             values = torch.cat([parameters, warp], -1)
             found = torch.cat([term.rows(values) for term in self.terms], -1)
             if found.shape[-1]:
-                residuals = torch.cat([residuals, found[..., -1, :]], -1)
-                none = found.new_zeros((*found.shape[:-2], 3, found.shape[-1]))
                 by_value = [
                     self.free.collapse(found[..., list(self.free), :], -2),
-                    none,
+                    found.new_zeros((*found.shape[:-2], 3, found.shape[-1])),
                     found[..., -3 : -3 + self._warps, :],
+                    found[..., -1:, :],
                 ]
-                jacobian = torch.cat([jacobian, torch.cat(by_value, -2)], -1)
-        return DenseLinearisation(residuals, jacobian.transpose(-1, -2))
+                rows = torch.cat([rows, torch.cat(by_value, -2)], -1)
+        return DenseLinearisation.of_rows(rows)
+
+    def _rows(self, points: Tensor, parameters: Tensor) -> Tensor:
+        """(..., U + 3 + 1, 2, K): the shifts of the nodes' images, last, and their derivatives by lens and rotation."""
+        if on_host((self.model,), points, parameters):
+            return node_rows(points, parameters, self.model, self.free, self.folded.pixels)
+        seen = project_components(points, parameters, self.model, self.free.indices)
+        turn = step_rows(seen.by_point, points)[..., :3, :, :]
+        shift = torch.where(seen.regular[..., None, :], seen.pixels - self.folded.pixels, torch.nan)
+        return torch.cat([self.free.collapse(seen.by_camera, -3), turn, shift[..., None, :, :]], -3)
 
     def retract(self, state: State, step: State) -> State:
         """See `Problem.retract`."""
@@ -300,7 +303,8 @@ class ReducedProblem:
         lens, turn, bend = step[0].split([len(self.free), 3, self._warps], -1)
         parameters = parameters.clone()
         parameters[..., list(self.free)] += self.free.expand(lens)
-        return parameters, warp + bend if self._warps else warp, rotation_from_vector(turn) @ rotation
+        rotation, _ = screw(rotation, torch.zeros_like(turn), torch.cat([turn, torch.zeros_like(turn)], -1))
+        return parameters, warp + bend if self._warps else warp, rotation
 
     def unfold(self, state: State) -> State:
         """One solution (no batch) with the poses that answer it, as a state of `BoardProblem`."""

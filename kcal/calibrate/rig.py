@@ -18,7 +18,6 @@ from kcal.calibrate.rig_sources import RigData
 from kcal.calibrate.rig_spread import SharedSpread
 from kcal.calibrate.rig_start import Begun, first_poses
 from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, Status
 
@@ -65,6 +64,7 @@ def solve_rig(data: RigData, options: JointOptions | None = None) -> RigSolution
 
     Example:
         >>> from kcal.calibrate.rig_sources import Landmarks
+        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
         >>> truth = torch.tensor([[0.0, 0, 0], [10.0, 0, 0]], dtype=torch.float64)  # both look north
         >>> look = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
@@ -200,7 +200,7 @@ def _solution(
     solved = problem.cameras(state)
     kept = all(not len(free) for free in work.free)
     cameras = data.cameras if kept else tuple(
-        Camera(values, size=camera.size, model=camera.model)
+        camera.with_parameters(values)
         for values, camera in zip(solved.parameters, data.cameras, strict=True)
     )  # fmt: skip
     squared, counts = torch.zeros(len(cameras)).double(), torch.zeros(len(cameras)).double()

@@ -92,8 +92,8 @@ class Adjustment:
         count = len(self.data.cameras)
         free = [Free((), ())] * count if held else self.free
         turning, moving = ([not held and one for one in each] for each in (self._turning, self._moving))
-        models = [c.model for c in self.data.cameras]
-        return RigProblem(models, groups, () if held else self.terms, free, turning, moving, loss)
+        models, fields = [c.model for c in self.data.cameras], [c.field for c in self.data.cameras]
+        return RigProblem(models, fields, groups, () if held else self.terms, free, turning, moving, loss)
 
     def part(self, masks: Sequence[Tensor]) -> State:
         """The state of the cameras and of the items in the masks."""
@@ -125,6 +125,15 @@ class Adjustment:
         """χ² of every item as things stand; NaN for items outside the masks and infinite for what cannot be seen."""
         found = []
         for mask, part in zip(masks, self.problem(masks).block_squares(self.part(masks)), strict=True):
+            whole = torch.full(mask.shape, math.nan, dtype=torch.float64)
+            whole[mask] = part.nan_to_num(math.inf, math.inf)
+            found.append(whole)
+        return found
+
+    def deletions(self, masks: Sequence[Tensor]) -> list[Tensor]:
+        """By how much χ² would fall without each item (`RigProblem.deletions`); NaN outside the masks."""
+        found = []
+        for mask, part in zip(masks, self.problem(masks).deletions(self.part(masks)), strict=True):
             whole = torch.full(mask.shape, math.nan, dtype=torch.float64)
             whole[mask] = part.nan_to_num(math.inf, math.inf)
             found.append(whole)

@@ -21,6 +21,7 @@ from kcal.calibrate.rules import Free
 from kcal.lens.model import LensModel
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import project_components
+from kcal.lens.residual import Field
 from kcal.solve.result import State
 
 # Unknowns of the largest block, a board's pose.
@@ -32,6 +33,7 @@ class Sight(NamedTuple):
 
     parameters: Tensor
     model: LensModel
+    field: Field | None
     rotation: Tensor
     centre: Tensor
     free: Free
@@ -90,7 +92,7 @@ class Group(ABC):
         for c, sight in enumerate(sights):
             q = sight.rotation @ (y - w * sight.centre[:, None])
             wanted = sight.free.indices if derivatives else None
-            found = project_components(q, sight.parameters, sight.model, wanted)
+            found = project_components(q, sight.parameters, sight.model, wanted, sight.field)
             # As an error of a seen point, so that a pose behind which it lies is no candidate.
             bad = torch.where(found.regular, 0.0, torch.nan)[..., None, :]
             error = torch.where(self.seen[:, c, None, :], found.pixels - self.target[:, c] + bad, 0.0)

@@ -18,6 +18,7 @@ from kcal.calibrate.rules import Free
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, rotation_from_vector
 from kcal.lens.projection import INTRINSICS
+from kcal.lens.residual import Field
 from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import SchurLinearisation
@@ -100,6 +101,7 @@ class RigProblem:
 
     Args:
         models: one a camera.
+        fields: for each camera what corrects its lens, held as it is, or None.
         groups: what is seen, and how many tensors each group's local state has.
         terms: what was measured of the cameras besides.
         free: free parameters of each camera.
@@ -114,6 +116,7 @@ class RigProblem:
     def __init__(
         self,
         models: Sequence[LensModel],
+        fields: Sequence[Field | None],
         groups: Sequence[tuple[Group, int]],
         terms: Sequence[SharedTerm],
         free: Sequence[Free],
@@ -121,7 +124,7 @@ class RigProblem:
         moving: Sequence[bool],
         loss: RobustLoss | None = None,
     ) -> None:
-        self.models, self.free, self.loss = tuple(models), tuple(free), loss
+        self.models, self.fields, self.free, self.loss = tuple(models), tuple(fields), tuple(free), loss
         self.groups = tuple(group for group, _ in groups)
         self._tensors = [count for _, count in groups]
         self._terms = tuple(terms)
@@ -153,9 +156,18 @@ class RigProblem:
         """The cameras with their places in a step."""
         parameters, rotation, centre = self.cameras(state)
         return [
-            Sight(values, model, turn, place, *slots)
-            for values, model, turn, place, *slots in zip(
-                parameters, self.models, rotation, centre, self.free, self.inner, self.turn, self.shift, strict=True
+            Sight(values, model, field, turn, place, *slots)
+            for values, model, field, turn, place, *slots in zip(
+                parameters,
+                self.models,
+                self.fields,
+                rotation,
+                centre,
+                self.free,
+                self.inner,
+                self.turn,
+                self.shift,
+                strict=True,
             )
         ]
 
@@ -185,8 +197,30 @@ class RigProblem:
                 total = total + (count * self.loss.value(squares / count)).sum()
         return 0.5 * total
 
-    def linearise(self, state: State) -> SchurLinearisation:
-        """See `Problem.linearise`."""
+    def deletions(self, state: State) -> list[Tensor]:
+        """For each group (V,) by how much χ² would fall if one block were left out, at a minimum and to first order.
+
+        A block with leverage bends the solution towards itself and shows a small residual. With N the reduced normal
+        matrix, N_i and g_i the block's parts of it and of the gradient, χ² falls by the block's own squares and by
+        g_iᵀ (N - N_i)⁻¹ g_i of the others'; for a single residual that is its squared external Studentised value
+        (Baarda 1968; Cook and Weisberg 1982).
+        """
+        gram, L = self._gram(state), LOCAL_SIZE
+        scale = gram[:, :L, :L].diagonal(dim1=-2, dim2=-1).rsqrt()
+        factor, _ = torch.linalg.cholesky_ex(gram[:, :L, :L] * scale[:, :, None] * scale[:, None, :])
+        coupling = gram[:, :L, L:] * scale[:, :, None]
+        reduced = gram[:, L:, L:] - coupling.mT @ torch.cholesky_solve(coupling, factor)
+        terms = self.term_rows(state)
+        rest = (reduced.sum(0) + terms @ terms.T - reduced)[:, :-1, :-1]
+        unit = rest.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
+        roots, info = torch.linalg.cholesky_ex(rest * unit[:, :, None] * unit[:, None, :])
+        pull = torch.linalg.solve_triangular(roots, (reduced[:, :-1, -1] * unit)[..., None], upper=False)
+        # Without such a block the rest would determine nothing: it cannot be tested.
+        others = torch.where(info == 0, pull.square().sum((-2, -1)), 0.0)
+        return list((gram[:, -1, -1] + others).split([len(group) for group in self.groups]))
+
+    def _gram(self, state: State) -> Tensor:
+        """(V, L + S + 1, L + S + 1) products of the rows of all blocks, with the loss's weights."""
         sights, grams = self.sights(state), []
         for group, local in zip(self.groups, self.locals(state), strict=True):
             if not len(group):
@@ -202,9 +236,11 @@ class RigProblem:
             gram[:, missing:, missing:] = rows @ rows.transpose(-1, -2)
             grams.append(gram)
         size = LOCAL_SIZE + self.shared_size + 1
-        linear = SchurLinearisation(
-            torch.cat([state[0].new_zeros(0, size, size), *grams]), LOCAL_SIZE, self.term_rows(state)
-        )
+        return torch.cat([state[0].new_zeros(0, size, size), *grams])
+
+    def linearise(self, state: State) -> SchurLinearisation:
+        """See `Problem.linearise`."""
+        linear = SchurLinearisation(self._gram(state), LOCAL_SIZE, self.term_rows(state))
         if self.loss is not None:
             linear.cost = self.cost(state)
         return linear

@@ -41,9 +41,10 @@ def reject_wrong(work: Adjustment, masks: list[Tensor], reasons: list[dict[int, 
     for _ in range(_ROUNDS):
         work.solve(masks, solver)
         work.fit_corners(masks)
-        squares, freedom = work.squares(masks), work.freedom(masks)
-        limits = work.limits(squares, freedom)
-        excess = [torch.where(m, s / lim, 0.0) for m, s, lim in zip(masks, squares, limits, strict=True)]
+        falls, freedom = work.deletions(masks), work.freedom(masks)
+        # What is typical is told by the items' own squares: leverage is no misfit.
+        limits = work.limits(work.squares(masks), freedom)
+        excess = [torch.where(m, s / lim, 0.0) for m, s, lim in zip(masks, falls, limits, strict=True)]
         kind = max(range(3), key=lambda k: float(excess[k].max()) if len(excess[k]) else 0.0)
         if len(excess[kind]) and float(excess[kind].max()) > 1.0:
             masks[kind][int(excess[kind].argmax())] = False

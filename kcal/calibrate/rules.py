@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import torch
 from torch import Tensor
 
+from kcal.calibrate.mild import Mild
 from kcal.calibrate.terms import Prior, Term
 from kcal.errors import InputError
 from kcal.lens.model import PRESETS, LensModel
@@ -62,12 +63,19 @@ class Rules:
         tied: groups of names that are equal.
         free: names that are estimated although they are held by default.
         priors: name -> (mean, standard deviation), both in the parameter's units.
+        mild: a prior on all coefficients that have none of their own, or None.
     """
 
     fixed: Mapping[str, float] = dataclasses.field(default_factory=dict)
     tied: tuple[tuple[str, ...], ...] = ()
     free: tuple[str, ...] = ()
     priors: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    mild: Mild | None = None
+
+    @property
+    def informed(self) -> bool:
+        """Whether anything is known beside the corners."""
+        return bool(self.priors) or self.mild is not None
 
     def check(self, model: LensModel) -> None:
         """Raise `InputError` for names that do not exist, for contradictions and for values that are none."""
@@ -133,10 +141,13 @@ class Rules:
         """The priors as residuals beside corners of `noise` pixels."""
         names = parameter_names(model)
         known = {name: prior for name, prior in self.priors.items() if name in names}
-        if not known:
-            return ()
-        mean, sigma = torch.tensor(list(known.values()), dtype=torch.float64).unbind(-1)
-        return (Prior(torch.tensor([names.index(name) for name in known]), mean, noise / sigma),)
+        found: list[Term] = []
+        if known:
+            mean, sigma = torch.tensor(list(known.values()), dtype=torch.float64).unbind(-1)
+            found.append(Prior(torch.tensor([names.index(name) for name in known]), mean, noise / sigma))
+        if self.mild is not None:
+            found.append(self.mild.prior(model, noise, {*self.fixed, *self.priors}))
+        return tuple(found)
 
 
 def natural_value(name: str, size: tuple[int, int]) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.covariance import spread
+from kcal.calibrate.covariance import uncertainty_of
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.verdict import check_focal
 from kcal.errors import DegenerateError
@@ -14,6 +14,7 @@ from kcal.lens.projection import parameter_names, project_components
 from kcal.solve.implicit import Curvature, curvature
 from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import State
+from kcal.solve.schur import SchurLinearisation
 
 _POLISH = LMOptions(max_iterations=200, tolerance=1e-13)
 # Newton's steps after that: each squares the distance to the minimum.
@@ -41,6 +42,11 @@ class RecordedProblem(BoardProblem):
         if self.loss is not None:
             rows = rows * self.loss.weight(rows[:, -1].square().sum(-2)).sqrt()[:, None, None]
         return rows.flatten(-2)
+
+    def linearise(self, state: State) -> SchurLinearisation:
+        """See `Problem.linearise`."""
+        rows = self.rows(state)
+        return SchurLinearisation(rows @ rows.transpose(-1, -2), self.local_size, self.shared_rows(state))
 
 
 def settle(problem: BoardProblem, state: State) -> tuple[State, Curvature]:
@@ -74,7 +80,7 @@ def settle(problem: BoardProblem, state: State) -> tuple[State, Curvature]:
     if problem.shared_size:
         linear = found.beside(*zero)
         linear.cost = problem.cost(state)
-        known = spread(linear, problem.residual_count, problem.shared_size + zero[1].numel())
+        known = uncertainty_of(linear, problem.residual_count, problem.shared_size + zero[1].numel())
         groups = _unknowns(problem)
         names = [*(" = ".join(group) for group in groups), *(["the board's warp"] * 2)]
         lost = [name for name, sure in zip(names, known.determined.tolist(), strict=False) if not sure]

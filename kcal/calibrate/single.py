@@ -16,6 +16,7 @@ from kcal.calibrate.init import (
     spread_out,
 )
 from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
+from kcal.calibrate.mild import Mild
 from kcal.calibrate.options import CalibrationOptions
 from kcal.calibrate.poses import refining, unflipping
 from kcal.calibrate.problem import BoardProblem
@@ -38,7 +39,7 @@ _MINIMUM_WIDTH = 0.5
 _SUSPICIOUS_RMS = 2.0
 
 # Of a corner, pixels; and how often it is measured anew beside priors.
-_LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
+LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
 
 
 class BoardPoints(Protocol):
@@ -81,6 +82,7 @@ class Corners(Protocol):
 class Solved:
     """A solution for one set of corners, before it is judged."""
 
+    views: Views
     problem: BoardProblem
     result: Result
     minimum: Minimum
@@ -114,8 +116,12 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
         free_warp=options.board_warp,
         rules=rules,
     )
-    if rules.priors:
-        views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), _LEAST_NOISE))
+    reach = float(views.observed_radius(first))
+    if options.weak_prior is not None:
+        rules = dataclasses.replace(rules, mild=Mild(options.weak_prior, reach))
+        views = dataclasses.replace(views, rules=rules)
+    if rules.informed:
+        views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), LEAST_NOISE))
     minimum = yield from climb(views, first, cold, ladder, solver, progress)
     spent += minimum.iterations
 
@@ -131,10 +137,10 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
         if flipped:
             result = yield Solve(problem, state, solver)
             spent += int(result.iterations)
-    if rules.priors:
+    if rules.informed:
         # The noise, against which priors count, is that of this solution.
         for _ in range(_NOISE_ROUNDS):
-            views = dataclasses.replace(views, prior_noise=max(views.noise(result.state, model), _LEAST_NOISE))
+            views = dataclasses.replace(views, prior_noise=max(views.noise(result.state, model), LEAST_NOISE))
             problem = views.problem(model, terms=minimum.terms)
             result = yield Solve(problem, result.state, solver)
             spent += int(result.iterations)
@@ -150,7 +156,13 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
         result = yield Solve(problem, result.state, solver)
         spent += int(result.iterations)
     return Solved(
-        problem=problem, result=result, minimum=minimum, plain_cost=plain_cost, spent=spent, variance=variance
+        views=views,
+        problem=problem,
+        result=result,
+        minimum=minimum,
+        plain_cost=plain_cost,
+        spent=spent,
+        variance=variance,
     )
 
 

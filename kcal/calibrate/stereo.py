@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.align import MINIMUM_CORNERS, check_fit, consensus, pair_rms, pose_alone
-from kcal.calibrate.covariance import spread
+from kcal.calibrate.covariance import uncertainty_of
 from kcal.calibrate.init import spread_out
+from kcal.calibrate.pair_checks import FEWEST, alone_squares, disagreement
 from kcal.calibrate.pairs import Pair
 from kcal.calibrate.problem import BoardProblem, BoardState
 from kcal.calibrate.views import free_parameters
+from kcal.calibrate.weights import whitening
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
@@ -36,11 +39,15 @@ class RigOptions:
     Args:
         refine_cameras: solve for intrinsics and lenses again, jointly with the rig, starting from the given cameras.
         board_warp: estimate how the board bends.
+        weighted: let corners count by their covariances where all views have them.
+        reject: leave out pairs that noise cannot explain; otherwise a warning names them.
         solver: options of the Levenberg-Marquardt solver.
     """
 
     refine_cameras: bool = False
     board_warp: bool = False
+    weighted: bool = True
+    reject: bool = False
     solver: LMOptions = dataclasses.field(default_factory=LMOptions)
 
 
@@ -59,6 +66,10 @@ class RigCalibrationResult:
         excluded: pairs left out, with the reason.
         sigma_rotation: (3,) radians, of right_from_left about the right camera's x (pitch), y (yaw) and z (roll).
         sigma_translation: (3,) metres, of right_from_left along the right camera's axes.
+        covariance: of both cameras' parameters (zeros where they were held) and right_from_left together, in the order
+            of `kcal.locate.errors.RigCovariance`.
+        disagreement: (P,) of the pairs used: above 1, joining the cameras costs a pair more than noise explains; see
+            `kcal.calibrate.pair_checks`.
         pixels: (P, 2, N, 2) corners as used, turned where flipped; NaN where not seen.
         status: why the solver stopped.
         warnings: sentences about what the user should doubt.
@@ -74,6 +85,8 @@ class RigCalibrationResult:
     excluded: tuple[tuple[Pair, str], ...]
     sigma_rotation: Tensor
     sigma_translation: Tensor
+    covariance: Tensor
+    disagreement: Tensor
     pixels: Tensor
     status: Status
     warnings: tuple[str, ...]
@@ -126,7 +139,7 @@ def calibrate_rig(
         [-0.2, 0.0, 0.0]
     """
     options = options or RigOptions()
-    pixels, names = _pixels(left, right, left_observations, right_observations, pairs)
+    pixels, names, covariances = _pixels(left, right, left_observations, right_observations, pairs)
     board = left_observations.board.points
     cameras = (left, right)
     lost = _drop_rayless(pixels, cameras, names)
@@ -134,7 +147,11 @@ def calibrate_rig(
     check_fit(board, pixels, cameras, alone, options.solver)
 
     relative, turned, error = consensus(board, pixels, cameras, views[0], views[1])
+    # Before boards are turned: then a camera's own poses are no longer those of its corners.
+    apart, variance = alone_squares(board, pixels, cameras, views)
     pixels[turned, 1] = pixels[turned, 1].flip(-2)
+    if covariances is not None:
+        covariances[turned, 1] = covariances[turned, 1].flip(-3)
     flipped = [names[i] for i in turned.nonzero()[:, 0].tolist()]
     excluded: list[tuple[Pair, str]] = []
     keep = ~_outliers(error, *_ROUGH)
@@ -151,6 +168,8 @@ def calibrate_rig(
     ).pack()
     free = [free_parameters(camera.model) if options.refine_cameras else [] for camera in cameras]
     models, fields = [camera.model for camera in cameras], [camera.field for camera in cameras]
+    settled = False
+    suspects: list[tuple[int, str]] = []
     while True:
         if not bool(keep.any()):
             raise DegenerateError("no pair is left: do the views of a pair show the same board at the same moment?")
@@ -158,19 +177,43 @@ def calibrate_rig(
         problem = BoardProblem(board, pixels[keep], models, free, free_warp=options.board_warp, fields=fields)
         result = minimise(problem, (*shared, rotation[keep], translation[keep]), options.solver)
         rms = pair_rms(problem, result.state, pixels[keep])
-        # The worst alone: it has spoilt the others.
-        worse = _outliers(rms, *_FINE) & (rms == rms.max())
-        if not bool(worse.any()):
+        joined = 2.0 * problem.view_cost(result.state)
+        beyond = disagreement(joined, apart[keep], variance)
+        if settled:
             break
-        kept = keep.nonzero()[:, 0]
-        for i in worse.nonzero()[:, 0].tolist():
-            reason = f"RMS {float(rms[i]):.2f} px against {float(rms.median()):.2f} px typically"
-            excluded.append((names[int(kept[i])], reason))
-        keep[kept[worse]] = False
+        kept = keep.nonzero()[:, 0].tolist()
+        # The worst alone: it has spoilt the others.
+        worst = int(rms.argmax())
+        if bool(_outliers(rms, *_FINE)[worst]):
+            reason = f"RMS {float(rms[worst]):.2f} px against {float(rms.median()):.2f} px typically"
+            excluded.append((names[kept[worst]], reason))
+            keep[kept[worst]] = False
+            continue
+        worst = int(beyond.argmax())
+        if len(rms) >= FEWEST and float(beyond[worst]) > 1.0:
+            suspects.append((kept[worst], _disagrees(joined - apart[keep], worst)))
+            keep[kept[worst]] = False
+            continue
+        if not suspects or options.reject:
+            excluded += [(names[i], reason) for i, reason in suspects]
+            break
+        # Named, but used: once more with them.
+        keep[[i for i, _ in suspects]] = settled = True
+    if covariances is not None and options.weighted:
+        # What the plain solution leaves tells how much there is beyond the corners' own noise.
+        spread_left = 2.0 * float(result.cost) / problem.residual_count
+        weights = whitening(covariances[keep], spread_left)
+        problem = BoardProblem(
+            board, pixels[keep], models, free, free_warp=options.board_warp, whitening=weights, fields=fields
+        )  # fmt: skip
+        result = minimise(problem, result.state, options.solver)
     used = [names[i] for i in keep.nonzero()[:, 0].tolist()]
     solved = _result(problem, problem.tidy(result.state), Status(int(result.status)), cameras, pixels[keep], used)
+    if settled:
+        lost += [f"pair {names[i][0]}, {names[i][1]}: {reason}; was it one moment?" for i, reason in suspects]
     return dataclasses.replace(
         solved,
+        disagreement=beyond,
         flipped=tuple(pair for pair in flipped if pair in used),
         excluded=tuple(excluded),
         warnings=(*lost, *solved.warnings),
@@ -196,13 +239,18 @@ def _drop_rayless(pixels: Tensor, cameras: tuple[Camera, Camera], names: list[Pa
     return warnings
 
 
+def _disagrees(cost: Tensor, index: int) -> str:
+    times = math.sqrt(float(cost[index].clamp_min(0.0)) / max(float(cost.clamp_min(0.0).median()), 1e-12))
+    return f"its two views disagree about the rig {times:.1f} times as much as is typical"
+
+
 def _outliers(error: Tensor, times: float, floor: float) -> Tensor:
     return error > max(times * float(error.median()), floor)
 
 
 def _pixels(
     left: Camera, right: Camera, left_seen: Observations, right_seen: Observations, pairs: Sequence[Pair]
-) -> tuple[Tensor, list[Pair]]:
+) -> tuple[Tensor, list[Pair], Tensor | None]:
     if left_seen.board != right_seen.board:
         raise InputError(f"the cameras saw different boards: {left_seen.board} and {right_seen.board}")
     for word, camera, seen in (("left", left, left_seen), ("right", right, right_seen)):
@@ -213,9 +261,9 @@ def _pixels(
             )
     if not pairs:
         raise InputError("no pair of views")
-    lefts = left_seen.subset([pair[0] for pair in pairs]).pixels()
-    rights = right_seen.subset([pair[1] for pair in pairs]).pixels()
-    pixels = torch.stack([lefts, rights], 1)
+    sides = [seen.subset([pair[c] for pair in pairs]) for c, seen in enumerate((left_seen, right_seen))]
+    pixels = torch.stack([side.pixels() for side in sides], 1)
+    spreads = [spread for side in sides if (spread := side.covariances()) is not None]
     seen_corners = torch.isfinite(pixels).all(-1).sum(-1)
     for pair, counts in zip(pairs, seen_corners.tolist(), strict=True):
         if min(counts) < MINIMUM_CORNERS:
@@ -224,7 +272,7 @@ def _pixels(
     for c in (0, 1):
         for i in (~spread_out(board, pixels[:, c])).nonzero()[:, 0].tolist():
             raise InputError(f"{pairs[i][c]}: all its corners, or all but one, lie on one line; leave the pair out")
-    return pixels, list(pairs)
+    return pixels, list(pairs), torch.stack(spreads, 1) if len(spreads) == 2 else None
 
 
 def _result(
@@ -240,10 +288,13 @@ def _result(
     rig = StereoRig(
         solved[0], solved[1], nearest_rotation(s.cam_from_first_rotation[0]), s.cam_from_first_translation[0]
     )
-    squared = problem.residuals(state).unflatten(-1, (2, 2, -1)).pow(2).sum(-2)
+    # Plain pixels, also where corners were weighed.
+    squared = problem.pixel_errors(state).pow(2).sum(-2)
     seen = torch.isfinite(pixels).all(-1)
     each = torch.sqrt(squared.sum((0, 2)) / seen.sum((0, 2)))
-    uncertainty = spread(problem.linearise(state), problem.residual_count, problem.shared_size + 6 * len(pixels))
+    uncertainty = uncertainty_of(
+        problem.linearise(state), problem.residual_count, problem.shared_size + 6 * len(pixels)
+    )
     pose = uncertainty.sigma[sum(len(f) for f in problem.free) :][:6]
     warnings = []
     if len(used) < 3:
@@ -259,12 +310,28 @@ def _result(
         rms_left=float(each[0]),
         rms_right=float(each[1]),
         pairs=tuple(used),
-        per_pair_rms=pair_rms(problem, state, pixels),
+        per_pair_rms=torch.sqrt(squared.sum((1, 2)) / seen.sum((1, 2))),
         flipped=(),
         excluded=(),
         sigma_rotation=pose[:3],
         sigma_translation=pose[3:],
+        covariance=_joint(uncertainty.covariance, problem),
+        disagreement=torch.zeros(len(pixels), dtype=torch.float64),
         pixels=pixels,
         status=status,
         warnings=tuple(warnings),
     )
+
+
+def _joint(shared: Tensor, problem: BoardProblem) -> Tensor:
+    """The covariance of the shared unknowns as that of all parameters of both cameras and the relative pose."""
+    sizes = [5 + model.size for model in problem.models]
+    rows = torch.zeros(sum(sizes) + 6, len(shared), dtype=torch.float64)
+    start = column = 0
+    for size, free in zip(sizes, problem.free, strict=True):
+        for index, slot in zip(free.indices, free.slots, strict=True):
+            rows[start + index, column + slot] = 1.0
+        start, column = start + size, column + len(free)
+    rows[start:, column : column + 6] = torch.eye(6, dtype=torch.float64)
+    matrix = rows @ shared @ rows.T
+    return 0.5 * (matrix + matrix.T)

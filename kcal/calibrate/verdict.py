@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
-from kcal.calibrate.covariance import Spread
 from kcal.calibrate.ladder import Minimum
+from kcal.calibrate.opinion import Opinion
 from kcal.calibrate.outliers import corners_beyond
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError
@@ -63,6 +64,17 @@ def rival_warnings(
     return []
 
 
+def opinion_warnings(opinion: Opinion) -> list[str]:
+    """A warning where a milder lens fits nearly as well and sees the image elsewhere than σ explains."""
+    if opinion.explained:
+        return []
+    off = f"sees the picture up to {opinion.shift:.1f} px off" if math.isfinite(opinion.shift) else "reaches farther"
+    return [
+        f"a milder lens fits almost as well (RMS {opinion.rms:.4f} px) and {off}: the views do not determine this "
+        "model; use a weak prior (0.3), a smaller model or more views"
+    ]
+
+
 def standing_out(names: Sequence[str], residuals: Tensor) -> list[str]:
     """A warning where a corner is off by twice what noise explains; residuals (V, N, 2), NaN where not seen.
 
@@ -86,7 +98,7 @@ def warnings_of(
     camera: Camera,
     rms: float,
     per_view: Tensor,
-    uncertainty: Spread,
+    determined: Tensor,
     names: list[str],
     status: Status,
 ) -> list[str]:
@@ -101,7 +113,7 @@ def warnings_of(
         found.append(
             f"view {observations.names[i]}: RMS {float(per_view[i]):.2f} px against {typical:.2f} px typically"
         )
-    lost = [name for name, known in zip(names, uncertainty.determined.tolist(), strict=False) if not known]
+    lost = [name for name, known in zip(names, determined.tolist(), strict=False) if not known]
     if lost:
         found.append(f"the views do not determine {', '.join(lost)}: choose a smaller model or add views")
     if not bool(camera.covers_image()):

@@ -12,14 +12,15 @@ from torch import Tensor
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.rules import Free, Rules
 from kcal.calibrate.terms import Term
-from kcal.lens.camera import Camera
-from kcal.lens.inverse import valid_radius
 from kcal.lens.model import LensModel
-from kcal.lens.projection import INTRINSICS, parameter_names, project_components
+from kcal.lens.projection import parameter_names, project_components
 from kcal.solve.result import State
 
 # How far beyond the outermost point a lens must be regular; the image's corners move a little with the lens.
 _MARGIN = 1.05
+# Where `Views.trouble` looks: directions of the disc, points of each side of the image, steps from the axis outward.
+_DIRECTIONS, _SIDE, _STEPS = 16, 8, 250
+_SHARES = (0.5, 0.8, 1.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -85,30 +86,57 @@ class Views:
         return torch.where(seen, radius, 0.0).max()
 
     def trouble(self, state: State, model: LensModel) -> float:
-        """0 for a lens that is regular in the whole image, 1 if it folds outside the observed radius, else infinity."""
-        if not bool(valid_radius(state[0][len(INTRINSICS) :], model) > self.observed_radius(state)):
+        """0 for a lens that is regular in the whole image, 1 if it folds outside the observed radius, else infinity.
+
+        Looked at along some directions, in small steps: candidates of a search are many, and the one that is chosen
+        is measured (`kcal.lens.region`) when its camera is made.
+        """
+        angle = torch.arange(_DIRECTIONS, dtype=torch.float64) * (2.0 * math.pi / _DIRECTIONS)
+        disc = float(self.observed_radius(state)) * torch.stack([torch.cos(angle), torch.sin(angle)])
+        if not _regular_up_to(disc, state[0], model):
             return math.inf
-        return 0.0 if bool(Camera(state[0], size=self.size, model=model).covers_image()) else 1.0
+        border = _border(state[0], model, self.size)
+        return 0.0 if border is not None and _regular_up_to(border, state[0], model) else 1.0
+
+
+def _regular_up_to(ends: Tensor, parameters: Tensor, model: LensModel) -> bool:
+    """Whether a lens is regular on the straight ways from the axis to points (2, K) of the plane z = 1."""
+    steps = torch.linspace(0.0, 1.0, _STEPS + 1, dtype=torch.float64)[1:]
+    places = (ends[..., None] * steps).flatten(1)
+    points = torch.cat([places, torch.ones_like(places[:1])])
+    return bool(project_components(points, parameters, model).regular.all())
 
 
 def _rim(parameters: Tensor, model: LensModel, size: tuple[int, int]) -> float | None:
     """Largest radius on the plane z = 1 that the image's border shows; None where the lens does not reach it."""
-    width, height = size[0] - 1.0, size[1] - 1.0
-    u = torch.tensor([0.0, 0.5, 1.0, 0.0, 1.0, 0.0, 0.5, 1.0], dtype=torch.float64) * width
-    v = torch.tensor([0.0, 0.0, 0.0, 0.5, 0.5, 1.0, 1.0, 1.0], dtype=torch.float64) * height
-    wanted = torch.stack([u, v])
-    x, y = (u - parameters[2]) / parameters[0], (v - parameters[3]) / parameters[1]
-    for _ in range(12):
-        seen = project_components(torch.stack([x, y, torch.ones_like(x)]), parameters, model, ())
-        error = wanted - seen.pixels
-        if not bool(seen.regular.all()):
+    border = _border(parameters, model, size)
+    return None if border is None else float(torch.hypot(*border).max())
+
+
+def _border(parameters: Tensor, model: LensModel, size: tuple[int, int]) -> Tensor | None:
+    """Places (2, K) on the plane z = 1 that the image's border shows; None where the lens does not reach all of it."""
+    t = torch.linspace(0.0, 1.0, _SIDE + 1, dtype=torch.float64)[:-1]
+    zero, one = torch.zeros_like(t), torch.ones_like(t)
+    u, v = torch.cat([t, one, 1.0 - t, zero]), torch.cat([zero, t, one, 1.0 - t])
+    border = torch.stack([u * (size[0] - 1.0), v * (size[1] - 1.0)])
+    centre = torch.stack([parameters[2], parameters[3]])[:, None]
+    x, y = _SHARES[0] * (border - centre) / torch.stack([parameters[0], parameters[1]])[:, None]
+    for share in _SHARES:
+        # Outward in stretches, because Newton's steps from afar may leave a strongly distorting lens.
+        wanted = centre + share * (border - centre)
+        for _ in range(12):
+            seen = project_components(torch.stack([x, y, torch.ones_like(x)]), parameters, model, ())
+            error = wanted - seen.pixels
+            if not bool(seen.regular.all()):
+                return None
+            if float(error.abs().max()) < 1e-3:
+                break
+            ux, vx, uy, vy = seen.by_point[:2].flatten(0, 1)
+            scale = 1.0 / (ux * vy - uy * vx)
+            x, y = x + (vy * error[0] - uy * error[1]) * scale, y + (ux * error[1] - vx * error[0]) * scale
+        else:
             return None
-        if float(error.abs().max()) < 1e-3:
-            return float(torch.hypot(x, y).max())
-        ux, vx, uy, vy = seen.by_point[:2].flatten(0, 1)
-        scale = 1.0 / (ux * vy - uy * vx)
-        x, y = x + (vy * error[0] - uy * error[1]) * scale, y + (ux * error[1] - vx * error[0]) * scale
-    return None
+    return torch.stack([x, y])
 
 
 def free_parameters(model: LensModel) -> list[int]:

@@ -44,6 +44,14 @@ def calibrate(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE±SIGMA", help="Gaussian knowledge of a parameter; +- will do for ±."),
     ] = None,
+    weak_prior: Annotated[
+        float | None,
+        typer.Option(metavar="SHARE", help="Expect a lens this close to a pinhole: 0.3 keeps rich models tame."),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(help="A known camera: only the board's poses are found, and what --free names."),
+    ] = None,
     loss: Annotated[
         str | None,
         typer.Option(metavar="KIND", help="Robust loss against wrong corners: huber, cauchy or tukey."),
@@ -66,13 +74,15 @@ def calibrate(
 
     Minimises the reprojection error of all corners over all parameters. Rich lens models are reached through the
     models nested in them, so that more coefficients never end with a larger RMS. A small RMS is not yet accuracy:
-    look at the σ of the parameters, and prefer the smaller model where they are large.
+    look at the σ of the parameters, and prefer the smaller model, or a weak prior, where they are large.
 
     **Examples**
 
     `kcal calibrate left.obs.json -o left.camera.json`
 
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --board-warp --picture left.png`
+
+    `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --weak-prior 0.3`
 
     `kcal calibrate left.obs.json -o left.camera.json --model hybrid --board-warp`: a plain lens corrected by a smooth
     field, kept only where it predicts views that were held out better than every parametric model.
@@ -92,15 +102,22 @@ def calibrate(
         from kcal.cli.calibrate_hybrid import calibrate_hybrid_file
 
         for option, given in (
-            ("--fix", fix), ("--tie", tie), ("--free", free), ("--prior", prior), ("--loss", loss), ("--reject", reject)
+            ("--fix", fix), ("--tie", tie), ("--free", free), ("--prior", prior), ("--loss", loss),
+            ("--reject", reject), ("--weak-prior", weak_prior), ("--camera", camera),
         ):  # fmt: skip
             if given:
-                raise InputError(f"{option} does not go with --model hybrid; find bad corners with a parametric model")
+                raise InputError(f"{option} does not go with --model hybrid")
         calibrate_hybrid_file(
             observations, output, name, picture, board_warp=board_warp, focal=focal, fov=fov, groups=groups
         )
         return
     lens = LensModel.named(model)
+    known = None
+    if camera is not None:
+        from kcal.io.camera_file import load_camera
+
+        known = load_camera(camera)
+        lens = known.model
 
     from kcal.calibrate.ladder import steps_to
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
@@ -120,6 +137,8 @@ def calibrate(
         tied=tuple(tuple(name.strip() for name in text.split("=")) for text in tie or []),
         free=tuple(free or []),
         priors=_priors(prior or []),
+        weak_prior=weak_prior,
+        camera=known,
         loss=robust,
         reject=rejection,
     )
@@ -200,6 +219,7 @@ def record(result: CameraCalibrationResult, seen: Observations, name: str, sourc
         result.camera,
         name=name,
         standard_deviations=result.sigma,
+        covariance=result.covariance,
         calibration=CameraCalibration(
             rms=result.rms,
             views=len(seen.views) - len(result.rejected_views),

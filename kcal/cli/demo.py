@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.demo_tables import print_diagonals, print_results, print_truth
+from kcal.cli.demo_tables import print_diagonals, print_results
 
 if TYPE_CHECKING:
     import torch
@@ -17,9 +16,8 @@ if TYPE_CHECKING:
     from kcal.corners.board import Board
     from kcal.corners.observations import Observations
     from kcal.locate.geodesy import Origin
-    from kcal.sim.scene import DemoScene
 
-_SIDES = ("left", "right")
+SIDES = ("left", "right")
 
 
 def demo(
@@ -41,9 +39,10 @@ def demo(
 ) -> None:
     """Run the main job from images to positions, and show what came out against the truth.
 
-    Without images it renders a site: two cameras 10 m apart, boards seen through distorting lenses with blur and
-    noise, and targets from 100 m to 5 km. The pictures go through the same detection, calibration, rig and location as
-    anyone's would; the truth is used at the end, for the comparison.
+    Without images it renders a site: two cameras 10 m apart behind ray-traced lenses, boards with blur and noise,
+    twelve surveyed landmarks, and targets from 100 m to 5 km. The pictures go through the same detection, calibration,
+    rig and location as anyone's would; the truth is used at the end, for the comparison. `summary.html` says what was
+    done and what came out.
 
     **Examples**
 
@@ -58,69 +57,14 @@ def demo(
     except OSError as error:
         raise FileError(f"{output}: cannot make this folder: {error.strerror}") from error
     if images is None:
-        _simulated(output, seed)
+        from kcal.cli.demo_site import simulated
+
+        simulated(output, seed)
     else:
         from kcal.corners.board import Board
         from kcal.locate.geodesy import Origin
 
         _real(output, images, Board.parse(size, square), Origin.parse(origin), heading)
-
-
-def _simulated(output: Path, seed: int) -> None:
-    from kcal.cli.console import out
-    from kcal.corners.board import Board
-    from kcal.io.rig_file import load_rig
-    from kcal.locate.export import write_positions
-    from kcal.locate.geodesy import Origin
-    from kcal.locate.positions import locate
-    from kcal.report.map_page import save_map
-    from kcal.report.positions import save_positions_picture
-    from kcal.sim.scene import DemoScene
-
-    scene = DemoScene(seed=seed)
-    out.print(
-        f"A simulated site: two cameras {float(scene.rig.baseline):.3f} m apart, {scene.near_views} close views each, "
-        f"{scene.pair_views} views of a large board together, {len(scene.targets.names)} targets."
-    )
-    files = _render(scene, output / "images")
-    boards = {
-        kind: Board(columns=size.columns, rows=size.rows, square=size.square)
-        for kind, size in (("near", scene.near_board), ("pair", scene.pair_board))
-    }
-    seen = {key: _detect(paths, boards[key[1]], output / f"{key[0]}.{key[1]}.obs.json") for key, paths in files.items()}
-    for side in _SIDES:
-        _calibrate(seen[side, "near"], side, output)
-    _solve_rig(seen["left", "pair"], seen["right", "pair"], output)
-
-    marks, targets = scene.target_marks, scene.targets
-    _write_marks(output / "points.csv", targets.names, marks.left, marks.right)
-    locate_marks = partial(
-        locate,
-        load_rig(output / "rig.json"),
-        origin=Origin(lat=scene.lat, lon=scene.lon, height=scene.height),
-        heading_deg=scene.heading_deg,
-        pitch_deg=scene.pitch_deg,
-        roll_deg=scene.roll_deg,
-        pixel_sigma=scene.mark_sigma,
-        names=targets.names,
-    )
-    located = locate_marks(marks.left, marks.right)
-    exact = locate_marks(marks.true_left, marks.true_right)
-    write_positions(output / "points.geojson", located)
-    write_positions(output / "positions.csv", located)
-    save_positions_picture(output / "map.png", located, targets.enu)
-    save_map(output / "map.html", located, targets.enu)
-    print_truth(located, exact, targets.enu)
-    out.print(
-        f"Marks have {scene.mark_sigma:g} px of noise in each image, and the interval covers that alone. The last "
-        "column is what the same rig gives for marks without noise: the calibration's own share of the error."
-    )
-    print_results(
-        output,
-        f"kcal locate {output}/rig.json {output}/points.csv --origin {scene.lat},{scene.lon},{scene.height:g} "
-        f"--heading {scene.heading_deg:g} --pitch {scene.pitch_deg:g} --roll {scene.roll_deg:g} "
-        f"--pixel-sigma {scene.mark_sigma:g} -o again.geojson",
-    )
 
 
 def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: float) -> None:
@@ -133,9 +77,9 @@ def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: flo
     from kcal.report.map_page import save_map
     from kcal.report.positions import save_positions_picture
 
-    seen = {side: _detect(_side_images(folder, side), board, output / f"{side}.obs.json") for side in _SIDES}
-    for side in _SIDES:
-        _calibrate(seen[side], side, output)
+    seen = {side: detect(_side_images(folder, side), board, output / f"{side}.obs.json") for side in SIDES}
+    for side in SIDES:
+        calibrate(seen[side], side, output)
     pairs, pixels = _solve_rig(seen["left"], seen["right"], output)
 
     # Two opposite corners of each board, whose distance is known.
@@ -145,7 +89,7 @@ def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: flo
     left, right = marks[:, 0].reshape(-1, 2), marks[:, 1].reshape(-1, 2)
     both = torch.isfinite(left).all(-1) & torch.isfinite(right).all(-1)
     chosen = [name for name, ok in zip(names, both.tolist(), strict=True) if ok]
-    _write_marks(output / "points.csv", chosen, left[both], right[both])
+    write_marks(output / "points.csv", chosen, left[both], right[both])
     located = locate(
         load_rig(output / "rig.json"), left[both], right[both], origin=origin, heading_deg=heading, names=chosen
     )
@@ -163,22 +107,6 @@ def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: flo
     )
 
 
-def _render(scene: DemoScene, folder: Path) -> dict[tuple[str, str], list[Path]]:
-    """Write the site's images; returns the files by camera and kind."""
-    from kcal.cli.console import steps
-    from kcal.io.images import write_png
-    from kcal.sim.scene import render_demo
-
-    files: dict[tuple[str, str], list[Path]] = {}
-    with steps("rendering", scene.images) as advance:
-        for view in render_demo(scene, advance):
-            place = folder / f"{view.camera}-{view.kind}"
-            place.mkdir(parents=True, exist_ok=True)
-            path = write_png(place / f"{view.name}.png", view.image.numpy())
-            files.setdefault((view.camera, view.kind), []).append(path)
-    return files
-
-
 def _side_images(folder: Path, side: str) -> list[Path]:
     """Images of one camera: the subfolder of that name, or the files whose name begins with it."""
     from kcal.corners.images import expand_images
@@ -192,7 +120,8 @@ def _side_images(folder: Path, side: str) -> list[Path]:
     return found
 
 
-def _detect(paths: list[Path], board: Board, target: Path) -> Observations:
+def detect(paths: list[Path], board: Board, target: Path) -> Observations:
+    """Find a board in images, write what was found, and say what was not."""
     from rich.markup import escape
 
     from kcal.cli.console import err, out, steps
@@ -207,7 +136,8 @@ def _detect(paths: list[Path], board: Board, target: Path) -> Observations:
     return observations
 
 
-def _calibrate(seen: Observations, side: str, output: Path) -> CameraCalibrationResult:
+def calibrate(seen: Observations, side: str, output: Path) -> CameraCalibrationResult:
+    """Calibrate a camera; its file and its picture go to a folder."""
     from kcal.calibrate.mono import calibrate_camera
     from kcal.cli.calibrate import record
     from kcal.cli.console import err, out, steps
@@ -252,7 +182,8 @@ def _solve_rig(
     return result.pairs, result.pixels
 
 
-def _write_marks(path: Path, names: tuple[str, ...] | list[str], left: torch.Tensor, right: torch.Tensor) -> None:
+def write_marks(path: Path, names: tuple[str, ...] | list[str], left: torch.Tensor, right: torch.Tensor) -> None:
+    """Write marks as `kcal locate` reads them."""
     from kcal.files import write_atomic
 
     lines = ["name,left_u,left_v,right_u,right_v"]

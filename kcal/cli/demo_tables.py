@@ -12,35 +12,39 @@ if TYPE_CHECKING:
     from kcal.locate.positions import Located, Position
 
 
+_HEADS = ("target", "true m", "estimate m", "95 % interval m", "error m", "%", "across m", "calibration m")
+
+
 def print_truth(located: Located, exact: Located, truth: torch.Tensor) -> None:
     """Range and error of each target, and the share of the error that marks without noise leave."""
     from rich.table import Table
 
     from kcal.cli.console import out
 
+    head, *rows = truth_rows(located, exact, truth)
     table = Table(box=None, pad_edge=False, header_style="bold", title="True against estimated positions")
-    table.add_column("target", no_wrap=True)
-    for column in ("true m", "estimate m", "95 % interval m", "error m", "%", "across m", "calibration m"):
-        table.add_column(column, justify="right", no_wrap=True)
+    for number, column in enumerate(head):
+        table.add_column(column, justify="right" if number else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    out.print(table)
+
+
+def truth_rows(located: Located, exact: Located, truth: torch.Tensor) -> list[list[str]]:
+    """The same as cells, the heads first."""
+    rows = [list(_HEADS)]
     for position, noiseless, true in zip(located.positions, exact.positions, truth, strict=True):
         distance = float(true.norm())
         if position.enu is None or position.range_m is None:
-            table.add_row(position.name, f"{distance:.1f}", "-", "-", "-", "-", "-", position.reason)
+            rows.append([position.name, f"{distance:.1f}", "-", "-", "-", "-", "-", position.reason])
             continue
         along, across = _along_and_across(position, true)
         low, high = position.range_low_m or 0.0, position.range_high_m or 0.0
         share = "-" if noiseless.enu is None else f"{_along_and_across(noiseless, true)[0]:+.2f}"
-        table.add_row(
-            position.name,
-            f"{distance:.1f}",
-            f"{position.range_m:.1f}",
-            f"{low:.1f} – {high:.1f}",
-            f"{along:+.2f}",
-            f"{100 * along / distance:+.2f}",
-            f"{across:.2f}",
-            share,
-        )
-    out.print(table)
+        estimate, interval = f"{position.range_m:.1f}", f"{low:.1f} – {high:.1f}"
+        error = [f"{along:+.2f}", f"{100 * along / distance:+.2f}", f"{across:.2f}"]
+        rows.append([position.name, f"{distance:.1f}", estimate, interval, *error, share])
+    return rows
 
 
 def _along_and_across(position: Position, true: torch.Tensor) -> tuple[float, float]:
@@ -74,12 +78,13 @@ def print_diagonals(located: Located, board: Board) -> None:
     out.print(table)
 
 
-def print_results(output: Path, again: str) -> None:
+def print_results(output: Path, again: str, *, summary: bool = False) -> None:
     """Where the results are, what they are, and the command that makes the positions again."""
     from kcal.cli.console import out
 
     out.print(f"\nResults are in {output.resolve()}:", markup=False)
     for name, what in (
+        *((("summary.html", "what was done and what came out, on one page"),) if summary else ()),
         ("map.png", "the map"),
         ("map.html", "the map, interactive, for any browser"),
         ("points.geojson", "positions for a GIS"),

@@ -15,12 +15,16 @@ def locate(
     rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
     points: Annotated[Path, typer.Argument(help="CSV with the columns name,left_u,left_v,right_u,right_v.")],
     origin: Annotated[
-        str,
-        typer.Option(metavar="LAT,LON,HEIGHT", help="Left camera: degrees, degrees, metres above the WGS84 ellipsoid."),
-    ],
+        str | None,
+        typer.Option(
+            metavar="LAT,LON,HEIGHT",
+            help="Left camera: degrees, degrees, metres above the WGS84 ellipsoid. From the rig file if it has it.",
+        ),
+    ] = None,
     heading: Annotated[
-        float, typer.Option(metavar="DEG", help="Azimuth of the left camera's axis, clockwise from true north.")
-    ],
+        float | None,
+        typer.Option(metavar="DEG", help="Azimuth of the left camera's axis, clockwise from true north."),
+    ] = None,
     pitch: Annotated[float, typer.Option(metavar="DEG", help="Elevation of the left camera's axis, up.")] = 0.0,
     roll: Annotated[
         float, typer.Option(metavar="DEG", help="Roll of the left camera, clockwise as seen from behind it.")
@@ -45,6 +49,10 @@ def locate(
     geoid: Annotated[
         Path | None, typer.Option(help="A geoid grid (.tif, .gtx); one that PROJ finds is used if not given.")
     ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(metavar="CSV", help="True positions, name,lat,lon,height: errors in the table and on the maps."),
+    ] = None,
     output: Annotated[
         list[Path] | None,
         typer.Option("--output", "-o", help="A .geojson, .csv, .kml or .cot file to write; may be repeated."),
@@ -63,10 +71,12 @@ def locate(
 ) -> None:
     """Locate what was marked in both images: latitude, longitude, height and an honest range interval.
 
-    The interval holds the true range for 95 % of marks with the given noise. Errors of the calibration come on top:
-    0.01° of relative yaw is 436 m at 5 km with a baseline of 10 m; `--yaw-sigma` puts them in. Where the parallax is
-    below three sigma only the bearing is given. Heights are ellipsoidal; with a geoid grid the files also hold the
-    height of the geoid.
+    The interval holds the true range for 95 % of marks with the given noise. Errors of the rig come on top: those that
+    the rig file holds are included, and `--yaw-sigma` adds some; 0.01° of relative yaw is 436 m at 5 km with a baseline
+    of 10 m. Where the parallax is below three sigma only the bearing is given. Heights are ellipsoidal; with a geoid
+    grid the files also hold the height of the geoid.
+
+    A rig that was solved with landmarks knows where it stands: then no `--origin` and `--heading` are needed.
 
     Ends with exit code 1 if nothing at all could be located.
 
@@ -74,7 +84,7 @@ def locate(
 
     `kcal locate rig.json points.csv --origin 19.07,72.87,14 --heading 35 -o points.geojson`
 
-    `kcal locate rig.json points.csv --origin 19.07,72.87,14 --heading 35 --map map.html`
+    `kcal locate rig.json points.csv --map map.html --truth survey.csv`
 
     `kcal locate rig.json points.csv --origin -33.9,151.2,10 --heading 250 --pitch -1.5 -o p.geojson -o p.csv
     --picture map.png`
@@ -84,15 +94,16 @@ def locate(
     import torch
 
     from kcal.cli.console import out, steps
-    from kcal.errors import DegenerateError
+    from kcal.errors import DegenerateError, InputError
     from kcal.files import check_writable
-    from kcal.io.rig_file import load_rig
+    from kcal.io.rig_file import RigFile
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.errors import RigCovariance, mounting_covariance
     from kcal.locate.export import check_format, write_positions
     from kcal.locate.geodesy import Origin
     from kcal.locate.marks import read_marks
     from kcal.locate.positions import locate as locate_pairs
+    from kcal.locate.truth import misses, read_truth
     from kcal.report.figures import check_picture_format
     from kcal.report.map_page import check_map_format, save_map
     from kcal.report.positions import save_positions_picture
@@ -100,19 +111,40 @@ def locate(
     outputs = output or []
     for path in outputs:
         check_format(path)
-        check_writable(path, rig, points)
+        check_writable(path, rig, points, *([truth] if truth else []))
     if picture is not None:
         check_picture_format(picture)
         check_writable(picture)
     if web_map is not None:
         check_map_format(web_map)
         check_writable(web_map)
-    place = Origin.parse(origin)
+    if (origin is None) != (heading is None):
+        raise typer.BadParameter("--origin and --heading belong together")
+    if heading is None and (pitch or roll or grid is not None):
+        raise typer.BadParameter("--pitch, --roll and --grid belong to --heading; the rig file has its own attitude")
+    # Before the rig is read: a wrong option is told first.
+    place = None if origin is None else Origin.parse(origin)
     marks = read_marks(points)
-    solved = load_rig(rig)
-    yaw = torch.zeros(6, 6, dtype=torch.float64)
-    yaw[1, 1] = math.radians(yaw_sigma) ** 2
+    file = RigFile.load(rig)
+    solved = file.rig()
+    calibration = file.joint_covariance()
+    if yaw_sigma:
+        yaw = torch.zeros(6, 6, dtype=torch.float64)
+        yaw[1, 1] = math.radians(yaw_sigma) ** 2
+        more = RigCovariance.of(solved, pose=yaw).matrix
+        calibration = more if calibration is None else calibration + more
+    link = None
     standing = mounting_covariance(origin_m=[origin_sigma] * 3, attitude_deg=(0.0, 0.0, heading_sigma))
+    if place is None or heading is None:
+        stored = file.mounting
+        if stored is None:
+            raise InputError(f"{rig}: does not say where the rig stands; give --origin and --heading")
+        place = Origin(lat=stored.lat, lon=stored.lon, height=stored.height)
+        heading, pitch, roll = stored.heading_deg, stored.pitch_deg, stored.roll_deg
+        if stored.covariance is not None:
+            standing = standing + torch.tensor(stored.covariance, dtype=torch.float64)
+        if stored.link is not None:
+            link = torch.tensor(stored.link, dtype=torch.float64)
     heights = find_geoid(geoid)
     located = locate_pairs(
         solved,
@@ -124,23 +156,25 @@ def locate(
         roll_deg=roll,
         pixel_sigma=pixel_sigma,
         names=marks.names,
-        calibration=RigCovariance.of(solved, pose=yaw) if yaw_sigma else None,
-        mounting=standing if heading_sigma or origin_sigma else None,
+        calibration=None if calibration is None else RigCovariance.of(solved, joint=calibration),
+        mounting=standing if bool(standing.any()) else None,
+        link=link,
         refraction=refraction,
         geoid=heights,
     )
+    true = None if truth is None else read_truth(truth, located)
     written = [*outputs, *(path for path in (picture, web_map) if path is not None)]
     with steps("writing", len(written)) as advance:
         for path in outputs:
             write_positions(path, located)
             advance(path.name)
         if picture is not None:
-            save_positions_picture(picture, located)
+            save_positions_picture(picture, located, true)
             advance(picture.name)
         if web_map is not None:
-            save_map(web_map, located, tiles=tiles, image=image, online=online)
+            save_map(web_map, located, true, tiles=tiles, image=image, online=online)
             advance(web_map.name)
-    for line in _table(located):
+    for line in _table(located, None if true is None else misses(located, true)):
         out.print(line, markup=False)
     for position in located.positions:
         if position.reason:
@@ -153,10 +187,16 @@ def locate(
         raise DegenerateError(f"{points}: none of the {len(located.positions)} pairs could be located; see the table")
 
 
-def _table(located: Located) -> list[str]:
+def _table(located: Located, off: list[tuple[float, float, bool] | None] | None = None) -> list[str]:
     """Aligned lines as wide as they need: a table fitted to the 80 columns of a pipe would cut names and digits."""
     rows = [["name", "lat °", "lon °", "height m", "range m", "interval m", "status"]]
     rows += [_row(position) for position in located.positions]
+    if off is not None:
+        rows[0][-1:-1] = ["off level m", "off in range m", "in interval"]
+        for row, miss in zip(rows[1:], off, strict=True):
+            row[-1:-1] = (
+                ["", "", ""] if miss is None else [_metres(miss[0]), f"{miss[1]:+.1f}", "yes" if miss[2] else "no"]
+            )
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     lines = []
     for name, *numbers, status in rows:

@@ -9,6 +9,7 @@ import typer
 from rich.markup import escape
 
 import kcal
+from kcal.cli.bake import bake
 from kcal.cli.batch import batch
 from kcal.cli.board import board
 from kcal.cli.budget import budget
@@ -55,6 +56,7 @@ app.add_typer(rig, name="rig")
 app.command("locate")(locate)
 app.command("budget")(budget)
 app.command("undistort")(undistort)
+app.command("bake")(bake)
 
 
 def main() -> None:

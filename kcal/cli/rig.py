@@ -82,6 +82,9 @@ def solve(
     board_warp: Annotated[
         bool, typer.Option("--board-warp", help="Boards only: also estimate how the board bends.")
     ] = False,
+    reject: Annotated[
+        bool, typer.Option("--reject", help="Boards only: leave out pairs that noise cannot explain.")
+    ] = False,
     picture: Annotated[
         Path | None, typer.Option(help="A .png file: residuals by source and a plan. Not for boards only.")
     ] = None,
@@ -119,10 +122,14 @@ def solve(
     if sources.only_boards and sources.pairs is None:
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     if sources.only_boards and sources.pairs is not None and not picture and intrinsics == "fixed":
-        _from_boards(left, right, sources.pairs, match, output, refine_cameras=refine_cameras, board_warp=board_warp)
+        _from_boards(
+            left, right, sources.pairs, match, output, reject, refine_cameras=refine_cameras, board_warp=board_warp
+        )
         return
-    if refine_cameras or board_warp:
-        raise InputError("--refine-cameras and --board-warp are for boards only; use --intrinsics prior or free here")
+    if refine_cameras or board_warp or reject:
+        raise InputError(
+            "--refine-cameras, --board-warp and --reject are for boards only; use --intrinsics prior or free here"
+        )
     _from_all(left, right, sources, output, picture, intrinsics, reject=not keep_all)
 
 
@@ -162,6 +169,7 @@ def _from_boards(
     pairs: tuple[Path, Path],
     match: Path | None,
     output: Path,
+    reject: bool,
     *,
     refine_cameras: bool,
     board_warp: bool,
@@ -186,7 +194,7 @@ def _from_boards(
             seen[0],
             seen[1],
             matched,
-            RigOptions(refine_cameras=refine_cameras, board_warp=board_warp),
+            RigOptions(refine_cameras=refine_cameras, board_warp=board_warp, reject=reject),
         )
         advance("done")
     rig_record(result, None if refine_cameras else cameras).save(output)
@@ -224,6 +232,7 @@ def rig_record(result: RigCalibrationResult, cameras: tuple[CameraFile, CameraFi
         result.rig,
         left=cameras[0] if cameras else None,
         right=cameras[1] if cameras else None,
+        covariance=result.covariance,
         calibration=RigCalibration(
             rms=result.rms,
             rms_left=result.rms_left,

@@ -17,17 +17,12 @@ import torch
 import kcal
 from kcal.errors import InputError
 from kcal.files import NativeFile
+from kcal.io.record import CovarianceRecord, Record
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.residual import Field, FieldGrid, FieldResidual, FieldScale
-
-
-class Record(pydantic.BaseModel):
-    """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused."""
-
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class LensOrders(Record):
@@ -173,7 +168,8 @@ class CameraFile(NativeFile):
         intrinsics: fx, fy, cx, cy, skew in pixels.
         coefficients: name -> value, exactly the names of the model.
         standard_deviations: name -> one sigma of the parameter, None where it was held fixed; the whole is None
-            when no covariance was computed.
+            when none was computed.
+        covariance: of all parameters together; None when none was computed.
         residual: what corrects the lens before the intrinsics are applied, one entry a width; None: nothing. A camera
             with it is a `HybridCamera`, and means nothing without it: weights and parameters share one file, so that
             they cannot be mixed up.
@@ -199,6 +195,7 @@ class CameraFile(NativeFile):
     intrinsics: Intrinsics
     coefficients: dict[str, float]
     standard_deviations: dict[str, pydantic.NonNegativeFloat | None] | None = None
+    covariance: CovarianceRecord | None = None
     residual: tuple[FieldScaleRecord, ...] | None = None
     valid_region: ValidRegion | None = None
     calibration: CameraCalibration | None = None
@@ -216,6 +213,23 @@ class CameraFile(NativeFile):
             what = f"{missing[0]} is missing" if missing else f"{unknown[0]} is unknown"
             raise ValueError(f"{what}; the lens model needs exactly {', '.join(names) or 'nothing'}")
         return {name: value[name] for name in names}
+
+    @pydantic.field_validator("covariance")
+    @classmethod
+    def _of_model(cls, value: CovarianceRecord | None, info: pydantic.ValidationInfo) -> CovarianceRecord | None:
+        if value is None or "model" not in info.data:
+            return value
+        names = (*INTRINSICS, *info.data["model"].model().names)
+        unknown = [name for name in value.names if name not in names]
+        if unknown:
+            raise ValueError(f"covariance: {unknown[0]} is unknown; the lens model has {', '.join(names)}")
+        return value
+
+    def covariance_matrix(self) -> torch.Tensor | None:
+        """(5 + P, 5 + P) in the order of `Camera.names`, zero for what is exact; None if the file has no covariance."""
+        if self.covariance is None:
+            return None
+        return self.covariance.expand((*INTRINSICS, *self.coefficients))
 
     def camera(self) -> Camera:
         """The camera, equal to the stored one to the last bit."""
@@ -282,6 +296,7 @@ def camera_to_file(
     *,
     name: str = "",
     standard_deviations: Mapping[str, float | None] | None = None,
+    covariance: torch.Tensor | None = None,
     calibration: CameraCalibration | None = None,
 ) -> CameraFile:
     """Put a camera in the form in which it is stored.
@@ -290,10 +305,12 @@ def camera_to_file(
         camera: a single camera, not a batch.
         name: free text that tells cameras apart.
         standard_deviations: parameter name -> one sigma; names left out, and None, stand for parameters held fixed.
+        covariance: (5 + P, 5 + P) in the order of `Camera.names`; parameters whose variance is zero are held fixed.
         calibration: how the camera was calibrated.
 
     Raises:
-        InputError: a batch of cameras, a parameter that is not finite, or a name that the camera does not have.
+        InputError: a batch of cameras, a parameter that is not finite, a name that the camera does not have, or a
+            matrix that is no covariance of its parameters.
 
     Example:
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
@@ -308,6 +325,10 @@ def camera_to_file(
         if unknown:
             raise InputError(f"standard deviation of {unknown[0]!r}: the camera has {', '.join(camera.names)}")
         standard_deviations = {key: standard_deviations.get(key) for key in camera.names}
+    if covariance is not None and tuple(covariance.shape) != (len(camera.names),) * 2:
+        raise InputError(
+            f"covariance: this camera has {len(camera.names)} parameters, got shape {tuple(covariance.shape)}"
+        )
     stored = dict(zip(camera.names, values.tolist(), strict=True))
     model = camera.model
     try:
@@ -325,6 +346,7 @@ def camera_to_file(
             intrinsics=Intrinsics(**{key: stored[key] for key in INTRINSICS}),
             coefficients={key: stored[key] for key in model.names},
             standard_deviations=standard_deviations,
+            covariance=None if covariance is None else CovarianceRecord.of(covariance.detach(), camera.names),
             residual=_residual(camera.field),
             valid_region=ValidRegion(
                 radius=float(camera.valid_radius),

@@ -65,6 +65,17 @@ def is_differentiated(*tensors: Tensor) -> bool:
     return not is_traced() and any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
 
 
+def plain_on_host(*tensors: Tensor) -> bool:
+    """Whether NumPy may do the work: on the CPU, where nothing is differentiated, traced or mapped."""
+    if torch.is_grad_enabled() or is_traced() or any(tensor.device.type != "cpu" for tensor in tensors):
+        return False
+    try:
+        # What `torch.func` wraps has no memory of its own.
+        return not is_differentiated(*tensors) and all(tensor.data_ptr() >= 0 for tensor in tensors)
+    except RuntimeError:
+        return False
+
+
 def in_chunks(
     function: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor, batch: int, *, differentiated: bool
 ) -> tuple[Tensor, Tensor]:

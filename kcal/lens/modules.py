@@ -17,8 +17,7 @@ class Unproject(nn.Module):
     Compiled and exported graphs take a fixed number of Newton steps for every point: what has not arrived by
     then, beside a fold, is flagged as not valid. An eager call goes on until it knows.
 
-    Export with `torch.onnx.export(..., dynamo=True, optimize=False)`: the optimiser of onnxscript 0.7 takes constants
-    within 1e-5 of one for one, and drops a factor such as the cosine of a small tilt without a word.
+    `kcal.io.onnx_file.save_onnx` writes it, and every other module of points, as ONNX.
 
     Args:
         camera: the camera, kept as a submodule.

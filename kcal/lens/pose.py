@@ -45,11 +45,6 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
     return u @ vh
 
 
-def move(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
-    """Apply steps (..., 6) to rotations (..., 3, 3) and translations (..., 3)."""
-    return rotation_from_vector(step[..., :3]) @ rotation, translation + step[..., 3:]
-
-
 def step_rows(by_point: Tensor, rotated: Tensor) -> Tensor:
     """Derivatives by the six numbers of a step, from derivatives by the moved point.
 

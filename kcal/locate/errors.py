@@ -39,7 +39,7 @@ class RigCovariance:
 
     The order is: the parameters of the left camera as in `Camera.names`, those of the right one, the rotation of
     right_from_left (3 radians: a rotation vector about the right camera's axes, `exp([ω]x) R`), its translation
-    (3 metres), as in `kcal.lens.pose.move` and in `RigCalibrationResult`.
+    (3 metres), as in `kcal.lens.pose` and in `RigCalibrationResult`.
 
     Args:
         matrix: (P, P) float64, P = the two cameras' parameters + 6.
@@ -94,6 +94,20 @@ class RigCovariance:
         values, vectors = torch.linalg.eigh(self.matrix / safe[:, None] / safe[None, :])
         kept = values > 1e-14 * values[-1].clamp_min(1e-300)
         return scale[:, None] * vectors[:, kept] * values[kept].sqrt()
+
+
+def checked_link(calibration: RigCovariance | None, mounting: Tensor | None, link: Tensor) -> Tensor:
+    """`link` as float64: (P, 6), and one covariance together with those of calibration (P, P) and mounting (6, 6)."""
+    if calibration is None or mounting is None:
+        raise InputError("link: it needs the covariances of both the calibration and the mounting")
+    size = len(calibration.matrix)
+    if not isinstance(link, Tensor) or tuple(link.shape) != (size, 6):
+        raise InputError(f"link: a covariance of the calibration with the mounting, ({size}, 6), is needed")
+    upper = torch.cat([calibration.matrix, link.to(calibration.matrix)], 1)
+    lower = torch.cat([link.T.to(calibration.matrix), mounting.to(calibration.matrix)], 1)
+    return checked_covariance("covariance of calibration and mounting", torch.cat([upper, lower]), size + 6)[
+        :size, size:
+    ]
 
 
 def mounting_covariance(

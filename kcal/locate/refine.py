@@ -234,7 +234,7 @@ def _finish(at: _At, theta: Tensor, setting: _Setting, usable: Tensor) -> Fit:
 def by_pose(fit: Fit, number: int) -> Tensor:
     """Derivatives (..., 6, 2, N) of the predicted pixels of a camera by a step of its pose: rotation, translation.
 
-    The step is that of `kcal.lens.pose.move`: a rotation vector (radians) from the left and an added translation
+    The step is that of `kcal.lens.pose`: a rotation vector (radians) from the left and an added translation
     (in units of `scale`, as the inverse distance is).
     """
     rows = step_rows(fit.projections[number].by_point, fit.turned[number])

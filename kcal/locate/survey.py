@@ -42,7 +42,7 @@ class Survey(NamedTuple):
     origin: Origin | None
 
 
-def read_survey(path: str | Path, origin: Origin | None = None) -> Survey:
+def read_survey(path: str | Path, origin: Origin | None = None, *, measured: bool = True) -> Survey:
     r"""Read surveyed places: `name,lat,lon,height,sigma` or `name,east,north,up,sigma`, and if need be `sigma_up`.
 
     Degrees, metres above the WGS84 ellipsoid, metres; `sigma` holds along each axis, `sigma_up` upward where that
@@ -51,6 +51,7 @@ def read_survey(path: str | Path, origin: Origin | None = None) -> Survey:
     Args:
         path: of the file.
         origin: of the frame; the first place if left out and the file has latitudes.
+        measured: whether a sigma is needed; it is zero where it is not and is not given.
 
     Raises:
         FileError: see `kcal.locate.tables.read_rows`; a latitude out of range, a sigma that is not positive.
@@ -64,7 +65,7 @@ def read_survey(path: str | Path, origin: Origin | None = None) -> Survey:
         >>> [round(value, 2) for value in survey.points[1].tolist()]  # across the antimeridian
         [1001.88, 0.0, 9.92]
     """
-    rows = read_rows(path, "name,lat,lon,height,sigma", _PLACES, ("sigma",))
+    rows = read_rows(path, "name,lat,lon,height,sigma", _PLACES, ("sigma",) if measured else ())
     columns = _columns(rows[0], path)
     values = torch.tensor([[row.number(column) for column in columns] for row in rows], dtype=torch.float64)
     if columns == _EARTH:
@@ -76,7 +77,7 @@ def read_survey(path: str | Path, origin: Origin | None = None) -> Survey:
             origin = origin or place
         assert origin is not None
         values = geodetic_to_enu(values, origin)
-    sigma = [_sigma(row) for row in rows]
+    sigma = [_sigma(row) if measured or row.cells.get("sigma") else (0.0, 0.0, 0.0) for row in rows]
     return Survey(tuple(row.name for row in rows), values, torch.tensor(sigma, dtype=torch.float64), origin)
 
 

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
-from kcal.sim.board import BoardLike, BoardPose, LensLike, board_points
+from kcal.sim.board import BoardLike, BoardPose, LensLike, RigLike, board_points
 
 _DRAWS = 4096
 
@@ -95,7 +94,7 @@ def sample_board_poses(
 
 
 def sample_pair_poses(
-    rig: StereoRig,
+    rig: RigLike,
     board: BoardLike,
     count: int,
     generator: torch.Generator,
@@ -122,6 +121,7 @@ def sample_pair_poses(
     Example:
         >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
+        >>> from kcal.lens.rig import StereoRig
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> from kcal.sim.board import BoardSize, project_board
         >>> board = BoardSize(9, 6, 0.1)
@@ -138,7 +138,7 @@ def sample_pair_poses(
     return _choose(drawn, [(rig.left, *still), (rig.right, rotation, translation)], board, count, options)
 
 
-def rig_pose(rig: StereoRig, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
+def rig_pose(rig: RigLike, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
     """right_from_board of a board whose pose in the left camera is given."""
     rotation, translation = left_from_board
     return BoardPose(rig.right_from_left_rotation @ rotation, rig.right_from_left(translation))

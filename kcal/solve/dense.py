@@ -2,34 +2,58 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.solve.result import State
+from kcal.solve.result import State, blend
 
 
 class DenseLinearisation:
     """Normal equations of one dense Jacobian (..., R, P), columns scaled to length one."""
 
     def __init__(self, residuals: Tensor, jacobian: Tensor) -> None:
-        self.cost = 0.5 * (residuals * residuals).sum(-1)
         norm = torch.linalg.vector_norm(jacobian, dim=-2)
         # A column of zeros (a parameter that nothing depends on) keeps its place and never moves.
-        self._scale = torch.where(norm > 0, 1.0 / norm, 1.0)
-        scaled = jacobian * self._scale[..., None, :]
-        self._normal = scaled.transpose(-1, -2) @ scaled
-        self._gradient = (scaled * residuals[..., None]).sum(-2)
+        scale = torch.where(norm > 0, 1.0 / norm, 1.0)
+        scaled = jacobian * scale[..., None, :]
+        normal, gradient = scaled.transpose(-1, -2) @ scaled, (scaled * residuals[..., None]).sum(-2)
+        self._parts = 0.5 * (residuals * residuals).sum(-1), scale, normal, gradient
+
+    @classmethod
+    def of_rows(cls, rows: Tensor) -> DenseLinearisation:
+        """From (..., P + 1, R): the derivatives by each parameter, and last the residuals, by one product."""
+        self = cls.__new__(cls)
+        gram = rows @ rows.transpose(-1, -2)
+        normal = gram[..., :-1, :-1]
+        diagonal = normal.diagonal(dim1=-2, dim2=-1)
+        scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
+        scaled = normal * scale[..., :, None] * scale[..., None, :]
+        self._parts = 0.5 * gram[..., -1, -1], scale, scaled, gram[..., :-1, -1] * scale
+        return self
+
+    @property
+    def cost(self) -> Tensor:
+        """See `Linearisation`."""
+        return self._parts[0]
+
+    def blend(self, mask: Tensor, other: DenseLinearisation) -> DenseLinearisation:
+        """See `Linearisation.blend`."""
+        out = copy.copy(self)
+        out._parts = blend(mask, self._parts, other._parts)
+        return out
 
     def step(self, damping: Tensor) -> tuple[State, Tensor]:
         """See `Linearisation.step`."""
-        identity = torch.eye(self._normal.shape[-1], dtype=self._normal.dtype, device=self._normal.device)
-        factor, info = torch.linalg.cholesky_ex(self._normal + damping[..., None, None] * identity)
-        delta = -torch.cholesky_solve(self._gradient[..., None], factor)[..., 0]
-        predicted = 0.5 * (damping * (delta * delta).sum(-1) - (self._gradient * delta).sum(-1))
-        return (delta * self._scale,), torch.where(info == 0, predicted, torch.nan)
+        _, scale, normal, gradient = self._parts
+        identity = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
+        factor, info = torch.linalg.cholesky_ex(normal + damping[..., None, None] * identity)
+        delta = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
+        predicted = 0.5 * (damping * (delta * delta).sum(-1) - (gradient * delta).sum(-1))
+        return (delta * scale,), torch.where(info == 0, predicted, torch.nan)
 
 
 class DenseProblem:

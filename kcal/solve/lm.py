@@ -15,7 +15,7 @@ from kcal.errors import InputError
 from kcal.solve.dense import DenseProblem
 from kcal.solve.implicit import attach_implicit_gradient
 from kcal.solve.problem import Problem
-from kcal.solve.result import Result, State, Status
+from kcal.solve.result import Result, State, Status, blend
 
 # Called after each trial step with (trial, cost (...)); returning True stops.
 Callback = Callable[[int, Tensor], bool | None]
@@ -54,12 +54,6 @@ class LMOptions:
             raise InputError("LMOptions: flatness must be in [0, 1)")
         if not self.initial_damping > 0 or not self.residual_floor >= 0:
             raise InputError("LMOptions: initial_damping must be positive, residual_floor not negative")
-
-
-def _where(mask: Tensor, new: State, old: State) -> State:
-    return tuple(
-        torch.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b) for a, b in zip(new, old, strict=True)
-    )
 
 
 def minimise(
@@ -151,7 +145,7 @@ def _minimise(problem: Problem, start: State, options: LMOptions, callback: Call
         if accept.all():
             state = candidate
         elif accept.any():
-            state = _where(on_device(accept), candidate, state)
+            state = blend(on_device(accept), state, candidate)
         cost = np.where(accept, new_cost, cost)
         history.append(cost if whole is None else whole.costs(history[-1], cost))
 
@@ -172,7 +166,10 @@ def _minimise(problem: Problem, start: State, options: LMOptions, callback: Call
         if callback is not None and callback(trial, on_device(history[-1])):
             status = np.where(status == 0, int(Status.INTERRUPTED), status)
         if (accept & (status == 0)).any():
-            linear = problem.linearise(state) if joint is None or not accept.all() else joint
+            if joint is None:
+                linear = problem.linearise(state)
+            else:
+                linear = joint if accept.all() else linear.blend(on_device(accept), joint)
 
     status = np.where(status == 0, int(Status.ITERATION_LIMIT), status)
     if whole is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol, Self
 
 from torch import Tensor
 
@@ -16,7 +16,14 @@ class Linearisation(Protocol):
     units and the answer does not depend on the units of the parameters.
     """
 
-    cost: Tensor
+    @property
+    def cost(self) -> Tensor:
+        """(...) half the sum of squared residuals."""
+        ...
+
+    def blend(self, mask: Tensor, other: Self) -> Self:
+        """This one, but where the mask (...) of the batch is true the other."""
+        ...
 
     def step(self, damping: Tensor) -> tuple[State, Tensor]:
         """Solve (JᵀJ + λ D) δ = -Jᵀr with D = diag(JᵀJ).
@@ -54,7 +61,7 @@ class Problem(Protocol):
         """Half the sum of squared residuals, (...)."""
         ...
 
-    def linearise(self, state: State) -> Linearisation:
+    def linearise(self, state: State) -> Any:
         """The problem's linearisation at `state`."""
         ...
 

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+from typing import TypeVar, cast
 
 import torch
 from torch import Tensor
 
 State = tuple[Tensor, ...]
+_Tensors = TypeVar("_Tensors", bound=State)
+
+
+def blend(mask: Tensor, old: _Tensors, new: _Tensors) -> _Tensors:
+    """Of each pair of tensors, which begin with the batch, the new one where the mask (...) says so."""
+    chosen = (
+        torch.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b) for a, b in zip(new, old, strict=True)
+    )
+    return cast(_Tensors, tuple(chosen))
 
 
 class Status(enum.IntEnum):

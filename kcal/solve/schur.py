@@ -6,12 +6,13 @@ complement) leaves a small system in the shared parameters, so that the work gro
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 
 import torch
 from torch import Tensor
 
-from kcal.solve.result import State
+from kcal.solve.result import State, blend
 
 
 class SchurLinearisation:
@@ -21,30 +22,45 @@ class SchurLinearisation:
         gram: (..., V, L + S + 1, L + S + 1): for each view the products of its rows, see `SchurProblem.rows`.
         local_size: L.
         shared_rows: (..., S + 1, Q): likewise of Q residuals that depend on the shared parameters alone, or None.
+        slopes: (S, W), if the S shared parameters are functions of W others, over which the problem is solved: their
+            derivatives. All above stays in terms of the S.
     """
 
-    def __init__(self, gram: Tensor, local_size: int, shared_rows: Tensor | None = None) -> None:
+    def __init__(
+        self, gram: Tensor, local_size: int, shared_rows: Tensor | None = None, slopes: Tensor | None = None
+    ) -> None:
         L = local_size
         total = gram[..., L:, L:].sum(-3)
         if shared_rows is not None:
             total = total + shared_rows @ shared_rows.transpose(-1, -2)
-        self.cost = 0.5 * total[..., -1, -1]
-        local, coupling, shared = gram[..., :L, :L], gram[..., :L, L:-1], total[..., :-1, :-1]
-        self._local_scale = _inverse_root(local.diagonal(dim1=-2, dim2=-1))
+        shared, gradient, right = total[..., :-1, :-1], total[..., :-1, -1], gram[..., :L, L:]
+        if slopes is not None:
+            shared, gradient = slopes.T @ shared @ slopes, gradient @ slopes
+            right = torch.cat([right[..., :-1] @ slopes, right[..., -1:]], -1)
+        self._local_scale = _inverse_root(gram[..., :L, :L].diagonal(dim1=-2, dim2=-1))
         self._shared_scale = _inverse_root(shared.diagonal(dim1=-2, dim2=-1))
-        self._local = local * self._local_scale[..., :, None] * self._local_scale[..., None, :]
-        self._coupling = coupling * self._local_scale[..., :, None] * self._shared_scale[..., None, None, :]
+        scale = torch.cat([self._shared_scale, torch.ones_like(total[..., -1, -1:])], -1)
+        self._local = gram[..., :L, :L] * self._local_scale[..., :, None] * self._local_scale[..., None, :]
+        # The coupling with the shared parameters, and last the gradient.
+        self._right = right * self._local_scale[..., :, None] * scale[..., None, None, :]
         self._shared = shared * self._shared_scale[..., :, None] * self._shared_scale[..., None, :]
-        self._local_gradient = gram[..., :L, -1] * self._local_scale
-        self._shared_gradient = total[..., :-1, -1] * self._shared_scale
+        self._shared_gradient = gradient * self._shared_scale
+        self.cost = 0.5 * total[..., -1, -1]
+
+    def blend(self, mask: Tensor, other: SchurLinearisation) -> SchurLinearisation:
+        """See `Linearisation.blend`."""
+        out = copy.copy(self)
+        names = tuple(vars(self))
+        old, new = (tuple(vars(one)[name] for name in names) for one in (self, other))
+        vars(out).update(zip(names, blend(mask, old, new), strict=True))
+        return out
 
     def _reduce(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Eliminate the local blocks: reduced matrix, reduced gradient, D⁻¹[B, g] of the views, failures."""
         factor, info = torch.linalg.cholesky_ex(_damped(self._local, damping[..., None]))
-        right = torch.cat([self._coupling, self._local_gradient[..., None]], -1)
-        solved = torch.cholesky_solve(right, factor)
+        solved = torch.cholesky_solve(self._right, factor)
         # One product over all views at once: (S, V L) times (V L, S + 1).
-        folded = self._coupling.flatten(-3, -2).transpose(-1, -2) @ solved.flatten(-3, -2)
+        folded = self._right[..., :-1].flatten(-3, -2).transpose(-1, -2) @ solved.flatten(-3, -2)
         matrix = _damped(self._shared, damping) - folded[..., :-1]
         return matrix, self._shared_gradient - folded[..., -1], solved, (info != 0).any(-1)
 
@@ -55,7 +71,7 @@ class SchurLinearisation:
         shared = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
         local = -(solved[..., -1] + (solved[..., :-1] @ shared[..., None, :, None])[..., 0])
         squared = (shared * shared).sum(-1) + (local * local).sum((-2, -1))
-        along = (self._shared_gradient * shared).sum(-1) + (self._local_gradient * local).sum((-2, -1))
+        along = (self._shared_gradient * shared).sum(-1) + (self._right[..., -1] * local).sum((-2, -1))
         predicted = 0.5 * (damping * squared - along)
         predicted = torch.where(failed | (info != 0), torch.nan, predicted)
         return (shared * self._shared_scale, local * self._local_scale), predicted
@@ -80,7 +96,7 @@ class SchurLinearisation:
         """
         factor, info = torch.linalg.cholesky_ex(self._local)
         factor = torch.where((info == 0)[..., None, None], factor, torch.nan)
-        along = torch.cholesky_solve(self._coupling, factor)
+        along = torch.cholesky_solve(self._right[..., :-1], factor)
         column, row = self._local_scale[..., :, None], self._local_scale[..., None, :]
         inverse = torch.cholesky_inverse(factor) * column * row
         return -along * column / self._shared_scale[..., None, None, :], inverse
@@ -92,8 +108,9 @@ def _inverse_root(diagonal: Tensor) -> Tensor:
 
 
 def _damped(matrix: Tensor, damping: Tensor) -> Tensor:
-    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    return matrix + damping[..., None, None] * identity
+    out = matrix.clone()
+    out.diagonal(dim1=-2, dim2=-1).add_(damping[..., None])
+    return out
 
 
 class SchurProblem(ABC):

@@ -7,7 +7,7 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.covariance import Covariance, covariance, projection_covariance, spread
+from kcal.calibrate.covariance import Covariance, covariance, projection_covariance, uncertainty_of
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.views import free_parameters
 from kcal.errors import InputError
@@ -65,7 +65,7 @@ def test_blocks_are_those_of_the_whole_inverse(missing: bool) -> None:
     scale = sigma * sigma[:, None]
     torch.testing.assert_close(torch.cat(rows) / scale, expected / scale, rtol=0, atol=1e-8)
     torch.testing.assert_close(found.poses, torch.stack([found.block(v, v) for v in range(4)]))
-    sigmas = spread(linear, problem.residual_count, count)
+    sigmas = uncertainty_of(linear, problem.residual_count, count)
     torch.testing.assert_close(sigmas.sigma, found.shared.diagonal().sqrt())
     assert bool(found.determined.all())
 

@@ -39,8 +39,9 @@ def summary(found: CalibratedViews) -> Tensor:
         CalibrationOptions(model="opencv4"),
         CalibrationOptions(model="opencv4", board_warp=True, tied=(("fx", "fy"),), fixed={"p1": 0.0}, priors=PRIORS),
         CalibrationOptions(model="opencv4", loss=RobustLoss(kind="cauchy", scale=0.5), priors=PRIORS),
+        CalibrationOptions(model="opencv14", weak_prior=0.3),
     ],
-    ids=["plain", "warp, tie, fixed, priors", "robust, priors"],
+    ids=["plain", "warp, tie, fixed, priors", "robust, priors", "14 coefficients, weak prior"],
 )
 def test_derivatives_are_those_of_solving_anew(options: CalibrationOptions) -> None:
     """Along random directions, by corners, board points (off their plane too) and prior means."""

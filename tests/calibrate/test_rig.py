@@ -131,6 +131,41 @@ class TestTruth:
             assert bool((found.mean(0).abs() < 4.5 * (predicted / 40).sqrt()).all()), sigma
 
 
+class TestWeights:
+    def test_corners_count_by_their_covariances(self) -> None:
+        """Half the corners five times worse, and known to be: the scatter of the yaw falls."""
+        noise = torch.where(torch.arange(BOARD.corners) % 2 == 0, 0.05, 0.4)[:, None]
+        error: dict[bool, list[float]] = {True: [], False: []}
+        for seed in range(6):
+            pixels = views(4, 5) + noise * torch.randn(
+                4, 2, BOARD.corners, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+            )
+            pairs = names(4)
+            seen = []
+            for c in (0, 1):
+                plain = observe(pixels[:, c], names=[pair[c] for pair in pairs])
+                spread = tuple((float(s) ** 2, 0.0, float(s) ** 2) for s in noise[:, 0])
+                known = tuple(view.model_copy(update={"covariance": spread}) for view in plain.views)
+                seen.append(plain.model_copy(update={"views": known}))
+            for weighted in error:
+                result = calibrate_rig(LEFT, RIGHT, seen[0], seen[1], pairs, RigOptions(weighted=weighted))
+                error[weighted].append(off(result)[0] ** 2)
+                # The RMS that is reported stays the plain one.
+                assert result.rms == pytest.approx(float(noise.square().mean().sqrt()) * 2**0.5, rel=0.2)
+        assert sum(error[True]) < 0.25 * sum(error[False])
+
+    def test_covariance_is_that_of_the_sigmas(self) -> None:
+        for refine in (False, True):
+            result = solve(views(5, 3, noise=0.1), refine_cameras=refine)
+            assert result.covariance.shape == (26, 26)
+            sigma = result.covariance.diagonal().sqrt()
+            torch.testing.assert_close(sigma[20:23], result.sigma_rotation, rtol=1e-6, atol=0)
+            torch.testing.assert_close(sigma[23:], result.sigma_translation, rtol=1e-6, atol=0)
+            # Parameters that were held have none: all, or the skew of each camera.
+            assert bool((sigma[:20] > 0).any()) == refine
+            assert sigma[4] == sigma[14] == 0
+
+
 class TestTurned:
     """Trap 8: a board read from its other end in some pairs."""
 
@@ -205,6 +240,28 @@ class TestWrongPairs:
         assert [pair for pair, _ in result.excluded] == [("l3", "r3")]
         assert off(result)[0] < 5 * float(result.sigma_rotation.norm())
         assert off(result)[1] < 5 * float(result.sigma_translation.norm())
+
+    @pytest.mark.parametrize("shift", [(1.0, 0.0), (0.0, 1.0), (0.5, 0.5)])
+    def test_a_pixel_is_noticed_and_can_be_left_out(self, shift: tuple[float, float]) -> None:
+        """Each camera alone fits such a pair well, and the joint RMS hardly rises: what joining it costs tells."""
+        pixels = views(8, 2, noise=0.1)
+        pixels[3, 1] += torch.tensor(shift, dtype=torch.float64)
+        warned = solve(pixels)
+        assert warned.excluded == ()
+        assert [text.split(":")[0] for text in warned.warnings] == ["pair l3, r3"]
+        assert warned.disagreement.argmax() == 3
+        result = solve(pixels, reject=True)
+        assert [pair for pair, _ in result.excluded] == [("l3", "r3")]
+        assert "disagree about the rig" in result.excluded[0][1]
+        assert result.warnings == ()
+        assert off(result)[0] < 5 * float(result.sigma_rotation.norm())
+        assert off(result)[0] < 0.5 * off(warned)[0]
+
+    def test_good_pairs_are_neither_named_nor_left_out(self) -> None:
+        for seed in range(3):
+            result = solve(views(6, 2, noise=0.1, noise_seed=seed), reject=True)
+            assert result.excluded == ()
+            assert result.warnings == ()
 
     def test_an_exact_capture_loses_no_pair_to_rounding(self) -> None:
         assert solve(views(6, 2)).excluded == ()

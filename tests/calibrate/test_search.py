@@ -10,6 +10,7 @@ from torch import Tensor
 from kcal.calibrate.ladder import embed
 from kcal.calibrate.motion import screw
 from kcal.calibrate.reduced import ReducedProblem, fold
+from kcal.calibrate.rules import Rules
 from kcal.calibrate.terms import Prior, RadialBound
 from kcal.calibrate.views import Views, free_parameters
 from kcal.lens.model import LensModel
@@ -121,3 +122,38 @@ class TestFold:
             problem.cost(problem.retract(state, (h * step[0],))) - problem.cost(problem.retract(state, (-h * step[0],)))
         ) / (2 * h)
         assert float(slope) == pytest.approx(-2.0 * float(predicted), rel=1e-4)
+
+
+def test_steps_are_the_same_for_numpy_and_for_torch() -> None:
+    generator = torch.Generator().manual_seed(3)
+    step = torch.randn(4, 6, generator=generator, dtype=torch.float64) * torch.tensor([1e-9, 1e-3, 0.1, 2.0])[:, None]
+    rotation = rotation_from_vector(torch.randn(4, 3, generator=generator, dtype=torch.float64))
+    translation = torch.randn(4, 3, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        fast = screw(rotation, translation, step)
+    for found, expected in zip(fast, screw(rotation, translation, step), strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-14)
+
+
+def test_rows_are_the_same_for_numpy_and_for_torch() -> None:
+    """Of all corners and of folded views, with a warp, tied parameters and some corners unseen."""
+    truth = camera("opencv14")
+    poses = motions(truth, 6, 4)
+    pixels = pixels_of(truth, poses, noise=0.2)
+    pixels[2, :5] = torch.nan
+    rules = Rules(tied=(("fx", "fy"),), free=("skew",))
+    views = Views(board_points=BOARD.points, pixels=pixels[:, None], size=SIZE, free_warp=True, rules=rules)
+    nothing = torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
+    state = (truth.parameters_vector.detach(), torch.tensor([1e-3, -2e-3]).double(), *nothing, *poses)
+    problem, stacked = views.problem(truth.model), tuple(torch.stack([t, t]) for t in state)
+    folded = fold(views.problem(truth.model, poses_only=True), state, 1.0)
+    reduced = ReducedProblem(folded, truth.model, views.rules.parameters(truth.model), batch=(2,))
+    start = reduced.start(torch.stack([state[0], 1.001 * state[0]]))
+    with torch.no_grad():
+        rows, both, cost = problem.rows(state), problem.rows(stacked), reduced.linearise(start).cost
+        assert rows.isfinite().all()
+    slow = problem.rows(state)
+    scale = slow.abs().amax((0, 2))[:, None]
+    torch.testing.assert_close(rows / scale, slow / scale, rtol=0, atol=1e-12)
+    torch.testing.assert_close(both[1] / scale, slow / scale, rtol=0, atol=1e-12)
+    torch.testing.assert_close(cost, reduced.linearise(start).cost, rtol=1e-10, atol=0)

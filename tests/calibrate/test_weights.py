@@ -6,7 +6,7 @@ from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.weights import whitening
 from kcal.corners.observations import Observations
-from kcal.lens.pose import move
+from kcal.lens.pose import rotation_from_vector
 
 
 def with_covariance(seen, sigma):
@@ -87,7 +87,8 @@ def test_rows_are_the_derivatives_of_weighted_residuals():
         torch.zeros(2, dtype=torch.float64),
         torch.zeros(0, 3, 3, dtype=torch.float64),
         torch.zeros(0, 3, dtype=torch.float64),
-        *move(rotation, translation, torch.full((3, 6), 1e-3, dtype=torch.float64)),
+        rotation_from_vector(torch.full((3, 3), 1e-3, dtype=torch.float64)) @ rotation,
+        translation + 1e-3,
     )
     errors = problem.pixel_errors(state)[:, 0].mT  # (V, N, 2)
     by_hand = (torch.nan_to_num(weights) @ errors[..., None])[..., 0]

@@ -142,6 +142,26 @@ class TestCalibrate:
         assert run(monkeypatch, "calibrate", "one.obs.json", "-o", "one.json") == 0
         assert "corner 5 of view left02.png" in capsys.readouterr().err
 
+    def test_a_known_camera_and_a_weak_prior(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert run(monkeypatch, "calibrate", "left.obs.json", "-o", "left.json", "--weak-prior", "0.3") == 0
+        first = CameraFile.load(folder / "left.json")
+        matrix = first.covariance_matrix()
+        assert first.standard_deviations is not None
+        assert matrix is not None
+        assert float(matrix[0, 0]) ** 0.5 == pytest.approx(first.standard_deviations["fx"])
+        assert run(monkeypatch, "calibrate", "left.obs.json", "-o", "again.json", "--camera", "left.json") == 0
+        assert "fixed" in capsys.readouterr().out
+        again = CameraFile.load(folder / "again.json")
+        assert again.camera().fingerprint == first.camera().fingerprint
+        assert again.covariance is not None
+        assert again.covariance.names == ()
+        both = ["--camera", "left.json", "--fix", "cx"]
+        assert "known camera" in refuse(
+            folder, monkeypatch, capsys, "calibrate", "left.obs.json", "-o", "a.json", *both
+        )
+
     def test_parameters_by_name(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:

@@ -114,7 +114,7 @@ class TestRealImages:
 class TestDemo:
     def test_simulated_site(self, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         # A third of the images, so that the test takes seconds.
-        small = functools.partial(kcal.sim.scene.DemoScene, near_views=8, pair_views=4)
+        small = functools.partial(kcal.sim.scene.DemoScene, near_views=7, pair_views=3)
         monkeypatch.setattr(kcal.sim.scene, "DemoScene", small)
         code, text, _ = run("demo", "-o", "out", "--seed", "3")
         assert code == 0
@@ -127,8 +127,16 @@ class TestDemo:
             estimate = float(rows[name]["range_m"])
             # Marks of 0.1 px leave 4.4 % at 5 km and less before; five sigma of that and of the few views.
             assert abs(estimate / distance - 1) < 0.004 + 0.22 * distance / 5000
-        for name in ("map.png", "points.geojson", "left.png", "right.png"):
+        for name in ("map.png", "points.geojson", "left.png", "right.png", "rig.png"):
             assert Path("out", name).stat().st_size > 1000
+        page = Path("out", "summary.html").read_text()
+        assert page.count("data:image/png;base64,") == 4
+        assert all(f"<td>{name}</td>" in page for name in scene.targets.names)
+        # The rig file says where the rig stands: positions follow from it and the marks alone.
+        assert run("locate", "out/rig.json", "out/points.csv", "--pixel-sigma", "0.1", "-o", "again.csv")[0] == 0
+        again = {row["name"]: row for row in csv.DictReader(Path("again.csv").read_text().splitlines())}
+        for name in scene.targets.names:
+            assert float(again[name]["range_m"]) == pytest.approx(float(rows[name]["range_m"]), rel=1e-9)
 
     def test_output_that_is_a_file(self, run: Run) -> None:
         Path("taken").write_text("mine")

@@ -101,6 +101,60 @@ class TestCamera:
         assert after.standard_deviations["fy"] == 0.1 / 2
         assert tuple(after.standard_deviations) == camera.names
 
+    def test_covariance_round_trip(self, tmp_path: Path, camera: Camera) -> None:
+        """By name, without what was held, to the last bit; and as a rig's covariance wants it."""
+        count = len(camera.names)
+        factor = torch.randn(count, count, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        factor[camera.names.index("skew")] = 0.0
+        matrix = factor @ factor.T
+        file = CameraFile.load(camera_to_file(camera, covariance=matrix).save(tmp_path / "camera.json"))
+        assert file.covariance is not None
+        assert file.covariance.names == tuple(name for name in camera.names if name != "skew")
+        again = file.covariance_matrix()
+        assert again is not None
+        assert torch.equal(again, matrix)
+        assert camera_to_file(camera).covariance_matrix() is None
+        exact = camera_to_file(camera, covariance=torch.zeros_like(matrix)).covariance_matrix()
+        assert exact is not None
+        assert torch.equal(exact, torch.zeros_like(matrix))
+        shuffled = file.covariance.model_copy(
+            update={
+                "names": file.covariance.names[::-1],
+                "matrix": tuple(row[::-1] for row in file.covariance.matrix[::-1]),
+            }
+        )
+        assert torch.equal(shuffled.expand(camera.names), matrix)
+
+    @pytest.mark.parametrize(
+        ("names", "matrix", "message"),
+        [
+            (("fx", "fy"), ((1.0, 0.0),), "2 rows of 2"),
+            (("fx", "fy"), ((1.0, 0.5), (0.4, 1.0)), "symmetric"),
+            (("fx", "fy"), ((1.0, 2.0), (2.0, 1.0)), "negative eigenvalue"),
+            (("fx", "fx"), ((1.0, 0.0), (0.0, 1.0)), "twice"),
+            (("fx", "k9x"), ((1.0, 0.0), (0.0, 1.0)), "k9x is unknown"),
+            (("fx",), ((math.inf,),), "finite"),
+        ],
+    )
+    def test_no_covariance(
+        self,
+        tmp_path: Path,
+        camera: Camera,
+        names: tuple[str, ...],
+        matrix: tuple[tuple[float, ...], ...],
+        message: str,
+    ) -> None:
+        content = camera_to_file(camera).dump()
+        content["covariance"] = {"names": names, "matrix": matrix}
+        path = tmp_path / "camera.json"
+        path.write_text(json.dumps(content))
+        with pytest.raises(FileError, match=message):
+            CameraFile.load(path)
+
+    def test_covariance_of_another_camera(self, camera: Camera) -> None:
+        with pytest.raises(InputError, match="covariance"):
+            camera_to_file(camera, covariance=torch.eye(3).double())
+
     def test_stored_form(self) -> None:
         # The format, spelled out: whoever reads these files elsewhere depends on it.
         camera = Camera.build(focal=(800, 801), center=(320, 240), size=(640, 480), coefficients=[0.1], model="opencv4")
@@ -120,6 +174,7 @@ class TestCamera:
             "intrinsics": {"fx": 800.0, "fy": 801.0, "cx": 320.0, "cy": 240.0, "skew": 0.0},
             "coefficients": {"k1": 0.1, "k2": 0.0, "p1": 0.0, "p2": 0.0},
             "standard_deviations": None,
+            "covariance": None,
             "valid_region": {
                 "radius": math.tan(math.radians(89.0)),
                 "polygon": [[-0.5, 479.5], [-0.5, -0.5], [639.5, -0.5], [639.5, 479.5]],

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from kcal.lens.pose import move, nearest_rotation, rotation_from_vector, step_rows, vector_from_rotation
+from kcal.lens.pose import nearest_rotation, rotation_from_vector, step_rows, vector_from_rotation
 
 # Lengths of rotation vectors: none, far below the root of rounding, about it, moderate, almost half a turn.
 LENGTHS = [0.0, 1e-12, 1e-8, 1e-6, 1e-4, 1e-2, 0.5, 2.0, 3.0, math.pi - 1e-3]
@@ -101,21 +101,7 @@ class TestNearestRotation:
         torch.testing.assert_close(nearest_rotation(1e6 * r), r, rtol=0, atol=1e-14)
 
 
-class TestMove:
-    def test_is_a_turn_from_the_left_and_a_shift(self) -> None:
-        r, t = rotation_from_vector(0.9 * axis(5)), axis(6)
-        step = torch.cat([0.3 * axis(7), 0.2 * axis(8)])
-        turned, moved = move(r, t, step)
-        torch.testing.assert_close(turned, rotation_from_vector(step[:3]) @ r, rtol=0, atol=1e-15)
-        # The shift is not turned: rotation and translation are independent.
-        torch.testing.assert_close(moved, t + step[3:], rtol=0, atol=1e-15)
-
-    def test_no_step_changes_nothing(self) -> None:
-        r, t = rotation_from_vector(0.9 * axis(5)), axis(6)
-        turned, moved = move(r, t, torch.zeros(6).double())
-        assert torch.equal(turned, r)
-        assert torch.equal(moved, t)
-
+class TestStep:
     def test_rows_are_the_derivatives_of_a_moved_point(self) -> None:
         generator = torch.Generator().manual_seed(9)
         points = torch.randn(3, 5, generator=generator, dtype=torch.float64)
@@ -123,7 +109,7 @@ class TestMove:
         r, t = rotation_from_vector(0.9 * axis(5)), axis(6)
 
         def image(step: Tensor) -> Tensor:
-            turned, moved = move(r, t, step)
+            turned, moved = rotation_from_vector(step[:3]) @ r, t + step[3:]
             return torch.einsum("ukn,kn->un", weights, turned @ points + moved[:, None])
 
         expected = torch.func.jacfwd(image)(torch.zeros(6).double()).movedim(-1, 0)

@@ -255,7 +255,8 @@ class TestCamera:
         # A ramp shows in each new pixel the column where the hybrid, not its lens alone, puts that pixel's ray.
         ramp = torch.arange(128.0, dtype=torch.float64).expand(1, 1, 72, 128)
         module = Undistort(small)
-        image, mask = (part[0, 0] for part in module(ramp))
+        images, masks = module(ramp)
+        image, mask = images[0, 0], masks[0]
         pixels = module.new_camera.grid(128, 72)
         wanted, _ = small.project(module.new_camera.unproject(pixels)[0])
         torch.testing.assert_close(image[mask], wanted[..., 0][mask], rtol=0, atol=1e-9)

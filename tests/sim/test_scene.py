@@ -32,7 +32,7 @@ def test_both_cameras_see_every_target_and_two_lie_near_the_edges():
     scene = DemoScene()
     marks, landmarks = scene.target_marks, scene.landmark_marks
     assert marks.left.shape == (7, 2)
-    assert landmarks.left.shape == (8, 2)
+    assert landmarks.left.shape == (12, 2)
     x = marks.true_left[:, 0]
     assert float(x.min()) < 0.06 * 1920
     assert float(x.max()) > 0.94 * 1920

@@ -1,0 +1,52 @@
+"""`kcal bake`: a camera as lookup tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from kcal.cli.console import out
+from kcal.files import check_writable
+
+
+def bake(
+    camera: Annotated[Path, typer.Argument(help="Camera file from `kcal calibrate`.", show_default=False)],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="FILE", help="File to write, .npz; beside the camera if not given."),
+    ] = None,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", min=1e-8, help="Largest error in pixels, in both directions.")
+    ] = 1e-3,
+) -> None:
+    """Turn a camera into lookup tables, for programs that know no lens formulas.
+
+    Writes one .npz file with two bicubic tables, pixels to rays and rays to pixels, the coarsest that keep the
+    tolerance. What the arrays mean, and how to read them with numpy alone, is written in `kcal/io/lookup_file.py`.
+
+    **Example**
+
+    `kcal bake left.camera.json --tolerance 0.001 -o left.npz`
+    """
+    name = camera.name.removesuffix(".json").removesuffix(".camera")
+    path = check_writable(output or camera.with_name(f"{name}_lookup.npz"), camera)
+
+    from kcal.io.camera_file import load_camera
+    from kcal.io.lookup_file import save_lookup
+    from kcal.lens.bake import bake as bake_camera
+
+    lookup = bake_camera(load_camera(camera), tolerance)
+    save_lookup(lookup, path)
+    for which, table, bound, coverage in zip(
+        ("pixels to rays", "rays to pixels"),
+        (lookup.chart_from_pixels, lookup.pixels_from_chart),
+        lookup.bound[::-1],
+        lookup.coverage[::-1],
+        strict=True,
+    ):
+        rows, columns = table.cells.shape
+        lost = "" if coverage == 1.0 else f"; answers for {coverage:.1%} of the image's valid pixels"
+        out.print(f"{which}: {columns} x {rows} cells, error at most {bound:.1e} px{lost}")
+    out.print(f"wrote {path}", markup=False)

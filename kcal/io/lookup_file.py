@@ -1,0 +1,127 @@
+"""Lookup cameras as .npz files, for consumers that know no lens formulas, no nets and no torch.
+
+What a file holds (numpy arrays, read with `np.load(path, allow_pickle=False)`):
+
+| name | shape, type | meaning |
+|---|---|---|
+| `kcal`, `version` | text, integer | `"lookup"`, 1 |
+| `image_size` | (2,) integers | width, height |
+| `center` | (2,) float64 | principal point, pixels |
+| `bound` | (2,) float64 | largest error in pixels of project, of unproject |
+| `coverage` | (2,) float64 | share of the image's pixels with a ray that each answers for |
+| `source` | text | fingerprint of the camera that was baked |
+| `project_*`, `unproject_*` | | a spline each: |
+| `*_coefficients` | (2, rows + 3, columns + 3) float64 | coefficients of both values |
+| `*_origin`, `*_step` | (2,) float64 | place of the first coefficient and distance of the next, x then y |
+| `*_cells` | (rows, columns) bool | which cells may be used |
+
+How to read a value at (x, y): t = ((x, y) - origin) / step; (i, j) = floor(t), which must be 1 to columns and 1 to rows
+(on the far edge itself, take the last cell); f = t - (i, j). If `cells[j - 1, i - 1]`, each of the two values is the
+sum over the coefficients [j - 1 + m, i - 1 + n], m and n from 0 to 3, times b_m(f_y) b_n(f_x) with
+
+    b_0 = (1 - f)³ / 6,  b_1 = (3 f³ - 6 f² + 4) / 6,  b_2 = (-3 f³ + 3 f² + 3 f + 1) / 6,  b_3 = f³ / 6
+
+`unproject` takes a pixel and gives a position (p, q) of the stereographic chart: with s = (p² + q²) / 4, the ray is
+(p, q, 1 - s) / (1 + s). `project` takes (p, q) = 2 (X, Y) / (√(X² + Y² + Z²) + Z) and gives the pixel; it is valid if
+it also lies in the image, from -0.5 to width - 0.5 and height - 0.5. Pixel (0, 0) is the centre of the first pixel;
+x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from kcal.errors import FileError, InputError
+from kcal.files import write_atomic
+from kcal.lens.lookup import LookupCamera
+from kcal.lens.spline import Spline
+
+KIND, VERSION = "lookup", 1
+_TABLES = {"project": "pixels_from_chart", "unproject": "chart_from_pixels"}
+
+
+def save_lookup(camera: LookupCamera, path: str | Path) -> Path:
+    """Write a lookup camera as .npz; see the module's first lines for what is in it.
+
+    Raises:
+        FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from kcal.lens.bake import bake
+        >>> from kcal.lens.camera import Camera
+        >>> lookup = bake(Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole"))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = save_lookup(lookup, Path(folder, "camera.npz"))
+        ...     load_lookup(path).size, np.load(path)["image_size"].tolist()
+        ((640, 480), [640, 480])
+    """
+    arrays = {
+        "kcal": np.array(KIND),
+        "version": np.array(VERSION),
+        "image_size": np.array(camera.size),
+        "center": camera.center.cpu().numpy(),
+        "bound": np.array(camera.bound),
+        "coverage": np.array(camera.coverage),
+        "source": np.array(camera.source),
+    }
+    for name, attribute in _TABLES.items():
+        table: Spline = getattr(camera, attribute)
+        for part, value in table._asdict().items():
+            arrays[f"{name}_{part}"] = value.cpu().numpy()
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    return write_atomic(path, buffer.getvalue())
+
+
+def load_lookup(path: str | Path) -> LookupCamera:
+    """Read a lookup camera; nothing in the file is executed.
+
+    Raises:
+        FileError: missing, no .npz, another kind or version, or arrays that are missing or do not fit.
+
+    Example:
+        >>> load_lookup("no-such-file.npz")
+        Traceback (most recent call last):
+        kcal.errors.FileError: no-such-file.npz: cannot read: No such file or directory
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except OSError as error:
+        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
+    except (ValueError, zipfile.BadZipFile, EOFError, AttributeError) as error:
+        raise FileError(f"{path}: not an .npz file with a lookup camera") from error
+    if str(arrays.get("kcal")) != KIND or arrays.get("version") != VERSION:
+        raise FileError(f"{path}: not a kcal {KIND} file of version {VERSION}")
+    try:
+        tables = {}
+        for name, attribute in _TABLES.items():
+            parts = {part: torch.from_numpy(arrays[f"{name}_{part}"]) for part in Spline._fields}
+            tables[attribute] = Spline(**parts)
+            numbers = [parts["coefficients"], parts["origin"], parts["step"]]
+            if not all(n.dtype == torch.float64 and bool(n.isfinite().all()) for n in numbers):
+                raise InputError(f"{name}: numbers must be finite and float64")
+            if parts["cells"].dtype != torch.bool or not bool((parts["step"] > 0).all()):
+                raise InputError(f"{name}: cells must be bool and steps positive")
+            if any(parts[part].shape != (2,) for part in ("origin", "step")):
+                raise InputError(f"{name}: origin and step have two numbers each")
+        width, height = (int(value) for value in arrays["image_size"])
+        bound, coverage = (tuple(float(v) for v in arrays[key]) for key in ("bound", "coverage"))
+        return LookupCamera(
+            size=(width, height),
+            center=torch.from_numpy(arrays["center"]),
+            bound=(bound[0], bound[1]),
+            coverage=(coverage[0], coverage[1]),
+            source=str(arrays["source"]),
+            **tables,
+        )
+    except KeyError as error:
+        raise FileError(f"{path}: bad lookup file: {error.args[0]} is missing") from error
+    except (InputError, ValueError, TypeError, IndexError) as error:
+        raise FileError(f"{path}: bad lookup file: {error}") from error

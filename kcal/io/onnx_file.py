@@ -1,0 +1,72 @@
+"""Modules of points as ONNX files, for runtimes other than torch."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import tempfile
+import warnings
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from kcal.checks import as_points
+from kcal.errors import FileError, InputError
+from kcal.files import check_writable
+
+
+def save_onnx(module: nn.Module, example: Tensor, path: str | Path) -> Path:
+    """Write a module that maps points (N, K) as ONNX, for any number of points from two up.
+
+    `Camera` itself is such a module (`project`), `Unproject`, `LookupCamera` and `Triangulate` are others. The graph is
+    written as it was traced: the optimiser of onnxscript 0.7, on by default in `torch.onnx.export`, takes constants
+    within 1e-5 of one for one and below 1e-8 for zero, and so drops the cosine of a small tilt or a small coefficient
+    without a word. Runtimes optimise on their own when they load the graph.
+
+    Args:
+        module: its parameters become constants.
+        example: (N, K) points to trace it with, at least two.
+        path: of the file.
+
+    Raises:
+        InputError: points of another shape, or the extra `onnx` is not installed.
+        FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from kcal.lens.camera import Camera
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_onnx(camera, torch.ones(2, 3), Path(folder, "camera.onnx")).name
+        'camera.onnx'
+    """
+    path = check_writable(path)
+    if not isinstance(example, Tensor) or example.ndim != 2 or len(example) < 2:
+        raise InputError("save_onnx: an example (N, K) of at least two points is needed")
+    example = as_points("example", example, example.shape[-1])
+    if importlib.util.find_spec("onnxscript") is None:
+        raise InputError("save_onnx: onnx and onnxscript are needed; install kcal[onnx]")
+    training = module.training
+    try:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+            written = Path(folder, path.name)
+            with warnings.catch_warnings():
+                # Of torch's own use of its tree library, nothing that a user could change.
+                warnings.simplefilter("ignore", FutureWarning)
+                torch.onnx.export(
+                    module.eval(),
+                    (example,),
+                    written,
+                    dynamo=True,
+                    dynamic_shapes=({0: torch.export.Dim("count", min=2)},),
+                    external_data=False,
+                    optimize=False,
+                    verbose=False,
+                )
+            os.replace(written, path)
+    except OSError as error:
+        raise FileError(f"{path}: cannot write: {error.strerror or error}") from error
+    finally:
+        module.train(training)
+    return path

@@ -1,0 +1,60 @@
+"""Blocks inside kcal's files."""
+
+from __future__ import annotations
+
+import pydantic
+import torch
+
+# Of the eigenvalues of a matrix of correlations.
+_ROUNDING = 1e-9
+
+
+class Record(pydantic.BaseModel):
+    """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class CovarianceRecord(Record):
+    """How the parameters of a camera scatter together: what one sigma of each does not tell.
+
+    Args:
+        names: of the parameters that were estimated, in the order of the camera's; all others are exact.
+        matrix: their covariance, row by row: symmetric, in products of the parameters' units (pixels for intrinsics,
+            none for coefficients, radians for tilts). A parameter that the data leave open has a very large variance.
+    """
+
+    names: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+
+    @pydantic.model_validator(mode="after")
+    def _is_covariance(self) -> CovarianceRecord:
+        count = len(self.names)
+        if len(set(self.names)) != count:
+            raise ValueError("covariance: a name occurs twice")
+        if len(self.matrix) != count or any(len(row) != count for row in self.matrix):
+            raise ValueError(f"covariance: {count} names need {count} rows of {count} numbers")
+        values = torch.tensor(self.matrix, dtype=torch.float64).reshape(count, count)
+        scale = values.diagonal().clamp_min(0.0).sqrt()
+        # Entries have different units: compare them as correlations.
+        unit = values / torch.where(scale > 0, scale, 1.0)[:, None] / torch.where(scale > 0, scale, 1.0)
+        if not torch.allclose(unit, unit.T, rtol=0, atol=1e-9):
+            raise ValueError("covariance: the matrix is not symmetric")
+        if count and float(torch.linalg.eigvalsh(unit)[0]) < -_ROUNDING * count:
+            raise ValueError("covariance: the matrix has a negative eigenvalue")
+        return self
+
+    @classmethod
+    def of(cls, covariance: torch.Tensor, names: tuple[str, ...]) -> CovarianceRecord:
+        """From a matrix of all parameters; those whose variance is zero are left out."""
+        free = (covariance.diagonal() != 0).nonzero()[:, 0]
+        rows = covariance[free[:, None], free].tolist()
+        return cls(names=tuple(names[i] for i in free.tolist()), matrix=tuple(map(tuple, rows)))
+
+    def expand(self, names: tuple[str, ...]) -> torch.Tensor:
+        """The covariance (P, P) of all parameters `names`, zero for those that are exact."""
+        places = torch.tensor([names.index(name) for name in self.names], dtype=torch.long)
+        out = torch.zeros(len(names), len(names), dtype=torch.float64)
+        if len(places):
+            out[places[:, None], places] = torch.tensor(self.matrix, dtype=torch.float64)
+        return out

@@ -1,0 +1,64 @@
+"""Positions against the truth, where somebody knows it: read it, and say how far off each one is."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.locate.geodesy import Origin
+from kcal.locate.positions import Located
+from kcal.locate.survey import read_survey
+
+
+def read_truth(path: str | Path, located: Located) -> Tensor:
+    """True positions (N, 3) east, north, up of the left camera for the located points by name; NaN where unknown.
+
+    Args:
+        path: a CSV with name,lat,lon,height or name,east,north,up (of the left camera), other columns as a survey has.
+        located: what they are compared with.
+
+    Raises:
+        FileError: see `kcal.locate.survey.read_survey`.
+        InputError: no name is in both.
+    """
+    here = Origin(lat=located.origin.lat, lon=located.origin.lon, height=located.origin.height)
+    survey = read_survey(path, here, measured=False)
+    index = {name: i for i, name in enumerate(survey.names)}
+    names = [position.name for position in located.positions]
+    if not any(name in index for name in names):
+        raise InputError(f"{path}: none of its names ({', '.join(survey.names[:3])} ...) is among the points")
+    nowhere = torch.full((3,), math.nan, dtype=torch.float64)
+    return torch.stack([survey.points[index[name]] if name in index else nowhere for name in names])
+
+
+def misses(located: Located, truth: Tensor) -> list[tuple[float, float, bool] | None]:
+    """How far off each position is; None where position or truth is unknown.
+
+    For each its level distance from the truth and its range minus the true one (metres), and whether the range interval
+    holds the true range.
+
+    Example:
+        >>> from kcal.lens.camera import Camera
+        >>> from kcal.lens.rig import StereoRig
+        >>> from kcal.locate.positions import locate
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> found = locate(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
+        ...                origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> [round(value, 6) for value in misses(found, torch.tensor([[3.0, 996.0, 0.0]]).double())[0][:1]]
+        [5.0]
+    """
+    out: list[tuple[float, float, bool] | None] = []
+    for position, true in zip(located.positions, truth, strict=True):
+        if position.enu is None or position.range_m is None or not bool(torch.isfinite(true).all()):
+            out.append(None)
+            continue
+        east, north, _ = (torch.tensor(position.enu, dtype=torch.float64) - true).tolist()
+        away = float(torch.linalg.vector_norm(true))
+        low, high = position.range_low_m or 0.0, position.range_high_m or math.inf
+        out.append((math.hypot(east, north), position.range_m - away, low <= away <= high))
+    return out

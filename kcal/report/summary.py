@@ -1,0 +1,123 @@
+"""One HTML page that says what was done and what came out, with its pictures inside: it opens without a network."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import html
+from collections.abc import Sequence
+from pathlib import Path
+
+from kcal.corners.images import read_bytes
+from kcal.errors import InputError
+from kcal.files import write_atomic
+
+_STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.55 system-ui, sans-serif; color: #111827; background: #f3f4f6; margin: 0; }
+main { max-width: 62rem; margin: 0 auto; padding: 2rem 1.2rem 4rem; }
+h1 { font-size: 1.7rem; margin: 0 0 .4rem; }
+h2 { font-size: 1.15rem; margin: 0 0 .5rem; }
+section { background: #fff; border: 1px solid #e5e7eb; border-radius: 8px; padding: 1.1rem 1.3rem; margin: 1.2rem 0; }
+p { margin: .3rem 0 .8rem; max-width: 52rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .92rem; font-variant-numeric: tabular-nums; }
+th, td { padding: .3rem .8rem; text-align: right; border-bottom: 1px solid #e5e7eb; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; }
+th { color: #4b5563; font-weight: 600; }
+figure { margin: .6rem 0; }
+figcaption { color: #4b5563; font-size: .88rem; }
+img { max-width: 100%; height: auto; }
+pre { background: #f3f4f6; padding: .7rem .9rem; overflow-x: auto; font-size: .85rem; }
+.row { display: flex; gap: 1rem; flex-wrap: wrap; }
+.row figure { flex: 1 1 20rem; }
+"""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Part:
+    """A part of the page: a heading, sentences, and what belongs to them.
+
+    Args:
+        heading: of the part.
+        text: paragraphs.
+        table: rows of cells, the first row being the heads; none: no table.
+        pictures: PNG or JPEG files with their captions, side by side where there is room.
+        code: a command to copy, or "".
+    """
+
+    heading: str
+    text: tuple[str, ...] = ()
+    table: tuple[tuple[str, ...], ...] = ()
+    pictures: tuple[tuple[str | Path, str], ...] = ()
+    code: str = ""
+
+
+def summary_page(title: str, lead: str, parts: Sequence[Part]) -> str:
+    """The page as HTML.
+
+    Args:
+        title: of the page.
+        lead: one paragraph under it.
+        parts: in their order.
+
+    Raises:
+        FileError: a picture cannot be read.
+        InputError: a picture that is neither PNG nor JPEG, or a table whose rows differ in length.
+
+    Example:
+        >>> part = Part(heading="Found", table=(("name", "m"), ("gate", "100")))
+        >>> page = summary_page("A rig", "Two cameras.", [part])
+        >>> "<td>gate</td><td>100</td>" in page, "http" in page
+        (True, False)
+    """
+    body = "\n".join(_part(part) for part in parts)
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{html.escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n<main>\n"
+        f"<h1>{html.escape(title)}</h1>\n<p>{html.escape(lead)}</p>\n{body}\n</main>\n</body>\n</html>\n"
+    )
+
+
+def save_summary(path: str | Path, title: str, lead: str, parts: Sequence[Part]) -> Path:
+    """Write the page of `summary_page`, atomically.
+
+    Raises:
+        FileError: the file cannot be written, or see `summary_page`.
+        InputError: see `summary_page`.
+    """
+    return write_atomic(path, summary_page(title, lead, parts))
+
+
+def _part(part: Part) -> str:
+    lines = ["<section>", f"<h2>{html.escape(part.heading)}</h2>"]
+    lines += [f"<p>{html.escape(text)}</p>" for text in part.text]
+    if part.table:
+        lines.append(_table(part))
+    if part.pictures:
+        figures = "\n".join(_picture(path, caption) for path, caption in part.pictures)
+        lines.append(f'<div class="row">\n{figures}\n</div>')
+    if part.code:
+        lines.append(f"<pre>{html.escape(part.code)}</pre>")
+    return "\n".join([*lines, "</section>"])
+
+
+def _table(part: Part) -> str:
+    if len({len(row) for row in part.table}) > 1:
+        raise InputError(f"the table of {part.heading!r}: rows of different lengths")
+    head, *rows = part.table
+    lines = ["<tr>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in head) + "</tr>"]
+    lines += ["<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
+    return '<div class="scroll"><table>\n' + "\n".join(lines) + "\n</table></div>"
+
+
+def _picture(path: str | Path, caption: str) -> str:
+    data = read_bytes(path)
+    kinds = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg"}
+    kind = next((name for start, name in kinds.items() if data.startswith(start)), None)
+    if kind is None:
+        raise InputError(f"{path}: neither a PNG nor a JPEG picture")
+    source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+    text = html.escape(caption)
+    return f'<figure><img src="{source}" alt="{text}"><figcaption>{text}</figcaption></figure>'

@@ -1,0 +1,219 @@
+"""`kcal rig` from a survey, `kcal rig check`, `kcal locate` with what the rig file knows; across the antimeridian."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.cli.main import main
+from kcal.io.camera_file import camera_to_file
+from kcal.io.rig_file import RigFile
+from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic
+
+ORIGIN = Origin(lat=-17.5, lon=179.9999, height=40.0)
+CAMERAS = [
+    Camera.build(focal=(1602, 1600), center=(968, 534), size=(1920, 1080), coefficients=[-0.2, 0.06, 3e-4, -2e-4]),
+    Camera.build(focal=(1611, 1610), center=(951, 546), size=(1920, 1080), coefficients=[-0.19, 0.05, -2e-4, 3e-4]),
+]
+ROTATION = [enu_from_cam(16.0, -0.5, 0.4).T, enu_from_cam(16.2, -0.3, -0.2).T]
+CENTRE = torch.tensor([[2.0, -1.0, 3.0], [11.6, -3.7, 3.1]], dtype=torch.float64)
+HEADER = "name,left_u,left_v,right_u,right_v"
+
+
+def points(count: int, near: float, far: float, seed: int) -> Tensor:
+    draw = torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    distance = near * (far / near) ** draw[:, :1]
+    across, up = 0.7 * (draw[:, 1:2] - 0.5), 0.4 * (draw[:, 2:] - 0.5)
+    right, down, ahead = ROTATION[0]
+    return CENTRE[0] + distance * (ahead + across * right - up * down)
+
+
+def marked(where: Tensor, seed: int, yaw: float = 0.0) -> Tensor:
+    """(N, 2, 2) marks with 0.1 px of noise; the right camera turned by `yaw` radians."""
+    turns = rotation_from_vector(torch.tensor([[0.0, 0, 0], [0, yaw, 0]], dtype=torch.float64))
+    sides = [CAMERAS[c].project((where - CENTRE[c]) @ (turns[c] @ ROTATION[c]).T)[0] for c in (0, 1)]
+    exact = torch.stack(sides, 1)
+    return exact + 0.1 * torch.randn(exact.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def table(path: Path, header: str, rows: list[tuple]) -> None:
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+
+
+def marks_table(path: Path, prefix: str, pixels: Tensor, header: str = HEADER, *more: tuple) -> None:
+    table(path, header, [(f"{prefix}{i}", *a, *b) for i, (a, b) in enumerate(pixels.tolist())] + list(more))
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    for name, camera in zip(("left", "right"), CAMERAS, strict=True):
+        camera_to_file(camera, name=name).save(tmp_path / f"{name}.json")
+    posts = points(12, 60.0, 2000.0, 5)
+    places = enu_to_geodetic(posts, ORIGIN)
+    places[4, 2] += 3.0
+    rows = [(f"post{i}", *place, 0.02) for i, place in enumerate(places.tolist())]
+    table(tmp_path / "survey.csv", "name,lat,lon,height,sigma", [*rows, ("tree", -17.5, 179.99, 50, 0.1)])
+    marks_table(tmp_path / "marks.csv", "post", marked(posts, 1))
+    marks_table(tmp_path / "later.csv", "post", marked(posts, 2, math.radians(0.02)))
+    far = points(15, 8000.0, 30_000.0, 9)
+    rows = [
+        (f"peak{i}", *a, *b, distance, 0.1 * distance)
+        for i, ((a, b), distance) in enumerate(
+            zip(marked(far, 3).tolist(), (far - CENTRE.mean(0)).norm(dim=-1).tolist(), strict=True)
+        )
+    ]
+    table(tmp_path / "far.csv", f"{HEADER},range,range_sigma", rows)
+    static = points(25, 400.0, 6000.0, 33)
+    marks_table(tmp_path / "then.csv", "s", marked(static, 4))
+    now = marked(static, 5, math.radians(0.01))
+    now[3] += 9.0
+    marks_table(tmp_path / "now.csv", "s", now)
+    positions = enu_to_geodetic(CENTRE, ORIGIN).tolist()
+    table(tmp_path / "gnss.csv", "name,lat,lon,height,sigma,sigma_up", [
+        (name, *place, 0.02, 0.04) for name, place in zip(("left", "right"), positions, strict=True)
+    ])  # fmt: skip
+    targets = points(5, 100.0, 4000.0, 77)
+    marks_table(tmp_path / "points.csv", "t", marked(targets, 6))
+    table(tmp_path / "truth.csv", "name,lat,lon,height", [
+        (f"t{i}", *place) for i, place in enumerate(enu_to_geodetic(targets, ORIGIN).tolist())
+    ])  # fmt: skip
+    return tmp_path
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["kcal", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    code = stopped.value.code
+    return code if isinstance(code, int) else 0
+
+
+SOLVE = ["rig", "left.json", "right.json", "--landmarks", "survey.csv", "--marks", "marks.csv", "--mark-sigma", "0.1"]
+
+
+def test_from_survey_to_positions(
+    site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = ["--features", "far.csv", "--positions", "gnss.csv", "--baseline", "9.97+-0.05", "--picture", "rig.png"]
+    assert run(monkeypatch, *SOLVE, *more, "-o", "rig.json") == 0
+    printed = capsys.readouterr()
+    assert "surveyed, but not marked: tree" in printed.err
+    assert "left out: landmarks post4: its marks are off the surveyed place by" in printed.err
+    assert (site / "rig.png").read_bytes().startswith(b"\x89PNG")
+    file = RigFile.load(site / "rig.json")
+    assert file.calibration is not None
+    assert [entry.name for entry in file.calibration.excluded] == ["landmarks post4"]
+    assert {source.name for source in file.calibration.sources} == {"landmarks", "features", "baselines", "positions"}
+    # The mounting is the left camera's own, within its sigmas, on the other side of the antimeridian.
+    stands = file.mounting
+    assert stands is not None
+    assert stands.covariance is not None
+    true = enu_to_geodetic(CENTRE[0], ORIGIN).tolist()
+    assert [stands.lat, stands.lon] == pytest.approx(true[:2], abs=1e-6)
+    assert stands.height == pytest.approx(true[2], abs=4.5 * stands.covariance[2][2] ** 0.5)
+    assert stands.heading_deg == pytest.approx(16.0, abs=4.5 * math.degrees(stands.covariance[5][5] ** 0.5))
+    joint = file.joint_covariance()
+    assert joint is not None
+    turn = vector_from_rotation(file.rig().right_from_left_rotation @ (ROTATION[1] @ ROTATION[0].T).T)
+    assert bool((turn.abs() < 4.5 * joint.diagonal()[-6:-3].sqrt()).all())
+
+    outputs = ["-o", "out.geojson", "--map", "map.html", "--picture", "map.png"]
+    assert (
+        run(monkeypatch, "locate", "rig.json", "points.csv", "--truth", "truth.csv", "--pixel-sigma", "0.1", *outputs)
+        == 0
+    )
+    printed = capsys.readouterr()
+    assert "95 % of the marks' noise and the calibration's errors and the mounting's errors" in printed.out
+    rows = [line.split() for line in printed.out.splitlines() if line.startswith("t")]
+    assert len(rows) == 5
+    assert [row[-2] for row in rows].count("yes") >= 4
+    # Level distances from the truth: a few percent of the range at the most.
+    assert all(abs(float(row[-4])) < 0.1 * float(row[4]) for row in rows)
+    assert '"truth": [[' in (site / "map.html").read_text()
+    assert len(json.loads((site / "out.geojson").read_text())["features"]) == 12
+
+
+def test_check_and_relock(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
+    before = (site / "rig.json").read_bytes()
+    capsys.readouterr()
+    check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "now.csv", "--mark-sigma", "0.1"]
+    assert run(monkeypatch, *check) == 0
+    printed = capsys.readouterr()
+    assert "left out: s3: its marks do not meet" in printed.err
+    assert "has changed beyond chance" in printed.out
+    line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))
+    yaw, sigma = float(line.split()[6]), float(line.split()[8])
+    assert abs(yaw - 0.01) < 4.5 * sigma < 0.01
+    assert "a target at 5000 m is found at" in printed.out
+    assert (site / "rig.json").read_bytes() == before
+
+    assert run(monkeypatch, *check, "--relock") == 0
+    (kept,) = site.glob("rig.before-*.json")
+    assert kept.read_bytes() == before
+    old, new = RigFile.load(kept), RigFile.load(site / "rig.json")
+    assert new.left == old.left
+    assert new.calibration is not None
+    assert new.calibration.relocked is not None
+    assert new.calibration.relocked.endswith("from now.csv")
+    turn = vector_from_rotation(new.rig().right_from_left_rotation @ old.rig().right_from_left_rotation.T)
+    assert math.degrees(float(turn[1])) == pytest.approx(yaw, abs=1e-5)
+    assert float(new.rig().baseline) == pytest.approx(float(old.rig().baseline), rel=1e-9)
+    spread = [file.joint_covariance() for file in (old, new)]
+    assert spread[0] is not None
+    assert spread[1] is not None
+    assert float(spread[1][-5, -5]) > float(spread[0][-5, -5])
+
+
+def test_check_by_landmarks(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
+    capsys.readouterr()
+    arguments = ["rig", "check", "rig.json", "--landmarks", "survey.csv", "--marks", "later.csv", "--mark-sigma", "0.1"]
+    assert run(monkeypatch, *arguments, "--relock") == 0
+    printed = capsys.readouterr()
+    line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))
+    assert abs(float(line.split()[6]) - 0.02) < 4.5 * float(line.split()[8])
+    new = RigFile.load(site / "rig.json")
+    assert new.mounting is not None
+    assert new.mounting.heading_deg == pytest.approx(16.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--landmarks", "survey.csv"], "--landmarks and --marks belong together"),
+        (["--features", "far.csv", "--baseline", "10"], "write LENGTH±SIGMA in metres"),
+        (["--features", "far.csv"], "nothing tells where right stands"),
+        (["--landmarks", "survey.csv", "--marks", "then.csv"], "names must be the same in both files"),
+        (["--landmarks", "survey.csv", "--marks", "marks.csv", "--refine-cameras"], "are for boards only"),
+        (["--landmarks", "survey.csv", "--marks", "marks.csv", "--intrinsics", "prior"], "no standard deviations"),
+        (["--landmarks", "survey.csv", "--marks", "marks.csv", "--picture", "a.jpg"], "end with .png"),
+    ],
+)
+def test_refusals(
+    site: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    assert run(monkeypatch, "rig", "left.json", "right.json", *arguments, "-o", "rig.json") == 1
+    assert message in capsys.readouterr().err
+    assert not (site / "rig.json").exists()
+
+
+def test_usage(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
+    assert run(monkeypatch, "rig", "check", "rig.json", "--marks", "now.csv") == 1
+    assert "--reference" in capsys.readouterr().err
+    assert run(monkeypatch, "locate", "rig.json", "points.csv", "--origin", "1,2,3") == 2
+    assert run(monkeypatch, "locate", "rig.json", "points.csv", "--pitch", "1") == 2
