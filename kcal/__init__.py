@@ -10,9 +10,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from kcal.calibrate.drift import measure_drift
+    from kcal.calibrate.hybrid import HybridOptions, calibrate_hybrid
     from kcal.calibrate.inverse_fit import train_inverse
     from kcal.calibrate.layer import CalibrationLayer
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera, calibrate_cameras
+    from kcal.calibrate.rig import JointOptions, solve_rig
+    from kcal.calibrate.rig_sources import RigData
     from kcal.calibrate.stereo import RigOptions, calibrate_rig
     from kcal.corners.board import Board
     from kcal.corners.detect import detect_images
@@ -22,6 +26,7 @@ if TYPE_CHECKING:
     from kcal.io.rig_file import load_rig, save_rig
     from kcal.lens.bake import bake
     from kcal.lens.camera import Camera
+    from kcal.lens.hybrid import HybridCamera
     from kcal.lens.images import Undistort, undistort_maps
     from kcal.lens.inverse_net import InverseNet
     from kcal.lens.lookup import LookupCamera
@@ -43,7 +48,10 @@ __all__ = [
     "CalibrationLayer",
     "CalibrationOptions",
     "Camera",
+    "HybridCamera",
+    "HybridOptions",
     "InverseNet",
+    "JointOptions",
     "KcalError",
     "LMOptions",
     "LensModel",
@@ -52,6 +60,7 @@ __all__ = [
     "Observations",
     "Origin",
     "RigCovariance",
+    "RigData",
     "RigOptions",
     "StereoLocalizer",
     "StereoRig",
@@ -62,13 +71,16 @@ __all__ = [
     "bake",
     "calibrate_camera",
     "calibrate_cameras",
+    "calibrate_hybrid",
     "calibrate_rig",
     "detect_images",
     "load_camera",
     "load_rig",
+    "measure_drift",
     "new_pinhole",
     "save_camera",
     "save_rig",
+    "solve_rig",
     "train_inverse",
     "undistort_maps",
 ]
@@ -78,7 +90,10 @@ _HOME = {
     "CalibrationLayer": "kcal.calibrate.layer",
     "CalibrationOptions": "kcal.calibrate.mono",
     "Camera": "kcal.lens.camera",
+    "HybridCamera": "kcal.lens.hybrid",
+    "HybridOptions": "kcal.calibrate.hybrid",
     "InverseNet": "kcal.lens.inverse_net",
+    "JointOptions": "kcal.calibrate.rig",
     "KcalError": "kcal.errors",
     "LMOptions": "kcal.solve.lm",
     "LensModel": "kcal.lens.model",
@@ -87,6 +102,7 @@ _HOME = {
     "Observations": "kcal.corners.observations",
     "Origin": "kcal.locate.geodesy",
     "RigCovariance": "kcal.locate.errors",
+    "RigData": "kcal.calibrate.rig_sources",
     "RigOptions": "kcal.calibrate.stereo",
     "StereoLocalizer": "kcal.locate.localizer",
     "StereoRig": "kcal.lens.rig",
@@ -97,13 +113,16 @@ _HOME = {
     "bake": "kcal.lens.bake",
     "calibrate_camera": "kcal.calibrate.mono",
     "calibrate_cameras": "kcal.calibrate.mono",
+    "calibrate_hybrid": "kcal.calibrate.hybrid",
     "calibrate_rig": "kcal.calibrate.stereo",
     "detect_images": "kcal.corners.detect",
     "load_camera": "kcal.io.camera_file",
     "load_rig": "kcal.io.rig_file",
+    "measure_drift": "kcal.calibrate.drift",
     "new_pinhole": "kcal.lens.pinhole",
     "save_camera": "kcal.io.camera_file",
     "save_rig": "kcal.io.rig_file",
+    "solve_rig": "kcal.calibrate.rig",
     "train_inverse": "kcal.calibrate.inverse_fit",
     "undistort_maps": "kcal.lens.images",
 }

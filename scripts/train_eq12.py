@@ -17,24 +17,22 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from bench_hybrid import RIVALS, folds, held_out, load, subset
 from page import write_section
 from timing import row, show
 from torch import Tensor
 
-from kcal.calibrate.align import pose_alone
 from kcal.calibrate.global_fit import train_global
+from kcal.calibrate.hybrid import HybridOptions, calibrate_hybrid
 from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
 from kcal.calibrate.problem import BoardProblem
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
+from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.global_residual import GlobalResidual
@@ -56,30 +54,22 @@ LAMBDA = 1.0
 RATES, INVERSE_RATE = [10.0**e for e in range(-9, 0)], 1e-2
 TRIAL = 0.1
 REFIT = LMOptions(max_iterations=100, tolerance=1e-10, flatness=1e-7)
-POSES = LMOptions(max_iterations=60, tolerance=1e-12)
 
 
 class Data(NamedTuple):
-    """Board points (N, 3), corners (V, N, 2), weights (V, N) that are 0 where a corner does not count, image size."""
+    """Views of the board, and the weight (V, N) of each corner, 0 where it does not count."""
 
-    board: Board
-    corners: Tensor
-    weight: Tensor
-    size: tuple[int, int]
+    seen: Observations
+    weight: np.ndarray
 
     def some(self, index: np.ndarray) -> Data:
         """Some of the views."""
-        return self._replace(corners=self.corners[index], weight=self.weight[index])
-
-    @property
-    def pixels(self) -> Tensor:
-        """(V, N, 2), NaN where a corner does not count."""
-        return torch.where(self.weight[..., None] > 0, self.corners, torch.nan)
+        return Data(subset(self.seen, index), self.weight[index])
 
     @property
     def whitening(self) -> Tensor:
         """(V, 1, N, 2, 2)."""
-        return self.weight[:, None, :, None, None] * torch.eye(2, dtype=torch.float64)
+        return torch.from_numpy(self.weight)[:, None, :, None, None] * torch.eye(2, dtype=torch.float64)
 
 
 class Fitted(NamedTuple):
@@ -90,53 +80,15 @@ class Fitted(NamedTuple):
     seconds: float
 
 
-def load() -> Data:
-    folder = os.environ.get("KCAL_DATA")
-    if not folder:
-        raise SystemExit("set KCAL_DATA to the folder that holds wide_lens_corners.npz")
-    with np.load(Path(folder, "wide_lens_corners.npz")) as file:
-        columns, rows = (int(n) for n in file["board_size"])
-        width, height = (int(n) for n in file["image_size"])
-        board = Board(columns=columns, rows=rows, square=float(file["square_m"]))
-        weight = torch.from_numpy(np.maximum(file["weight"], 0.0)).double()
-        return Data(board, torch.from_numpy(file["corners"]).double(), weight, (width, height))
-
-
-def folds(views: int) -> list[np.ndarray]:
-    """20 contiguous blocks of views, shuffled with seed 0, dealt to 5 folds."""
-    blocks = np.array_split(np.arange(views), 20)
-    order = np.random.default_rng(0).permutation(len(blocks))
-    return [np.sort(np.concatenate([blocks[i] for i in order[k::5]])) for k in range(5)]
-
-
-def observations(data: Data) -> Observations:
-    views = []
-    for i, (points, weights) in enumerate(zip(data.corners.tolist(), data.weight.tolist(), strict=True)):
-        pixels = tuple(tuple(p) if w > 0 else None for p, w in zip(points, weights, strict=True))
-        covariance = tuple((1 / w**2, 0.0, 1 / w**2) if w > 0 else None for w in weights)
-        views.append(View(name=f"{i:03d}", pixels=pixels, covariance=covariance))
-    return Observations(board=data.board, image_size=data.size, views=tuple(views))
-
-
 def board_state(parameters: Tensor, warp: Tensor, rotation: Tensor, translation: Tensor) -> State:
     none = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
     return (parameters, warp, *none, rotation, translation)
 
 
-def held_out(fitted: Fitted, data: Data) -> tuple[float, float]:
+def judged(fitted: Fitted, data: Data) -> tuple[float, float]:
     """Sum of w² |r|² over views whose poses are solved again, and how many corners."""
-    camera, count = fitted.camera, len(data.corners)
-    alone, _ = pose_alone(data.board.points, data.pixels, camera, POSES)
-    problem = BoardProblem(
-        data.board.points, data.pixels[:, None, None], [camera.model], [()],
-        whitening=data.whitening[:, None], fields=[camera.field], batch=(count,),
-    )  # fmt: skip
-    parameters, *shared, rotation, translation = board_state(
-        camera.parameters_vector.detach(), fitted.warp, alone.rotation, alone.translation
-    )
-    start = (*(t.expand(count, *t.shape) for t in (parameters, *shared)), rotation[:, None], translation[:, None])
-    cost = minimise(problem, start, POSES).cost
-    return 2.0 * float(torch.nan_to_num(cost, nan=math.inf).sum()), float((data.weight > 0).sum())
+    total, count = held_out(fitted.camera, fitted.warp, data.seen, data.weight)
+    return total, float(count)
 
 
 class Views(NamedTuple):
@@ -149,8 +101,9 @@ class Views(NamedTuple):
 
 def views_of(data: Data, problem: BoardProblem, state: State) -> Views:
     _, points = problem.points(problem.unpack(state))
-    seen = data.weight > 0
-    return Views(points.transpose(-1, -2)[seen].T, data.corners[seen].T, data.weight[seen])
+    weight = torch.from_numpy(data.weight)
+    seen = weight > 0
+    return Views(points.transpose(-1, -2)[seen].T, data.seen.pixels()[seen].T, weight[seen])
 
 
 def eq12(
@@ -196,12 +149,13 @@ def best_rate(train: Callable[[float, int], tuple[Tensor, float]], steps: int) -
 def parametric(data: Data) -> tuple[Fitted, BoardProblem, State]:
     """20 coefficients, by the calibration and then to the end on the weights of the file alone."""
     clock = time.process_time()
-    result = calibrate_camera(observations(data), CalibrationOptions(model=MODEL, board_warp=True))
+    result = calibrate_camera(data.seen, CalibrationOptions(model=MODEL, board_warp=True))
     camera = result.camera
     free = GlobalResidual(camera).corrected
     problem = BoardProblem(
-        data.board.points, data.pixels[:, None], [camera.model], [free], free_warp=True, whitening=data.whitening
-    )
+        data.seen.board.points, data.seen.pixels()[:, None], [camera.model], [free],
+        free_warp=True, whitening=data.whitening,
+    )  # fmt: skip
     assert result.board_warp is not None
     start = board_state(
         camera.parameters_vector.detach(),
@@ -210,7 +164,7 @@ def parametric(data: Data) -> tuple[Fitted, BoardProblem, State]:
         result.cam_from_board_translation,
     )
     state = minimise(problem, start, REFIT).state
-    camera = Camera(state[0], size=data.size, model=MODEL)
+    camera = Camera(state[0], size=camera.size, model=MODEL)
     return Fitted(camera, state[1], time.process_time() - clock), problem, state
 
 
@@ -222,10 +176,8 @@ def fit_all(data: Data, steps: int, rates: dict[str, float]) -> dict[str, Fitted
 
     clock = time.process_time()
     residual = GlobalResidual(camera)
-    result = train_global(problem, state, residual, REFIT)
-    out["Eq. 11 (global), joint least squares"] = Fitted(
-        residual.camera(), result.state[2], time.process_time() - clock
-    )
+    joint = train_global(problem, state, residual, REFIT)
+    out["Eq. 11 (global), joint least squares"] = Fitted(residual.camera(), joint.state[2], time.process_time() - clock)
 
     views = views_of(data, problem, state)
     residual = GlobalResidual(camera)
@@ -235,7 +187,7 @@ def fit_all(data: Data, steps: int, rates: dict[str, float]) -> dict[str, Fitted
 
     still = project_components(views.points, camera.parameters_vector, camera.model).pixels
     x, y = from_pixels(still[0], still[1], camera.parameters_vector)
-    half = 0.5 * data.size[0] / float(camera.focal[0])
+    half = 0.5 * camera.size[0] / float(camera.focal[0])
     grid = FieldGrid.covering(
         (float(x.min()), float(y.min())), (float(x.max()), float(y.max())), [width * half for width in WIDTHS]
     )
@@ -258,13 +210,20 @@ def fit_all(data: Data, steps: int, rates: dict[str, float]) -> dict[str, Fitted
         seconds = time.process_time() - clock
         try:
             if project is by_global:
-                trained: Camera = Camera(residual.parameters_at(weights), size=data.size, model=MODEL)
+                trained: Camera = Camera(residual.parameters_at(weights), size=camera.size, model=MODEL)
             else:
                 trained = HybridCamera.of(camera, FieldResidual(grid, weights))
         except InputError as error:
             show([f"{name}: {error}"])
             continue
         out[name] = Fitted(trained, warp, seconds)
+
+    clock = time.process_time()
+    result = calibrate_hybrid(data.seen, HybridOptions(board_warp=True, gate=False, rivals=RIVALS)).calibration
+    assert result.board_warp is not None
+    out["field, `calibrate_hybrid` without its gate"] = Fitted(
+        result.camera, result.board_warp, time.process_time() - clock
+    )
     return out
 
 
@@ -275,19 +234,20 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help=f"also write the section of docs/{PAGE}")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    data = load()
+    data = Data(*load())
+    every = np.arange(len(data.weight))
     sums: dict[str, list[tuple[float, float, float, float, float]]] = {}
     rates: dict[str, float] = {}
     apart = 0.0
-    for out in folds(len(data.corners))[: arguments.folds]:
-        train, test = data.some(np.setdiff1d(np.arange(len(data.corners)), out)), data.some(out)
+    for out in folds("blocks20", len(every))[: arguments.folds]:
+        train, test = data.some(np.setdiff1d(every, out)), data.some(out)
         found = fit_all(train, arguments.steps, rates)
         first, second, *_ = found.values()
         pixels = first.camera.grid(33, 23).reshape(-1, 2)
         rays, seen = first.camera.unproject(pixels)
         apart = max(apart, float((second.camera.project(rays)[0] - pixels).norm(dim=-1)[seen].max()))
         for name, fitted in found.items():
-            sums.setdefault(name, []).append((*held_out(fitted, train), *held_out(fitted, test), fitted.seconds))
+            sums.setdefault(name, []).append((*judged(fitted, train), *judged(fitted, test), fitted.seconds))
             s = sums[name][-1]
             print(f"  {name}: {math.sqrt(s[0] / s[1]):.4f} {math.sqrt(s[2] / s[3]):.4f} {s[4]:.1f} s", flush=True)
     lines = [
@@ -299,9 +259,10 @@ def main() -> None:
         "net, A*, K*, warp and poses held, λ = 1 with both errors in focal lengths, the "
         f"learning rate of the residual the best of {len(RATES)} decades by MSE(y3, y3*) after short runs on the first "
         f"fold ({', '.join(f'{rate:.0e}' for rate in rates.values())}), that of the inverse net {INVERSE_RATE:.0e}. "
-        "*Joint*: Levenberg-Marquardt over weights, warp and poses. CPU seconds are those of the added step alone, "
-        "median over folds; the first row is the calibration that all others start from. Eq. 11 read literally, fitted "
-        "jointly, and the calibration itself "
+        "*Joint*: Levenberg-Marquardt over weights, warp and poses. The last row is a field on a plainer lens, with "
+        "priors chosen inside each training set, from the corners to the camera. Other CPU seconds are those of the "
+        "added step alone, median over folds; the first row is the calibration that these start from. Eq. 11 read "
+        "literally, fitted jointly, and the calibration itself "
         f"project rays of the whole image at most {apart:.1e} px apart.",
         "",
         "| model | folds | training RMS px | held-out RMS px | CPU s |",

@@ -37,7 +37,7 @@ class Drift:
     Args:
         left: (3,) turn of the left camera; None where only the relative attitude can be told.
         right: (3,) of the right camera; likewise.
-        relative: (3,) of right_from_left about the right camera's axes, as in `kcal.lens.pose.move`.
+        relative: (3,) of right_from_left about the right camera's axes, as in `kcal.calibrate.motion.screw`.
         left_covariance: (3, 3), None as above.
         right_covariance: (3, 3), None as above.
         relative_covariance: (3, 3).

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.forms import Forms, linearise_views
+from kcal.calibrate.grouped import PARTS, POSES, GroupedViews, group_views, judge_parametric, some_views
 from kcal.calibrate.ladder import Progress
 from kcal.calibrate.mono import calibrate_camera
 from kcal.calibrate.options import CalibrationOptions, CameraCalibrationResult
@@ -18,23 +19,16 @@ from kcal.calibrate.poses import refine_poses
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.single import Solved, solve
 from kcal.calibrate.stacking import CANDIDATES, Prior, average_fit, deal, stack_weights
-from kcal.calibrate.terms import Term
 from kcal.calibrate.together import alone
 from kcal.calibrate.weights import whitening
 from kcal.corners.observations import Observations
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera
+from kcal.errors import InputError
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import from_pixels
 from kcal.lens.residual import Field, FieldGrid, FieldResidual
-from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import State, Status
 
-_GATE = 5
-_LARGEST_GROUPS, _FEWEST_GROUPS, _RUN = 20, 5, 5
-_POSES = LMOptions(max_iterations=30, tolerance=1e-10)
-_REFIT = LMOptions(max_iterations=100, tolerance=1e-9, flatness=1e-6)
 # Rounds of averaging anew where the last average stands, until a step moves no corner by more than this share of the
 # noise.
 _ROUNDS, _STILL = 6, 0.02
@@ -115,84 +109,6 @@ class HybridResult:
     largest: float
 
 
-@dataclasses.dataclass(frozen=True)
-class _Setting:
-    """All views, with the weights that every model is judged by."""
-
-    observations: Observations
-    options: HybridOptions
-    pixels: Tensor
-    weights: Tensor | None
-    groups: list[list[int]]
-
-    def problem(
-        self, model: LensModel, views: Sequence[int], field: Field | None = None, terms: Sequence[Term] = ()
-    ) -> BoardProblem:
-        """Corners of some views."""
-        chosen = list(views)
-        rules = self.options.parametric(model).rules(self.observations.image_size)
-        return BoardProblem(
-            self.observations.board.points,
-            self.pixels[chosen],
-            [model],
-            [rules.parameters(model)],
-            free_warp=self.options.board_warp,
-            whitening=None if self.weights is None else self.weights[chosen],
-            fields=[field],
-            terms=terms,
-        )
-
-    def held_out(self, model: LensModel, state: State, views: Sequence[int], field: Field | None) -> float:
-        """Sum of squared residuals of views whose poses are solved again, all else held."""
-        chosen = list(views)
-        _, cost = refine_poses(
-            self.observations.board.points,
-            self.pixels[chosen],
-            [model],
-            _some(state, chosen),
-            _POSES,
-            [field],
-            None if self.weights is None else self.weights[chosen],
-        )
-        return float(torch.nan_to_num(2.0 * cost, nan=math.inf).sum())
-
-    @property
-    def count(self) -> int:
-        """Corners seen."""
-        return int(torch.isfinite(self.pixels).all(-1).sum())
-
-
-def _some(state: State, views: Sequence[int]) -> State:
-    *shared, rotation, translation = state
-    return (*shared, rotation[list(views)], translation[list(views)])
-
-
-def group_views(observations: Observations, groups: Literal["blocks", "views"] | Sequence[Hashable]) -> list[list[int]]:
-    """Indices of the views that are held out together, see `HybridOptions.groups`.
-
-    At most twenty groups; runs of five views or more where there are views enough.
-
-    Raises:
-        InputError: labels that do not fit the views.
-        DegenerateError: fewer than five groups.
-    """
-    views = len(observations.views)
-    if groups == "blocks":
-        count = min(_LARGEST_GROUPS, max(views // _RUN, min(views, _FEWEST_GROUPS)))
-        found = [part.tolist() for part in torch.arange(views).tensor_split(count)]
-    elif groups == "views":
-        count = min(_LARGEST_GROUPS, views)
-        found = [list(range(i, views, count)) for i in range(count)]
-    else:
-        labels = list(groups)
-        if isinstance(groups, str) or len(labels) != views:
-            raise InputError(f"groups: 'blocks', 'views' or a label for each of the {views} views, got {groups!r}")
-        found = [[i for i, label in enumerate(labels) if label == one] for one in dict.fromkeys(labels)]
-    if len(found) < _FEWEST_GROUPS:
-        raise DegenerateError(f"{len(found)} groups of views: at least {_FEWEST_GROUPS} are needed to hold some out")
-    return found
-
-
 def calibrate_hybrid(
     observations: Observations, options: HybridOptions | None = None, progress: Progress = lambda _: None
 ) -> HybridResult:
@@ -215,6 +131,26 @@ def calibrate_hybrid(
     Raises:
         DegenerateError: as `calibrate_camera`, and with too few groups of views.
         InputError: as `calibrate_camera`.
+
+    Example:
+        >>> from kcal.corners.board import Board
+        >>> from kcal.corners.observations import View
+        >>> from kcal.lens.camera import Camera
+        >>> from kcal.lens.pose import rotation_from_vector
+        >>> board = Board(columns=7, rows=6, square=0.05)
+        >>> truth = Camera.build(focal=(800, 805), center=(322, 238), size=(640, 480), coefficients=[-0.1, 0.02])
+        >>> noise, views = torch.Generator().manual_seed(0), []
+        >>> for i in range(8):
+        ...     tilt = 0.5 * torch.tensor([[math.cos(i), math.sin(i), 0.2]], dtype=torch.float64)
+        ...     points = board.points @ rotation_from_vector(tilt)[0].T
+        ...     pixels, _ = truth.project(points + torch.tensor([-0.15, -0.12, 0.6], dtype=torch.float64))
+        ...     pixels = pixels + 0.1 * torch.randn(pixels.shape, dtype=torch.float64, generator=noise)
+        ...     views.append(View(name=str(i), pixels=pixels.tolist()))
+        >>> seen = Observations(board=board, image_size=(640, 480), views=views)
+        >>> options = HybridOptions(model="opencv5", rivals=("opencv4",), widths=(1.0,), groups="views")
+        >>> result = calibrate_hybrid(seen, options)
+        >>> result.kept, type(result.calibration.camera).__name__  # the lens is parametric, and so is the answer
+        (False, 'Camera')
     """
     options = options or HybridOptions()
     groups = group_views(observations, options.groups)
@@ -224,18 +160,24 @@ def calibrate_hybrid(
     weights = None
     if covariances is not None and solved.variance is not None:
         weights = whitening(covariances, solved.variance)[:, None]
-    setting = _Setting(observations, options, observations.pixels()[:, None], weights, groups)
+    setting = GroupedViews(
+        board_points=observations.board.points,
+        pixels=observations.pixels()[:, None],
+        weights=weights,
+        groups=groups,
+        free_warp=options.board_warp,
+    )
     grid, half = _grid(solved, observations.image_size, options.widths)
     precisions = [prior.precision(grid, half) for prior in CANDIDATES]
     state = solved.result.state
     forms = _forms(setting, base, state, grid, torch.zeros(2, grid.count, dtype=torch.float64))
 
-    parts = deal(len(groups), _GATE)
+    parts = deal(len(groups), PARTS)
     held_out = {"hybrid": _judge_hybrid(setting, base, state, forms, grid, precisions, parts)}
     progress("hybrid judged")
     for rival in dict.fromkeys(LensModel.named(r) for r in options.rivals):
         own = solved if rival == base else alone(solve(observations, options.parametric(rival), lambda _: None))
-        held_out[str(rival)] = _judge_parametric(setting, rival, own, parts)
+        held_out[str(rival)] = judge_parametric(setting, rival, own, parts)
         progress(f"{rival} judged")
 
     best = min((name for name in held_out if name != "hybrid"), key=lambda name: held_out[name], default=None)
@@ -247,7 +189,7 @@ def calibrate_hybrid(
     kept = settled and (wins or not options.gate)
     if kept:
         covariance = _covariance(last, precisions, shares)
-        calibration = _result(setting, base, final, field, solved, covariance)
+        calibration = _result(setting, observations.image_size, base, final, field, solved, covariance)
     else:
         calibration = calibrate_camera(observations, options.parametric(best or base))
     unit = float(final[0][:2].log().mean().exp())
@@ -293,10 +235,10 @@ def _grid(solved: Solved, size: tuple[int, int], widths: Sequence[float]) -> tup
     return FieldGrid.covering(low, high, [half * value for value in widths]), half
 
 
-def _forms(setting: _Setting, model: LensModel, state: State, grid: FieldGrid, weights: Tensor) -> Forms:
+def _forms(setting: GroupedViews, model: LensModel, state: State, grid: FieldGrid, weights: Tensor) -> Forms:
     order = [view for group in setting.groups for view in group]
     problem = setting.problem(model, order, Field(grid, weights))
-    return linearise_views(problem, _some(state, order), grid, weights, [len(group) for group in setting.groups])
+    return linearise_views(problem, some_views(state, order), grid, weights, [len(group) for group in setting.groups])
 
 
 def _moved(problem: BoardProblem, state: State, step: Tensor, grid: FieldGrid, weights: Tensor) -> tuple[State, Field]:
@@ -309,7 +251,7 @@ def _moved(problem: BoardProblem, state: State, step: Tensor, grid: FieldGrid, w
 
 
 def _judge_hybrid(
-    setting: _Setting,
+    setting: GroupedViews,
     model: LensModel,
     state: State,
     forms: Forms,
@@ -331,22 +273,8 @@ def _judge_hybrid(
     return math.sqrt(total / setting.count)
 
 
-def _judge_parametric(setting: _Setting, model: LensModel, solved: Solved, parts: Sequence[Tensor]) -> float:
-    """Likewise of a parametric model, solved again without each part from its solution for all views."""
-    total = 0.0
-    start = solved.result.state
-    for part in parts:
-        out = set(part.tolist())
-        train = [i for g, group in enumerate(setting.groups) if g not in out for i in group]
-        problem = setting.problem(model, train, terms=solved.minimum.terms)
-        *shared, _, _ = minimise(problem, _some(start, train), _REFIT).state
-        views = [i for g in out for i in setting.groups[g]]
-        total += setting.held_out(model, (*shared, *start[-2:]), views, None)
-    return math.sqrt(total / setting.count)
-
-
 def _settle(
-    setting: _Setting,
+    setting: GroupedViews,
     model: LensModel,
     state: State,
     grid: FieldGrid,
@@ -374,11 +302,11 @@ def _settle(
         if not (math.isfinite(moved) and moved < 4.0 * before):
             return state, Field(grid, weights), forms, False
         after, cost = refine_poses(
-            setting.observations.board.points,
+            setting.board_points,
             setting.pixels,
             [model],
             after,
-            _POSES,
+            POSES,
             [field],
             setting.weights,
         )
@@ -404,15 +332,18 @@ def _covariance(forms: Forms, precisions: Sequence[Tensor], shares: Tensor) -> T
 
 
 def _result(
-    setting: _Setting, model: LensModel, state: State, field: Field, solved: Solved, covariance: Tensor
+    setting: GroupedViews,
+    size: tuple[int, int],
+    model: LensModel,
+    state: State,
+    field: Field,
+    solved: Solved,
+    covariance: Tensor,
 ) -> CameraCalibrationResult:
-    observations = setting.observations
     problem = setting.problem(model, range(len(setting.pixels)), field)
     state = problem.tidy(state)
     s = problem.unpack(state)
-    camera = HybridCamera(
-        s.parameters[0], size=observations.image_size, model=model, residual=FieldResidual(field.grid, field.weights)
-    )
+    camera = HybridCamera(s.parameters[0], size=size, model=model, residual=FieldResidual(field.grid, field.weights))
     residuals = problem.pixel_errors(state)[:, 0].transpose(-1, -2)
     seen = problem.seen[:, 0]
     squared = (residuals**2).sum(-1)
@@ -436,4 +367,4 @@ def _result(
     )
 
 
-__all__ = ["Camera", "HybridOptions", "HybridResult", "calibrate_hybrid", "group_views"]
+__all__ = ["HybridOptions", "HybridResult", "calibrate_hybrid"]

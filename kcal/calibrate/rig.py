@@ -64,6 +64,7 @@ def solve_rig(data: RigData, options: JointOptions | None = None) -> RigSolution
 
     Example:
         >>> from kcal.calibrate.rig_sources import Landmarks
+        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
         >>> truth = torch.tensor([[0.0, 0, 0], [10.0, 0, 0]], dtype=torch.float64)  # both look north
         >>> look = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)

@@ -136,6 +136,13 @@ class RigSolution:
         rows = [parameter_rows(self._problem, first), parameter_rows(self._problem, second)]
         return self._spread.of(torch.cat([*rows, relative_rows(self._problem, self._state, first, second)]))[0]
 
+    def mounting_link(self, first: int = 0, second: int = 1) -> Tensor:
+        """(P, 6) covariance of `joint_covariance`'s P quantities with the mounting of the first camera."""
+        rows = [parameter_rows(self._problem, first), parameter_rows(self._problem, second)]
+        rows.append(relative_rows(self._problem, self._state, first, second))
+        rows.append(mounting_rows(self._problem, self._state, first))
+        return self._spread.of(torch.cat(rows))[0][:-6, -6:]
+
     def mounting_covariance(self, camera: int = 0) -> Tensor:
         """(6, 6) of a camera's centre (metres) and of small turns of it (radians), both about the local frame's axes.
 

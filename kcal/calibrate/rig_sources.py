@@ -197,6 +197,14 @@ class RigData:
         features: see `Features`.
         baselines: see `Baseline`.
         positions: see `MeasuredPosition`.
+
+    Raises:
+        InputError: names or shapes that do not fit each other, fewer than two cameras.
+
+    Example:
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080))
+        >>> RigData(cameras=(camera, camera), names=("left", "right")).absolute
+        False
     """
 
     cameras: tuple[Camera, ...]
@@ -213,6 +221,8 @@ class RigData:
         if count < 2:
             raise InputError("a rig has two cameras or more")
         _names("cameras", self.names, count)
+        if not all(isinstance(camera, Camera) and camera.parameters_vector.ndim == 1 for camera in self.cameras):
+            raise InputError("a rig is made of single cameras of the kinds Camera and HybridCamera")
         if self.covariances is not None and len(self.covariances) != count:
             raise InputError(f"covariances: one a camera is needed, got {len(self.covariances)} for {count}")
         for kind, source in (("boards", self.boards), ("landmarks", self.landmarks), ("features", self.features)):

@@ -152,7 +152,7 @@ def _largest(problem: RigProblem, direction: Tensor, names: Sequence[str]) -> st
 
 
 def relative_rows(problem: RigProblem, state: State, first: int, second: int) -> Tensor:
-    """(6, S): the step (ω, v) of second_from_first (`kcal.lens.pose.move`) by a step of the shared unknowns."""
+    """(6, S): the step (ω, v) of second_from_first (`kcal.calibrate.motion.screw`) by a step of the shared unknowns."""
     rotation, centre = state[1], state[2]
     relative = rotation[second] @ rotation[first].T
     translation = rotation[second] @ (centre[first] - centre[second])

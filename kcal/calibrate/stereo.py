@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.calibrate.align import MINIMUM_CORNERS, check_fit, consensus, pair_rms, pose_alone
 from kcal.calibrate.covariance import uncertainty_of
 from kcal.calibrate.init import spread_out
-from kcal.calibrate.joined import FEWEST, alone_squares, disagreement
+from kcal.calibrate.pair_checks import FEWEST, alone_squares, disagreement
 from kcal.calibrate.pairs import Pair
 from kcal.calibrate.problem import BoardProblem, BoardState
 from kcal.calibrate.views import free_parameters
@@ -69,7 +69,7 @@ class RigCalibrationResult:
         covariance: of both cameras' parameters (zeros where they were held) and right_from_left together, in the order
             of `kcal.locate.errors.RigCovariance`.
         disagreement: (P,) of the pairs used: above 1, joining the cameras costs a pair more than noise explains; see
-            `kcal.calibrate.joined`.
+            `kcal.calibrate.pair_checks`.
         pixels: (P, 2, N, 2) corners as used, turned where flipped; NaN where not seen.
         status: why the solver stopped.
         warnings: sentences about what the user should doubt.

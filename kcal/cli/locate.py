@@ -133,6 +133,7 @@ def locate(
         yaw[1, 1] = math.radians(yaw_sigma) ** 2
         more = RigCovariance.of(solved, pose=yaw).matrix
         calibration = more if calibration is None else calibration + more
+    link = None
     standing = mounting_covariance(origin_m=[origin_sigma] * 3, attitude_deg=(0.0, 0.0, heading_sigma))
     if place is None or heading is None:
         stored = file.mounting
@@ -142,6 +143,8 @@ def locate(
         heading, pitch, roll = stored.heading_deg, stored.pitch_deg, stored.roll_deg
         if stored.covariance is not None:
             standing = standing + torch.tensor(stored.covariance, dtype=torch.float64)
+        if stored.link is not None:
+            link = torch.tensor(stored.link, dtype=torch.float64)
     heights = find_geoid(geoid)
     located = locate_pairs(
         solved,
@@ -155,6 +158,7 @@ def locate(
         names=marks.names,
         calibration=None if calibration is None else RigCovariance.of(solved, joint=calibration),
         mounting=standing if bool(standing.any()) else None,
+        link=link,
         refraction=refraction,
         geoid=heights,
     )

@@ -152,7 +152,7 @@ def mounting(solution: RigSolution, origin: Origin | None) -> Mounting | None:
     covariance = solution.mounting_covariance(0)
     if not bool(torch.isfinite(covariance).all()):
         return None
-    return mounting_of(solution.rotation[0], solution.centre[0], covariance, origin)
+    return mounting_of(solution.rotation[0], solution.centre[0], covariance, origin, solution.mounting_link())
 
 
 def record(
@@ -179,6 +179,7 @@ def record(
             pitch_deg=there.pitch_deg,
             roll_deg=there.roll_deg,
             covariance=tuple(map(tuple, there.covariance.tolist())),
+            link=tuple(map(tuple, there.link.tolist())),
         )
     return rig_to_file(
         rig,

@@ -69,6 +69,7 @@ class RigMounting(Record):
         pitch_deg: of its axis, positive up.
         roll_deg: clockwise as seen from behind.
         covariance: (6, 6) of east, north, up of the centre (metres) and of turns about these axes (radians).
+        link: (P, 6) covariance of the rig's P quantities (`RigFile.covariance`) with these six.
     """
 
     lat: float = pydantic.Field(ge=-90, le=90)
@@ -78,6 +79,7 @@ class RigMounting(Record):
     pitch_deg: float = pydantic.Field(ge=-90, le=90)
     roll_deg: float
     covariance: Matrix | None = None
+    link: Matrix | None = None
 
     @pydantic.model_validator(mode="after")
     def _square(self) -> RigMounting:
@@ -171,7 +173,17 @@ class RigFile(NativeFile):
     def _measured(self) -> RigFile:
         if self.covariance is not None:
             counts = (len(self.left.coefficients), len(self.right.coefficients))
-            _matrix(self.covariance, sum(counts) + 2 * len(INTRINSICS) + 6, "the rig's covariance")
+            matrix = _matrix(self.covariance, sum(counts) + 2 * len(INTRINSICS) + 6, "the rig's covariance")
+            if self.mounting is not None and self.mounting.link is not None:
+                link, stands = self.mounting.link, self.mounting.covariance
+                if stands is None or len(link) != len(matrix) or any(len(row) != 6 for row in link):
+                    raise ValueError(f"the mounting's link must be {len(matrix)} x 6, beside a covariance")
+                cross = torch.tensor(link, dtype=torch.float64)
+                below = torch.cat([cross.T, torch.tensor(stands, dtype=torch.float64)], 1)
+                whole = torch.cat([torch.cat([matrix, cross], 1), below])
+                _matrix(tuple(map(tuple, whole.tolist())), len(whole), "rig and mounting together")
+        elif self.mounting is not None and self.mounting.link is not None:
+            raise ValueError("the mounting's link needs the rig's covariance")
         length = math.hypot(*self.right_from_left.translation)
         # A thousandth of a millimetre in a metre: more is not rounding but another rig.
         if self.calibration and not math.isclose(self.calibration.baseline_m, length, rel_tol=1e-6):

@@ -96,6 +96,20 @@ class RigCovariance:
         return scale[:, None] * vectors[:, kept] * values[kept].sqrt()
 
 
+def checked_link(calibration: RigCovariance | None, mounting: Tensor | None, link: Tensor) -> Tensor:
+    """`link` as float64: (P, 6), and one covariance together with those of calibration (P, P) and mounting (6, 6)."""
+    if calibration is None or mounting is None:
+        raise InputError("link: it needs the covariances of both the calibration and the mounting")
+    size = len(calibration.matrix)
+    if not isinstance(link, Tensor) or tuple(link.shape) != (size, 6):
+        raise InputError(f"link: a covariance of the calibration with the mounting, ({size}, 6), is needed")
+    upper = torch.cat([calibration.matrix, link.to(calibration.matrix)], 1)
+    lower = torch.cat([link.T.to(calibration.matrix), mounting.to(calibration.matrix)], 1)
+    return checked_covariance("covariance of calibration and mounting", torch.cat([upper, lower]), size + 6)[
+        :size, size:
+    ]
+
+
 def mounting_covariance(
     *, origin_m: Sequence[float] = (0.0, 0.0, 0.0), attitude_deg: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> Tensor:

@@ -14,7 +14,7 @@ from kcal.errors import DegenerateError, InputError
 from kcal.lens.eager import CHUNK, is_differentiated, is_traced, known_true
 from kcal.lens.rig import StereoRig
 from kcal.locate.ellipsoid import mean_radius
-from kcal.locate.errors import RigCovariance, checked_covariance
+from kcal.locate.errors import RigCovariance, checked_covariance, checked_link
 from kcal.locate.geodesy import Origin, anchor, enu_from_cam, place_enu
 from kcal.locate.ranges import BEARING_SIGMAS, QUANTILE
 from kcal.locate.refine import Fit, Sight, by_pose, refine
@@ -87,6 +87,7 @@ class StereoLocalizer(nn.Module):
         pixel_sigma: standard deviation of a mark along each axis, px, where no covariance is given.
         calibration: how well the rig is known; exact if left out.
         mounting: (6, 6) of `mounting_covariance`; origin and attitude are exact if left out.
+        link: (P, 6) covariance of the calibration with the mounting, where both come from the same landmarks.
         refraction: bending of light as a share of the Earth's curvature, 0.13 in standard air; 0: straight lines.
 
     Raises:
@@ -113,6 +114,7 @@ class StereoLocalizer(nn.Module):
     geodetic_of_origin: Tensor
     calibration_factor: Tensor | None
     mounting: Tensor | None
+    link: Tensor | None
 
     def __init__(
         self,
@@ -125,6 +127,7 @@ class StereoLocalizer(nn.Module):
         pixel_sigma: float = 0.3,
         calibration: RigCovariance | None = None,
         mounting: Tensor | None = None,
+        link: Tensor | None = None,
         refraction: float = 0.0,
     ) -> None:
         super().__init__()
@@ -151,6 +154,8 @@ class StereoLocalizer(nn.Module):
         self.register_buffer("calibration_factor", factor)
         standing = None if mounting is None else checked_covariance("mounting", mounting, 6).to(device)
         self.register_buffer("mounting", standing)
+        joined = None if link is None else checked_link(calibration, mounting, link).to(device)
+        self.register_buffer("link", joined)
 
     def forward(
         self, pixels_left: Tensor, pixels_right: Tensor, cov: Tensor | None = None, mask: Tensor | None = None
@@ -241,7 +246,8 @@ class StereoLocalizer(nn.Module):
         unit = self.pixel_sigma**2 if plain else 1.0
         spread = [unit * entry for entry in fit.covariance]
         if self.calibration_factor is not None:
-            moved = calibration_effect(fit, scale) @ self.calibration_factor  # (..., N, 3, K)
+            effect = calibration_effect(fit, scale)  # (..., N, 3, P)
+            moved = effect @ self.calibration_factor  # (..., N, 3, K)
             for number, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
                 spread[number] = spread[number] + (moved[..., i, :] * moved[..., j, :]).sum(-1)
 
@@ -278,6 +284,9 @@ class StereoLocalizer(nn.Module):
         if self.mounting is not None:
             turn = _turning(enu)
             covariance = covariance + turn @ self.mounting @ turn.mT
+            if self.link is not None and self.calibration_factor is not None:
+                mixed = by_unknown.movedim(-3, -2) @ (effect @ self.link) @ turn.mT
+                covariance = covariance + mixed + mixed.mT
         covariance = torch.where(ok[..., None, None], covariance, torch.diag(covariance.new_full((3,), math.inf)))
         geodetic = place_enu(enu, self.ecef_from_enu, self.ecef_of_origin)
         return Localization(

@@ -21,6 +21,7 @@ class Mounting(NamedTuple):
         pitch_deg: positive up.
         roll_deg: clockwise as seen from behind.
         covariance: (6, 6) of east, north, up (metres) and of turns about these axes (radians), all at the camera.
+        link: (P, 6) covariance of other quantities with these six.
     """
 
     origin: Origin
@@ -28,6 +29,7 @@ class Mounting(NamedTuple):
     pitch_deg: float
     roll_deg: float
     covariance: Tensor
+    link: Tensor
 
 
 def attitude(enu_from_cam: Tensor) -> tuple[float, float, float]:
@@ -48,7 +50,9 @@ def attitude(enu_from_cam: Tensor) -> tuple[float, float, float]:
     return math.degrees(heading) % 360.0, math.degrees(pitch), math.degrees(math.atan2(below, beside))
 
 
-def mounting_of(cam_from_enu: Tensor, centre: Tensor, covariance: Tensor, origin: Origin) -> Mounting:
+def mounting_of(
+    cam_from_enu: Tensor, centre: Tensor, covariance: Tensor, origin: Origin, link: Tensor | None = None
+) -> Mounting:
     """How a camera with a pose in the frame of `origin` stands where it is.
 
     North and up at the camera are not those at the origin: a kilometre apart they differ by 0.01° (up), and by that
@@ -59,6 +63,7 @@ def mounting_of(cam_from_enu: Tensor, centre: Tensor, covariance: Tensor, origin
         centre: (3,) metres.
         covariance: (6, 6) of the centre and of turns of the camera, both about the frame's axes.
         origin: of the frame.
+        link: (P, 6) covariance of anything else with these six.
 
     Example:
         >>> from kcal.locate.geodesy import enu_from_cam
@@ -71,4 +76,5 @@ def mounting_of(cam_from_enu: Tensor, centre: Tensor, covariance: Tensor, origin
     here = Origin(lat=lat, lon=lon, height=height)
     turn = ecef_from_enu_rotation(lat, lon).T @ ecef_from_enu_rotation(origin.lat, origin.lon)
     both = torch.block_diag(turn, turn)
-    return Mounting(here, *attitude(turn @ cam_from_enu.T), both @ covariance @ both.T)
+    link = torch.zeros(0, 6, dtype=torch.float64) if link is None else link
+    return Mounting(here, *attitude(turn @ cam_from_enu.T), both @ covariance @ both.T, link @ both.T)

@@ -140,6 +140,7 @@ def locate(
     cov: Tensor | None = None,
     calibration: RigCovariance | None = None,
     mounting: Tensor | None = None,
+    link: Tensor | None = None,
     refraction: float = 0.0,
     geoid: Geoid | None = None,
 ) -> Located:
@@ -158,6 +159,7 @@ def locate(
         cov: (N, 4, 4) covariance of each pair's four coordinates, in place of `pixel_sigma`.
         calibration: how well the rig is known.
         mounting: how well origin and attitude are known, see `mounting_covariance`.
+        link: how calibration and mounting go together, see `StereoLocalizer`.
         refraction: bending of light as a share of the Earth's curvature, see `StereoLocalizer`.
         geoid: a grid from `kcal.locate.datum.find_geoid`.
 
@@ -191,7 +193,7 @@ def locate(
     with torch.no_grad():
         localize = StereoLocalizer(
             rig, origin=origin, heading_deg=heading_deg, pitch_deg=pitch_deg, roll_deg=roll_deg,
-            pixel_sigma=pixel_sigma, calibration=calibration, mounting=mounting, refraction=refraction,
+            pixel_sigma=pixel_sigma, calibration=calibration, mounting=mounting, link=link, refraction=refraction,
         )  # fmt: skip
         slopes = [slope.tolist() for slope in localize.sensitivity(pixels_left, pixels_right)]
         result = Localization(*(tensor.cpu() for tensor in localize(pixels_left, pixels_right, cov)))

@@ -70,6 +70,7 @@ def relocked(file: RigFile, drift: Drift, note: str) -> RigFile:
             pitch_deg=pitch,
             roll_deg=roll,
             covariance=spread,
+            link=mounting.link,
         )
     rig = drift.rig
     calibration = file.calibration

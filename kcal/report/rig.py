@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ _COLOURS = {
     "positions": "#dd7a1f",
 }
 _WRONG, _FAINT = "#c02a6b", "#9aa3af"
+_CAMERAS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
+_HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 _ROWS = 45
 
 
@@ -104,7 +107,7 @@ def _draw_plan(axes: Axes, solution: RigSolution) -> None:
                 ring = np.log1p(radius / unit) / math.log1p(reach / unit)
                 axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=_FAINT, linewidth=0.7, linestyle=":")
                 text = f"{radius / 1000:g} km" if radius >= 1000 else f"{radius:g} m"
-                axes.text(0.0, ring, text, fontsize=8, color="#4b5563", ha="center", va="bottom")
+                axes.text(0.0, ring, text, fontsize=8, color="#4b5563", ha="center", va="bottom", path_effects=_HALO)
     for kind, (points, names, used) in places.items():
         drawn, good = place(points), np.array(used)
         marker = {"landmarks": "^", "boards": "s", "features": "o"}[kind]
@@ -134,7 +137,7 @@ def _draw_plan(axes: Axes, solution: RigSolution) -> None:
             "", (float(here[0] + 0.12 * ahead[0]), float(here[1] + 0.12 * ahead[1])), (float(here[0]), float(here[1])),
             arrowprops={"arrowstyle": "-|>", "color": "#111827", "linewidth": 1.2},
         )  # fmt: skip
-        axes.plot(*here, "o", color="#111827", markersize=5, zorder=5, label=f"{name} camera")
+        axes.plot(*here, "o", color=_CAMERAS[c % len(_CAMERAS)], markersize=6, zorder=5, label=f"{name} camera")
     seen = np.concatenate([place(centres), *(place(points) for points, _, _ in places.values())])
     low, high = seen.min(0) - 0.1, seen.max(0) + 0.15
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")

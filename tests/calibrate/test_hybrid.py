@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.forms import linearise_views
-from kcal.calibrate.hybrid import HybridOptions, HybridResult, calibrate_hybrid, group_views
+from kcal.calibrate.grouped import group_views
+from kcal.calibrate.hybrid import HybridOptions, HybridResult, calibrate_hybrid
 from kcal.calibrate.poses import refine_poses
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.stacking import CANDIDATES, Prior, simplex_minimum, stack_weights

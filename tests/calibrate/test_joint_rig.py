@@ -31,7 +31,10 @@ from kcal.calibrate.rig_result import RigSolution
 from kcal.calibrate.rig_sources import Baseline, MeasuredPosition, RigData, inverse_range_beyond
 from kcal.calibrate.rules import Free
 from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.hybrid import HybridCamera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.lens.residual import FieldGrid, FieldResidual
 from kcal.solve.result import State, Status
 
 APART = float((CENTRE[0] - CENTRE[1]).norm())
@@ -58,7 +61,7 @@ def off(found: RigSolution) -> float:
 
 
 def pose_error(found: RigSolution) -> Tensor:
-    """(6,) of the relative pose, as `kcal.lens.pose.move` counts it."""
+    """(6,) of the relative pose, as `kcal.calibrate.motion.screw` counts it."""
     rotation = ROTATION[1] @ ROTATION[0].T
     rig = found.stereo()
     shift = rig.right_from_left_translation - ROTATION[1] @ (CENTRE[0] - CENTRE[1])
@@ -241,6 +244,32 @@ class TestRecovery:
         # Yaw is locked to a thousandth of a degree, while where the baseline points is hardly seen from afar.
         assert math.degrees(float(sigma[1])) < 0.002
         assert float(sigma[4:].max()) > 0.1
+
+
+class TestHybrid:
+    def test_corrections_of_the_lens_are_in_it(self) -> None:
+        """Half a pixel of learned correction: the rig is the true one, also with the parameters free."""
+        camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), coefficients=[-0.1])
+        grid = FieldGrid.covering((-0.7, -0.4), (0.7, 0.4), widths=[0.25])
+        cameras = tuple(
+            HybridCamera.of(camera, FieldResidual(grid, 3e-4 * normal((2, grid.count), 70 + c))) for c in (0, 1)
+        )
+        marks = landmarks(count=30)
+        sides = [cameras[c].project((marks.points - CENTRE[c]) @ ROTATION[c].T) for c in (0, 1)]
+        plain = camera.project((marks.points - CENTRE[0]) @ ROTATION[0].T)[0]
+        assert float((sides[0][0] - plain).abs().max()) > 0.2
+        assert bool((sides[0][1] & sides[1][1]).all())
+        sources = RigData(
+            cameras=cameras,
+            names=NAMES[:2],
+            landmarks=dataclasses.replace(marks, pixels=torch.stack([side[0] for side in sides], 1)),
+        )
+        found = solve_rig(sources)
+        assert off(found) < 1e-9
+        assert found.left_out == ()
+        free = solve_rig(sources, JointOptions(intrinsics="free"))
+        assert off(free) < 1e-6
+        assert all(isinstance(solved, HybridCamera) for solved in free.cameras)
 
 
 class TestIntrinsics:
