@@ -255,7 +255,8 @@ def _distance(rigs: Results) -> list[str]:
     lines += ["", *orders, ""]
     for name, runs in rigs.items():
         lines += [
-            f"Range error by calibration, *{name}*, absolute values, metres; at 5 km in percent as well. Below: RMS "
+            f"Range error by calibration, *{name}*, absolute values, metres; at 5 km in percent as well. *Lenses "
+            f"alone*: with landmarks whose places and marks have no noise, medians. Below: RMS "
             f"with "
             f"marks of {MARK_SIGMA:g} px ({DRAWS} draws of their noise each), and what the marks alone leave.",
             "",
@@ -266,6 +267,11 @@ def _distance(rigs: Results) -> list[str]:
             columns = list(zip(*(run["located"][label]["range_error"] for run in runs), strict=True))
             cells = [middle([abs(v) for v in column], 1) for column in columns]
             lines.append(row(label, *cells, middle([100 * abs(v) / 5003 for v in columns[-1]], 2)))
+        for label in every[name]:
+            columns = list(zip(*(run["located"][label]["lens_error"] for run in runs), strict=True))
+            cells = [f"{median(abs(v) for v in column):.1f}" for column in columns]
+            share = 100 * median(abs(v) for v in columns[-1]) / 5003
+            lines.append(row(f"{label}, lenses alone", *cells, f"{share:.2f}"))
         for label in every[name]:
             columns = list(zip(*(run["located"][label]["total_rms"] for run in runs), strict=True))
             cells = [f"{median(column):.1f}" for column in columns]
