@@ -194,7 +194,7 @@ def _climb_folded(
         if not float(result.cost) <= float(problem.cost(nested)):
             result = yield Solve(problem, nested, options)
             spent += int(result.iterations)
-        if views.corner_count <= _MANY_CORNERS:
+        if views.corner_count <= _MANY_CORNERS and views.rules.mild is None:
             result, steps = yield from _lower(views, problem, large, first, result, options)
             spent += steps
         reached, landed = result.state, large
@@ -270,7 +270,7 @@ def _climb_wholly(
         spent += int(found.iterations.max()) + int(result.iterations)
         kept[0] = result.state
         small = large
-        if last and terms and views.corner_count <= _MANY_CORNERS:
+        if last and terms and views.corner_count <= _MANY_CORNERS and views.rules.mild is None:
             result, steps = yield from _lower(views, views.problem(large, terms=terms), large, first, result, options)
             spent += steps
             kept[0] = result.state
