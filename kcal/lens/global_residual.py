@@ -22,8 +22,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.net import Widths, evaluate, evaluate_with_slopes, initial_weights
 from kcal.lens.projection import INTRINSICS
 
-# The order of a correction: of fx, fy, cx, cy in focal lengths, of coefficients as they are.
-_INTRINSIC_UNIT, _LENS_UNIT = 1e-3, 1e-2
+# The order of a correction: of fx, fy, cx, cy in focal lengths, of coefficients as a share of themselves, the least.
+_INTRINSIC_UNIT, _LENS_UNIT, _LEAST_UNIT = 1e-3, 1e-2, 1e-9
 _SKEW = INTRINSICS.index("skew")
 
 
@@ -31,9 +31,9 @@ class GlobalResidual(nn.Module):
     """Corrections of a camera's parameters by a network of three layers that sees its distortion vector (Eq. 11).
 
     Convention: the order of parameters is `Camera.names`; skew is left as it is. K* is divided by its largest
-    coefficient, corrections come in units of a thousandth of the focal length (fx, fy, cx, cy) and of 0.01
-    (coefficients). A new network corrects nothing: its last layer is zero. Float64; weights do not require gradients
-    until asked.
+    coefficient. Corrections come in units of a thousandth of the focal length (fx, fy, cx, cy) and of a hundredth of
+    each coefficient, because those of high orders count by powers of ten more than others. A new network corrects
+    nothing: its last layer is zero. Float64; weights do not require gradients until asked.
 
     Args:
         camera: a single parametric camera: A* and K*.
@@ -67,7 +67,7 @@ class GlobalResidual(nn.Module):
         self.widths: Widths = (camera.model.size, hidden, hidden, len(self.corrected))
         self.weights = nn.Parameter(initial_weights(self.widths, seed).to(start.device), requires_grad=False)
         lens = start[len(INTRINSICS) :]
-        units = torch.full_like(start, _LENS_UNIT)
+        units = (_LENS_UNIT * start.abs()).clamp(min=_LEAST_UNIT)
         units[: len(INTRINSICS)] = _INTRINSIC_UNIT * start[:2].mean()
         for name, value in {
             "start": start.clone(),
