@@ -18,7 +18,7 @@ from kcal.calibrate.problem import BoardProblem
 from kcal.lens.distortion import distort_components
 from kcal.lens.plane import plane_from_points
 from kcal.lens.projection import INTRINSICS
-from kcal.lens.residual import FieldGrid, field_basis
+from kcal.lens.residual import Field, field_basis
 from kcal.solve.result import State
 
 # Relative to the scaled normal matrix, whose diagonal is one: keeps its factors apart from rounding.
@@ -98,16 +98,13 @@ class Forms:
         return float(torch.linalg.solve(field + torch.diag(precision[own]), field).diagonal().sum())
 
 
-def linearise_views(
-    problem: BoardProblem, state: State, grid: FieldGrid, weights: Tensor, sizes: Sequence[int]
-) -> Forms:
+def linearise_views(problem: BoardProblem, state: State, field: Field, sizes: Sequence[int]) -> Forms:
     """Fold views into forms.
 
     Args:
         problem: of one camera, its `fields` the field at the state.
         state: of this problem.
-        grid: the field's units.
-        weights: (2, K) of the field at the state, focal lengths.
+        field: at the state, the same.
         sizes: how many views each group has; the views are in the order of the groups.
     """
     s = problem.unpack(state)
@@ -127,12 +124,12 @@ def linearise_views(
     for size in sizes:
         chosen = slice(start, start + size)
         start += size
-        basis = field_basis(x[chosen], y[chosen], grid) * seen[chosen, None]
+        basis = field_basis(x[chosen], y[chosen], field.grid) * seen[chosen, None]
         rows = problem.rows(_some(state, chosen), chosen)
         pose, shared, residual = rows[:, :6], rows[:, 6:-1], rows[:, -1:]
         moved = problem.whiten(along[:, :, None].expand(size, 2, 2, x.shape[-1]), chosen)
-        field = (moved[:, :, None] * basis[:, None, :, None]).flatten(1, 2).flatten(-2)
-        others = torch.cat([shared, field, residual], 1)
+        by_weight = (moved[:, :, None] * basis[:, None, :, None]).flatten(1, 2).flatten(-2)
+        others = torch.cat([shared, by_weight, residual], 1)
         factor = torch.linalg.cholesky(pose @ pose.transpose(-1, -2))
         across = torch.linalg.solve_triangular(factor, pose, upper=False)
         others = others - (others @ across.transpose(-1, -2)) @ across
@@ -143,7 +140,7 @@ def linearise_views(
         groups=torch.stack(forms),
         counts=torch.tensor(counts),
         lens=problem.shared_size,
-        weights=weights.flatten() * unit,
+        weights=field.weights.flatten() * unit,
     )
 
 

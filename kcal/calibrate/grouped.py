@@ -24,9 +24,9 @@ from kcal.solve.result import State
 
 # Into so many parts the groups are dealt, each held out once.
 PARTS = 5
-# Of poses under a lens that is held.
-POSES = LMOptions(max_iterations=30, tolerance=1e-10)
-_REFIT = LMOptions(max_iterations=100, tolerance=1e-9, flatness=1e-6)
+# Of poses under a lens that is held, and of a fit to a part of the views from that to all of them.
+_POSES = LMOptions(max_iterations=30, tolerance=1e-10)
+REFIT = LMOptions(max_iterations=100, tolerance=1e-9, flatness=1e-6)
 _LARGEST_GROUPS, _FEWEST_GROUPS, _RUN = 20, 5, 5
 
 
@@ -69,7 +69,7 @@ class GroupedViews:
         chosen = list(views)
         weights = None if self.weights is None else self.weights[chosen]
         _, cost = refine_poses(
-            self.board_points, self.pixels[chosen], [model], some_views(state, chosen), POSES, [field], weights
+            self.board_points, self.pixels[chosen], [model], some_views(state, chosen), _POSES, [field], weights
         )
         return float(torch.nan_to_num(2.0 * cost, nan=math.inf).sum())
 
@@ -128,7 +128,7 @@ def judge_parametric(setting: GroupedViews, model: LensModel, solved: Solved, pa
         out = set(part.tolist())
         train = [i for g, group in enumerate(setting.groups) if g not in out for i in group]
         problem = setting.problem(model, train, terms=solved.minimum.terms)
-        *shared, _, _ = minimise(problem, some_views(start, train), _REFIT).state
+        *shared, _, _ = minimise(problem, some_views(start, train), REFIT).state
         views = [i for g in out for i in setting.groups[g]]
         total += setting.held_out(model, (*shared, *start[-2:]), views, None)
     return math.sqrt(total / setting.count)

@@ -11,14 +11,13 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.forms import Forms, linearise_views
-from kcal.calibrate.grouped import PARTS, POSES, GroupedViews, group_views, judge_parametric, some_views
+from kcal.calibrate.grouped import PARTS, REFIT, GroupedViews, group_views, judge_parametric, some_views
 from kcal.calibrate.ladder import Progress
 from kcal.calibrate.mono import calibrate_camera
 from kcal.calibrate.options import CalibrationOptions, CameraCalibrationResult
-from kcal.calibrate.poses import refine_poses
-from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.single import Solved, solve
 from kcal.calibrate.stacking import CANDIDATES, Prior, average_fit, deal, stack_weights
+from kcal.calibrate.terms import Term
 from kcal.calibrate.together import alone
 from kcal.calibrate.weights import whitening
 from kcal.corners.observations import Observations
@@ -26,12 +25,15 @@ from kcal.errors import InputError
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import from_pixels
-from kcal.lens.residual import Field, FieldGrid, FieldResidual
+from kcal.lens.residual import LARGEST_SLOPE, Field, FieldGrid, FieldResidual, field_bounds
+from kcal.solve.lm import minimise
 from kcal.solve.result import State, Status
 
 # Rounds of averaging anew where the last average stands, until a step moves no corner by more than this share of the
 # noise.
 _ROUNDS, _STILL = 6, 0.02
+# The last step may still move the residuals by this share of their squared length.
+_SETTLED = 1e-4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -169,11 +171,11 @@ def calibrate_hybrid(
     )
     grid, half = _grid(solved, observations.image_size, options.widths)
     precisions = [prior.precision(grid, half) for prior in CANDIDATES]
-    state = solved.result.state
-    forms = _forms(setting, base, state, grid, torch.zeros(2, grid.count, dtype=torch.float64))
+    none = Field(grid, torch.zeros(2, grid.count, dtype=torch.float64))
+    forms = _forms(setting, base, solved.result.state, none)
 
     parts = deal(len(groups), PARTS)
-    held_out = {"hybrid": _judge_hybrid(setting, base, state, forms, grid, precisions, parts)}
+    held_out = {"hybrid": _judge_hybrid(setting, base, solved, forms, grid, precisions, parts)}
     progress("hybrid judged")
     for rival in dict.fromkeys(LensModel.named(r) for r in options.rivals):
         own = solved if rival == base else alone(solve(observations, options.parametric(rival), lambda _: None))
@@ -184,7 +186,7 @@ def calibrate_hybrid(
     wins = best is None or held_out["hybrid"] < held_out[best]
     everything = torch.ones(len(groups), dtype=torch.bool)
     shares = stack_weights(forms, everything, precisions)
-    final, field, last, settled = _settle(setting, base, state, grid, precisions, shares)
+    final, field, last, settled = _settle(setting, base, solved, grid, precisions, shares)
     reason = _reason(held_out, best, wins, settled)
     kept = settled and (wins or not options.gate)
     if kept:
@@ -192,7 +194,7 @@ def calibrate_hybrid(
         calibration = _result(setting, observations.image_size, base, final, field, solved, covariance)
     else:
         calibration = calibrate_camera(observations, options.parametric(best or base))
-    unit = float(final[0][:2].log().mean().exp())
+    unit = _focal(final)
     form = forms.total(everything)
     return HybridResult(
         calibration=calibration,
@@ -235,87 +237,90 @@ def _grid(solved: Solved, size: tuple[int, int], widths: Sequence[float]) -> tup
     return FieldGrid.covering(low, high, [half * value for value in widths]), half
 
 
-def _forms(setting: GroupedViews, model: LensModel, state: State, grid: FieldGrid, weights: Tensor) -> Forms:
+def _forms(setting: GroupedViews, model: LensModel, state: State, field: Field) -> Forms:
     order = [view for group in setting.groups for view in group]
-    problem = setting.problem(model, order, Field(grid, weights))
-    return linearise_views(problem, some_views(state, order), grid, weights, [len(group) for group in setting.groups])
+    problem = setting.problem(model, order, field)
+    return linearise_views(problem, some_views(state, order), field, [len(group) for group in setting.groups])
 
 
-def _moved(problem: BoardProblem, state: State, step: Tensor, grid: FieldGrid, weights: Tensor) -> tuple[State, Field]:
-    """A state and a field after a step of `Forms`; poses stay, to be solved again."""
-    unit = float(state[0][:2].log().mean().exp())
-    shared, rest = step[: problem.shared_size], step[problem.shared_size : -1]
-    still = torch.zeros((len(state[-1]), 6), dtype=torch.float64)
-    after = problem.retract(state, (shared, still))
-    return after, Field(grid, weights + rest.unflatten(0, (2, -1)) / unit)
+def _stepped(field: Field, step: Tensor, forms: Forms, unit: float) -> Field:
+    """The field after a step of `Forms`; `unit` is the focal length of the state where these were taken."""
+    return Field(field.grid, field.weights + step[forms.lens : -1].unflatten(0, (2, -1)) / unit)
+
+
+def _refit(
+    setting: GroupedViews, model: LensModel, state: State, views: Sequence[int], field: Field, terms: Sequence[Term]
+) -> State:
+    """Lens, warp and poses of some views solved again under a field that is held.
+
+    To first order that is the step that the forms gave; a lens whose coefficients the data hardly determine, though,
+    has long steps, and only the whole problem with its walls keeps it a lens.
+    """
+    chosen = list(views)
+    return minimise(setting.problem(model, chosen, field, terms), some_views(state, chosen), REFIT).state
 
 
 def _judge_hybrid(
     setting: GroupedViews,
     model: LensModel,
-    state: State,
+    solved: Solved,
     forms: Forms,
     grid: FieldGrid,
     precisions: Sequence[Tensor],
     parts: Sequence[Tensor],
 ) -> float:
     """RMS on each part of the groups of a hybrid whose priors and weights come from the other parts alone."""
-    total = 0.0
-    problem = setting.problem(model, range(len(setting.pixels)))
-    zero = torch.zeros(2, grid.count, dtype=torch.float64)
+    total, state = 0.0, solved.result.state
+    none = Field(grid, torch.zeros(2, grid.count, dtype=torch.float64))
     for part in parts:
         chosen = torch.ones(len(forms.counts), dtype=torch.bool)
         chosen[part] = False
         step = average_fit(forms, chosen, precisions, stack_weights(forms, chosen, precisions))
-        after, field = _moved(problem, state, step, grid, zero)
+        field = _stepped(none, step, forms, _focal(state))
+        train = [i for g in chosen.nonzero()[:, 0].tolist() for i in setting.groups[g]]
+        *shared, _, _ = _refit(setting, model, state, train, field, solved.minimum.terms)
         views = [i for g in part.tolist() for i in setting.groups[g]]
-        total += setting.held_out(model, after, views, field)
+        total += setting.held_out(model, (*shared, *state[-2:]), views, field)
     return math.sqrt(total / setting.count)
+
+
+def _focal(state: State) -> float:
+    return float(state[0][:2].log().mean().exp())
 
 
 def _settle(
     setting: GroupedViews,
     model: LensModel,
-    state: State,
+    solved: Solved,
     grid: FieldGrid,
     precisions: Sequence[Tensor],
     shares: Tensor,
 ) -> tuple[State, Field, Forms, bool]:
-    """The averaged fit of all views: step, poses solved again, forms taken anew, until it stands still.
+    """The averaged fit of all views: a step of the field, all else solved again, anew until it stands still.
 
     Returns the state, its field, the last forms, and whether it settled.
     """
-    weights = torch.zeros(2, grid.count, dtype=torch.float64)
+    state = solved.result.state
+    field = Field(grid, torch.zeros(2, grid.count, dtype=torch.float64))
     every = torch.ones(len(setting.groups), dtype=torch.bool)
     before = math.inf
     for _ in range(_ROUNDS):
-        forms = _forms(setting, model, state, grid, weights)
+        forms = _forms(setting, model, state, field)
         step = average_fit(forms, every, precisions, shares)
-        problem = setting.problem(model, range(len(setting.pixels)), Field(grid, weights))
         now = forms.total(every)
         noise = float(now[-1, -1])
-        # Of the squared residuals, how much the step changes their vector.
-        change = step.clone()
-        change[-1] = 0.0
+        # How much the step changes the residuals, as their squared length.
+        change = torch.cat([step[:-1], torch.zeros_like(step[-1:])])
         moved = float(change @ now @ change)
-        after, field = _moved(problem, state, step, grid, weights)
-        if not (math.isfinite(moved) and moved < 4.0 * before):
-            return state, Field(grid, weights), forms, False
-        after, cost = refine_poses(
-            setting.board_points,
-            setting.pixels,
-            [model],
-            after,
-            POSES,
-            [field],
-            setting.weights,
-        )
-        if not bool(torch.isfinite(cost).all()):
-            return state, Field(grid, weights), forms, False
-        state, weights, before = after, field.weights, moved
+        after = _stepped(field, step, forms, _focal(state))
+        steady = math.isfinite(moved) and moved < 4.0 * before
+        if not steady or not field_bounds(after)[1] <= LARGEST_SLOPE:
+            return state, field, forms, False
+        state = _refit(setting, model, state, range(len(setting.pixels)), after, solved.minimum.terms)
+        field, before = after, moved
         if moved <= _STILL**2 * noise / setting.count:
             break
-    return state, Field(grid, weights), forms, moved <= 1e-4 * noise
+    return state, field, forms, moved <= _SETTLED * noise
 
 
 def _covariance(forms: Forms, precisions: Sequence[Tensor], shares: Tensor) -> Tensor:

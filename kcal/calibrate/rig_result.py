@@ -159,8 +159,9 @@ def check_determined(
     for second in range(1, len(names)):
         _, determined = spread.of(relative_rows(problem, state, 0, second))
         if not bool(determined.all()):
+            what = "; ".join(open_[:3]) + (" and more" if len(open_) > 3 else "")
             raise DegenerateError(
-                f"the data do not determine how {names[second]} stands from {names[0]}: {'; '.join(open_)} "
+                f"the data do not determine how {names[second]} stands from {names[0]}: {what} "
                 "could be anything; add boards seen by both, surveyed landmarks, far features of known range, a "
                 "measured baseline or measured positions"
             )

@@ -81,7 +81,7 @@ class TestForms:
     def test_predict_the_cost_with_poses_solved_again(self) -> None:
         problem, state, grid = setting()
         zero = torch.zeros(2, grid.count, dtype=torch.float64)
-        forms = linearise_views(problem, state, grid, zero, [4, 6])
+        forms = linearise_views(problem, state, Field(grid, zero), [4, 6])
         step = 0.2 * torch.randn(len(forms.groups[0]), dtype=torch.float64, generator=torch.Generator().manual_seed(1))
         step[2 : forms.lens] = 0.0
         step[:2] = torch.tensor([0.3, -0.2])
@@ -102,7 +102,7 @@ class TestForms:
         problem, state, grid = setting()
         weights = 1e-5 * torch.randn(2, grid.count, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
         problem.fields = (Field(grid, weights),)
-        forms = linearise_views(problem, state, grid, weights, [5, 5])
+        forms = linearise_views(problem, state, Field(grid, weights), [5, 5])
         form = forms.total(torch.ones(2, dtype=torch.bool))
         precision = torch.full((2 * grid.count,), 3.0, dtype=torch.float64)
         precision[::3] = torch.inf
@@ -119,7 +119,7 @@ class TestForms:
     def test_effective_number(self) -> None:
         problem, state, grid = setting()
         zero = torch.zeros(2, grid.count, dtype=torch.float64)
-        forms = linearise_views(problem, state, grid, zero, [5, 5])
+        forms = linearise_views(problem, state, Field(grid, zero), [5, 5])
         form = forms.total(torch.ones(2, dtype=torch.bool))
         free = [forms.freedom(form, torch.full((2 * grid.count,), p, dtype=torch.float64)) for p in (1e-9, 1.0, 1e9)]
         # Two shifts, two scales and two radial terms are the lens's.
@@ -154,7 +154,7 @@ class TestStacking:
     def test_weights_are_those_of_training_groups_alone(self) -> None:
         problem, state, grid = setting()
         zero = torch.zeros(2, grid.count, dtype=torch.float64)
-        forms = linearise_views(problem, state, grid, zero, [2] * 5)
+        forms = linearise_views(problem, state, Field(grid, zero), [2] * 5)
         precisions = [prior.precision(grid, 0.65) for prior in CANDIDATES]
         chosen = torch.tensor([True, True, True, True, False])
         weights = stack_weights(forms, chosen, precisions)

@@ -7,6 +7,8 @@ import math
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rig_scenes import (
     BOARD,
     CAMERAS,
@@ -246,6 +248,33 @@ class TestRecovery:
         assert float(sigma[4:].max()) > 0.1
 
 
+class TestFrame:
+    @settings(max_examples=6)
+    @given(
+        turn=st.tuples(*[st.floats(-3.0, 3.0)] * 3),
+        shift=st.tuples(*[st.floats(-5e4, 5e4)] * 3),
+    )
+    def test_the_solution_moves_with_the_frame(self, turn: tuple, shift: tuple) -> None:
+        """Landmarks turned and shifted as a whole, up to 50 km: cameras follow, relative pose and sigmas stay."""
+        marks = landmarks(noise=0.1, error=0.02)
+        rotation, offset = rotation_from_vector(tensor(*turn)), tensor(*shift)
+        moved = dataclasses.replace(marks, points=marks.points @ rotation.T + offset)
+        here, there = solve_rig(data(landmarks=marks)), solve_rig(data(landmarks=moved))
+        sigma = here.relative_covariance().diagonal().sqrt()
+        assert bool(((pose_error(there) - pose_error(here)).abs() < 1e-4 * sigma).all())
+        torch.testing.assert_close(there.relative_covariance().diagonal().sqrt(), sigma, rtol=1e-5, atol=0)
+        spread = float(here.mounting_covariance().diagonal()[:3].sqrt().min())
+        assert float((there.centre - (here.centre @ rotation.T + offset)).abs().max()) < 1e-4 * spread + 1e-9
+
+    def test_a_free_lens_that_landmarks_cannot_tell_is_refused_by_name(self) -> None:
+        with pytest.raises(DegenerateError, match=r"how right stands from left: a mixture of .* and more could"):
+            solve_rig(data(landmarks=landmarks(count=4, noise=0.1)), JointOptions(intrinsics="free"))
+
+    def test_three_landmarks_leave_nothing_to_check_with(self) -> None:
+        found = solve_rig(data(landmarks=landmarks(count=3, noise=0.1)))
+        assert any("nothing is left over to check" in text for text in found.warnings)
+
+
 class TestHybrid:
     def test_corrections_of_the_lens_are_in_it(self) -> None:
         """Half a pixel of learned correction: the rig is the true one, also with the parameters free."""
@@ -308,9 +337,9 @@ class TestIntrinsics:
 
 class TestCovariance:
     def test_is_the_spread(self) -> None:
-        """30 rigs: the sum of squared errors in sigmas is χ² with 180 degrees of freedom, ± 4 of its deviations."""
+        """20 rigs: the sum of squared errors in sigmas is χ² with 120 degrees of freedom, ± 4 of its deviations."""
         total = [0.0, 0.0]
-        for seed in range(0, 30_000, 1000):
+        for seed in range(0, 20_000, 1000):
             found = solve_rig(data(landmarks=landmarks(noise=0.1, error=0.02, seed=seed), baselines=BASELINE))
             assert found.left_out == ()
             turn = vector_from_rotation(found.rotation[0].T @ ROTATION[0])
@@ -319,8 +348,8 @@ class TestCovariance:
             for k, (error, covariance) in enumerate(zip(errors, covariances, strict=True)):
                 total[k] += float(error @ torch.linalg.solve(covariance, error))
         # Of the baseline's length the truth is given here, not a draw: at most one degree of freedom in six is smaller.
-        assert 150 - 4 * (2 * 150) ** 0.5 < total[0] < 180 + 4 * (2 * 180) ** 0.5
-        assert 180 - 4 * (2 * 180) ** 0.5 < total[1] < 180 + 4 * (2 * 180) ** 0.5
+        assert 100 - 4 * (2 * 100) ** 0.5 < total[0] < 120 + 4 * (2 * 120) ** 0.5
+        assert 120 - 4 * (2 * 120) ** 0.5 < total[1] < 120 + 4 * (2 * 120) ** 0.5
 
     def test_joint_covariance_has_the_order_of_the_rig(self) -> None:
         found = solve_rig(data(landmarks=landmarks(noise=0.1)), JointOptions(intrinsics="fixed"))
@@ -384,7 +413,7 @@ class TestWrong:
             assert float(falls[i]) == pytest.approx(whole.chi2 - without.chi2, rel=2e-2)
 
     def test_good_ones_stay(self) -> None:
-        for seed in range(5):
+        for seed in range(3):
             kind = {"landmarks": landmarks(noise=0.1, error=0.02, seed=seed), "boards": boards(noise=0.1, seed=seed)}
             assert solve_rig(data(**kind)).left_out == ()
 
@@ -423,8 +452,8 @@ class TestNotDetermined:
 
     def test_features_of_unknown_range_leave_huge_errors_not_silence(self) -> None:
         """Epipolar geometry alone: the relative yaw hangs on what little the epipolar lines turn."""
-        known = solve_rig(data(features=features(count=40, noise=0.1, known=0.1), baselines=BASELINE))
-        free = solve_rig(data(features=features(count=40, noise=0.1), baselines=BASELINE))
+        known = solve_rig(data(features=features(noise=0.1, known=0.1), baselines=BASELINE))
+        free = solve_rig(data(features=features(noise=0.1), baselines=BASELINE))
         yaw = [math.degrees(float(found.relative_covariance()[1, 1].sqrt())) for found in (known, free)]
         assert yaw[1] > 10 * yaw[0]
 
