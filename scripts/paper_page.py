@@ -52,7 +52,8 @@ def _head(results: Results, views: int) -> list[str]:
         "of its tables and figures is made again beside the paper's numbers.",
         "",
         f"Made by `scripts/reproduce_paper.py --write` with kcal {kcal.__version__}, torch {torch.__version__}, OpenCV "
-        f"{cv2.__version__} on {platform.machine()}, one thread; {seeds} draws of each kind of camera, {views} board "
+        f"{cv2.__version__} on {platform.machine()}, one thread; {seeds} draw{'s' * (seeds > 1)} of each kind of "
+        f"camera, {views} board "
         "views a camera. Values are medians over the draws, with the smallest and the largest.",
         "",
         "**The cameras.** 1920 x 1080, behind lenses that are traced ray by ray (`kcal.sim.truth`): *glass*, a "
