@@ -73,6 +73,7 @@ def _models(rigs: Results) -> None:
         ):
             axes = figure.add_subplot(len(rigs), 2, 2 * line + column + 1)
             values = np.array([[value(run, m) for m in models] for run in runs])
+            values[~np.isfinite(values)] = np.nan
             axes.plot(place, values.T, color=FAINT, linewidth=0.8)
             axes.plot(place, np.nanmedian(values, 0), color=FOUND, linewidth=2, marker="o")
             axes.set_xticks(place, models)

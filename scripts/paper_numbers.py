@@ -28,6 +28,8 @@ def middle(values: Sequence[float], digits: int = 3) -> str:
     good = [value for value in values if math.isfinite(value)]
     if not good:
         return "–"
+    if len(values) == 1:
+        return f"{good[0]:.{digits}f}"
     text = f"{statistics.median(good):.{digits}f} ({min(good):.{digits}f} to {max(good):.{digits}f})"
     return text if len(good) == len(values) else f"{text}, {len(values) - len(good)} failed"
 

@@ -129,8 +129,8 @@ def choice(rigs: Results) -> list[str]:
     return [
         *lines,
         "",
-        "A leak can only look better than what it is measured on; the third column below the first is what it "
-        "pretends.",
+        "The third column can only look better than the others, on these seven points: what it gains over the first is "
+        "what the leak pretends.",
     ]
 
 

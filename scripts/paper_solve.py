@@ -14,6 +14,7 @@ import torch
 from paper_site import KINDS, MARK_SIGMA, SURVEY_SIGMA, lenses, observe, paper_scene
 from torch import Tensor
 
+from kcal.calibrate.align import pose_alone
 from kcal.calibrate.hybrid import HybridOptions, calibrate_hybrid
 from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
 from kcal.calibrate.rig import JointOptions, solve_rig
@@ -24,6 +25,7 @@ from kcal.lens.camera import Camera
 from kcal.locate.stereo import Triangulate
 from kcal.sim.infinity import error_at_infinity
 from kcal.sim.scene import DemoScene
+from kcal.solve.lm import LMOptions
 
 SIDES = ("left", "right")
 # What the paper calls 14, 16, 18, 20, 20 (its second one), 22 and 24 parameters.
@@ -138,10 +140,13 @@ def held_out(seen: dict[str, Observations], model: str) -> float:
     for observations in seen.values():
         names = list(observations.names)
         camera, _ = fit(observations.subset([n for i, n in enumerate(names) if i % 3]), model)
-        left_out = observations.subset(names[::3])
-        residuals = calibrate_camera(left_out, CalibrationOptions(camera=camera, weighted=False)).residuals
-        some = torch.isfinite(residuals).all(-1)
-        squares += float(residuals[some].square().sum())
+        board, pixels = observations.board.points, observations.subset(names[::3]).pixels()
+        poses, _ = pose_alone(board, pixels, camera, LMOptions())
+        seen_at, valid = camera.project(board @ poses.rotation.transpose(-1, -2) + poses.translation[:, None])
+        some = torch.isfinite(pixels).all(-1)
+        if bool((some & ~valid).any()):
+            return math.inf  # a corner that the lens does not reach
+        squares += float((seen_at - pixels)[some].square().sum())
         count += int(some.sum())
     return math.sqrt(squares / count)
 
