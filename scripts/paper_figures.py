@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import statistics
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 from page import DOCS
-from paper_numbers import DISTANCES, SHOWN, TABLE_3, Results, edge_means, labels, rms
+from paper_numbers import DISTANCES, SHOWN, TABLE_3, Results, edge_means, labels, median, rms
 from paper_site import KINDS
 
 from kcal.corners.observations import Observations
@@ -75,7 +74,7 @@ def _models(rigs: Results) -> None:
             axes = figure.add_subplot(len(rigs), 2, 2 * line + column + 1)
             values = np.array([[value(run, m) for m in models] for run in runs])
             axes.plot(place, values.T, color=FAINT, linewidth=0.8)
-            axes.plot(place, np.median(values, 0), color=FOUND, linewidth=2, marker="o")
+            axes.plot(place, np.nanmedian(values, 0), color=FOUND, linewidth=2, marker="o")
             axes.set_xticks(place, models)
             axes.set_yscale("log")
             axes.set_title(f"{name}: {title}", fontsize=10, loc="left")
@@ -95,8 +94,8 @@ def _distance(rigs: Results) -> None:
             pixels = np.array([run["located"][label]["reprojection"] for run in runs])
             metres = np.abs([run["located"][label]["range_error"] for run in runs]) / true * 100
             for axes, values in ((left, pixels), (right, metres)):
-                middle = np.median(values, 0)
-                bars = [middle - values.min(0), values.max(0) - middle]
+                middle = np.nanmedian(values, 0)
+                bars = [middle - np.nanmin(values, 0), np.nanmax(values, 0) - middle]
                 axes.errorbar(
                     place + shift, middle, bars, color=COLOURS[label], marker="o", markersize=4, capsize=2,
                     linewidth=1.2, elinewidth=0.8, label=label,
@@ -120,7 +119,7 @@ def _edges(rigs: Results) -> None:
         models = labels(runs, SHOWN)
         place = np.arange(len(models))
         for shift, which, title, colour in ((-0.2, 0, "centre", FAINT), (0.2, 1, "edge", FOUND)):
-            values = [statistics.median(edge_means(run, m)[which] for run in runs) for m in models]
+            values = [median(edge_means(run, m)[which] for run in runs) for m in models]
             axes.bar(place + shift, values, 0.38, color=colour, label=title)
         axes.set_xticks(place, models)
         axes.set_ylabel("mean reprojection error, pixels")
@@ -132,7 +131,7 @@ def _edges(rigs: Results) -> None:
 
 def _map(rigs: Results) -> None:
     """Plan view of the first draw, with a logarithmic range: as the paper's Fig. 6 and 11."""
-    figure = new_figure(13.5, 4.3 * len(rigs))
+    figure = new_figure(13.5, 2.7 * len(rigs))
     for line, (name, runs) in enumerate(rigs.items()):
         last = "field" if "field" in runs[0]["located"] else "24"
         panels = [("14", "integer"), ("14", "marked"), ("20", "marked"), (last, "marked")]

@@ -87,7 +87,9 @@ def run_seed(folder: Path, name: str, seed: int, views: int) -> dict[str, Any]:
                 result["held_out"][label] = NAN
             spent[f"held-out views, {label}"] = time.process_time() - start
             start = time.process_time()
-            result["located"][label] = located(scene, (pair["left"][0], pair["right"][0]))
+            both = pair["left"][0], pair["right"][0]
+            alone = located(scene, both, noise=False)["range_error"]
+            result["located"][label] = located(scene, both) | {"lens_error": alone}
             spent[f"rig and positions, {label}"] = time.process_time() - start
     if "OpenCV" not in result["cameras"]:
         start = time.process_time()
@@ -99,7 +101,8 @@ def run_seed(folder: Path, name: str, seed: int, views: int) -> dict[str, Any]:
             for side, (rms, matrix, lens) in theirs.items()
         }
         if scene is not None:
-            result["located"]["OpenCV"] = located_by_opencv(scene, theirs)
+            alone = located_by_opencv(scene, theirs, noise=False)["range_error"]
+            result["located"]["OpenCV"] = located_by_opencv(scene, theirs) | {"lens_error": alone}
     if scene is not None:
         pixels = scene.target_marks.true_left
         result["bound"], result["target_pixels"] = bound(scene), pixels.tolist()
@@ -146,14 +149,14 @@ def held_out(seen: dict[str, Observations], model: str) -> float:
 # --- positions ---------------------------------------------------------------------------------------------------
 
 
-def located(scene: DemoScene, cameras: tuple[Camera, Camera]) -> dict[str, Any]:
-    """Orient the cameras by the landmarks, and locate the seven points."""
-    marks, surveyed = scene.landmark_marks, scene.surveyed(scene.landmarks)
+def located(scene: DemoScene, cameras: tuple[Camera, Camera], noise: bool = True) -> dict[str, Any]:
+    """Orient the cameras by the landmarks, and locate the seven points; without noise only the lenses are wrong."""
+    points, left, right = oriented_by(scene, noise)
     landmarks = Landmarks(
-        names=surveyed.names,
-        points=surveyed.enu,
-        sigma=torch.full_like(surveyed.enu, SURVEY_SIGMA),
-        pixels=torch.stack([marks.left, marks.right], 1),
+        names=scene.landmarks.names,
+        points=points,
+        sigma=torch.full_like(points, SURVEY_SIGMA),
+        pixels=torch.stack([left, right], 1),
         pixel_sigma=MARK_SIGMA,
     )
     # Nothing is left out: a lens model that contradicts the landmarks is to show it.
@@ -175,10 +178,18 @@ def located(scene: DemoScene, cameras: tuple[Camera, Camera]) -> dict[str, Any]:
 
 def nowhere(count: int) -> dict[str, Any]:
     """What is recorded where there is no camera."""
-    lines = ("reprojection", "range_error", "position_error", "total_rms", "check_reprojection")
+    lines = ("reprojection", "range_error", "lens_error", "position_error", "total_rms", "check_reprojection")
     return {name: [NAN] * count for name in lines} | {
         name: [[NAN] * 3] * count for name in ("marked", "exact", "integer")
     }
+
+
+def oriented_by(scene: DemoScene, noise: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Places of the landmarks, and their pixels left and right, as surveyed and marked, or as they truly are."""
+    marks = scene.landmark_marks
+    if noise:
+        return scene.surveyed(scene.landmarks).enu, marks.left, marks.right
+    return scene.landmarks.enu, marks.true_left, marks.true_right
 
 
 def judge(scene: DemoScene, place: Any, project: Any) -> dict[str, Any]:
@@ -241,11 +252,13 @@ def as_camera(matrix: Any, lens: Any, seen: Observations) -> Camera:
     )
 
 
-def located_by_opencv(scene: DemoScene, cameras: dict[str, tuple[float, Any, Any]]) -> dict[str, Any]:
+def located_by_opencv(
+    scene: DemoScene, cameras: dict[str, tuple[float, Any, Any]], noise: bool = True
+) -> dict[str, Any]:
     """`solvePnP` on the landmarks, `undistortPoints` and `triangulatePoints`, as a user of OpenCV would."""
-    marks, surveyed = scene.landmark_marks, scene.surveyed(scene.landmarks).enu.numpy()
-    poses = {}
-    for side, pixels in zip(SIDES, (marks.left, marks.right), strict=True):
+    points, *marks = oriented_by(scene, noise)
+    surveyed, poses = points.numpy(), {}
+    for side, pixels in zip(SIDES, marks, strict=True):
         _, matrix, lens = cameras[side]
         _, turn, shift = cv2.solvePnP(surveyed, pixels.numpy(), matrix, lens, flags=cv2.SOLVEPNP_SQPNP)
         poses[side] = cv2.solvePnPRefineLM(surveyed, pixels.numpy(), matrix, lens, turn, shift)

@@ -19,15 +19,17 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.reduced import ReducedProblem, fold
 from kcal.calibrate.terms import RadialBound, Term
 from kcal.calibrate.together import Solve, Steps
+from kcal.calibrate.valley import escape
 from kcal.calibrate.views import Views
 from kcal.calibrate.wide import wide_starts
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Result, State, Status
+from kcal.solve.result import Result, State, Status, pick, stack
 
 # For each start of a batch; the best one is then taken to convergence.
 _SCOUT = LMOptions(max_iterations=150, tolerance=1e-9, flatness=1e-5)
@@ -41,8 +43,14 @@ _FOLD_PRICE = 20.0
 _STRETCH, _STRETCHES = 12, 20
 # With fewer corners than this, all starts are solved on all views.
 _FEW_CORNERS = 1000
-# Models that are solved on the way to a richer one where minima are searched on folded views.
-_LANDINGS = ("opencv8", "opencv12", "opencv14", "ext16", "ext18", "ext20")
+# Models through which minima are searched on folded views.
+_RUNGS = ("opencv8", "opencv12", "opencv14", "ext16", "ext18", "ext20", "ext22")
+# Those of them that are solved on all views on the way.
+_LANDINGS = ("opencv14", "ext20", "ext22")
+# With more corners than this, valleys are not followed from the solution: a batch of starts would take too long.
+_MANY_CORNERS = 4000
+# How far all boards together may be turned against the first model's at a lower minimum, radians.
+_MOST_TURN = math.radians(7.0)
 # Enough to tell the minima apart and to come near the best one.
 _SEARCH = LMOptions(max_iterations=60, tolerance=1e-7, initial_damping=1e-6)
 # Height of the wall before a fold, in units of the noise.
@@ -81,7 +89,9 @@ def steps_to(model: LensModel) -> list[LensModel]:
         >>> [str(m) for m in steps_to(LensModel.named("opencv12"))]
         ['opencv5', 'opencv8', 'opencv12']
     """
-    ladder = [PRESETS[name] for name in ("opencv5", "opencv8", "opencv12", "opencv14", "ext16", "ext18", "ext20")]
+    ladder = [
+        PRESETS[name] for name in ("opencv5", "opencv8", "opencv12", "opencv14", "ext16", "ext18", "ext20", "ext22")
+    ]
     below = [step for step in ladder if model.contains(step) and step != model]
     return [*below, model]
 
@@ -119,16 +129,6 @@ def near_cancelling(parameters: Tensor, model: LensModel, largest: float, place:
     out[bottom] = 0.0
     out[bottom[0]], out[bottom[1]] = -2.0 * s0 / (s0**2 + w**2), 1.0 / (s0**2 + w**2)
     return out
-
-
-def stack(states: Sequence[State]) -> State:
-    """Several states as one batch."""
-    return tuple(torch.stack(tensors) for tensors in zip(*states, strict=True))
-
-
-def pick(state: State, index: int) -> State:
-    """One element of a batch."""
-    return tuple(tensor[index] for tensor in state)
 
 
 def climb(
@@ -169,7 +169,8 @@ def _climb_folded(
     observed = float(views.observed_radius(first))
     folded = fold(views.problem(small, poses_only=True), first, observed)
     kept, reached, spent = [first[0]], first, 0
-    for large in [model for model in models[1:-1] if str(model) in _LANDINGS] + [models[-1]]:
+    landed = small
+    for large in [model for model in models[1:-1] if str(model) in _RUNGS] + [models[-1]]:
         terms = (RadialBound(large, radius, _WALL * noise),)
         starts = [embed(parameters, small, large) for parameters in kept]
         bumpy = large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2
@@ -180,20 +181,53 @@ def _climb_folded(
         search = ReducedProblem(folded, large, views.rules.parameters(large), known, (len(starts),))
         found = yield Solve(search, search.start(torch.stack(starts)), _SEARCH)
         kept = [found.state[0][i] for i in _distinct(found)]
+        spent += int(found.iterations.max())
+        small = large
+        if large != models[-1] and str(large) not in _LANDINGS:
+            continue
         ends = [search.unfold(pick(found.state, i)) for i in _distinct(found)]
-
+        # To the end also on the way: what a richer model starts from is the solution of the one nested in it.
         problem = views.problem(large, terms=terms)
-        enough = options if large == models[-1] else _LANDING
-        result = yield Solve(problem, ends[0], enough)
-        nested = (embed(reached[0], small, large), *reached[1:])
-        spent += int(found.iterations.max()) + int(result.iterations)
+        result = yield Solve(problem, ends[0], options)
+        nested = (embed(reached[0], landed, large), *reached[1:])
+        spent += int(result.iterations)
         if not float(result.cost) <= float(problem.cost(nested)):
-            result = yield Solve(problem, nested, enough)
+            result = yield Solve(problem, nested, options)
             spent += int(result.iterations)
-        reached, small = result.state, large
+        if views.corner_count <= _MANY_CORNERS:
+            result, steps = yield from _lower(views, problem, large, first, result, options)
+            spent += steps
+        reached, landed = result.state, large
+        if large != models[-1]:
+            # What is searched next answers best from here.
+            kept = [result.state[0], *kept[1:]]
+            folded = fold(views.problem(large, poses_only=True), result.state, observed)
         progress(str(large))
     others = [(embed(first[0], models[0], small), *first[1:]), *ends[1:]]
     return _minimum(views, result, terms, small, others, spent)
+
+
+def _lower(
+    views: Views, problem: BoardProblem, model: LensModel, first: State, result: Result, options: LMOptions
+) -> Steps[tuple[Result, int]]:
+    """What lies further along the valleys, and the trial steps spent.
+
+    It must be no less of a lens. Neither may the camera's axis be somewhere else altogether: a tilt can be traded
+    against a turn of the camera, and far along that valley the last bit of RMS is bought with absurd principal points.
+    """
+    limit = views.trouble(result.state, model)
+
+    def turn(state: State) -> float:
+        """By how much all boards together are turned against the first model's, radians."""
+        return math.acos(min(1.0, max(-1.0, 0.5 * (float((state[-2] * first[-2]).sum((-2, -1)).mean()) - 1.0))))
+
+    most = max(_MOST_TURN, turn(result.state))
+
+    def accepts(state: State) -> bool:
+        return turn(state) <= most and views.trouble(state, model) <= limit
+
+    found = yield from escape(problem, result, options, accepts)
+    return found, int(found.iterations)
 
 
 def _minimum(
@@ -231,10 +265,15 @@ def _climb_wholly(
         carried = [(embed(state[0], small, large), *state[1:]) for state in kept]
         found = yield from _scout(views, carried, plain, small, large, options)
         kept = _rank(views, found, carried[0], large)
-        result, terms = yield from _finish(views, kept[0], large, options)
+        last = large == models[-1] or str(large) in _LANDINGS
+        result, terms = yield from _finish(views, kept[0], large, options if last else _LANDING)
         spent += int(found.iterations.max()) + int(result.iterations)
         kept[0] = result.state
         small = large
+        if last and terms and views.corner_count <= _MANY_CORNERS:
+            result, steps = yield from _lower(views, views.problem(large, terms=terms), large, first, result, options)
+            spent += steps
+            kept[0] = result.state
         progress(str(large))
     others = [(embed(first[0], models[0], small), *first[1:]), *kept[1:]]
     return _minimum(views, result, terms, small, others, spent)

@@ -45,8 +45,8 @@ _GRID = (17, 11)
 _ITERATIONS = 60
 # Steps stop where they would gain less χ² than this.
 _ENOUGH = 0.1
-# With fewer corners than this all views are solved at once.
-_FEW_CORNERS = 1000
+# With fewer corners, or from a start that is worse (pixels), all views are solved at once.
+_FEW_CORNERS, _SUSPICIOUS_RMS = 1000, 2.0
 
 
 class Opinion(NamedTuple):
@@ -94,8 +94,12 @@ def second_opinion(
         None where the data exclude the mild lens, so that the solution stands alone.
     """
     model = plain.models[0]
-    if views.corner_count > _FEW_CORNERS:
-        start = _search(views, problem, start, model)
+    if not bool(torch.isfinite(problem.cost(start))):
+        return None
+    if views.corner_count > _FEW_CORNERS and views.rms(start, model) <= _SUSPICIOUS_RMS:
+        near = _search(views, problem, start, model)
+        if bool(problem.cost(near) < problem.cost(start)):
+            start = near
     mild = minimise(problem, start, _rough(plain.residual_count)).state
     linear, cost = plain.linearise(mild), float(plain.cost(state))
     count = plain.shared_size + 6 * len(state[-1])

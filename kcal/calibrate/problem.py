@@ -170,6 +170,12 @@ class BoardProblem(SchurProblem):
         fields = tuple(id(field) for field in self.fields if field is not None)
         return board, self.models, self.free, self.free_warp, self.whitened, self.loss, terms, fields
 
+    def repeated(self, count: int) -> BoardProblem:
+        """A batch of this problem, which is none yet."""
+        batch = copy.copy(self)
+        batch.batch = (count,)
+        return batch
+
     def select(self, elements: Tensor) -> BoardProblem | None:
         """See `SchurProblem.select`."""
         if len(self.batch) != 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+from collections.abc import Sequence
 from typing import TypeVar, cast
 
 import torch
@@ -19,6 +20,16 @@ def blend(mask: Tensor, old: _Tensors, new: _Tensors) -> _Tensors:
         torch.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b) for a, b in zip(new, old, strict=True)
     )
     return cast(_Tensors, tuple(chosen))
+
+
+def stack(states: Sequence[State]) -> State:
+    """Several states as one batch."""
+    return tuple(torch.stack(tensors) for tensors in zip(*states, strict=True))
+
+
+def pick(state: State, index: int) -> State:
+    """One element of a batch."""
+    return tuple(tensor[index] for tensor in state)
 
 
 class Status(enum.IntEnum):

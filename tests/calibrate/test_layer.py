@@ -90,7 +90,7 @@ def test_recorded_steps_have_the_same_derivatives_and_second_ones(loss: RobustLo
 
 
 def test_the_curvature_of_residuals_counts() -> None:
-    """With Gauss and Newton's matrix in place of the Hessian the derivative would be off by a percent here."""
+    """With Gauss and Newton's matrix in place of the Hessian the derivative would be off by three percent here."""
     corners = CORNERS.clone().requires_grad_(True)
     found = calibrate_views(corners, BOARD.points, SIZE, CalibrationOptions(model="opencv4"))
     (exact,) = torch.autograd.grad(found.parameters[0], corners)

@@ -9,7 +9,7 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 
 from kcal.calibrate.join import join_boards, join_reduced, split_boards
-from kcal.calibrate.ladder import embed, stack
+from kcal.calibrate.ladder import embed
 from kcal.calibrate.mono import CalibrationOptions, CameraCalibrationResult, calibrate_camera, calibrate_cameras
 from kcal.calibrate.outliers import OutlierRejection
 from kcal.calibrate.reduced import ReducedProblem, fold
@@ -20,7 +20,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimise
-from kcal.solve.result import State, Status
+from kcal.solve.result import State, Status, stack
 
 CPU = torch.device("cpu")
 

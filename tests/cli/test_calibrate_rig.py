@@ -305,6 +305,26 @@ class TestRig:
         side = float(next(line for line in printed.out.splitlines() if "triangulated" in line).split()[2])
         assert side == pytest.approx(50.0, rel=2e-3)
 
+    def test_boards_in_the_joint_adjustment(
+        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """With a measured baseline beside them, which agrees with what the boards say to a few of its sigmas."""
+        content = json.loads((cameras / "right.obs.json").read_text())
+        content["views"][1]["pixels"].reverse()
+        (cameras / "right.obs.json").write_text(json.dumps(content))
+        more = ["--baseline", f"{float(RIG.baseline)}±0.0002", "-o", "joint.json", "--picture", "rig.png"]
+        assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, *more) == 0
+        printed = capsys.readouterr()
+        assert printed.out.startswith("source")
+        assert "turned by 180°: left01.png right01.png (right)" in printed.out
+        assert (cameras / "rig.png").read_bytes().startswith(b"\x89PNG")
+        file = RigFile.load(cameras / "joint.json")
+        assert file.calibration is not None
+        assert file.calibration.pairs == 6
+        assert file.calibration.baseline_m == pytest.approx(float(RIG.baseline), abs=0.001)
+        assert file.mounting is None
+        assert file.joint_covariance() is not None
+
     def test_pairs_from_a_csv(
         self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:

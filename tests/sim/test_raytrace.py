@@ -108,6 +108,39 @@ def test_light_comes_back_the_way_it_went(name: str) -> None:
     assert float(torch.linalg.cross(back.points - start, heading).abs().max()) < 1e-11
 
 
+# Rays from (x, y, -1) mm with slopes (a, b), and where optiland 0.6.3 has them on the image plane, x, y, L, M
+# (aspheres with tol=1e-15, max_iter=200).
+# fmt: off
+RAYS = ((0.02, -0.03, 0.05, 0.1), (-0.05, 0.02, -0.1, 0.02), (0.01, 0.04, 0.08, -0.12))
+OPTILAND = {
+    "surveillance": [(0.07369570274457, 0.12737694709939, -0.20657122148397, -0.30984280949685)],
+    "machine-vision": [
+        (0.09883435249064, 0.19800314785043, -0.03589075996423, -0.03670945774654),
+        (-0.19598460585771, 0.03908342979135, 0.07719613309069, -0.02047063769068),
+        (0.15722553326381, -0.23644894857965, -0.04575138481677, 0.04110607862647),
+    ],
+    "webcam": [
+        (0.27936895208818, 0.55910670256236, 0.05264056832421, 0.11780128856756),
+        (-0.55858057371511, 0.11168254297711, -0.1036428434514, 0.01894132485849),
+        (0.44601186492501, -0.6695211643764, 0.08744689593979, -0.14103321960917),
+    ],
+}
+# fmt: on
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rays_are_those_of_optiland(name: str) -> None:
+    lens, known = PRESCRIPTIONS[name], torch.tensor(OPTILAND[name], dtype=torch.float64)
+    points = torch.tensor([[x, y, -1.0] for x, y, _, _ in RAYS[: len(known)]], dtype=torch.float64)
+    rays = trace(
+        place(lens, 1.0, 1.0, Misalignment()), points, unit([[a, b, 1.0] for _, _, a, b in RAYS[: len(known)]])
+    )
+    plane = sum(surface.thickness for surface in lens.surfaces)
+    at = rays.points + rays.directions * ((plane - rays.points[:, 2:]) / rays.directions[:, 2:])
+    assert bool(rays.valid.all())
+    torch.testing.assert_close(torch.cat([at[:, :2], rays.directions[:, :2]], -1), known, atol=1e-12, rtol=0)
+
+
 def test_pieces_of_glass_are_counted_and_checked() -> None:
     lens = PRESCRIPTIONS["surveillance"]
     assert lens.elements[1] == (2, 4)  # cemented
