@@ -1,7 +1,8 @@
 """The hybrid on a real wide lens, on views that were held out: which model predicts them, at what cost in time.
 
     python scripts/bench_hybrid.py --out hybrid.jsonl            # fits that the file holds already are not done again
-    python scripts/bench_hybrid.py --out hybrid.jsonl --write    # the tables in docs/hybrid.md, from the file alone
+    python scripts/bench_hybrid.py --out hybrid.jsonl --write    # the table in docs/hybrid.md, from the file alone
+    python scripts/bench_hybrid.py --points --write              # what a point costs: another table there
 
 Data: `wide_lens_corners.npz` in $KCAL_DATA: 93 views of a 10 x 10 board through a lens of some 150 degrees (mrcal's
 tour). A lens is fitted to the training views; on each held-out view only its pose is solved again, lens and board warp
@@ -15,6 +16,7 @@ second view. The hybrid chooses its priors inside each training set alone: `hybr
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import math
 import os
@@ -25,7 +27,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from page import write_section
-from timing import row, show
+from timing import ratios, row, show, spread, times
 
 from kcal.calibrate.align import Poses, pose_alone
 from kcal.calibrate.hybrid import HybridOptions, calibrate_hybrid
@@ -34,6 +36,8 @@ from kcal.calibrate.poses import refine_poses
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
+from kcal.lens.hybrid import HybridCamera
+from kcal.lens.residual import FieldGrid, FieldResidual
 from kcal.solve.lm import LMOptions
 
 PARAMETRIC = ("opencv5", "opencv8", "opencv12", "opencv14", "ext18", "ext20", "ext24")
@@ -129,14 +133,50 @@ def rms(records: list[Record]) -> float:
     return math.sqrt(sum(r["sum"] for r in records) / sum(r["count"] for r in records))
 
 
+def points_table(count: int = 10_000, rounds: int = 15) -> list[str]:
+    """Million points a second of 14 coefficients, and of a hybrid with all its default units in use."""
+    lens = [-0.1, 0.02, 1e-4, -2e-4, 0.001, 0.01, 0.002, 0.001, 1e-4, 2e-4, -1e-4, 1e-4, 0.002, -0.001]
+    size, half = (1920, 1080), 0.6
+    plain = Camera.build(focal=(1600, 1600), center=(960, 540), size=size, coefficients=lens, model="opencv14")
+    base = Camera.build(focal=(1600, 1600), center=(960, 540), size=size, coefficients=lens[:8], model="opencv8")
+    grid = FieldGrid.covering((-0.6, -0.35), (0.6, 0.35), widths=[half * width for width in HybridOptions().widths])
+    weights = 1e-4 * torch.randn(2, grid.count, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    cameras = (plain, HybridCamera.of(base, FieldResidual(grid, weights)))
+    pixels = torch.rand(count, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    pixels = pixels * torch.tensor([1919.0, 1079.0], dtype=torch.float64)
+    rays = [camera.unproject(pixels)[0] for camera in cameras]
+    worst = float((cameras[1].project(rays[1])[0] - pixels).abs().max())
+    lines = [
+        f"{grid.count} units, {count} points, one thread, eager, {rounds} rounds; million points a second, median "
+        f"(smallest to largest). Round trip of the hybrid: {worst:.1e} px.",
+        "",
+        row("direction", "14 coefficients", "hybrid", "hybrid's time over 14's"),
+        row("---", "---:", "---:", "---:"),
+    ]
+    for direction, given in (("project", rays), ("unproject", [pixels, pixels])):
+        calls = [functools.partial(getattr(c, direction), x) for c, x in zip(cameras, given, strict=True)]
+        first, second = times(calls, rounds)
+        rates = [spread([count / 1e6 / t for t in found], 2) for found in (first, second)]
+        lines.append(row(direction, *rates, ratios(first, second, 1)))
+    return lines
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="JSON lines, one a fit")
+    parser.add_argument("--out", type=Path, help="JSON lines, one a fit")
+    parser.add_argument("--points", action="store_true", help="what a point costs, instead of the fits")
     parser.add_argument("--splits", nargs="*", default=["blocks20", "evenodd"])
     parser.add_argument("--models", nargs="*", default=[*PARAMETRIC, *HYBRID])
     parser.add_argument("--write", action="store_true", help="write docs/hybrid.md from the file")
     args = parser.parse_args()
     torch.set_num_threads(1)
+    if args.points:
+        lines = show(points_table())
+        if args.write:
+            write_section("hybrid.md", "points", "\n".join(lines))
+        return
+    if args.out is None:
+        raise SystemExit("--out is needed")
     seen, weight = load()
     done: list[Record] = []
     if args.out.exists():
@@ -152,13 +192,17 @@ def main() -> None:
                     done += records
                     with args.out.open("a") as file:
                         file.writelines(json.dumps(record) + "\n" for record in records)
-    lines = [row("model", *args.splits), row("---", *["---:"] * len(args.splits))]
+    lines = [row("model", *args.splits, "s (CPU) a fit"), row("---", *["---:"] * (len(args.splits) + 1))]
     for model in args.models:
-        cells = []
+        cells, spent = [], []
         for split in args.splits:
             of = [r for r in done if r["split"] == split and r["model"] == model]
-            cells.append(f"{rms(of):.4f}" if len(of) == len(folds(split, len(seen.views))) else "")
-        lines.append(row(model, *cells))
+            whole = len(of) == len(folds(split, len(seen.views)))
+            worst = [math.sqrt(r["sum"] / r["count"]) for r in of]
+            cells.append(f"{rms(of):.4f} ({min(worst):.3f} to {max(worst):.3f})" if whole else "")
+            spent += [r["cpu_s"] for r in of]
+        if any(cells):
+            lines.append(row(model, *cells, f"{sum(spent) / len(spent):.1f}"))
     show(lines)
     if args.write:
         write_section("hybrid.md", "held out", "\n".join(lines))

@@ -32,15 +32,19 @@ def field_figure(observations: Observations, camera: Camera) -> Figure:
     if not isinstance(camera, HybridCamera):
         raise InputError("a picture of the field: this camera has none")
     width, height = camera.size
-    figure = new_figure(10.0, 10.0 * height / width + 0.9)
-    axes = figure.add_subplot()
+    figure = new_figure(11.0, 9.0 * height / width + 1.0)
+    axes = figure.add_axes((0.07, 0.08, 0.82, 0.86))
+    beside = figure.add_axes((0.905, 0.08, 0.02, 0.86))
     fine, moved = _correction(camera, *_FINE)
     size = np.linalg.norm(moved, axis=-1)
     drawn = axes.contourf(fine[..., 0], fine[..., 1], size, levels=24, cmap="viridis")
-    figure.colorbar(drawn, ax=axes, label="correction, pixels", shrink=0.85)
+    figure.colorbar(drawn, cax=beside, label="correction, pixels")
     place, arrows = _correction(camera, *_COARSE)
     longest = max(float(np.linalg.norm(arrows, axis=-1).max()), 1e-12)
-    scale = 10.0 ** np.floor(np.log10(0.06 * width / longest))
+    # A round magnification that makes the longest arrow about as long as the arrows are apart.
+    wanted = width / _COARSE[0] / longest
+    scale = 10.0 ** np.floor(np.log10(wanted))
+    scale *= max(step for step in (1, 2, 5) if step * scale <= wanted)
     axes.quiver(
         place[..., 0],
         place[..., 1],
@@ -50,7 +54,7 @@ def field_figure(observations: Observations, camera: Camera) -> Figure:
         angles="xy",
         scale_units="xy",
         scale=1,
-        width=0.0018,
+        width=0.0022,
     )
     pixels = observations.pixels().numpy()
     seen = pixels[np.isfinite(pixels).all(-1)]
