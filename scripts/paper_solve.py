@@ -121,9 +121,11 @@ def fit(seen: Observations, model: str) -> tuple[Camera, float]:
     have no neighbours, so that every view may be held out for itself.
     """
     if model == "hybrid":
-        found = calibrate_hybrid(seen, HybridOptions(model="ext20", groups="views")).calibration
+        found = calibrate_hybrid(seen, HybridOptions(models=("ext20",), groups="views")).calibration
     elif model == "field":
-        found = calibrate_hybrid(seen, HybridOptions(model="ext20", groups="views", gate=False, rivals=())).calibration
+        found = calibrate_hybrid(
+            seen, HybridOptions(models=("ext20",), groups="views", gate=False, rivals=())
+        ).calibration
     else:
         found = calibrate_camera(seen, CalibrationOptions(model=model))
     return found.camera, found.rms

@@ -86,7 +86,7 @@ def some_views(state: State, views: Sequence[int]) -> State:
 
 
 def group_views(observations: Observations, groups: Literal["blocks", "views"] | Sequence[Hashable]) -> list[list[int]]:
-    """Indices of the views that are held out together, see `kcal.calibrate.hybrid.HybridOptions.groups`.
+    """Indices of the views that are held out together, see `kcal.calibrate.hybrid_options.HybridOptions.groups`.
 
     At most twenty groups; runs of five views or more where there are views enough.
 

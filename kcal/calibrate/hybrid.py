@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Hashable, Sequence
-from typing import Literal
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.forms import Forms, linearise_views
 from kcal.calibrate.grouped import PARTS, REFIT, GroupedViews, group_views, judge_parametric, some_views
+from kcal.calibrate.hybrid_options import HybridOptions, HybridResult
 from kcal.calibrate.ladder import Progress
 from kcal.calibrate.mono import calibrate_camera
-from kcal.calibrate.options import CalibrationOptions, CameraCalibrationResult
+from kcal.calibrate.options import CameraCalibrationResult
 from kcal.calibrate.single import Solved, solve
-from kcal.calibrate.stacking import CANDIDATES, Prior, average_fit, deal, stack_weights
+from kcal.calibrate.stacking import CANDIDATES, average_fit, deal, stack_weights
 from kcal.calibrate.terms import Term
 from kcal.calibrate.together import alone
 from kcal.calibrate.weights import whitening
 from kcal.corners.observations import Observations
-from kcal.errors import InputError
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import from_pixels
@@ -34,81 +33,6 @@ from kcal.solve.result import State, Status
 _ROUNDS, _STILL = 6, 0.02
 # The last step may still move the residuals by this share of their squared length.
 _SETTLED = 1e-4
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class HybridOptions:
-    """Options of `calibrate_hybrid`.
-
-    Args:
-        model: the lens model that the field corrects. A field does better on a plain lens: on a rich one the two
-            compete for the same residuals.
-        rivals: the parametric models that it has to beat.
-        board_warp: estimate how the board bends.
-        weighted: as in `CalibrationOptions`.
-        groups: which views are held out together. "blocks": runs of views in the order of the observations, for
-            videos and captures in which neighbours are alike; "views": every view for itself; or a label for each view.
-            The claim that a hybrid is better holds for new data that differ from the calibration's as the groups
-            differ from each other.
-        widths: of the field's units, in half widths of the image. The narrowest says what detail the field can show
-            and most of what it costs: units grow with its inverse square.
-        gate: keep the hybrid only where it wins; False returns it in any case, with the same figures.
-        focal: as in `CalibrationOptions`.
-        field_of_view: likewise.
-    """
-
-    model: LensModel | str = "opencv8"
-    rivals: tuple[LensModel | str, ...] = ("opencv5", "opencv8", "opencv12", "opencv14", "ext18", "ext20")
-    board_warp: bool = False
-    weighted: bool = True
-    groups: Literal["blocks", "views"] | Sequence[Hashable] = "blocks"
-    widths: tuple[float, ...] = (1.2, 0.6, 0.3, 0.15)
-    gate: bool = True
-    focal: float | None = None
-    field_of_view: float | None = None
-
-    def __post_init__(self) -> None:
-        if not self.widths or not all(0.02 <= width <= 10 for width in self.widths):
-            raise InputError(f"HybridOptions: widths from 0.02 to 10 half widths of the image, got {self.widths}")
-
-    def parametric(self, model: LensModel | str) -> CalibrationOptions:
-        """What a parametric model is calibrated with."""
-        return CalibrationOptions(
-            model=model,
-            board_warp=self.board_warp,
-            weighted=self.weighted,
-            focal=self.focal,
-            field_of_view=self.field_of_view,
-        )
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class HybridResult:
-    """What `calibrate_hybrid` found, and why it returns what it returns.
-
-    Args:
-        calibration: of the camera that is returned, a `HybridCamera` or the best parametric `Camera`. A hybrid's σ
-            counts what the averaged fits disagree about.
-        kept: whether the hybrid is returned.
-        reason: one sentence that says why.
-        held_out: name -> RMS (pixels, by the corners' weights) on views that were held out in groups, their poses
-            solved again: of each parametric model and of "hybrid". Infinite where a model could not show a corner.
-        groups: how many groups of views there were.
-        shares: how much each prior counts in the average that makes the field.
-        effective: how many of the field's weights the data determine, in effect; `units` x 2 there are.
-        units: of the field.
-        largest: the most that the field moves a point, pixels.
-    """
-
-    calibration: CameraCalibrationResult
-    kept: bool
-    reason: str
-    held_out: dict[str, float]
-    groups: int
-    shares: tuple[tuple[Prior, float], ...]
-    effective: float
-    units: int
-    largest: float
 
 
 def calibrate_hybrid(
@@ -149,19 +73,20 @@ def calibrate_hybrid(
         ...     pixels = pixels + 0.1 * torch.randn(pixels.shape, dtype=torch.float64, generator=noise)
         ...     views.append(View(name=str(i), pixels=pixels.tolist()))
         >>> seen = Observations(board=board, image_size=(640, 480), views=views)
-        >>> options = HybridOptions(model="opencv5", rivals=("opencv4",), widths=(1.0,), groups="views")
+        >>> options = HybridOptions(models=("opencv5",), rivals=("opencv4",), widths=(1.0,), groups="views")
         >>> result = calibrate_hybrid(seen, options)
         >>> result.kept, type(result.calibration.camera).__name__  # the lens is parametric, and so is the answer
         (False, 'Camera')
     """
     options = options or HybridOptions()
     groups = group_views(observations, options.groups)
-    base = LensModel.named(options.model)
-    solved = alone(solve(observations, options.parametric(base), progress))
+    solutions = _Solutions(observations, options, progress)
+    models = tuple(dict.fromkeys(LensModel.named(model) for model in options.models))
+    first = solutions[models[0]]
     covariances = observations.covariances() if options.weighted else None
     weights = None
-    if covariances is not None and solved.variance is not None:
-        weights = whitening(covariances, solved.variance)[:, None]
+    if covariances is not None and first.variance is not None:
+        weights = whitening(covariances, first.variance)[:, None]
     setting = GroupedViews(
         board_points=observations.board.points,
         pixels=observations.pixels()[:, None],
@@ -169,48 +94,95 @@ def calibrate_hybrid(
         groups=groups,
         free_warp=options.board_warp,
     )
-    grid, half = _grid(solved, observations.image_size, options.widths)
-    precisions = [prior.precision(grid, half) for prior in CANDIDATES]
-    none = Field(grid, torch.zeros(2, grid.count, dtype=torch.float64))
-    forms = _forms(setting, base, solved.result.state, none)
-
     parts = deal(len(groups), PARTS)
-    held_out = {"hybrid": _judge_hybrid(setting, base, solved, forms, grid, precisions, parts)}
-    progress("hybrid judged")
+    bases = []
+    for model in models:
+        bases.append(_base(setting, observations.image_size, model, solutions[model], options.widths, parts))
+        progress(f"{model} with a field judged")
+    bases.sort(key=lambda base: base.held_out)
+    rivals = {}
     for rival in dict.fromkeys(LensModel.named(r) for r in options.rivals):
-        own = solved if rival == base else alone(solve(observations, options.parametric(rival), lambda _: None))
-        held_out[str(rival)] = judge_parametric(setting, rival, own, parts)
+        rivals[str(rival)] = judge_parametric(setting, rival, solutions[rival], parts)
         progress(f"{rival} judged")
 
-    best = min((name for name in held_out if name != "hybrid"), key=lambda name: held_out[name], default=None)
-    wins = best is None or held_out["hybrid"] < held_out[best]
     everything = torch.ones(len(groups), dtype=torch.bool)
-    shares = stack_weights(forms, everything, precisions)
-    final, field, last, settled = _settle(setting, base, solved, grid, precisions, shares)
-    reason = _reason(held_out, best, wins, settled)
-    kept = settled and (wins or not options.gate)
-    if kept:
-        covariance = _covariance(last, precisions, shares)
-        calibration = _result(setting, observations.image_size, base, final, field, solved, covariance)
+    for base in bases:
+        shares = stack_weights(base.forms, everything, base.precisions)
+        final, field, last, settled = _settle(setting, base, shares)
+        if settled:
+            break
     else:
-        calibration = calibrate_camera(observations, options.parametric(best or base))
-    unit = _focal(final)
-    form = forms.total(everything)
+        base = bases[0]
+        shares = stack_weights(base.forms, everything, base.precisions)
+    held_out = {"hybrid": base.held_out, **rivals}
+    best = min(rivals, key=lambda name: rivals[name], default=None)
+    wins = best is None or base.held_out < rivals[best]
+    if settled and (wins or not options.gate):
+        covariance = _covariance(last, base.precisions, shares)
+        calibration = _result(setting, observations.image_size, base, final, field, covariance)
+    else:
+        calibration = calibrate_camera(observations, options.parametric(best or base.model))
+    form = base.forms.total(everything)
     return HybridResult(
         calibration=calibration,
-        kept=kept,
-        reason=reason,
+        kept=settled and (wins or not options.gate),
+        reason=_reason(held_out, best, wins, settled),
         held_out=held_out,
+        model=base.model,
         groups=len(groups),
         shares=tuple((prior, share) for prior, share in zip(CANDIDATES, shares.tolist(), strict=True) if share > 1e-3),
         effective=sum(
-            share * forms.freedom(form, precision)
-            for share, precision in zip(shares.tolist(), precisions, strict=True)
+            share * base.forms.freedom(form, precision)
+            for share, precision in zip(shares.tolist(), base.precisions, strict=True)
             if share > 1e-3
         ),
-        units=grid.count,
-        largest=FieldResidual(grid, field.weights).bounds()[0] * unit if settled else math.nan,
+        units=base.grid.count,
+        largest=FieldResidual(base.grid, field.weights).bounds()[0] * _focal(final) if settled else math.nan,
     )
+
+
+class _Solutions(dict[LensModel, Solved]):
+    """Parametric solutions, each found when it is first asked for."""
+
+    def __init__(self, observations: Observations, options: HybridOptions, progress: Progress) -> None:
+        super().__init__()
+        self._ask = observations, options, progress
+
+    def __missing__(self, model: LensModel) -> Solved:
+        observations, options, progress = self._ask
+        self[model] = alone(solve(observations, options.parametric(model), progress))
+        return self[model]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Base:
+    """A lens model that a field may correct, and how well the two do on groups that were held out (RMS)."""
+
+    model: LensModel
+    solved: Solved
+    grid: FieldGrid
+    precisions: list[Tensor]
+    forms: Forms
+    held_out: float
+
+
+def _base(
+    setting: GroupedViews,
+    size: tuple[int, int],
+    model: LensModel,
+    solved: Solved,
+    widths: Sequence[float],
+    parts: Sequence[Tensor],
+) -> _Base:
+    grid, half = _grid(solved, size, widths)
+    precisions = [prior.precision(grid, half) for prior in CANDIDATES]
+    forms = _forms(setting, model, solved.result.state, _no_field(grid))
+    base = _Base(model=model, solved=solved, grid=grid, precisions=precisions, forms=forms, held_out=math.nan)
+    return dataclasses.replace(base, held_out=_judge_hybrid(setting, base, parts))
+
+
+def _no_field(grid: FieldGrid) -> Field:
+    return Field(grid, torch.zeros(2, grid.count, dtype=torch.float64))
 
 
 def _reason(held_out: dict[str, float], best: str | None, wins: bool, settled: bool) -> str:
@@ -260,27 +232,18 @@ def _refit(
     return minimise(setting.problem(model, chosen, field, terms), some_views(state, chosen), REFIT).state
 
 
-def _judge_hybrid(
-    setting: GroupedViews,
-    model: LensModel,
-    solved: Solved,
-    forms: Forms,
-    grid: FieldGrid,
-    precisions: Sequence[Tensor],
-    parts: Sequence[Tensor],
-) -> float:
+def _judge_hybrid(setting: GroupedViews, base: _Base, parts: Sequence[Tensor]) -> float:
     """RMS on each part of the groups of a hybrid whose priors and weights come from the other parts alone."""
-    total, state = 0.0, solved.result.state
-    none = Field(grid, torch.zeros(2, grid.count, dtype=torch.float64))
+    total, state, forms = 0.0, base.solved.result.state, base.forms
     for part in parts:
         chosen = torch.ones(len(forms.counts), dtype=torch.bool)
         chosen[part] = False
-        step = average_fit(forms, chosen, precisions, stack_weights(forms, chosen, precisions))
-        field = _stepped(none, step, forms, _focal(state))
+        step = average_fit(forms, chosen, base.precisions, stack_weights(forms, chosen, base.precisions))
+        field = _stepped(_no_field(base.grid), step, forms, _focal(state))
         train = [i for g in chosen.nonzero()[:, 0].tolist() for i in setting.groups[g]]
-        *shared, _, _ = _refit(setting, model, state, train, field, solved.minimum.terms)
+        *shared, _, _ = _refit(setting, base.model, state, train, field, base.solved.minimum.terms)
         views = [i for g in part.tolist() for i in setting.groups[g]]
-        total += setting.held_out(model, (*shared, *state[-2:]), views, field)
+        total += setting.held_out(base.model, (*shared, *state[-2:]), views, field)
     return math.sqrt(total / setting.count)
 
 
@@ -288,25 +251,18 @@ def _focal(state: State) -> float:
     return float(state[0][:2].log().mean().exp())
 
 
-def _settle(
-    setting: GroupedViews,
-    model: LensModel,
-    solved: Solved,
-    grid: FieldGrid,
-    precisions: Sequence[Tensor],
-    shares: Tensor,
-) -> tuple[State, Field, Forms, bool]:
+def _settle(setting: GroupedViews, base: _Base, shares: Tensor) -> tuple[State, Field, Forms, bool]:
     """The averaged fit of all views: a step of the field, all else solved again, anew until it stands still.
 
     Returns the state, its field, the last forms, and whether it settled.
     """
-    state = solved.result.state
-    field = Field(grid, torch.zeros(2, grid.count, dtype=torch.float64))
+    model, terms = base.model, base.solved.minimum.terms
+    state, field = base.solved.result.state, _no_field(base.grid)
     every = torch.ones(len(setting.groups), dtype=torch.bool)
     before = math.inf
     for _ in range(_ROUNDS):
         forms = _forms(setting, model, state, field)
-        step = average_fit(forms, every, precisions, shares)
+        step = average_fit(forms, every, base.precisions, shares)
         now = forms.total(every)
         noise = float(now[-1, -1])
         # How much the step changes the residuals, as their squared length.
@@ -316,7 +272,7 @@ def _settle(
         steady = math.isfinite(moved) and moved < 4.0 * before
         if not steady or not field_bounds(after)[1] <= LARGEST_SLOPE:
             return state, field, forms, False
-        state = _refit(setting, model, state, range(len(setting.pixels)), after, solved.minimum.terms)
+        state = _refit(setting, model, state, range(len(setting.pixels)), after, terms)
         field, before = after, moved
         if moved <= _STILL**2 * noise / setting.count:
             break
@@ -339,16 +295,17 @@ def _covariance(forms: Forms, precisions: Sequence[Tensor], shares: Tensor) -> T
 def _result(
     setting: GroupedViews,
     size: tuple[int, int],
-    model: LensModel,
+    base: _Base,
     state: State,
     field: Field,
-    solved: Solved,
     covariance: Tensor,
 ) -> CameraCalibrationResult:
-    problem = setting.problem(model, range(len(setting.pixels)), field)
+    problem = setting.problem(base.model, range(len(setting.pixels)), field)
     state = problem.tidy(state)
     s = problem.unpack(state)
-    camera = HybridCamera(s.parameters[0], size=size, model=model, residual=FieldResidual(field.grid, field.weights))
+    camera = HybridCamera(
+        s.parameters[0], size=size, model=base.model, residual=FieldResidual(field.grid, field.weights)
+    )
     residuals = problem.pixel_errors(state)[:, 0].transpose(-1, -2)
     seen = problem.seen[:, 0]
     squared = (residuals**2).sum(-1)
@@ -367,7 +324,7 @@ def _result(
         sigma={camera.names[i]: float(of_all[i, i].sqrt()) for i in free},
         covariance=of_all,
         status=Status.CONVERGED,
-        iterations=solved.spent,
+        iterations=base.solved.spent,
         warnings=(),
     )
 

@@ -166,7 +166,7 @@ class TestStacking:
 @functools.cache
 def solved(field: float, gate: bool = True) -> HybridResult:
     seen, *_ = views(field, 0.05, 20)
-    options = HybridOptions(model="opencv5", rivals=("opencv5",), widths=(1.2, 0.6, 0.3), gate=gate)
+    options = HybridOptions(models=("opencv5",), rivals=("opencv5",), widths=(1.2, 0.6, 0.3), gate=gate)
     return calibrate_hybrid(seen, options)
 
 
