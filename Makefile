@@ -26,7 +26,10 @@ check: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# The folder kcal is there for the examples in its docstrings.
+# The folder kcal is there for the examples in its docstrings. One thread in each of the processes, or they would wait
+# for each other.
+test: export OMP_NUM_THREADS = 1
+test: export OPENBLAS_NUM_THREADS = 1
 test: check
 	$(BIN)/python -m pytest -n 2 kcal tests
 
