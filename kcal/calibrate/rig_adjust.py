@@ -25,6 +25,9 @@ Intrinsics = Literal["fixed", "prior", "free"]
 Source = Literal["boards", "landmarks", "features", "baselines", "positions"]
 # Chance that any good item at all is taken for a wrong one.
 _FALSE_ALARM = 1e-3
+# Of fewer boards nobody can say what is typical where lenses are not quite their models; one does not belong then if
+# its residuals are so many times as large as their noise.
+_FEW_BOARDS, _WORSE_BOARD = 4, 3.0
 # px; of a corner.
 _LEAST_SIGMA = 1e-3
 # The kinds of items, in the order of masks.
@@ -152,8 +155,11 @@ class Adjustment:
         """χ² beyond which items do not belong: where all of a kind fit worse than stated, they are judged by that."""
         total = sum(int((f > 0).sum()) for f in freedom)
         level = 1.0 - _FALSE_ALARM / max(total, 1)
-        each = zip(squares, freedom, strict=True)
-        return [max(1.0, typical_excess(s, dof)) * chi2_quantile(dof.double(), level) for s, dof in each]
+        each = [(max(1.0, typical_excess(s, f)), f.double()) for s, f in zip(squares, freedom, strict=True)]
+        boards, *others = [excess * chi2_quantile(dof, level) for excess, dof in each]
+        if int((freedom[0] > 0).sum()) < _FEW_BOARDS:
+            boards = torch.maximum(boards, _WORSE_BOARD**2 * freedom[0])
+        return [boards, *others]
 
     def fit_corners(self, masks: Sequence[Tensor], *, robust: bool = False) -> None:
         """Set the corners' sigma from the boards' residuals, unless it was given.
