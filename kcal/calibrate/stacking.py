@@ -93,7 +93,8 @@ def simplex_minimum(matrix: Tensor) -> Tensor:
     values = (matrix / matrix.diagonal().min()).numpy()
     # Steps along the simplex alone count: what all candidates have in common does not change there.
     curved = values - values.mean(0) - values.mean(1, keepdims=True) + values.mean()
-    rate = 1.0 / max(float(np.linalg.eigvalsh(0.5 * (curved + curved.T))[-1]), 1e-300)
+    # A single candidate, or candidates alike, have no curvature.
+    rate = 1.0 / max(float(np.linalg.eigvalsh(0.5 * (curved + curved.T))[-1]), 1e-9)
     weights = np.full(len(values), 1.0 / len(values))
     ahead, momentum = weights, 1.0
     for trial in range(_STEPS):

@@ -130,6 +130,9 @@ class TestForms:
 
 
 class TestStacking:
+    def test_one_candidate_takes_all(self) -> None:
+        torch.testing.assert_close(simplex_minimum(torch.tensor([[3.0]], dtype=torch.float64)), torch.ones(1).double())
+
     def test_simplex_minimum_is_one(self) -> None:
         generator = torch.Generator().manual_seed(3)
         for _ in range(10):
