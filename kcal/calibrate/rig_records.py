@@ -130,7 +130,7 @@ def _moved(work: Adjustment, index: int) -> float:
 def _reason(work: Adjustment, kind: Source, pixels: Sequence[float | None], sigmas: float) -> str:
     seen = [(value, name) for value, name in zip(pixels, work.data.names, strict=True) if value is not None]
     text = ", ".join(
-        f"{value:.1f} px in {name}" if math.isfinite(value) else f"not seen by {name}" for value, name in seen
+        f"{value:.2g} px in {name}" if math.isfinite(value) else f"not seen by {name}" for value, name in seen
     )
     if kind == "landmarks":
         return f"its marks are off the surveyed place by {text} ({sigmas:.0f} sigma): a wrong mark or survey"
