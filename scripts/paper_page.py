@@ -171,8 +171,7 @@ def _table_3(rigs: Results) -> list[str]:
         *lines,
         "",
         f"From 14 to 20 coefficients the paper's residual falls by 0.1 %; here by {text}. The paper's flat table is "
-        f"what "
-        "corner noise looks like: its 0.2 px hide whatever the lens does. Kept small, the noise shows where 14 "
+        "what corner noise looks like: its 0.2 px hide whatever the lens does. Kept small, the noise shows where 14 "
         "coefficients end, if the lens is one that they cannot follow.",
     ]
 

@@ -80,7 +80,7 @@ def calibrate_hybrid(
     """
     options = options or HybridOptions()
     groups = group_views(observations, options.groups)
-    solutions = _Solutions(observations, options, progress)
+    solutions = _Solutions(observations, options)
     models = tuple(dict.fromkeys(LensModel.named(model) for model in options.models))
     first = solutions[models[0]]
     covariances = observations.covariances() if options.weighted else None
@@ -117,7 +117,8 @@ def calibrate_hybrid(
     held_out = {"hybrid": base.held_out, **rivals}
     best = min(rivals, key=lambda name: rivals[name], default=None)
     wins = best is None or base.held_out < rivals[best]
-    if settled and (wins or not options.gate):
+    kept = settled and (wins or not options.gate)
+    if kept:
         covariance = _covariance(last, base.precisions, shares)
         calibration = _result(setting, observations.image_size, base, final, field, covariance)
     else:
@@ -125,7 +126,7 @@ def calibrate_hybrid(
     form = base.forms.total(everything)
     return HybridResult(
         calibration=calibration,
-        kept=settled and (wins or not options.gate),
+        kept=kept,
         reason=_reason(held_out, best, wins, settled),
         held_out=held_out,
         model=base.model,
@@ -144,13 +145,13 @@ def calibrate_hybrid(
 class _Solutions(dict[LensModel, Solved]):
     """Parametric solutions, each found when it is first asked for."""
 
-    def __init__(self, observations: Observations, options: HybridOptions, progress: Progress) -> None:
+    def __init__(self, observations: Observations, options: HybridOptions) -> None:
         super().__init__()
-        self._ask = observations, options, progress
+        self._ask = observations, options
 
     def __missing__(self, model: LensModel) -> Solved:
-        observations, options, progress = self._ask
-        self[model] = alone(solve(observations, options.parametric(model), progress))
+        observations, options = self._ask
+        self[model] = alone(solve(observations, options.parametric(model), lambda _: None))
         return self[model]
 
 

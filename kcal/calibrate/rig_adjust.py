@@ -126,21 +126,11 @@ class Adjustment:
 
     def squares(self, masks: Sequence[Tensor]) -> list[Tensor]:
         """χ² of every item as things stand; NaN for items outside the masks and infinite for what cannot be seen."""
-        found = []
-        for mask, part in zip(masks, self.problem(masks).block_squares(self.part(masks)), strict=True):
-            whole = torch.full(mask.shape, math.nan, dtype=torch.float64)
-            whole[mask] = part.nan_to_num(math.inf, math.inf)
-            found.append(whole)
-        return found
+        return _of_all(masks, self.problem(masks).block_squares(self.part(masks)))
 
     def deletions(self, masks: Sequence[Tensor]) -> list[Tensor]:
         """By how much χ² would fall without each item (`RigProblem.deletions`); NaN outside the masks."""
-        found = []
-        for mask, part in zip(masks, self.problem(masks).deletions(self.part(masks)), strict=True):
-            whole = torch.full(mask.shape, math.nan, dtype=torch.float64)
-            whole[mask] = part.nan_to_num(math.inf, math.inf)
-            found.append(whole)
-        return found
+        return _of_all(masks, self.problem(masks).deletions(self.part(masks)))
 
     def freedom(self, masks: Sequence[Tensor]) -> list[Tensor]:
         """Degrees of freedom of every item beyond its own unknowns; 0 outside the masks."""
@@ -177,6 +167,16 @@ class Adjustment:
         if dof > 0 and 0 < excess < math.inf:
             # Noise-free corners would otherwise weigh infinitely much.
             self.sigma_corner = max(self.sigma_corner * math.sqrt(excess), _LEAST_SIGMA)
+
+
+def _of_all(masks: Sequence[Tensor], values: Sequence[Tensor]) -> list[Tensor]:
+    """Values of the items inside the masks put among all items: NaN for the others, infinite where there is none."""
+    found = []
+    for mask, part in zip(masks, values, strict=True):
+        whole = torch.full(mask.shape, math.nan, dtype=torch.float64)
+        whole[mask] = part.nan_to_num(math.inf, math.inf)
+        found.append(whole)
+    return found
 
 
 def typical_excess(squares: Tensor, freedom: Tensor) -> float:

@@ -25,6 +25,14 @@ def _positive(name: str, value: float) -> None:
         raise InputError(f"{name}: a positive number is needed, got {value}")
 
 
+def _marked(kind: str, names: tuple[str, ...], pixels: Tensor) -> None:
+    """Refuse marks that are not one in each camera for each name."""
+    count = len(names)
+    if pixels.ndim != 3 or pixels.shape[::2] != (count, 2):
+        raise InputError(f"{kind}: pixels ({count}, C, 2) are needed, got {tuple(pixels.shape)}")
+    _names(kind, names, count)
+
+
 def _names(kind: str, names: tuple[str, ...], count: int) -> None:
     if len(names) != count:
         raise InputError(f"{kind}: {len(names)} names for {count}; one each is needed")
@@ -97,9 +105,7 @@ class Landmarks:
                 f"landmarks: points and sigma ({count}, 3) are needed, got {tuple(self.points.shape)} and "
                 f"{tuple(self.sigma.shape)}"
             )
-        if self.pixels.ndim != 3 or self.pixels.shape[::2] != (count, 2):
-            raise InputError(f"landmarks: pixels ({count}, C, 2) are needed, got {tuple(self.pixels.shape)}")
-        _names("landmarks", self.names, count)
+        _marked("landmarks", self.names, self.pixels)
         require_finite("landmarks: points", as_points("landmarks: points", self.points, 3))
         if not bool((torch.isfinite(self.sigma) & (self.sigma > 0)).all()):
             raise InputError("landmarks: every sigma must be a positive number of metres; nothing is surveyed exactly")
@@ -130,9 +136,7 @@ class Features:
 
     def __post_init__(self) -> None:
         count = len(self.names)
-        if self.pixels.ndim != 3 or self.pixels.shape[::2] != (count, 2):
-            raise InputError(f"features: pixels ({count}, C, 2) are needed, got {tuple(self.pixels.shape)}")
-        _names("features", self.names, count)
+        _marked("features", self.names, self.pixels)
         if self.inverse_range.shape != (count,) or self.inverse_range_sigma.shape != (count,):
             raise InputError(f"features: inverse_range and its sigma ({count},) are needed")
         if not bool((torch.isfinite(self.inverse_range) & (self.inverse_range_sigma > 0)).all()):

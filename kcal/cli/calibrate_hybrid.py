@@ -31,7 +31,7 @@ def calibrate_hybrid_file(
         board_warp=board_warp, focal=focal, field_of_view=fov, groups="views" if groups == "views" else "blocks"
     )
     seen = Observations.load(observations)
-    with steps("calibrating", 2 + len(options.rivals)) as advance:
+    with steps("calibrating", len(options.models) + len(options.rivals)) as advance:
         result = calibrate_hybrid(seen, options, advance)
     found = result.calibration
     record(found, seen, name or observations.name.split(".")[0], observations.name).save(output)
