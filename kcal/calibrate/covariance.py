@@ -20,10 +20,19 @@ _LOST_SHARE = 1e-2
 
 
 class Uncertainty(NamedTuple):
-    """Covariance of the shared parameters (S, S), and whether the data determine each (S,)."""
+    """Covariance of the shared parameters (S, S), and whether the data determine each (S,).
+
+    Where a linearisation is not finite, because a corner lies on a fold of the lens, the covariance is NaN and nothing
+    counts as determined.
+    """
 
     covariance: Tensor
     determined: Tensor
+
+    @property
+    def computed(self) -> bool:
+        """Whether there is a covariance at all."""
+        return bool(torch.isfinite(self.covariance).all())
 
     @property
     def sigma(self) -> Tensor:
@@ -147,6 +156,8 @@ def projection_covariance(
 def _invert(linear: SchurLinearisation) -> tuple[Tensor, Tensor, Tensor]:
     """The inverse of the scaled information (S, S), the scale of each parameter, and whether it is determined."""
     information, scale = linear.information()
+    if not bool(torch.isfinite(information).all() & torch.isfinite(linear.cost)):
+        return torch.full_like(information, torch.nan), scale, torch.zeros_like(scale, dtype=torch.bool)
     eigenvalues, vectors = torch.linalg.eigh(information)
     floor = _RANK_TOLERANCE * eigenvalues[-1]
     lost = (vectors[:, eigenvalues <= floor] ** 2).sum(-1)

@@ -29,7 +29,14 @@ from kcal.calibrate.rules import Free
 from kcal.calibrate.single import LEAST_NOISE, Solved, corner_problem, solve
 from kcal.calibrate.terms import Prior, Term
 from kcal.calibrate.together import Solve, Steps, alone, together
-from kcal.calibrate.verdict import check_focal, opinion_warnings, rival_warnings, standing_out, warnings_of
+from kcal.calibrate.verdict import (
+    NO_ERROR_BARS,
+    check_focal,
+    opinion_warnings,
+    rival_warnings,
+    standing_out,
+    warnings_of,
+)
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
@@ -268,8 +275,13 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
     held = tuple(name for name in camera.names if name in rules.fixed)
     slot = {camera.names[i]: k for i, k in zip(free.indices, free.slots, strict=True)}
     names = [" = ".join(name for name in slot if slot[name] == k) for k in range(len(free))]
-    check_focal({name: float(uncertainty.sigma[k]) for name, k in slot.items()}, s.parameters[0])
-    known = uncertainty.determined.tolist()
+    known, determined = uncertainty.determined.tolist(), uncertainty.determined
+    if uncertainty.computed:
+        check_focal({name: float(uncertainty.sigma[k]) for name, k in slot.items()}, s.parameters[0])
+    else:
+        # Unknown is not the same as undetermined by the views.
+        determined = torch.ones_like(determined)
+        doubts = [NO_ERROR_BARS, *doubts]
     status = Status(int(solved.status))
     return CameraCalibrationResult(
         camera=camera,
@@ -289,7 +301,7 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
         status=status,
         iterations=found.spent,
         covariance=_by_parameter(uncertainty, free, len(camera.names)),
-        warnings=(*warnings_of(observations, camera, rms, per_view, uncertainty.determined, names, status), *doubts),
+        warnings=(*warnings_of(observations, camera, rms, per_view, determined, names, status), *doubts),
     )
 
 
@@ -311,7 +323,8 @@ def _uncertainty(
     plain = problem_with(*known)
     linear, count = plain.linearise(state), plain.shared_size + 6 * len(state[-1])
     own = uncertainty_of(linear, plain.residual_count + plain.prior_count, count)
-    if not is_rich(model) or options.weak_prior is not None or options.camera is not None or not minimum.rivals:
+    unquestioned = options.weak_prior is not None or options.camera is not None or not minimum.rivals
+    if not own.computed or not is_rich(model) or unquestioned:
         return own, []
     noise = max((2.0 * float(linear.cost) / plain.residual_count) ** 0.5, LEAST_NOISE)
     start = minimum.rivals[0][1]

@@ -125,10 +125,11 @@ class CameraCalibrationResult:
         cam_from_board_translation: (V, 3) metres; likewise.
         board_warp: (2,) metres of bend along x and y, or None if not estimated.
         sigma: name -> standard deviation of each parameter, priors counted; None where the data do not determine it and
-            where it was fixed. Skew is listed only if the options name it.
+            where it was fixed; all None, with a warning, where it cannot be computed. Skew is listed only if the
+            options name it.
         covariance: (5 + P, 5 + P) of all parameters in the order of `Camera.names`, poses free: of σ, the square in its
             diagonal. Zero for what was held; what the data leave open has a large variance, which rounding alone limits
-            (σ is None there).
+            (σ is None there). NaN, but for what was held, where it cannot be computed.
         status: why the solver stopped.
         iterations: trial steps of the solver, all starts and models together.
         warnings: sentences about what the user should doubt.

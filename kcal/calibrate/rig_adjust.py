@@ -201,6 +201,8 @@ def _free(data: RigData, camera: int, intrinsics: Intrinsics) -> Free:
         raise InputError(
             f"{data.names[camera]}: a covariance ({size}, {size}) is needed, {tuple(covariance.shape)} given"
         )
+    if not bool(torch.isfinite(covariance).all()):
+        raise InputError(f"{data.names[camera]}: the covariance of its parameters is not finite; calibrate it anew")
     return Free.of((covariance.diagonal() > 0).nonzero()[:, 0].tolist())
 
 

@@ -21,18 +21,23 @@ _MAX_FOCAL_SIGMA = 0.05
 _CLOSE_RIVAL = 25.0
 # A corner this many times farther off than noise explains is told of.
 _GROSS = 2.0
+NO_ERROR_BARS = (
+    "no error bars: a corner lies where the lens model folds, so that σ cannot be computed; choose a smaller model"
+)
 
 
 def check_focal(sigma: Mapping[str, float], parameters: Tensor) -> None:
     """Raise `DegenerateError` where the focal length is hardly known: that is no calibration.
 
     Args:
-        sigma: standard deviations of the free parameters by name, infinite where not determined.
+        sigma: standard deviations of the free parameters by name, infinite where not determined; NaN, of which nothing
+            is known, counts as that.
         parameters: (5 + P,).
     """
-    worst = max((sigma.get(name, 0.0) / float(parameters[i]) for i, name in enumerate(("fx", "fy"))), default=0.0)
+    shares = [sigma.get(name, 0.0) / float(parameters[i]) for i, name in enumerate(("fx", "fy"))]
+    worst = max(math.inf if math.isnan(share) else share for share in shares)
     if not worst <= _MAX_FOCAL_SIGMA:
-        known = "not at all" if worst == float("inf") else f"only to ±{100 * worst:.1f} %"
+        known = "not at all" if math.isinf(worst) else f"only to ±{100 * worst:.1f} %"
         raise DegenerateError(
             f"the views determine the focal length {known}: they are parallel to the image or too much alike; add "
             "views with the board tilted by 30 to 45 degrees in different directions, or choose a smaller model"

@@ -219,7 +219,7 @@ def record(result: CameraCalibrationResult, seen: Observations, name: str, sourc
         result.camera,
         name=name,
         standard_deviations=result.sigma,
-        covariance=result.covariance,
+        covariance=result.covariance if bool(result.covariance.isfinite().all()) else None,
         calibration=CameraCalibration(
             rms=result.rms,
             views=len(seen.views) - len(result.rejected_views),

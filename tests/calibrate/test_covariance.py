@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
-from calibrate_scenes import BOARD, SIZE, camera, motions, pixels_of
+from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
+from kcal.calibrate import mono, rig_adjust
 from kcal.calibrate.covariance import Covariance, covariance, projection_covariance, uncertainty_of
+from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.rig_sources import RigData
+from kcal.calibrate.verdict import check_focal
 from kcal.calibrate.views import free_parameters
-from kcal.errors import InputError
+from kcal.cli.calibrate import record
+from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.projection import project_components
 from kcal.solve.lm import LMOptions, minimise
 from kcal.solve.result import State
+from kcal.solve.schur import SchurLinearisation
 
 TIGHT = LMOptions(max_iterations=300, tolerance=1e-13)
 
@@ -168,3 +176,58 @@ def chi_square_bounds(freedom: int, deviations: float) -> tuple[float, float]:
     share = 2.0 / (9.0 * freedom)
     low, high = (freedom * (1.0 - share + sign * deviations * share**0.5) ** 3 for sign in (-1.0, 1.0))
     return low, high
+
+
+class TestWhatCannotBeComputed:
+    """A corner on a fold has an image but no derivative: σ is unknown then, not an error and no number."""
+
+    def test_no_derivatives_no_covariance(self) -> None:
+        gram = torch.eye(8, dtype=torch.float64)[None].clone()
+        assert uncertainty_of(SchurLinearisation(gram, 6), 9, 7).computed
+        gram[0, 3, 6] = gram[0, 6, 3] = torch.nan
+        found = uncertainty_of(SchurLinearisation(gram, 6), 9, 7)
+        assert not found.computed
+        assert bool(found.covariance.isnan().all())
+        assert not bool(found.determined.any())
+        assert bool(found.sigma.isinf().all())
+
+    def test_the_focal_length_counts_as_unknown(self) -> None:
+        parameters = torch.tensor([500.0, 500.0], dtype=torch.float64)
+        with pytest.raises(DegenerateError, match="not at all"):
+            check_focal({"fx": 1.0, "fy": math.nan}, parameters)
+
+    def test_the_calibration_is_returned_without_error_bars(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        poses = motions(camera(), 8, 3)
+        seen = observe(pixels_of(camera(), poses, noise=0.2))
+        linearise = BoardProblem.linearise
+        calls: list[Tensor] = []
+
+        def folded(problem: BoardProblem, state: State) -> SchurLinearisation:
+            linear = linearise(problem, state)
+            if calls:
+                linear.cost = linear.cost * torch.nan
+            return linear
+
+        def count(*given: object, **named: object) -> object:
+            calls.append(torch.ones(()))
+            return _uncertainty(*given, **named)  # type: ignore[arg-type]
+
+        # Only after the solution was found.
+        _uncertainty = mono._uncertainty
+        monkeypatch.setattr(mono, "_uncertainty", count)
+        monkeypatch.setattr(BoardProblem, "linearise", folded)
+        result = calibrate_camera(seen, CalibrationOptions(model="opencv14"))
+        assert calls
+        assert set(result.sigma.values()) == {None}
+        assert bool(result.covariance.diagonal()[:4].isnan().all())
+        assert any("no error bars" in text for text in result.warnings)
+        assert not any("do not determine" in text for text in result.warnings)
+        assert record(result, seen, "left", "left.json").covariance is None
+
+    def test_a_rig_takes_no_such_prior(self) -> None:
+        cameras = (camera(), camera())
+        size = len(cameras[0].names)
+        unknown = torch.full((size, size), torch.nan, dtype=torch.float64)
+        data = RigData(cameras=cameras, names=("left", "right"), covariances=(unknown, unknown))
+        with pytest.raises(InputError, match="not finite"):
+            rig_adjust._free(data, 0, "prior")
