@@ -8,6 +8,10 @@ Data: `wide_lens_corners.npz` in $KCAL_DATA: 93 views of a 10 x 10 board through
 tour). A lens is fitted to the training views; on each held-out view only its pose is solved again, lens and board warp
 as fitted. Measure: sqrt(sum w² |r|² / count), w the file's weights, pooled over all folds.
 
+`field`, `field-views`: the field alone on opencv8, its priors chosen likewise, but with no other model fitted and
+nothing compared. SPLINED: mrcal's lens of that many knots by `peer_mrcal.py`, where $KCAL_PEERS is a Python that has
+mrcal; it is regularised by a constant, and chooses nothing.
+
 Splits: `blocks20`: 20 contiguous blocks of 4 or 5 views, shuffled with seed 0, dealt to 5 folds; `evenodd`: every
 second view. The hybrid chooses its priors inside each training set alone: `hybrid` on blocks of its views,
 `hybrid-views` on interleaved views.
@@ -16,10 +20,13 @@ second view. The hybrid chooses its priors inside each training set alone: `hybr
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
 import json
 import math
 import os
+import subprocess
+import tempfile
 import time
 from pathlib import Path
 from typing import Any, Literal
@@ -42,7 +49,9 @@ from kcal.solve.lm import LMOptions
 
 PARAMETRIC = ("opencv5", "opencv8", "opencv12", "opencv14", "ext18", "ext20", "ext24")
 HYBRID = ("hybrid", "hybrid-views")
-RIVALS = ("opencv8", "opencv14", "ext20")
+# Their fields alone, on the plain lens: nothing is compared.
+FIELD = ("field", "field-views")
+PEERS = ("SPLINED11x8", "SPLINED16x11")
 EXACT = LMOptions(max_iterations=60, tolerance=1e-12)
 Record = dict[str, Any]
 
@@ -97,15 +106,18 @@ def measure(seen: Observations, weight: np.ndarray, split: str, fold: int, model
     data, test = subset(seen, train), subset(seen, out) if len(out) else None
     start, wall = time.process_time(), time.perf_counter()
     found = []
-    if model in HYBRID:
-        groups: Literal["views", "blocks"] = "views" if model == "hybrid-views" else "blocks"
-        options = HybridOptions(board_warp=True, groups=groups, gate=False, rivals=RIVALS)
+    if model in PEERS:
+        return [{"split": split, "fold": fold, "model": model, **mrcal_splined(seen, weight, train, out, model)}]
+    if model in (*HYBRID, *FIELD):
+        groups: Literal["views", "blocks"] = "views" if model.endswith("-views") else "blocks"
+        options = HybridOptions(board_warp=True, groups=groups, gate=False)
+        if model in FIELD:
+            options = dataclasses.replace(options, models=("opencv8",), rivals=())
         result = calibrate_hybrid(data, options)
-        best = min((name for name in result.held_out if name != "hybrid"), key=lambda name: result.held_out[name])
-        chosen = "hybrid" if result.held_out["hybrid"] < result.held_out[best] else best
         note = {
             "inside": result.held_out,
-            "chosen": chosen,
+            "chosen": result.choice,
+            "base": str(result.model),
             "effective": result.effective,
             "units": result.units,
             "largest": result.largest,
@@ -127,6 +139,39 @@ def measure(seen: Observations, weight: np.ndarray, split: str, fold: int, model
         records.append(record)
         print(json.dumps(record)[:300], flush=True)
     return records
+
+
+def mrcal_splined(
+    seen: Observations, weight: np.ndarray, train: np.ndarray, out: np.ndarray, model: str
+) -> dict[str, float]:
+    """Mrcal's splined lens on the same training set, in the interpreter of $KCAL_PEERS, with one thread."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "problem.npz")
+        np.savez(
+            path,
+            corners=seen.pixels().numpy(),
+            weight=weight,
+            train=train,
+            held=out,
+            image_size=seen.image_size,
+            board_size=(seen.board.columns, seen.board.rows),
+            square_m=seen.board.square,
+            # A rough one is enough: that of a lens of 120 degrees.
+            focal=seen.image_size[0] / (2.0 * math.tan(math.radians(60.0))),
+        )
+        script = Path(__file__).with_name("peer_mrcal.py")
+        told = subprocess.run(
+            [os.environ["KCAL_PEERS"], script, path, model],
+            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": ""},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    if told.returncode:
+        raise SystemExit(f"{model}: {told.stderr[-2000:]}")
+    print(model, told.stdout.strip().splitlines()[-1], flush=True)
+    found: dict[str, float] = json.loads(told.stdout.strip().splitlines()[-1])
+    return found
 
 
 def rms(records: list[Record]) -> float:
@@ -166,7 +211,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON lines, one a fit")
     parser.add_argument("--points", action="store_true", help="what a point costs, instead of the fits")
     parser.add_argument("--splits", nargs="*", default=["blocks20", "evenodd"])
-    parser.add_argument("--models", nargs="*", default=[*PARAMETRIC, *HYBRID])
+    peers = PEERS if os.environ.get("KCAL_PEERS") else ()
+    parser.add_argument("--models", nargs="*", default=[*PARAMETRIC, *HYBRID, *FIELD, *peers])
     parser.add_argument("--write", action="store_true", help="write docs/hybrid.md from the file")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -193,7 +239,8 @@ def main() -> None:
                     with args.out.open("a") as file:
                         file.writelines(json.dumps(record) + "\n" for record in records)
     lines = [row("model", *args.splits, "s (CPU) a fit"), row("---", *["---:"] * (len(args.splits) + 1))]
-    for model in args.models:
+    # From the file alone, peers too where it has them.
+    for model in dict.fromkeys([*args.models, *PEERS]):
         cells, spent = [], []
         for split in args.splits:
             of = [r for r in done if r["split"] == split and r["model"] == model]

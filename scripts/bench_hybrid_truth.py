@@ -6,12 +6,15 @@
 Truth: three lenses of `kcal.sim.prescription`, decentred by their tolerances (`drawn_lens`, strength 1), another draw
 for every seed; views of the paper's board (6 x 7 corners, 5 cm) with Gaussian corner noise. Measure: how far from
 the truth each camera sees infinitely distant points, all over the image, after the best rotation; pixels, RMS and
-largest. `hybrid` is what the gate returns, `field` the hybrid whether it wins or not.
+largest. `hybrid` is what the gate returns, `field` the hybrid whether it wins or not. `14 of a 14`: the error of 14
+coefficients where the truth has no more, which is the lens of 14 that fits the exact corners best, with the same poses
+and noise: what these views can tell, so that no model can be far below it. Rules were made on seeds from 100 on.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import json
 import math
@@ -34,18 +37,42 @@ from kcal.sim.infinity import error_at_infinity
 
 LENSES = ("webcam", "machine-vision", "surveillance")
 BOARD = Board(columns=7, rows=6, square=0.05)
-PARAMETRIC = ("opencv14", "ext20", "ext24")
-MODELS = (*PARAMETRIC, "hybrid", "field")
+PARAMETRIC = ("opencv14", "ext20")
+BOUND = "14 of a 14"
+MODELS = (*PARAMETRIC, "hybrid", "field", BOUND)
 Record = dict[str, Any]
 
 
-def observed(name: str, views: int, sigma: float, seed: int) -> tuple[Observations, Any]:
+@functools.lru_cache(maxsize=1)
+def captured(name: str, views: int, seed: int) -> tuple[Any, Any]:
+    """A lens, and its views with noise of one pixel, which is scaled afterwards."""
     lens = drawn_lens(name, 1.0, seed)
-    capture = capture_corners(lens, views, sigma=sigma, seed=1000 + seed)
+    capture = capture_corners(lens, views, sigma=1.0, seed=1000 + seed)
     assert torch.allclose(capture.points, BOARD.points)
-    pixels = [tuple((u, v) for u, v in view) for view in capture.pixels.tolist()]
-    seen = tuple(View(name=f"{i:03d}", pixels=view) for i, view in enumerate(pixels))
-    return Observations(board=BOARD, image_size=lens.size, views=seen), lens
+    return lens, capture
+
+
+def observations(pixels: torch.Tensor, size: tuple[int, int]) -> Observations:
+    corners = [tuple((u, v) for u, v in view) for view in pixels.tolist()]
+    return Observations(
+        board=BOARD, image_size=size, views=tuple(View(name=f"{i:03d}", pixels=view) for i, view in enumerate(corners))
+    )
+
+
+def observed(name: str, views: int, sigma: float, seed: int) -> tuple[Observations, Any]:
+    lens, capture = captured(name, views, seed)
+    return observations(capture.true_pixels + sigma * (capture.pixels - capture.true_pixels), lens.size), lens
+
+
+def bound(name: str, views: int, sigma: float, seed: int) -> tuple[Any, Any]:
+    """14 coefficients where the truth has no more: the lens that fits the exact corners best, same poses and noise."""
+    lens, capture = captured(name, views, seed)
+    best = calibrate_camera(observations(capture.true_pixels, lens.size), CalibrationOptions(model="opencv14"))
+    points = BOARD.points @ best.cam_from_board_rotation.mT + best.cam_from_board_translation[:, None]
+    pixels, valid = best.camera.project(points)
+    assert bool(valid.all())
+    seen = observations(pixels + sigma * (capture.pixels - capture.true_pixels), lens.size)
+    return calibrate_camera(seen, CalibrationOptions(model="opencv14")).camera, best.camera
 
 
 def cell(name: str, views: int, sigma: float, seed: int) -> list[Record]:
@@ -53,33 +80,39 @@ def cell(name: str, views: int, sigma: float, seed: int) -> list[Record]:
     seen, lens = observed(name, views, sigma, seed)
     out: list[Record] = []
 
-    def note(model: str, camera: Any, start: float, **more: Any) -> None:
-        error = error_at_infinity(camera, lens)
+    def note(model: str, camera: Any, truth: Any, start: float, **more: Any) -> None:
+        error = error_at_infinity(camera, truth)
         record = {"lens": name, "views": views, "sigma": sigma, "seed": seed, "model": model, "rms": error.rms}
         record |= {"max": error.maximum, "valid": error.valid, "cpu_s": time.process_time() - start, **more}
         out.append(record)
         print(json.dumps(record)[:240], flush=True)
+
+    def failed(model: str, error: KcalError, start: float) -> None:
+        print(f"{name} {views} {sigma} {seed} {model}: {error}", flush=True)
+        record = {"lens": name, "views": views, "sigma": sigma, "seed": seed, "model": model}
+        out.append({**record, "rms": math.inf, "max": math.inf, "valid": 0.0, "cpu_s": time.process_time() - start})
 
     parametric = {}
     for model in PARAMETRIC:
         start = time.process_time()
         try:
             parametric[model] = calibrate_camera(seen, CalibrationOptions(model=model)).camera
+            note(model, parametric[model], lens, start)
         except KcalError as error:
-            print(f"{name} {views} {sigma} {seed} {model}: {error}", flush=True)
-            failed = {"lens": name, "views": views, "sigma": sigma, "seed": seed, "model": model}
-            out.append({**failed, "rms": math.inf, "max": math.inf, "valid": 0.0, "cpu_s": time.process_time() - start})
-            continue
-        note(model, parametric[model], start)
+            failed(model, error, start)
     start = time.process_time()
-    result = calibrate_hybrid(seen, HybridOptions(groups="views", rivals=("opencv8", "opencv14", "ext20"), gate=False))
-    note("field", result.calibration.camera, start, inside=result.held_out, effective=result.effective)
-    best = min((name for name in result.held_out if name != "hybrid"), key=lambda name: result.held_out[name])
-    if result.held_out["hybrid"] < result.held_out[best]:
-        note("hybrid", result.calibration.camera, start, chosen="hybrid")
-    else:
-        camera = parametric.get(best) or calibrate_camera(seen, CalibrationOptions(model=best)).camera
-        note("hybrid", camera, start, chosen=best)
+    try:
+        note(BOUND, *bound(name, views, sigma, seed), start)
+    except KcalError as error:
+        failed(BOUND, error, start)
+    start = time.process_time()
+    result = calibrate_hybrid(seen, HybridOptions(groups="views", gate=False))
+    more = {"inside": result.held_out, "effective": result.effective, "base": str(result.model)}
+    note("field", result.calibration.camera, lens, start, **more)
+    camera = result.calibration.camera
+    if result.choice != "hybrid":
+        camera = parametric.get(result.choice) or calibrate_camera(seen, CalibrationOptions(model=result.choice)).camera
+    note("hybrid", camera, lens, start, chosen=result.choice)
     return out
 
 
@@ -125,12 +158,16 @@ def main() -> None:
     done = [json.loads(line) for line in args.out.read_text().splitlines()] if args.out.exists() else []
     have = {(r["lens"], r["views"], r["sigma"], r["seed"]) for r in done}
     cells = itertools.product(args.views, range(0 if args.write else args.seeds), args.lenses, args.sigma)
-    for views, seed, lens, sigma in cells:
-        if (lens, views, sigma, seed) not in have:
-            records = cell(lens, views, sigma, seed)
-            done += records
-            with args.out.open("a") as file:
-                file.writelines(json.dumps(record) + "\n" for record in records)
+    todo = [(lens, views, sigma, seed) for views, seed, lens, sigma in cells if (lens, views, sigma, seed) not in have]
+    start, whole = time.process_time(), sum(views for _, views, *_ in todo)
+    for i, which in enumerate(todo):
+        records = cell(*which)
+        done += records
+        with args.out.open("a") as file:
+            file.writelines(json.dumps(record) + "\n" for record in records)
+        spent, past = time.process_time() - start, sum(views for _, views, *_ in todo[: i + 1])
+        left = spent * (whole / past - 1.0) / 60.0
+        print(f"{i + 1} of {len(todo)} cells, {spent / (i + 1):.1f} CPU s each, some {left:.0f} min left", flush=True)
     lines = show(table(done))
     if args.write:
         about = (__doc__ or "").split("Truth: ")[1]

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from bench_hybrid import RIVALS, folds, held_out, load, subset
+from bench_hybrid import folds, held_out, load, subset
 from page import write_section
 from timing import row, show
 from torch import Tensor
@@ -219,7 +219,7 @@ def fit_all(data: Data, steps: int, rates: dict[str, float]) -> dict[str, Fitted
         out[name] = Fitted(trained, warp, seconds)
 
     clock = time.process_time()
-    result = calibrate_hybrid(data.seen, HybridOptions(board_warp=True, gate=False, rivals=RIVALS)).calibration
+    result = calibrate_hybrid(data.seen, HybridOptions(board_warp=True, gate=False)).calibration
     assert result.board_warp is not None
     out["field, `calibrate_hybrid` without its gate"] = Fitted(
         result.camera, result.board_warp, time.process_time() - clock

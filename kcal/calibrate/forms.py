@@ -21,8 +21,9 @@ from kcal.lens.projection import INTRINSICS
 from kcal.lens.residual import Field, field_basis
 from kcal.solve.result import State
 
-# Relative to the scaled normal matrix, whose diagonal is one: keeps its factors apart from rounding.
-_JITTER = 1e-13
+# Relative to the scaled normal matrix, whose diagonal is one: keeps its factors apart from rounding. The first that
+# does: a lens whose coefficients nearly cancel needs more.
+_JITTERS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,12 +35,14 @@ class Forms:
 
     Args:
         groups: (G, S + 1, S + 1).
+        inner: likewise, of the corners that are not next to the border of what was seen.
         counts: (G,) corners.
         lens: how many unknowns come before the weights.
         weights: (2 K,) of the field at the state, pixels.
     """
 
     groups: Tensor
+    inner: Tensor
     counts: Tensor
     lens: int
     weights: Tensor
@@ -47,6 +50,13 @@ class Forms:
     def total(self, chosen: Tensor) -> Tensor:
         """The form (S + 1, S + 1) of all groups in a mask (G,)."""
         return self.groups[chosen].sum(0)
+
+    def inside(self, chosen: Tensor) -> Tensor:
+        """Likewise without the corners next to the border.
+
+        `total` minus this is what predicting those costs, with the poses given by the others.
+        """
+        return self.inner[chosen].sum(0)
 
     def fit(self, form: Tensor, precision: Tensor) -> Tensor:
         """The best step (S + 1,), with a last 1, under Gaussian priors on the weights alone.
@@ -68,10 +78,7 @@ class Forms:
         matrix = form[used][:, used]
         matrix.diagonal()[self.lens :].add_(precision[own])
         gradient[self.lens :] += precision[own] * self.weights[own]
-        scale = matrix.diagonal().clamp_min(1e-300).rsqrt()
-        matrix = matrix * scale[:, None] * scale
-        matrix.diagonal().add_(_JITTER)
-        factor = torch.linalg.cholesky(matrix)
+        factor, scale = _factor(matrix)
         step[used] = -torch.cholesky_solve((gradient * scale)[:, None], factor)[:, 0] * scale
         return step
 
@@ -80,11 +87,9 @@ class Forms:
         used = torch.cat([torch.ones(self.lens, dtype=torch.bool), torch.isfinite(precision)]).nonzero()[:, 0]
         matrix = form[used][:, used]
         matrix.diagonal()[self.lens :].add_(precision[used[self.lens :] - self.lens])
-        scale = matrix.diagonal().clamp_min(1e-300).rsqrt()
-        matrix = matrix * scale[:, None] * scale
-        matrix.diagonal().add_(_JITTER)
+        factor, scale = _factor(matrix)
         first = torch.eye(len(used), self.lens, dtype=form.dtype)
-        inverse = torch.cholesky_solve(first, torch.linalg.cholesky(matrix))
+        inverse = torch.cholesky_solve(first, factor)
         return inverse[: self.lens] * scale[: self.lens, None] * scale[: self.lens]
 
     def freedom(self, form: Tensor, precision: Tensor) -> float:
@@ -98,7 +103,26 @@ class Forms:
         return float(torch.linalg.solve(field + torch.diag(precision[own]), field).diagonal().sum())
 
 
-def linearise_views(problem: BoardProblem, state: State, field: Field, sizes: Sequence[int]) -> Forms:
+def _factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Cholesky's factor of a normal matrix once it is scaled, and the scale of each unknown."""
+    scale = matrix.diagonal().clamp_min(1e-300).rsqrt()
+    scaled = matrix * scale[:, None] * scale
+    before = 0.0
+    for jitter in _JITTERS:
+        scaled.diagonal().add_(jitter - before)
+        before = jitter
+        factor, failed = torch.linalg.cholesky_ex(scaled)
+        if not bool(failed):
+            break
+    else:
+        # NaN says so to whoever compares.
+        factor = torch.full_like(factor, torch.nan)
+    return factor, scale
+
+
+def linearise_views(
+    problem: BoardProblem, state: State, field: Field, sizes: Sequence[int], inner: BoardProblem | None = None
+) -> Forms:
     """Fold views into forms.
 
     Args:
@@ -106,6 +130,7 @@ def linearise_views(problem: BoardProblem, state: State, field: Field, sizes: Se
         state: of this problem.
         field: at the state, the same.
         sizes: how many views each group has; the views are in the order of the groups.
+        inner: the same problem without the corners next to the border; None: none is next to it.
     """
     s = problem.unpack(state)
     parameters, model = s.parameters[0], problem.models[0]
@@ -119,29 +144,74 @@ def linearise_views(problem: BoardProblem, state: State, field: Field, sizes: Se
     zero = torch.zeros_like(fx)
     # Along u and v by a shift along x and along y of the plane, per pixel of weight.
     along = torch.stack([torch.stack([fx, zero]), torch.stack([skew, fy])]) / unit
-    forms, counts = [], []
+    groups, inside, counts = [], [], []
     start = 0
     for size in sizes:
         chosen = slice(start, start + size)
         start += size
-        basis = field_basis(x[chosen], y[chosen], field.grid) * seen[chosen, None]
-        rows = problem.rows(_some(state, chosen), chosen)
-        pose, shared, residual = rows[:, :6], rows[:, 6:-1], rows[:, -1:]
+        basis = field_basis(x[chosen], y[chosen], field.grid)
+        rows = problem.rows(_some(state, chosen), chosen).unflatten(-1, (2, -1))
         moved = problem.whiten(along[:, :, None].expand(size, 2, 2, x.shape[-1]), chosen)
-        by_weight = (moved[:, :, None] * basis[:, None, :, None]).flatten(1, 2).flatten(-2)
-        others = torch.cat([shared, by_weight, residual], 1)
-        factor = torch.linalg.cholesky(pose @ pose.transpose(-1, -2))
-        across = torch.linalg.solve_triangular(factor, pose, upper=False)
-        others = others - (others @ across.transpose(-1, -2)) @ across
-        flat = others.transpose(0, 1).flatten(1)
-        forms.append(flat @ flat.T)
+        groups.append(_eliminated(rows, moved, basis, seen[chosen]))
+        left = seen[chosen] if inner is None else inner.seen[chosen, 0]
+        same = torch.equal(left, seen[chosen])
+        inside.append(groups[-1] if same else _eliminated(rows, moved, basis, left))
         counts.append(int(seen[chosen].sum()))
     return Forms(
-        groups=torch.stack(forms),
+        groups=torch.stack(groups),
+        inner=torch.stack(inside),
         counts=torch.tensor(counts),
         lens=problem.shared_size,
         weights=field.weights.flatten() * unit,
     )
+
+
+def _eliminated(rows: Tensor, moved: Tensor, basis: Tensor, seen: Tensor) -> Tensor:
+    """The quadratic form of some views, their poses eliminated.
+
+    Args:
+        rows: (V, 6 + L + 1, 2, N) derivatives by pose, lens and warp, and last the residuals.
+        moved: (V, 2, 2, N) what a shift along x and one along y move, u and v of each corner.
+        basis: (V, K, N) units of the field at each corner.
+        seen: (V, N) corners that count.
+    """
+    rows = (rows * seen[:, None, None]).flatten(-2)
+    pose, others = rows[:, :6], rows[:, 6:]
+    factor = torch.linalg.cholesky(pose @ pose.transpose(-1, -2))
+    across = torch.linalg.solve_triangular(factor, pose, upper=False)
+    # Lens and residuals with the pose taken out row by row: a difference of products would leave little of them.
+    others = others - (others @ across.transpose(-1, -2)) @ across
+    # (K, V N): the field's columns are these, weighed, and the same for x and y.
+    units = (basis * seen[:, None]).transpose(0, 1).flatten(1)
+
+    def weighed(values: Tensor) -> Tensor:
+        """(V, P, 2, N): rows (V, P, R) along x and y at each corner."""
+        return torch.einsum("vpun,vqun->vpqn", values.unflatten(-1, (2, -1)), moved)
+
+    field = _weighed_products(units, torch.einsum("vqun,vwun->qwvn", moved, moved).flatten(-2))
+    answered = (weighed(across) @ basis.transpose(-1, -2)[:, None]).flatten(0, 1).flatten(1)
+    field = field - answered.T @ answered
+    flat = others.transpose(0, 1).flatten(1)
+    small, mixed = flat @ flat.T, (weighed(others).permute(1, 2, 0, 3).flatten(-2) @ units.T).flatten(1)
+    top = torch.cat([small[:-1, :-1], mixed[:-1], small[:-1, -1:]], 1)
+    middle = torch.cat([mixed[:-1].T, field, mixed[-1:].T], 1)
+    bottom = torch.cat([small[-1:, :-1], mixed[-1:], small[-1:, -1:]], 1)
+    return torch.cat([top, middle, bottom])
+
+
+def _weighed_products(units: Tensor, weights: Tensor) -> Tensor:
+    """(2 K, 2 K): units (K, M) times themselves under weights (2, 2, M) of x and y; no more products than needed."""
+
+    def product(values: Tensor) -> Tensor:
+        return (units * values) @ units.T
+
+    along_x = product(weights[0, 0])
+    # Corners that count alike in all directions need one product for both axes.
+    ratio = float(weights[1, 1].sum() / weights[0, 0].sum().clamp_min(1e-300))
+    alike = torch.allclose(weights[1, 1], ratio * weights[0, 0], rtol=1e-12, atol=0.0)
+    along_y = ratio * along_x if alike else product(weights[1, 1])
+    both = product(weights[0, 1]) if bool(weights[0, 1].any()) else torch.zeros_like(along_x)
+    return torch.cat([torch.cat([along_x, both], 1), torch.cat([both, along_y], 1)])
 
 
 def _some(state: State, views: slice) -> State:

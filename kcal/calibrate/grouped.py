@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Literal
 
 import torch
@@ -28,6 +28,8 @@ PARTS = 5
 _POSES = LMOptions(max_iterations=30, tolerance=1e-10)
 REFIT = LMOptions(max_iterations=100, tolerance=1e-9, flatness=1e-6)
 _LARGEST_GROUPS, _FEWEST_GROUPS, _RUN = 20, 5, 5
+# Of a view's corners so many are left inside the border, at least; fewer would hardly hold its pose.
+_SHARE, _FEWEST_LEFT = 0.4, 12
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -37,6 +39,7 @@ class GroupedViews:
     Args:
         board_points: (N, 3) metres.
         pixels: (V, 1, N, 2), NaN where not seen.
+        inner: (V, 1, N, 2) likewise without the corners next to the border, see `without_border`.
         weights: (V, 1, N, 2, 2) whitening of the corners, or None: all count alike.
         groups: indices of the views of each group.
         free_warp: whether the board's warp is estimated.
@@ -44,6 +47,7 @@ class GroupedViews:
 
     board_points: Tensor
     pixels: Tensor
+    inner: Tensor
     weights: Tensor | None
     groups: list[list[int]]
     free_warp: bool
@@ -64,19 +68,69 @@ class GroupedViews:
             fields=[field],
         )
 
-    def held_out(self, model: LensModel, state: State, views: Sequence[int], field: Field | None) -> float:
-        """Sum of squared residuals of views whose poses are solved again, all else held; infinite without a lens."""
+    def held_out(self, model: LensModel, state: State, field: Field | None, views: Sequence[int]) -> Tensor:
+        """(V,) squared residuals of views whose poses are solved again, all else held; infinite without a lens."""
         chosen = list(views)
         weights = None if self.weights is None else self.weights[chosen]
         _, cost = refine_poses(
             self.board_points, self.pixels[chosen], [model], some_views(state, chosen), _POSES, [field], weights
         )
-        return float(torch.nan_to_num(2.0 * cost, nan=math.inf).sum())
+        return torch.nan_to_num(2.0 * cost, nan=math.inf)
+
+    def judge(self, parts: Sequence[Tensor], fit: Fit) -> Tensor:
+        """(G,) squared residuals (pixels²) of each group under what was fitted without its part.
+
+        Args:
+            parts: numbers of the groups of each part.
+            fit: see `Fit`.
+        """
+        out = torch.zeros(len(self.groups), dtype=torch.float64)
+        for part in parts:
+            held = torch.zeros(len(self.groups), dtype=torch.bool)
+            held[part] = True
+            out[held] = self._by_group(self.held_out(*fit(~held), self.views(held)), held)
+        return out
+
+    def views(self, chosen: Tensor) -> list[int]:
+        """Indices of the views of the groups in a mask (G,), in the order of the groups."""
+        return [i for g in chosen.nonzero()[:, 0].tolist() for i in self.groups[g]]
+
+    def _by_group(self, values: Tensor, chosen: Tensor) -> Tensor:
+        """Sums over the views of each group in a mask, from values in the order of `views`."""
+        sizes = [len(self.groups[g]) for g in chosen.nonzero()[:, 0].tolist()]
+        return torch.stack([own.sum() for own in values.split(sizes)])
 
     @property
     def count(self) -> int:
         """Corners seen."""
         return int(torch.isfinite(self.pixels).all(-1).sum())
+
+    @property
+    def within(self) -> GroupedViews:
+        """The same without the corners next to the border."""
+        return dataclasses.replace(self, pixels=self.inner)
+
+
+# From a mask (G,) of the groups to fit to: the lens, a state with the poses of all views, from which those held out are
+# solved, and the field.
+Fit = Callable[[Tensor], tuple[LensModel, State, Field | None]]
+
+
+def without_border(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """Corners (..., V, N, 2) without those next to the border of what was seen, which become NaN.
+
+    That border lies within the image's, as no board is seen in part. What is taken away is as deep as what nobody saw,
+    on each side, so that predicting it is like predicting the image's edge. Views of which too little would be left
+    stay whole.
+    """
+    seen = torch.isfinite(pixels).all(-1)
+    corners = pixels[seen]
+    low, high = corners.amin(0), corners.amax(0)
+    first = torch.full_like(low, -0.5)
+    last = torch.tensor(size, dtype=pixels.dtype) - 0.5
+    inside = ((pixels > 2.0 * low - first) & (pixels < 2.0 * high - last)).all(-1)
+    enough = (seen & inside).sum(-1, keepdim=True) >= torch.clamp(_SHARE * seen.sum(-1, keepdim=True), min=_FEWEST_LEFT)
+    return torch.where((inside | ~enough)[..., None], pixels, torch.nan)
 
 
 def some_views(state: State, views: Sequence[int]) -> State:
@@ -111,8 +165,8 @@ def group_views(observations: Observations, groups: Literal["blocks", "views"] |
     return found
 
 
-def judge_parametric(setting: GroupedViews, model: LensModel, solved: Solved, parts: Sequence[Tensor]) -> float:
-    """RMS (pixels) of a parametric model on each part of the groups, fitted without that part.
+def judge_parametric(setting: GroupedViews, model: LensModel, solved: Solved, parts: Sequence[Tensor]) -> Tensor:
+    """(G,) squared residuals (pixels²) of each group under a parametric model that was fitted without its part.
 
     Every fit starts from the solution for all views, which can only favour the model.
 
@@ -122,13 +176,12 @@ def judge_parametric(setting: GroupedViews, model: LensModel, solved: Solved, pa
         solved: its solution for all views.
         parts: numbers of the groups of each part.
     """
-    total = 0.0
     start = solved.result.state
-    for part in parts:
-        out = set(part.tolist())
-        train = [i for g, group in enumerate(setting.groups) if g not in out for i in group]
+
+    def fit(chosen: Tensor) -> tuple[LensModel, State, None]:
+        train = setting.views(chosen)
         problem = setting.problem(model, train, terms=solved.minimum.terms)
         *shared, _, _ = minimise(problem, some_views(start, train), REFIT).state
-        views = [i for g in out for i in setting.groups[g]]
-        total += setting.held_out(model, (*shared, *start[-2:]), views, None)
-    return math.sqrt(total / setting.count)
+        return model, (*shared, *start[-2:]), None
+
+    return setting.judge(parts, fit)

@@ -2,37 +2,37 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
-from kcal.calibrate.forms import Forms, linearise_views
-from kcal.calibrate.grouped import PARTS, REFIT, GroupedViews, group_views, judge_parametric, some_views
+from kcal.calibrate.evidence import Contender, choose, surely_worse
+from kcal.calibrate.field_fit import SEEN, FieldFit, Settled, field_covariance, fit_field, focal_of, settle
+from kcal.calibrate.grouped import (
+    PARTS,
+    GroupedViews,
+    group_views,
+    judge_parametric,
+    without_border,
+)
 from kcal.calibrate.hybrid_options import HybridOptions, HybridResult
 from kcal.calibrate.ladder import Progress
-from kcal.calibrate.mono import calibrate_camera
+from kcal.calibrate.mono import judged
 from kcal.calibrate.options import CameraCalibrationResult
 from kcal.calibrate.single import Solved, solve
-from kcal.calibrate.stacking import CANDIDATES, average_fit, deal, stack_weights
-from kcal.calibrate.terms import Term
+from kcal.calibrate.stacking import CANDIDATES, deal
 from kcal.calibrate.together import alone
+from kcal.calibrate.views import free_parameters
 from kcal.calibrate.weights import whitening
 from kcal.corners.observations import Observations
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.model import LensModel
-from kcal.lens.projection import from_pixels
-from kcal.lens.residual import LARGEST_SLOPE, Field, FieldGrid, FieldResidual, field_bounds
-from kcal.solve.lm import minimise
-from kcal.solve.result import State, Status
+from kcal.lens.residual import FieldResidual
+from kcal.solve.result import Status
 
-# Rounds of averaging anew where the last average stands, until a step moves no corner by more than this share of the
-# noise.
-_ROUNDS, _STILL = 6, 0.02
-# The last step may still move the residuals by this share of their squared length.
-_SETTLED = 1e-4
+# A field of fewer weights in effect is what chance leaves of none.
+_LEAST = 3.0
 
 
 def calibrate_hybrid(
@@ -43,8 +43,10 @@ def calibrate_hybrid(
     From the parametric solution, the lens, the board's warp, all poses and the weights of a field of several widths
     are fitted jointly under Gaussian priors of the weights: what the intrinsics or the lens can carry, they do.
     Fits under thirteen priors, from no field to an almost free one, are averaged so that the average does best on
-    held-out groups of views. The same, done again without each fifth of the groups, is compared on that fifth with
-    every parametric model: only a hybrid that is better than all of them is returned.
+    held-out groups of views, and on the corners next to the border, held out in all of them, which tell how a field is
+    extrapolated. The same, done again without each fifth of the groups, is compared on that fifth with parametric
+    models. Of these, and likewise of the lenses under a field, the plainest is chosen that is not surely worse than the
+    best one (`kcal.calibrate.evidence`); the hybrid is returned where it is better than the parametric model.
 
     Args:
         observations: the views of one camera.
@@ -90,55 +92,57 @@ def calibrate_hybrid(
     setting = GroupedViews(
         board_points=observations.board.points,
         pixels=observations.pixels()[:, None],
+        inner=without_border(observations.pixels(), observations.image_size)[:, None],
         weights=weights,
         groups=groups,
         free_warp=options.board_warp,
     )
-    parts = deal(len(groups), PARTS)
+    # A single hybrid is compared with nothing.
+    parts = deal(len(groups), PARTS) if len(models) > 1 or options.rivals else []
     bases = []
     for model in models:
-        bases.append(_base(setting, observations.image_size, model, solutions[model], options.widths, parts))
+        bases.append(fit_field(setting, observations.image_size, model, solutions[model], options.widths, parts))
         progress(f"{model} with a field judged")
-    bases.sort(key=lambda base: base.held_out)
-    rivals = {}
-    for rival in dict.fromkeys(LensModel.named(r) for r in options.rivals):
-        rivals[str(rival)] = judge_parametric(setting, rival, solutions[rival], parts)
-        progress(f"{rival} judged")
+    rivals = []
+    for model in dict.fromkeys(LensModel.named(r) for r in options.rivals):
+        costs = judge_parametric(setting, model, solutions[model], parts)
+        rivals.append(Contender(name=str(model), costs=costs, parameters=len(free_parameters(model))))
+        progress(f"{model} judged")
 
-    everything = torch.ones(len(groups), dtype=torch.bool)
-    for base in bases:
-        shares = stack_weights(base.forms, everything, base.precisions)
-        final, field, last, settled = _settle(setting, base, shares)
-        if settled:
+    settled = None
+    for base in _by_preference(bases):
+        settled = settle(setting, base)
+        if settled is not None:
             break
     else:
         base = bases[0]
-        shares = stack_weights(base.forms, everything, base.precisions)
-    held_out = {"hybrid": base.held_out, **rivals}
-    best = min(rivals, key=lambda name: rivals[name], default=None)
-    wins = best is None or base.held_out < rivals[best]
-    kept = settled and (wins or not options.gate)
-    if kept:
-        covariance = _covariance(last, base.precisions, shares)
-        calibration = _result(setting, observations.image_size, base, final, field, covariance)
+    rival = choose(rivals) if rivals else None
+    # How much of a field to believe was settled by held-out views, with none at all among the candidates: it is no
+    # richer model that would have to be surely better, but a better one it has to be.
+    better = rival is None or (base.judged.total < rival.total and base.effective >= _LEAST)
+    wins = settled is not None and better
+    kept = settled is not None and (wins or not options.gate)
+    if settled is not None and kept:
+        calibration = _result(setting, observations.image_size, base, settled)
     else:
-        calibration = calibrate_camera(observations, options.parametric(best or base.model))
-    form = base.forms.total(everything)
+        model = base.model if rival is None else LensModel.named(rival.name)
+        calibration = judged(observations, solutions[model], options.parametric(model))
     return HybridResult(
         calibration=calibration,
         kept=kept,
-        reason=_reason(held_out, best, wins, settled),
-        held_out=held_out,
+        reason=_reason(base, rival, wins, settled is not None, setting.count),
+        choice="hybrid" if wins else str(base.model) if rival is None else rival.name,
+        held_out={one.name: math.sqrt(one.total / setting.count) for one in (base.judged, *rivals) if parts},
         model=base.model,
         groups=len(groups),
-        shares=tuple((prior, share) for prior, share in zip(CANDIDATES, shares.tolist(), strict=True) if share > 1e-3),
-        effective=sum(
-            share * base.forms.freedom(form, precision)
-            for share, precision in zip(shares.tolist(), base.precisions, strict=True)
-            if share > 1e-3
+        shares=tuple(
+            (prior, share) for prior, share in zip(CANDIDATES, base.shares.tolist(), strict=True) if share > SEEN
         ),
+        effective=base.effective,
         units=base.grid.count,
-        largest=FieldResidual(base.grid, field.weights).bounds()[0] * _focal(final) if settled else math.nan,
+        largest=math.nan
+        if settled is None
+        else FieldResidual(base.grid, settled.field.weights).bounds()[0] * focal_of(settled.state),
     )
 
 
@@ -155,154 +159,31 @@ class _Solutions(dict[LensModel, Solved]):
         return self[model]
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Base:
-    """A lens model that a field may correct, and how well the two do on groups that were held out (RMS)."""
-
-    model: LensModel
-    solved: Solved
-    grid: FieldGrid
-    precisions: list[Tensor]
-    forms: Forms
-    held_out: float
+def _by_preference(bases: Sequence[FieldFit]) -> list[FieldFit]:
+    """The one that held-out views choose, and then the others, the best first."""
+    first = choose([base.judged for base in bases])
+    return sorted(bases, key=lambda base: (base.judged is not first, base.judged.total))
 
 
-def _base(
-    setting: GroupedViews,
-    size: tuple[int, int],
-    model: LensModel,
-    solved: Solved,
-    widths: Sequence[float],
-    parts: Sequence[Tensor],
-) -> _Base:
-    grid, half = _grid(solved, size, widths)
-    precisions = [prior.precision(grid, half) for prior in CANDIDATES]
-    forms = _forms(setting, model, solved.result.state, _no_field(grid))
-    base = _Base(model=model, solved=solved, grid=grid, precisions=precisions, forms=forms, held_out=math.nan)
-    return dataclasses.replace(base, held_out=_judge_hybrid(setting, base, parts))
-
-
-def _no_field(grid: FieldGrid) -> Field:
-    return Field(grid, torch.zeros(2, grid.count, dtype=torch.float64))
-
-
-def _reason(held_out: dict[str, float], best: str | None, wins: bool, settled: bool) -> str:
+def _reason(base: FieldFit, rival: Contender | None, wins: bool, settled: bool, count: int) -> str:
     if not settled:
-        return "the field did not settle: the parametric camera is returned"
-    if best is None:
+        return "no step of the field was possible: the parametric camera is returned"
+    if rival is None:
         return "no parametric model was asked to compare with"
-    verb = "better than" if wins else "no better than"
-    return (
-        f"on held-out views the hybrid has {held_out['hybrid']:.4f} px, {verb} {best}, the best parametric model, "
-        f"with {held_out[best]:.4f} px"
+    own, other = (math.sqrt(one.total / count) for one in (base.judged, rival))
+    found = (
+        f"on held-out views the hybrid has {own:.4f} px, {rival.name}, the parametric model to choose, {other:.4f} px"
     )
+    if not wins:
+        return f"no better than a parametric model: {found}"
+    sure = "by more than chance explains" if surely_worse(rival, base.judged) else "if within chance"
+    return f"better than a parametric model, {sure}: {found}"
 
 
-def _grid(solved: Solved, size: tuple[int, int], widths: Sequence[float]) -> tuple[FieldGrid, float]:
-    """Units over the image, and half its width, on the distorted plane of a solution."""
-    width, height = size
-    parameters = solved.result.state[0]
-    u = torch.tensor([-0.5, width - 0.5], dtype=torch.float64)
-    v = torch.tensor([-0.5, height - 0.5], dtype=torch.float64)
-    x, y = from_pixels(u, v, parameters)
-    half = 0.5 * float(x[1] - x[0])
-    low, high = (float(x[0]), float(y[0])), (float(x[1]), float(y[1]))
-    return FieldGrid.covering(low, high, [half * value for value in widths]), half
-
-
-def _forms(setting: GroupedViews, model: LensModel, state: State, field: Field) -> Forms:
-    order = [view for group in setting.groups for view in group]
-    problem = setting.problem(model, order, field)
-    return linearise_views(problem, some_views(state, order), field, [len(group) for group in setting.groups])
-
-
-def _stepped(field: Field, step: Tensor, forms: Forms, unit: float) -> Field:
-    """The field after a step of `Forms`; `unit` is the focal length of the state where these were taken."""
-    return Field(field.grid, field.weights + step[forms.lens : -1].unflatten(0, (2, -1)) / unit)
-
-
-def _refit(
-    setting: GroupedViews, model: LensModel, state: State, views: Sequence[int], field: Field, terms: Sequence[Term]
-) -> State:
-    """Lens, warp and poses of some views solved again under a field that is held.
-
-    To first order that is the step that the forms gave; a lens whose coefficients the data hardly determine, though,
-    has long steps, and only the whole problem with its walls keeps it a lens.
-    """
-    chosen = list(views)
-    return minimise(setting.problem(model, chosen, field, terms), some_views(state, chosen), REFIT).state
-
-
-def _judge_hybrid(setting: GroupedViews, base: _Base, parts: Sequence[Tensor]) -> float:
-    """RMS on each part of the groups of a hybrid whose priors and weights come from the other parts alone."""
-    total, state, forms = 0.0, base.solved.result.state, base.forms
-    for part in parts:
-        chosen = torch.ones(len(forms.counts), dtype=torch.bool)
-        chosen[part] = False
-        step = average_fit(forms, chosen, base.precisions, stack_weights(forms, chosen, base.precisions))
-        field = _stepped(_no_field(base.grid), step, forms, _focal(state))
-        train = [i for g in chosen.nonzero()[:, 0].tolist() for i in setting.groups[g]]
-        *shared, _, _ = _refit(setting, base.model, state, train, field, base.solved.minimum.terms)
-        views = [i for g in part.tolist() for i in setting.groups[g]]
-        total += setting.held_out(base.model, (*shared, *state[-2:]), views, field)
-    return math.sqrt(total / setting.count)
-
-
-def _focal(state: State) -> float:
-    return float(state[0][:2].log().mean().exp())
-
-
-def _settle(setting: GroupedViews, base: _Base, shares: Tensor) -> tuple[State, Field, Forms, bool]:
-    """The averaged fit of all views: a step of the field, all else solved again, anew until it stands still.
-
-    Returns the state, its field, the last forms, and whether it settled.
-    """
-    model, terms = base.model, base.solved.minimum.terms
-    state, field = base.solved.result.state, _no_field(base.grid)
-    every = torch.ones(len(setting.groups), dtype=torch.bool)
-    before = math.inf
-    for _ in range(_ROUNDS):
-        forms = _forms(setting, model, state, field)
-        step = average_fit(forms, every, base.precisions, shares)
-        now = forms.total(every)
-        noise = float(now[-1, -1])
-        # How much the step changes the residuals, as their squared length.
-        change = torch.cat([step[:-1], torch.zeros_like(step[-1:])])
-        moved = float(change @ now @ change)
-        after = _stepped(field, step, forms, _focal(state))
-        steady = math.isfinite(moved) and moved < 4.0 * before
-        if not steady or not field_bounds(after)[1] <= LARGEST_SLOPE:
-            return state, field, forms, False
-        state = _refit(setting, model, state, range(len(setting.pixels)), after, terms)
-        field, before = after, moved
-        if moved <= _STILL**2 * noise / setting.count:
-            break
-    return state, field, forms, moved <= _SETTLED * noise
-
-
-def _covariance(forms: Forms, precisions: Sequence[Tensor], shares: Tensor) -> Tensor:
-    """(L, L) covariance of lens and warp: within each candidate's fit, and between the fits that are averaged."""
-    form = forms.total(torch.ones(len(forms.counts), dtype=torch.bool))
-    used = [(share, precision) for share, precision in zip(shares.tolist(), precisions, strict=True) if share > 0]
-    fits = torch.stack([forms.fit(form, precision)[: forms.lens] for _, precision in used])
-    share = torch.tensor([share for share, _ in used], dtype=form.dtype)[:, None]
-    within = torch.stack([forms.covariance(form, precision) for _, precision in used])
-    noise = float(form[-1, -1]) / (2.0 * float(forms.counts.sum()))
-    apart = fits - (share * fits).sum(0)
-    between = apart.T @ (share * apart)
-    return (share[..., None] * within).sum(0) * noise + between
-
-
-def _result(
-    setting: GroupedViews,
-    size: tuple[int, int],
-    base: _Base,
-    state: State,
-    field: Field,
-    covariance: Tensor,
-) -> CameraCalibrationResult:
+def _result(setting: GroupedViews, size: tuple[int, int], base: FieldFit, settled: Settled) -> CameraCalibrationResult:
+    field, covariance = settled.field, field_covariance(base, settled.forms)
     problem = setting.problem(base.model, range(len(setting.pixels)), field)
-    state = problem.tidy(state)
+    state = problem.tidy(settled.state)
     s = problem.unpack(state)
     camera = HybridCamera(
         s.parameters[0], size=size, model=base.model, residual=FieldResidual(field.grid, field.weights)
@@ -322,7 +203,9 @@ def _result(
         cam_from_board_rotation=s.first_from_board_rotation,
         cam_from_board_translation=s.first_from_board_translation,
         board_warp=s.warp if problem.free_warp else None,
-        sigma={camera.names[i]: float(of_all[i, i].sqrt()) for i in free},
+        sigma={
+            camera.names[i]: float(of_all[i, i].sqrt()) if bool(torch.isfinite(of_all[i, i])) else None for i in free
+        },
         covariance=of_all,
         status=Status.CONVERGED,
         iterations=base.solved.spent,

@@ -17,10 +17,11 @@ class HybridOptions:
     """Options of `calibrate_hybrid`.
 
     Args:
-        models: lens models for the field to correct; what was held out decides which of them. A plain lens leaves the
-            field a clear task where the data are few or noisy, a rich one leaves it little where the lens is far from
-            any plain formula.
-        rivals: the parametric models that it has to beat.
+        models: lens models for the field to correct: the plainest whose hybrid is not surely worse on what was held out
+            than the best one. A plain lens leaves the field a clear task where the data are few or noisy, a rich one
+            leaves it little where the lens is far from any plain formula.
+        rivals: the parametric models that it is compared with. With none and a single model nothing is compared, which
+            takes half the time.
         board_warp: estimate how the board bends.
         weighted: as in `CalibrationOptions`.
         groups: which views are held out together. "blocks": runs of views in the order of the observations, for
@@ -29,13 +30,14 @@ class HybridOptions:
             differ from each other.
         widths: of the field's units, in half widths of the image. The narrowest says what detail the field can show
             and most of what it costs: units grow with its inverse square.
-        gate: keep the hybrid only where it wins; False returns it in any case, with the same figures.
+        gate: keep the hybrid only where it is better on held-out views; False returns it in any case, with the same
+            figures.
         focal: as in `CalibrationOptions`.
         field_of_view: likewise.
     """
 
-    models: tuple[LensModel | str, ...] = ("opencv8", "ext20")
-    rivals: tuple[LensModel | str, ...] = ("opencv5", "opencv8", "opencv12", "opencv14", "ext18", "ext20")
+    models: tuple[LensModel | str, ...] = ("opencv14", "ext20")
+    rivals: tuple[LensModel | str, ...] = ("opencv14", "ext20")
     board_warp: bool = False
     weighted: bool = True
     groups: Literal["blocks", "views"] | Sequence[Hashable] = "blocks"
@@ -70,9 +72,11 @@ class HybridResult:
             counts what the averaged fits disagree about.
         kept: whether the hybrid is returned.
         reason: one sentence that says why.
+        choice: "hybrid", or the name of the parametric model that held-out views prefer.
         held_out: name -> RMS (pixels, by the corners' weights) on views that were held out in groups, their poses
             solved again: of each parametric model and of "hybrid". Infinite where a model could not show a corner.
-        model: the lens model that the field corrects: the one with the lowest such RMS whose field settled.
+            Empty where one model was given and no rival.
+        model: the lens model that the field corrects: chosen likewise.
         groups: how many groups of views there were.
         shares: how much each prior counts in the average that makes the field.
         effective: how many of the field's weights the data determine, in effect; `units` x 2 there are.
@@ -83,6 +87,7 @@ class HybridResult:
     calibration: CameraCalibrationResult
     kept: bool
     reason: str
+    choice: str
     held_out: dict[str, float]
     model: LensModel
     groups: int

@@ -146,10 +146,11 @@ def _calibrating(
     if options.reject is not None:
         return (yield from _calibrate_rejecting(observations, options, options.reject, progress))
     solved = yield from solve(observations, options, progress)
-    return _judge(observations, solved, options)
+    return judged(observations, solved, options)
 
 
-def _judge(observations: Observations, solved: Solved, options: CalibrationOptions) -> CameraCalibrationResult:
+def judged(observations: Observations, solved: Solved, options: CalibrationOptions) -> CameraCalibrationResult:
+    """A solution with error bars and with what is to be doubted of it."""
     found = _result(observations, solved, options)
     doubts = rival_warnings(found.camera, found.sigma, solved.minimum, solved.plain_cost, solved.problem.residual_count)
     doubts += standing_out(observations.names, _weighted_residuals(solved.problem, solved.result.state))
@@ -196,7 +197,7 @@ def _calibrate_rejecting(
         left, rejected = [left[i] for i in kept], beyond[kept]
         check_share(int(rejected.sum()) + sum(view.corners for view in gone), total, gone, rejection.limit)
         progress(f"{int(rejected.sum())} corners and {len(gone)} views left out")
-    found = _judge(used, dataclasses.replace(solved, spent=spent), options)
+    found = judged(used, dataclasses.replace(solved, spent=spent), options)
     problem = corner_problem(every, options, solved.minimum, solved.variance, None)
     plain = problem.pixel_errors(solved.result.state)[:, 0].norm(dim=-2)
     weighted = _weighted_residuals(problem, solved.result.state)

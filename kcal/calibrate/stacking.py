@@ -65,19 +65,30 @@ def deal(count: int, parts: int) -> list[Tensor]:
 def stack_weights(forms: Forms, chosen: Tensor, precisions: Sequence[Tensor]) -> Tensor:
     """The weights (C,) with which fits under candidate priors are averaged, from some groups (G,) of the forms.
 
-    The groups are held out in five parts. The average's held-out cost is quadratic in the weights, which are not
-    negative and sum to one.
+    The groups are held out in five parts, and of all of them the corners next to the border. The average's held-out
+    cost is quadratic in the weights, which are not negative and sum to one.
     """
     inside = chosen.nonzero()[:, 0]
-    whole = forms.total(chosen)
-    cost = torch.zeros(len(precisions), len(precisions), dtype=whole.dtype)
+    cost = torch.zeros(len(precisions), len(precisions), dtype=forms.groups.dtype)
     for part in deal(len(inside), _INNER):
-        held = forms.groups[inside[part]].sum(0)
-        fits = torch.stack([forms.fit(whole - held, precision) for precision in precisions])
+        out = torch.zeros_like(chosen)
+        out[inside[part]] = True
+        # A sum, not a difference: next to a pole one corner can outweigh all others.
+        left, held = forms.total(chosen & ~out), forms.total(out)
+        fits = torch.stack([forms.fit(left, precision) for precision in precisions])
         cost += fits @ held @ fits.T
+    left = forms.inside(chosen)
+    beyond = forms.total(chosen) - left
+    if bool(beyond.any()):
+        fits = torch.stack([forms.fit(left, precision) for precision in precisions])
+        cost += fits @ beyond @ fits.T
+    own = cost.diagonal().nan_to_num(nan=math.inf)
+    weights = torch.zeros_like(own)
+    if bool(own.isinf().all()):
+        weights[0] = 1.0
+        return weights
     # What is far worse on its own has no share; left in, its size would only slow the minimum down.
-    near = cost.diagonal() < _HOPELESS * cost.diagonal().min()
-    weights = torch.zeros_like(cost[0])
+    near = own <= _HOPELESS * own.min()
     weights[near] = simplex_minimum(cost[near][:, near])
     return weights
 
@@ -117,8 +128,7 @@ def _to_simplex(values: np.ndarray) -> np.ndarray:
     return np.maximum(values - shift[last], 0.0)
 
 
-def average_fit(forms: Forms, chosen: Tensor, precisions: Sequence[Tensor], weights: Tensor) -> Tensor:
-    """The weighted average (S + 1,) of the fits under candidate priors to some groups."""
-    form = forms.total(chosen)
+def average_fit(forms: Forms, form: Tensor, precisions: Sequence[Tensor], weights: Tensor) -> Tensor:
+    """The weighted average (S + 1,) of the fits under candidate priors to the views of a form of `forms`."""
     used = [(weight, precision) for weight, precision in zip(weights.tolist(), precisions, strict=True) if weight > 0]
     return torch.stack([weight * forms.fit(form, precision) for weight, precision in used]).sum(0)

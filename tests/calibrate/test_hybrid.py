@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.forms import linearise_views
-from kcal.calibrate.grouped import group_views
+from kcal.calibrate.grouped import group_views, without_border
 from kcal.calibrate.hybrid import HybridOptions, HybridResult, calibrate_hybrid
 from kcal.calibrate.poses import refine_poses
 from kcal.calibrate.problem import BoardProblem
@@ -98,6 +99,38 @@ class TestForms:
         # Second order in the step is left: poses that turn, and the field that moves with what it moves.
         torch.testing.assert_close(predicted - at_start, true - at_start, rtol=0.05, atol=0)
 
+    @pytest.mark.parametrize("alike", [True, False])
+    def test_are_the_rows_with_poses_projected_out(self, alike: bool) -> None:
+        problem, state, grid = setting(6)
+        state[0][4] = 3.0  # skew: a shift along y moves both coordinates
+        seen = torch.rand(6, 48, generator=torch.Generator().manual_seed(7)) < 0.8
+        pixels = torch.where(seen[:, None, :, None], problem.pixels, torch.nan)
+        root = torch.tensor([[2.0, 0.0], [0.0, 2.0]] if alike else [[2.0, 0.5], [0.0, 1.0]], dtype=torch.float64)
+        free = [0, 1, 2, 3, 5, 6]
+        each = torch.rand(6, 1, 48, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(8))
+        weighed = root * (1.0 + each)
+        problem, inner = (
+            BoardProblem(BOARD.points, p, problem.models, [free], free_warp=True, whitening=weighed)
+            for p in (problem.pixels, pixels)
+        )
+        field = Field(grid, torch.zeros(2, grid.count, dtype=torch.float64))
+        forms = linearise_views(problem, state, field, [6], inner)
+
+        def residuals(given: BoardProblem, shared: Tensor, weights: Tensor, local: Tensor) -> Tensor:
+            moved = copy.copy(given)
+            moved.fields = (Field(grid, weights.unflatten(0, (2, -1)) / unit),)
+            return moved.residuals(given.retract(state, (shared, local))).flatten()
+
+        unit = state[0][:2].log().mean().exp()
+        zero = torch.zeros(8).double(), torch.zeros(2 * grid.count).double(), torch.zeros(6, 6).double()
+        for given, form in ((problem, forms.groups[0]), (inner, forms.inner[0])):
+            blocks = torch.func.jacfwd(functools.partial(residuals, given), (0, 1, 2))(*zero)
+            pose = blocks[2].flatten(1)
+            rows = torch.cat([blocks[0], blocks[1], residuals(given, *zero)[:, None]], 1)
+            left = rows - pose @ torch.linalg.lstsq(pose, rows).solution
+            scale = torch.sqrt(form.diagonal()[:, None] * form.diagonal())
+            torch.testing.assert_close(left.T @ left / scale, form / scale, rtol=0, atol=1e-9)
+
     def test_fit_is_the_minimum_under_the_prior(self) -> None:
         problem, state, grid = setting()
         weights = 1e-5 * torch.randn(2, grid.count, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
@@ -154,6 +187,14 @@ class TestStacking:
         assert torch.equal(precision[: grid.count], precision[grid.count :])
         assert bool(Prior(torch.inf).precision(grid, 1.0).isinf().all())
 
+    def test_a_form_without_a_minimum_leaves_no_field(self) -> None:
+        problem, state, grid = setting()
+        forms = linearise_views(problem, state, Field(grid, torch.zeros(2, grid.count, dtype=torch.float64)), [2] * 5)
+        broken = dataclasses.replace(forms, groups=-forms.groups, inner=-forms.groups)
+        precisions = [prior.precision(grid, 0.65) for prior in CANDIDATES]
+        weights = stack_weights(broken, torch.ones(5, dtype=torch.bool), precisions)
+        assert weights.tolist() == [1.0] + [0.0] * (len(CANDIDATES) - 1)
+
     def test_weights_are_those_of_training_groups_alone(self) -> None:
         problem, state, grid = setting()
         zero = torch.zeros(2, grid.count, dtype=torch.float64)
@@ -208,10 +249,33 @@ class TestCalibration:
         assert not result.kept
         assert type(result.calibration.camera) is Camera
         assert "no better than" in result.reason
+        assert result.choice == "opencv5"
         # Nor does the hybrid do harm where it is asked for in any case.
         forced = solved(0.0, False)
         assert isinstance(forced.calibration.camera, HybridCamera)
         assert forced.held_out["hybrid"] < 1.02 * forced.held_out["opencv5"]
+
+    def test_alone_nothing_is_compared(self) -> None:
+        seen, *_ = views(0.7, 0.05, 20)
+        options = HybridOptions(models=("opencv5",), rivals=(), widths=(1.2, 0.6, 0.3), gate=False)
+        result = calibrate_hybrid(seen, options)
+        assert result.held_out == {}
+        assert result.kept
+        same = solved(0.7).calibration
+        assert result.calibration.rms == pytest.approx(same.rms, rel=1e-7)
+
+    def test_the_border_is_as_deep_as_what_nobody_saw(self) -> None:
+        axis = torch.linspace(40.0, 560.0, 27, dtype=torch.float64)
+        pixels = torch.cartesian_prod(axis, axis[:20])[None]
+        left = torch.isfinite(without_border(pixels, (640, 480))).all(-1)[0]
+        low, high = pixels[0][left].amin(0), pixels[0][left].amax(0)
+        # Seen up to 40.5 px from the left and upper edges, 79.5 from the right one, 59.5 from the lower one.
+        assert low.tolist() == pytest.approx([100.0, 100.0])
+        assert high.tolist() == pytest.approx([480.0, 360.0])
+        # A view that would keep too little stays whole.
+        few = torch.cat([pixels, torch.full_like(pixels, torch.nan)])
+        few[1, :20] = pixels[0, :20]
+        assert bool(torch.isfinite(without_border(few, (640, 480))[1, :20]).all())
 
     def test_groups(self) -> None:
         seen, *_ = views(0.0, 0.05, 20)

@@ -46,7 +46,8 @@ def observations(field: float) -> Observations:
 @pytest.fixture
 def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder, and fewer models and units than the command's own."""
-    few = functools.partial(kcal.calibrate.hybrid.HybridOptions, rivals=("opencv5", "opencv8"), widths=(1.2, 0.6, 0.3))
+    models = ("opencv5", "opencv8")
+    few = functools.partial(kcal.calibrate.hybrid.HybridOptions, models=models, rivals=models, widths=(1.2, 0.6, 0.3))
     monkeypatch.setattr(kcal.calibrate.hybrid, "HybridOptions", few)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
