@@ -152,12 +152,14 @@ def main() -> None:
     parser.add_argument("--views", type=int, nargs="*", default=[60, 30, 120])
     parser.add_argument("--sigma", type=float, nargs="*", default=[0.02, 0.05, 0.1, 0.2])
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--write", action="store_true", help="write docs/hybrid.md from the file")
     args = parser.parse_args()
     torch.set_num_threads(1)
     done = [json.loads(line) for line in args.out.read_text().splitlines()] if args.out.exists() else []
     have = {(r["lens"], r["views"], r["sigma"], r["seed"]) for r in done}
-    cells = itertools.product(args.views, range(0 if args.write else args.seeds), args.lenses, args.sigma)
+    seeds = range(args.first_seed, args.first_seed + (0 if args.write else args.seeds))
+    cells = itertools.product(args.views, seeds, args.lenses, args.sigma)
     todo = [(lens, views, sigma, seed) for views, seed, lens, sigma in cells if (lens, views, sigma, seed) not in have]
     start, whole = time.process_time(), sum(views for _, views, *_ in todo)
     for i, which in enumerate(todo):
