@@ -49,14 +49,14 @@ class Forms:
 
     def total(self, chosen: Tensor) -> Tensor:
         """The form (S + 1, S + 1) of all groups in a mask (G,)."""
-        return self.groups[chosen].sum(0)
+        return _sum(self.groups, chosen)
 
     def inside(self, chosen: Tensor) -> Tensor:
         """Likewise without the corners next to the border.
 
         `total` minus this is what predicting those costs, with the poses given by the others.
         """
-        return self.inner[chosen].sum(0)
+        return _sum(self.inner, chosen)
 
     def fit(self, form: Tensor, precision: Tensor) -> Tensor:
         """The best step (S + 1,), with a last 1, under Gaussian priors on the weights alone.
@@ -75,7 +75,8 @@ class Forms:
         step[used] = 0.0
         # Weights that stay at zero go there first, and the others answer.
         gradient = (form @ step)[used]
-        matrix = form[used][:, used]
+        # All of them is the usual case, and needs no gathering.
+        matrix = form[:-1, :-1].clone() if len(used) == len(form) - 1 else form[used][:, used]
         matrix.diagonal()[self.lens :].add_(precision[own])
         gradient[self.lens :] += precision[own] * self.weights[own]
         factor, scale = _factor(matrix)
@@ -101,6 +102,11 @@ class Forms:
         # What is left for the field once lens and warp have answered.
         field = form[self.lens + own][:, self.lens + own] - across.T @ torch.linalg.lstsq(lens, across).solution
         return float(torch.linalg.solve(field + torch.diag(precision[own]), field).diagonal().sum())
+
+
+def _sum(groups: Tensor, chosen: Tensor) -> Tensor:
+    """The sum of the groups in a mask, as one product: they are too many numbers to be copied."""
+    return (chosen.to(groups.dtype) @ groups.flatten(1)).unflatten(0, groups.shape[1:])
 
 
 def _factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
