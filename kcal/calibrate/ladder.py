@@ -51,12 +51,15 @@ _LANDINGS = ("opencv14", "ext20", "ext22")
 _MANY_CORNERS = 4000
 # How far all boards together may be turned against the first model's at a lower minimum, radians.
 _MOST_TURN = math.radians(7.0)
+# Of a corner, pixels, where priors count against it.
+LEAST_NOISE = 1e-3
 # Enough to tell the minima apart and to come near the best one.
 _SEARCH = LMOptions(max_iterations=60, tolerance=1e-7, initial_damping=1e-6)
 # Height of the wall before a fold, in units of the noise.
 _WALL = 0.3
 # For models on the way: as good as their solution.
 _LANDING = LMOptions(max_iterations=100, tolerance=1e-7, flatness=2e-5, initial_damping=1e-6)
+_STEP = LMOptions(max_iterations=100, tolerance=1e-6, initial_damping=1e-5)
 # Squared residuals of the wall, in units of the noise, from which on a lens counts as held back.
 _AT_WALL = 0.1
 # Where near-cancelling starts put their bump, as a fraction of the largest observed r².
@@ -152,9 +155,35 @@ def climb(
     if len(models) == 1:
         result = yield Solve(views.problem(small), first, options)
         return Minimum(result=result, iterations=0)
-    if views.corner_count <= _FEW_CORNERS or views.rms(first, small) > _SUSPICIOUS_RMS:
+    suspicious = views.rms(first, small) > _SUSPICIOUS_RMS
+    if views.rules.mild is not None and not suspicious:
+        return (yield from _step_mildly(views, first, models, progress))
+    if views.corner_count <= _FEW_CORNERS or suspicious:
         return (yield from _climb_wholly(views, first, cold, models, options, progress))
     return (yield from _climb_folded(views, first, models, options, progress))
+
+
+def _step_mildly(views: Views, first: State, models: Sequence[LensModel], progress: Progress) -> Steps[Minimum]:
+    """From the first model to the last in one step: a weak prior leaves one minimum, and nothing to search.
+
+    Solved as well as its noise can be told by; what priors count is not known before.
+    """
+    model = models[-1]
+    start = (views.rules.impose(embed(first[0], models[0], model), model), *first[1:])
+    noise = views.noise(first, models[0])
+    terms = (RadialBound(model, views.regular_radius(first, models[0]), _WALL * noise),)
+    problem, state, spent = views.problem(model, terms=terms), start, 0
+    if views.corner_count > _MANY_CORNERS:
+        folded = fold(views.problem(models[0], poses_only=True), first, float(views.observed_radius(first)))
+        known = (*terms, *views.rules.terms(model, views.prior_noise))
+        search = ReducedProblem(folded, model, views.rules.parameters(model), known, (1,))
+        found = yield Solve(search, search.start(start[0][None]), _STEP)
+        near, spent = search.unfold(pick(found.state, 0)), int(found.iterations)
+        if float(problem.cost(near)) < float(problem.cost(start)):
+            state = near
+    result = yield Solve(problem, state, _STEP)
+    progress(str(model))
+    return _minimum(views, result, terms, model, [start], spent + int(result.iterations))
 
 
 def _climb_folded(
@@ -270,6 +299,9 @@ def _climb_wholly(
         spent += int(found.iterations.max()) + int(result.iterations)
         kept[0] = result.state
         small = large
+        if views.rules.informed:
+            # Against the noise of a lens that fits badly priors would count far too much.
+            views = dataclasses.replace(views, prior_noise=max(views.noise(kept[0], large), LEAST_NOISE))
         if last and terms and views.corner_count <= _MANY_CORNERS and views.rules.mild is None:
             result, steps = yield from _lower(views, views.problem(large, terms=terms), large, first, result, options)
             spent += steps

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.covariance import Uncertainty, uncertainty_of
-from kcal.calibrate.ladder import Progress
-from kcal.calibrate.opinion import is_rich, mild_term, second_opinion
+from kcal.calibrate.ladder import LEAST_NOISE, Progress
+from kcal.calibrate.mild import is_rich
+from kcal.calibrate.opinion import mild_term, second_opinion
 from kcal.calibrate.options import CalibrationOptions, CameraCalibrationResult
 from kcal.calibrate.outliers import (
     OutlierRejection,
@@ -26,7 +27,7 @@ from kcal.calibrate.outliers import (
 )
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.rules import Free
-from kcal.calibrate.single import LEAST_NOISE, Solved, corner_problem, solve
+from kcal.calibrate.single import Solved, corner_problem, solve
 from kcal.calibrate.terms import Prior, Term
 from kcal.calibrate.together import Solve, Steps, alone, together
 from kcal.calibrate.verdict import check_focal, opinion_warnings, rival_warnings, standing_out, warnings_of
