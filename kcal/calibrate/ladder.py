@@ -35,7 +35,7 @@ from kcal.solve.result import Result, State, Status, pick, stack
 _SCOUT = LMOptions(max_iterations=150, tolerance=1e-9, flatness=1e-5)
 _KEPT = 4
 # Where the smaller model leaves more than this (pixels), the lens may be too wide for it.
-_SUSPICIOUS_RMS = 2.0
+SUSPICIOUS_RMS = 2.0
 # How much χ² a lens that folds inside the image must gain on one that does not: 20 is far beyond chance for the few
 # parameters that a step of the ladder adds.
 _FOLD_PRICE = 20.0
@@ -48,7 +48,7 @@ _RUNGS = ("opencv8", "opencv12", "opencv14", "ext16", "ext18", "ext20", "ext22")
 # Those of them that are solved on all views on the way.
 _LANDINGS = ("opencv14", "ext20", "ext22")
 # With more corners than this, valleys are not followed from the solution: a batch of starts would take too long.
-_MANY_CORNERS = 4000
+MANY_CORNERS = 4000
 # How far all boards together may be turned against the first model's at a lower minimum, radians.
 _MOST_TURN = math.radians(7.0)
 # Of a corner, pixels, where priors count against it.
@@ -59,7 +59,6 @@ _SEARCH = LMOptions(max_iterations=60, tolerance=1e-7, initial_damping=1e-6)
 _WALL = 0.3
 # For models on the way: as good as their solution.
 _LANDING = LMOptions(max_iterations=100, tolerance=1e-7, flatness=2e-5, initial_damping=1e-6)
-_STEP = LMOptions(max_iterations=100, tolerance=1e-6, initial_damping=1e-5)
 # Squared residuals of the wall, in units of the noise, from which on a lens counts as held back.
 _AT_WALL = 0.1
 # Where near-cancelling starts put their bump, as a fraction of the largest observed r².
@@ -155,35 +154,9 @@ def climb(
     if len(models) == 1:
         result = yield Solve(views.problem(small), first, options)
         return Minimum(result=result, iterations=0)
-    suspicious = views.rms(first, small) > _SUSPICIOUS_RMS
-    if views.rules.mild is not None and not suspicious:
-        return (yield from _step_mildly(views, first, models, progress))
-    if views.corner_count <= _FEW_CORNERS or suspicious:
+    if views.corner_count <= _FEW_CORNERS or views.rms(first, small) > SUSPICIOUS_RMS:
         return (yield from _climb_wholly(views, first, cold, models, options, progress))
     return (yield from _climb_folded(views, first, models, options, progress))
-
-
-def _step_mildly(views: Views, first: State, models: Sequence[LensModel], progress: Progress) -> Steps[Minimum]:
-    """From the first model to the last in one step: a weak prior leaves one minimum, and nothing to search.
-
-    Solved as well as its noise can be told by; what priors count is not known before.
-    """
-    model = models[-1]
-    start = (views.rules.impose(embed(first[0], models[0], model), model), *first[1:])
-    noise = views.noise(first, models[0])
-    terms = (RadialBound(model, views.regular_radius(first, models[0]), _WALL * noise),)
-    problem, state, spent = views.problem(model, terms=terms), start, 0
-    if views.corner_count > _MANY_CORNERS:
-        folded = fold(views.problem(models[0], poses_only=True), first, float(views.observed_radius(first)))
-        known = (*terms, *views.rules.terms(model, views.prior_noise))
-        search = ReducedProblem(folded, model, views.rules.parameters(model), known, (1,))
-        found = yield Solve(search, search.start(start[0][None]), _STEP)
-        near, spent = search.unfold(pick(found.state, 0)), int(found.iterations)
-        if float(problem.cost(near)) < float(problem.cost(start)):
-            state = near
-    result = yield Solve(problem, state, _STEP)
-    progress(str(model))
-    return _minimum(views, result, terms, model, [start], spent + int(result.iterations))
 
 
 def _climb_folded(
@@ -223,7 +196,7 @@ def _climb_folded(
         if not float(result.cost) <= float(problem.cost(nested)):
             result = yield Solve(problem, nested, options)
             spent += int(result.iterations)
-        if views.corner_count <= _MANY_CORNERS and views.rules.mild is None:
+        if views.corner_count <= MANY_CORNERS and views.rules.mild is None:
             result, steps = yield from _lower(views, problem, large, first, result, options)
             spent += steps
         reached, landed = result.state, large
@@ -233,7 +206,7 @@ def _climb_folded(
             folded = fold(views.problem(large, poses_only=True), result.state, observed)
         progress(str(large))
     others = [(embed(first[0], models[0], small), *first[1:]), *ends[1:]]
-    return _minimum(views, result, terms, small, others, spent)
+    return minimum_of(views, result, terms, small, others, spent)
 
 
 def _lower(
@@ -259,7 +232,7 @@ def _lower(
     return found, int(found.iterations)
 
 
-def _minimum(
+def minimum_of(
     views: Views, result: Result, terms: tuple[Term, ...], model: LensModel, others: list[State], spent: int
 ) -> Minimum:
     """A ladder's end, its cost without the wall; told `AT_BOUND` where the wall matters."""
@@ -302,13 +275,13 @@ def _climb_wholly(
         if views.rules.informed:
             # Against the noise of a lens that fits badly priors would count far too much.
             views = dataclasses.replace(views, prior_noise=max(views.noise(kept[0], large), LEAST_NOISE))
-        if last and terms and views.corner_count <= _MANY_CORNERS and views.rules.mild is None:
+        if last and terms and views.corner_count <= MANY_CORNERS and views.rules.mild is None:
             result, steps = yield from _lower(views, views.problem(large, terms=terms), large, first, result, options)
             spent += steps
             kept[0] = result.state
         progress(str(large))
     others = [(embed(first[0], models[0], small), *first[1:]), *kept[1:]]
-    return _minimum(views, result, terms, small, others, spent)
+    return minimum_of(views, result, terms, small, others, spent)
 
 
 def _price(cost: float, residual_count: int) -> float:
@@ -316,7 +289,7 @@ def _price(cost: float, residual_count: int) -> float:
     return _FOLD_PRICE * max(cost / residual_count, 1e-6)
 
 
-def _walls(views: Views, state: State, model: LensModel, radius: float) -> tuple[Term, ...]:
+def walls(views: Views, state: State, model: LensModel, radius: float) -> tuple[Term, ...]:
     """The wall at a radius, if `state` stands behind it."""
     wall = RadialBound(model, radius, _WALL * views.noise(state, model))
     return (wall,) if bool(torch.isfinite(wall.rows(torch.cat([state[0], state[1]]))).all()) else ()
@@ -333,7 +306,7 @@ def _finish(views: Views, start: State, model: LensModel, options: LMOptions) ->
     price = _price(before, plain.residual_count)
     ends: list[tuple[float, Result, tuple[Term, ...]]] = []
     for radius in (views.seen_radius(start), views.regular_radius(start, model)):
-        terms = _walls(views, start, model, radius)
+        terms = walls(views, start, model, radius)
         problem = views.problem(model, terms=terms)
         result = yield Solve(problem, start, options)
         trouble, cost = views.trouble(result.state, model), float(plain.cost(result.state))
@@ -372,7 +345,7 @@ def _scout(
     """Solve for `large` from all starts side by side, with a limited number of steps."""
     starts = [*carried, plain]
     if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
-        if views.rms(carried[0], large) > _SUSPICIOUS_RMS:
+        if views.rms(carried[0], large) > SUSPICIOUS_RMS:
             starts += wide_starts(views, large)
         largest = float(views.observed_radius(carried[0])) ** 2
         starts += [(near_cancelling(carried[0][0], large, largest, b), *carried[0][1:]) for b in _BUMPS]

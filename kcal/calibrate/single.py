@@ -17,6 +17,7 @@ from kcal.calibrate.mild import Mild, is_rich
 from kcal.calibrate.options import CalibrationOptions
 from kcal.calibrate.poses import unflipping
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.step import step
 from kcal.calibrate.together import Solve, Steps
 from kcal.calibrate.views import Views
 from kcal.calibrate.weights import whitening
@@ -99,7 +100,7 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
 
     solver = options.solver
     mild = options.weak_prior is not None and options.camera is None and is_rich(model)
-    ladder = [step for step in steps_to(model) if rules.allows(step)] if options.camera is None else [model]
+    ladder = [lens for lens in steps_to(model) if rules.allows(lens)] if options.camera is None else [model]
     if options.camera is None:
         rough = _ROUGH if mild and len(ladder) > 1 else solver
         first, cold, spent = yield from first_model(board, pixels, observations.image_size, ladder[0], options, rough)
@@ -125,7 +126,11 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
         views = dataclasses.replace(views, rules=rules)
     if rules.informed:
         views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), LEAST_NOISE))
-    minimum = yield from climb(views, first, cold, ladder, solver, progress)
+    minimum = None
+    if rules.mild is not None and len(ladder) > 1:
+        minimum = yield from step(views, first, ladder[0], model, progress)
+    if minimum is None:
+        minimum = yield from climb(views, first, cold, ladder, solver, progress)
     spent += minimum.iterations
 
     # The first model's poses were looked at; look once more under another lens.
