@@ -46,8 +46,8 @@ def step(views: Views, first: State, small: LensModel, model: LensModel, progres
         if float(problem.cost(near)) < float(problem.cost(start)):
             state = near
     result = yield Solve(problem, state, _ROUGH)
-    held_back = float(views.problem(model).cost(result.state)) < float(result.cost)
-    if int(result.status) not in (Status.CONVERGED, Status.EXACT) or held_back:
+    minimum = minimum_of(views, result, wall, model, [start], spent + int(result.iterations))
+    if int(minimum.result.status) not in (Status.CONVERGED, Status.EXACT):
         return None
     progress(str(model))
-    return minimum_of(views, result, wall, model, [start], spent + int(result.iterations))
+    return minimum
