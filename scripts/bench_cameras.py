@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import time
 from typing import Any
 
 from bench_solver import COLUMNS, MODELS, NOISE, ROWS, SIZE, SQUARE, simulate
+from memory import peak_megabytes
 from page import write_section
 from timing import row, show
 
@@ -43,14 +43,14 @@ def work(way: str, cameras: int, views: int, coefficients: int) -> None:
         seen = tuple(View(name=f"{i:04}", pixels=tuple(map(tuple, view))) for i, view in enumerate(pixels))
         sets.append(Observations(board=board, image_size=SIZE, views=seen))
     options = CalibrationOptions(model=MODELS[coefficients])
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    before = peak_megabytes()
     start = time.perf_counter()
     if way == "one call":
         found = calibrate_cameras(sets, options)
     else:
         found = [calibrate_camera(seen, options) for seen in sets]
     seconds = time.perf_counter() - start
-    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    after = peak_megabytes()
     good = [one for one in found if isinstance(one, CameraCalibrationResult)]
     print(json.dumps({
         "seconds": seconds,
