@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -287,6 +287,7 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
             if name in slot or name in held
         },
         fixed=held,
+        led_by_prior=_led_by_prior(found, camera.names, slot, uncertainty),
         status=status,
         iterations=found.spent,
         covariance=_by_parameter(uncertainty, free, len(camera.names)),
@@ -319,6 +320,20 @@ def _uncertainty(
     mild = problem_with(*known, mild_term(found.views, start, model, noise))
     opinion = second_opinion(found.views, mild, plain, start, state, own)
     return (own, []) if opinion is None else (opinion.uncertainty, opinion_warnings(opinion))
+
+
+def _led_by_prior(
+    found: Solved, names: Sequence[str], slot: Mapping[str, int], uncertainty: Uncertainty
+) -> tuple[str, ...]:
+    """Parameters whose variance would more than double without their prior."""
+    led = []
+    for term in found.minimum.terms:
+        if isinstance(term, Prior):
+            spread = found.views.prior_noise / term.weight
+            for index, sigma in zip(term.index.tolist(), spread.tolist(), strict=True):
+                if float(uncertainty.sigma[slot[names[index]]]) ** 2 > 0.5 * sigma**2:
+                    led.append(names[index])
+    return tuple(led)
 
 
 def _by_parameter(uncertainty: Uncertainty, free: Free, count: int) -> Tensor:

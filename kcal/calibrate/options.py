@@ -135,6 +135,8 @@ class CameraCalibrationResult:
         iterations: trial steps of the solver, all starts and models together.
         warnings: sentences about what the user should doubt.
         fixed: names of the parameters that the options held.
+        led_by_prior: names of the parameters of which a prior knows more than the views do: without it their σ would be
+            more than 1.4 times as large.
         rejected_corners: corners of the views that were used, left out by `CalibrationOptions.reject`.
         rejected_views: views left out likewise.
     """
@@ -153,6 +155,7 @@ class CameraCalibrationResult:
     iterations: int
     warnings: tuple[str, ...]
     fixed: tuple[str, ...] = ()
+    led_by_prior: tuple[str, ...] = ()
     rejected_corners: tuple[RejectedCorner, ...] = ()
     rejected_views: tuple[RejectedView, ...] = ()
 

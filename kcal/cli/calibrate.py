@@ -259,5 +259,7 @@ def _table(result: CameraCalibrationResult) -> Table:
         digits = 3 if name in ("fx", "fy", "cx", "cy") else 6
         unknown = "fixed" if name in result.fixed else "not determined"
         spread = unknown if sigma is None else f"{sigma:.{digits}f}"
+        if name in result.led_by_prior:
+            spread += " (by its prior)"
         table.add_row(name, f"{values[name]:.{digits}f}", spread)
     return table
