@@ -5,9 +5,9 @@
     KCAL_PEERS=/path/to/env/bin/python python scripts/bench_solver.py    Ceres too, from an environment with pyceres
     KCAL_MRCAL=/usr/bin/python3 python scripts/bench_solver.py           mrcal too, from one with mrcal and cv2
 
-Every solver runs in its own process and times the calibration alone. kcal and OpenCV calibrate from nothing; Ceres and
-mrcal start from `cv2.initCameraMatrix2D` and the true tilts, without which they keep flipped boards. The runs of all
-solvers alternate. RMS is recomputed from each solution alike. A lens that folds between the corners is no lens: such a
+Every solver runs in its own process, warmed up on a few views, and times the calibration alone. kcal and OpenCV
+calibrate from nothing; Ceres and mrcal start from `cv2.initCameraMatrix2D` and the true tilts, without which they keep
+flipped boards. The runs of all solvers alternate. RMS is recomputed from each solution alike. A lens that folds between the corners is no lens: such a
 solution is marked, and does not count as the best.
 """
 
@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from memory import peak_megabytes
 from page import write_section
+from timing import show
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
@@ -233,6 +234,8 @@ def work(name: str, path: str, coefficients: int) -> None:
 
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     data = dict(np.load(path))
+    # What is loaded at the first call only is not counted.
+    SOLVERS[name]({key: values if key == "board" else values[:8] for key, values in data.items()}, 5)
     pinhole, lens, rotation, translation, seconds = SOLVERS[name](data, coefficients)
     peak = peak_megabytes()
     arrays = {"pinhole": pinhole, "lens": lens, "rotation": rotation, "translation": translation}
@@ -293,8 +296,8 @@ def run(name: str, path: Path, coefficients: int, timeout: float) -> dict[str, A
     return found
 
 
-def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> list[str]:
-    """Lines of the table for one problem."""
+def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> tuple[list[str], dict[str, float]]:
+    """Lines of the table for one problem, and the median seconds of each solver."""
     names = [name for name in arguments.solvers if coefficients in KNOWN[name]]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "views.npz"
@@ -333,6 +336,29 @@ def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> lis
             f"{head} {1e3 * statistics.median(seconds):.0f} | {cells[0]} | {cells[1]} | {one['rms']:.6f} | {excess} | "
             f"{one['truth']:.2f} | {one['flipped']} | {memory:.0f} |"
         )
+    return lines, {name: statistics.median(one["seconds"] for one in runs[name]) for name in judged}
+
+
+def growth(seconds: dict[tuple[int, int], dict[str, float]]) -> list[str]:
+    """How kcal's time grows with the views and with the coefficients."""
+    lines = []
+    sizes, models = sorted({views for views, _ in seconds}), sorted({count for _, count in seconds})
+    for name in ("kcal", "kcal, weak prior"):
+        told = []
+        for count in models:
+            known = [(views, seconds[views, count][name]) for views in sizes if name in seconds[views, count]]
+            if len(known) > 1:
+                (few, quick), (many, slow) = known[-2:]
+                told.append(f"{count} coefficients {np.log(slow / quick) / np.log(many / few):.2f}")
+        if told:
+            lines.append(f"Time of *{name}* grows with the views, {few} to {many}, to the power of: {', '.join(told)}.")
+        pairs = [
+            f"{seconds[views, 20][name] / seconds[views, 14][name]:.2f} at {views}"
+            for views in sizes
+            if name in seconds.get((views, 20), {}) and name in seconds.get((views, 14), {})
+        ]
+        if pairs:
+            lines.append(f"20 coefficients take, times 14: {', '.join(pairs)} views.")
     return lines
 
 
@@ -344,17 +370,18 @@ def main() -> None:
     parser.add_argument("--views", type=int, nargs="*", default=[15, 50, 200, 800])
     parser.add_argument("--coefficients", type=int, nargs="*", default=list(MODELS), choices=list(MODELS))
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--timeout", type=float, default=120.0)
+    parser.add_argument("--timeout", type=float, default=60.0)
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
     arguments.solvers = [name for name in SOLVERS if name not in PYTHON or os.environ.get(PYTHON[name])]
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    threads = os.environ.setdefault("OMP_NUM_THREADS", "1")
     lines = [
-        "## Beside other solvers",
+        f"## Beside other solvers, {threads} thread{'s' if threads != '1' else ''}",
         "",
         f"Made by `scripts/bench_solver.py`: simulated views of a {COLUMNS}x{ROWS} board, {SIZE[0]}x{SIZE[1]} px, "
-        f"noise {NOISE} px an axis, {os.environ['OMP_NUM_THREADS']} thread(s), median of {arguments.repeats} "
-        "alternating runs. kcal and OpenCV start from nothing, Ceres and mrcal from a good start that is not timed. "
+        f"noise {NOISE} px an axis, {threads} thread(s), median of {arguments.repeats} "
+        "alternating runs after a small one. kcal and OpenCV start from nothing, Ceres and mrcal from a good start that "
+        "is not timed. "
         f"*Weak prior*: `CalibrationOptions(weak_prior={WEAK})`. *Ratio* is kcal's time over the other's, without and "
         "with the weak prior: below 1 kcal is faster. *Excess*: RMS over the best of a lens that does not fold between "
         "the corners; within 1e-4 counts as best. *Truth*: RMS over the image, in pixels, between the rays of the "
@@ -365,13 +392,14 @@ def main() -> None:
         "| flipped | memory MB |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
+    seconds = {}
     for views in arguments.views:
         for coefficients in arguments.coefficients:
-            for line in compare(views, coefficients, arguments):
-                print(line, flush=True)
-                lines.append(line)
+            found, seconds[views, coefficients] = compare(views, coefficients, arguments)
+            lines += show(found)
+    lines += show(["", *growth(seconds)])
     if not arguments.dry:
-        write_section("solver.md", "beside other solvers", "\n".join(lines))
+        write_section("solver.md", f"beside other solvers, {threads} thread(s)", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -187,8 +187,9 @@ def starts(sets: dict[str, Observations], count: int) -> list[str]:
                         for e in found]  # fmt: skip
                 good = sum(abs(r) <= SAME_RMS and p <= SAME_PIXELS for r, p in gaps)
                 worst = [f"{max(g[k] for g in gaps):{form}}" if gaps else "-" for k, form in ((0, "+.1e"), (1, ".1e"))]
+                prior = ", weak prior" if weak else ""
                 lines += show([
-                    f"| {name} | {coefficients}{', weak prior' if weak else ''} | {label} | {good} of {len(ends)} | {worst[0]} | {worst[1]} | "
+                    f"| {name} | {coefficients}{prior} | {label} | {good} of {len(ends)} | {worst[0]} | {worst[1]} | "
                     f"{took[label]:.2f} |"
                 ])  # fmt: skip
     return lines
