@@ -7,8 +7,8 @@
 
 Every solver runs in its own process, warmed up on a few views, and times the calibration alone. kcal and OpenCV
 calibrate from nothing; Ceres and mrcal start from `cv2.initCameraMatrix2D` and the true tilts, without which they keep
-flipped boards. The runs of all solvers alternate. RMS is recomputed from each solution alike. A lens that folds between the corners is no lens: such a
-solution is marked, and does not count as the best.
+flipped boards. The runs of all solvers alternate. RMS is recomputed from each solution alike. A lens that folds between
+the corners is no lens: such a solution is marked, and does not count as the best.
 """
 
 from __future__ import annotations
@@ -380,8 +380,8 @@ def main() -> None:
         "",
         f"Made by `scripts/bench_solver.py`: simulated views of a {COLUMNS}x{ROWS} board, {SIZE[0]}x{SIZE[1]} px, "
         f"noise {NOISE} px an axis, {threads} thread(s), median of {arguments.repeats} "
-        "alternating runs after a small one. kcal and OpenCV start from nothing, Ceres and mrcal from a good start that "
-        "is not timed. "
+        "alternating runs after a small one. kcal and OpenCV start from nothing, Ceres and mrcal from a good start "
+        "that is not timed. "
         f"*Weak prior*: `CalibrationOptions(weak_prior={WEAK})`. *Ratio* is kcal's time over the other's, without and "
         "with the weak prior: below 1 kcal is faster. *Excess*: RMS over the best of a lens that does not fold between "
         "the corners; within 1e-4 counts as best. *Truth*: RMS over the image, in pixels, between the rays of the "

@@ -32,7 +32,7 @@ from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, State, Status, pick, stack
 
 # For each start of a batch; the best one is then taken to convergence.
-_SCOUT = LMOptions(max_iterations=60, tolerance=1e-7, flatness=1e-4)
+_SCOUT = LMOptions(max_iterations=150, tolerance=1e-9, flatness=1e-5)
 _KEPT = 4
 # Where the smaller model leaves more than this (pixels), the lens may be too wide for it.
 SUSPICIOUS_RMS = 2.0
