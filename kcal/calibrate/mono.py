@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.covariance import Uncertainty, uncertainty_of
-from kcal.calibrate.ladder import Progress
-from kcal.calibrate.opinion import is_rich, mild_term, second_opinion
+from kcal.calibrate.ladder import LEAST_NOISE, Progress
+from kcal.calibrate.mild import is_rich
+from kcal.calibrate.opinion import mild_term, second_opinion
 from kcal.calibrate.options import CalibrationOptions, CameraCalibrationResult
 from kcal.calibrate.outliers import (
     OutlierRejection,
@@ -26,12 +27,13 @@ from kcal.calibrate.outliers import (
 )
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.rules import Free
-from kcal.calibrate.single import LEAST_NOISE, Solved, corner_problem, solve
+from kcal.calibrate.single import Solved, corner_problem, solve
 from kcal.calibrate.terms import Prior, Term
 from kcal.calibrate.together import Solve, Steps, alone, together
 from kcal.calibrate.verdict import (
     NO_ERROR_BARS,
     check_focal,
+    contradicted,
     opinion_warnings,
     rival_warnings,
     standing_out,
@@ -153,6 +155,7 @@ def judged(observations: Observations, solved: Solved, options: CalibrationOptio
     """A solution with error bars and with what is to be doubted of it."""
     found = _result(observations, solved, options)
     doubts = rival_warnings(found.camera, found.sigma, solved.minimum, solved.plain_cost, solved.problem.residual_count)
+    doubts += contradicted(solved.minimum.terms, solved.result.state, solved.views.prior_noise)
     doubts += standing_out(observations.names, _weighted_residuals(solved.problem, solved.result.state))
     return dataclasses.replace(found, warnings=(*found.warnings, *doubts))
 
@@ -299,6 +302,7 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
             if name in slot or name in held
         },
         fixed=held,
+        led_by_prior=_led_by_prior(found, camera.names, slot, uncertainty),
         status=status,
         iterations=found.spent,
         covariance=_by_parameter(uncertainty, free, len(camera.names)),
@@ -332,6 +336,20 @@ def _uncertainty(
     mild = problem_with(*known, mild_term(found.views, start, model, noise))
     opinion = second_opinion(found.views, mild, plain, start, state, own)
     return (own, []) if opinion is None else (opinion.uncertainty, opinion_warnings(opinion))
+
+
+def _led_by_prior(
+    found: Solved, names: Sequence[str], slot: Mapping[str, int], uncertainty: Uncertainty
+) -> tuple[str, ...]:
+    """Parameters whose variance would more than double without their prior."""
+    led = []
+    for term in found.minimum.terms:
+        if isinstance(term, Prior):
+            spread = found.views.prior_noise / term.weight
+            for index, sigma in zip(term.index.tolist(), spread.tolist(), strict=True):
+                if float(uncertainty.sigma[slot[names[index]]]) ** 2 > 0.5 * sigma**2:
+                    led.append(names[index])
+    return tuple(led)
 
 
 def _by_parameter(uncertainty: Uncertainty, free: Free, count: int) -> Tensor:
