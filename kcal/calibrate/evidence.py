@@ -3,8 +3,8 @@
 The lowest sum is the best guess, but a sum over some tens of groups is noisy. Two models are compared by paired
 differences: both are judged on the same groups, so that what these have in common cancels, and the differences say how
 sure their sum is (as the one-standard-error rule of Breiman et al. 1984 does for unpaired sums). A difference within
-two standard errors is no evidence: then the simpler of two lens models is kept, as the richer one errs more where no
-view has looked.
+two standard errors is no evidence: then the model that one would rather have is kept, which is the simpler of two lens
+models as a rule, as the richer one errs more where no view has looked.
 """
 
 from __future__ import annotations
@@ -25,12 +25,10 @@ class Contender:
     Args:
         name: of the model.
         costs: (G,) squared residuals of each group held out; infinite where the model could not show a corner.
-        parameters: how many its lens has.
     """
 
     name: str
     costs: Tensor
-    parameters: int
 
     @property
     def total(self) -> float:
@@ -46,11 +44,11 @@ def excess(one: Contender, other: Contender) -> tuple[float, float]:
 
     Example:
         >>> import torch
-        >>> a = Contender(name="a", costs=torch.tensor([1.0, 2.0, 3.0, 2.0]), parameters=3)
-        >>> b = Contender(name="b", costs=torch.tensor([1.5, 2.0, 3.5, 3.0]), parameters=2)
+        >>> a = Contender(name="a", costs=torch.tensor([1.0, 2.0, 3.0, 2.0]))
+        >>> b = Contender(name="b", costs=torch.tensor([1.5, 2.0, 3.5, 3.0]))
         >>> [round(value, 3) for value in excess(b, a)]
         [2.0, 0.816]
-        >>> c = Contender(name="c", costs=torch.tensor([1.0, 2.0, 3.0, math.inf]), parameters=2)
+        >>> c = Contender(name="c", costs=torch.tensor([1.0, 2.0, 3.0, math.inf]))
         >>> excess(c, a), excess(a, c)
         ((inf, 0.0), (-inf, 0.0))
     """
@@ -70,6 +68,6 @@ def surely_worse(one: Contender, other: Contender) -> bool:
 
 
 def choose(contenders: Sequence[Contender]) -> Contender:
-    """The simplest contender that is not surely worse than the best one."""
+    """The first contender, in order of preference, that is not surely worse than the best one."""
     best = min(contenders, key=lambda one: (int(one.costs.isinf().sum()), float(one.costs[one.costs.isfinite()].sum())))
-    return next(one for one in sorted(contenders, key=lambda one: one.parameters) if not surely_worse(one, best))
+    return next(one for one in contenders if not surely_worse(one, best))

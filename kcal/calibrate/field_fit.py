@@ -16,7 +16,6 @@ from kcal.calibrate.grouped import REFIT, GroupedViews, some_views
 from kcal.calibrate.single import Solved
 from kcal.calibrate.stacking import CANDIDATES, average_fit, stack_weights
 from kcal.calibrate.terms import Term
-from kcal.calibrate.views import free_parameters
 from kcal.lens.model import LensModel
 from kcal.lens.projection import from_pixels
 from kcal.lens.residual import LARGEST_SLOPE, Field, FieldGrid, field_bounds
@@ -90,7 +89,7 @@ def fit_field(
         forms=forms,
         shares=shares,
         effective=effective,
-        judged=Contender(name="hybrid", costs=shares.new_zeros(0), parameters=len(free_parameters(model))),
+        judged=Contender(name="hybrid", costs=shares.new_zeros(0)),
     )
     if not parts:
         return base

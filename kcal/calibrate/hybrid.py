@@ -23,7 +23,6 @@ from kcal.calibrate.options import CameraCalibrationResult
 from kcal.calibrate.single import Solved, solve
 from kcal.calibrate.stacking import CANDIDATES, deal
 from kcal.calibrate.together import alone
-from kcal.calibrate.views import free_parameters
 from kcal.calibrate.weights import whitening
 from kcal.corners.observations import Observations
 from kcal.lens.hybrid import HybridCamera
@@ -45,8 +44,9 @@ def calibrate_hybrid(
     Fits under thirteen priors, from no field to an almost free one, are averaged so that the average does best on
     held-out groups of views, and on the corners next to the border, held out in all of them, which tell how a field is
     extrapolated. The same, done again without each fifth of the groups, is compared on that fifth with parametric
-    models. Of these, and likewise of the lenses under a field, the plainest is chosen that is not surely worse than the
-    best one (`kcal.calibrate.evidence`); the hybrid is returned where it is better than the parametric model.
+    models. Of these, and likewise of the lenses under a field, the first is chosen that is not surely worse than the
+    best one (`kcal.calibrate.evidence`). The hybrid is returned where it is better than that parametric model; surely
+    better, if its lens does not contain that model.
 
     Args:
         observations: the views of one camera.
@@ -106,7 +106,7 @@ def calibrate_hybrid(
     rivals = []
     for model in dict.fromkeys(LensModel.named(r) for r in options.rivals):
         costs = judge_parametric(setting, model, solutions[model], parts)
-        rivals.append(Contender(name=str(model), costs=costs, parameters=len(free_parameters(model))))
+        rivals.append(Contender(name=str(model), costs=costs))
         progress(f"{model} judged")
 
     settled = None
@@ -117,9 +117,16 @@ def calibrate_hybrid(
     else:
         base = bases[0]
     rival = choose(rivals) if rivals else None
-    # How much of a field to believe was settled by held-out views, with none at all among the candidates: it is no
-    # richer model that would have to be surely better, but a better one it has to be.
-    better = rival is None or (base.judged.total < rival.total and base.effective >= _LEAST)
+    # How much of a field to believe was settled by held-out views, with none at all among the candidates: beside a lens
+    # within its own it need not be surely better, but better it has to be.
+    better = rival is None or (
+        base.effective >= _LEAST
+        and (
+            base.judged.total < rival.total
+            if base.model.contains(LensModel.named(rival.name))
+            else surely_worse(rival, base.judged)
+        )
+    )
     wins = settled is not None and better
     kept = settled is not None and (wins or not options.gate)
     if settled is not None and kept:

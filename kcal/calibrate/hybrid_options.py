@@ -17,11 +17,11 @@ class HybridOptions:
     """Options of `calibrate_hybrid`.
 
     Args:
-        models: lens models for the field to correct: the plainest whose hybrid is not surely worse on what was held out
-            than the best one. A plain lens leaves the field a clear task where the data are few or noisy, a rich one
-            leaves it little where the lens is far from any plain formula.
-        rivals: the parametric models that it is compared with. With none and a single model nothing is compared, which
-            takes half the time.
+        models: lens models for the field to correct, in order of preference: the first whose hybrid is not surely worse
+            on what was held out than the best one. A plain lens leaves the field a clear task where the data are few or
+            noisy or the lens is very wide, a rich one leaves it little where the lens is far from any plain formula.
+        rivals: the parametric models that it is compared with, in order of preference likewise. With none and a single
+            model nothing is compared, which takes half the time.
         board_warp: estimate how the board bends.
         weighted: as in `CalibrationOptions`.
         groups: which views are held out together. "blocks": runs of views in the order of the observations, for
@@ -36,7 +36,7 @@ class HybridOptions:
         field_of_view: likewise.
     """
 
-    models: tuple[LensModel | str, ...] = ("opencv14", "ext20")
+    models: tuple[LensModel | str, ...] = ("opencv14", "opencv8", "ext20")
     rivals: tuple[LensModel | str, ...] = ("opencv14", "ext20")
     board_warp: bool = False
     weighted: bool = True
