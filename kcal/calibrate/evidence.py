@@ -61,10 +61,10 @@ def excess(one: Contender, other: Contender) -> tuple[float, float]:
     return float(difference.sum()), float(difference.std() * len(difference) ** 0.5)
 
 
-def surely_worse(one: Contender, other: Contender) -> bool:
-    """Whether one costs more than another by more than two standard errors."""
+def surely_worse(one: Contender, other: Contender, errors: float = _SURE) -> bool:
+    """Whether one costs more than another by more than some standard errors."""
     more, error = excess(one, other)
-    return more > 0 and more > _SURE * error
+    return more > 0 and more > errors * error
 
 
 def choose(contenders: Sequence[Contender]) -> Contender:

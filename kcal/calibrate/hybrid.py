@@ -45,8 +45,8 @@ def calibrate_hybrid(
     held-out groups of views, and on the corners next to the border, held out in all of them, which tell how a field is
     extrapolated. The same, done again without each fifth of the groups, is compared on that fifth with parametric
     models. Of these, and likewise of the lenses under a field, the first is chosen that is not surely worse than the
-    best one (`kcal.calibrate.evidence`). The hybrid is returned where it is better than that parametric model; surely
-    better, if its lens does not contain that model.
+    best one (`kcal.calibrate.evidence`). The hybrid is returned where it is better than that parametric model; by
+    more than one standard error, if its lens does not contain that model.
 
     Args:
         observations: the views of one camera.
@@ -118,13 +118,13 @@ def calibrate_hybrid(
         base = bases[0]
     rival = choose(rivals) if rivals else None
     # How much of a field to believe was settled by held-out views, with none at all among the candidates: beside a lens
-    # within its own it need not be surely better, but better it has to be.
+    # within its own it need not be surely better, but better it has to be. Beside another lens it is another model.
     better = rival is None or (
         base.effective >= _LEAST
         and (
             base.judged.total < rival.total
             if base.model.contains(LensModel.named(rival.name))
-            else surely_worse(rival, base.judged)
+            else surely_worse(rival, base.judged, errors=1.0)
         )
     )
     wins = settled is not None and better
