@@ -64,6 +64,12 @@ def aims(results: Results) -> list[str]:
             1,
         ),
         line(
+            "the same, lenses alone (landmarks without noise), ≥ 5",
+            lambda run: run["located"]["OpenCV"]["lens_far"] / run["located"]["hybrid"]["lens_far"],
+            lambda v: v >= TIMES,
+            1,
+        ),
+        line(
             "hybrid: total error at 5 km over the marks' bound ≤ 1.25",
             lambda run: over_bound(run, "hybrid"),
             lambda v: v <= OVER,
@@ -138,10 +144,12 @@ def _limits(name: str, runs: list[dict]) -> str:
             (calibration, "OpenCV"),
         )
     )
+    if not math.isfinite(both + theirs):
+        return f"*{name}*: half of the draws or more have no rig."
     larger = "its lenses" if lens > rig else "the landmarks' noise"
     text = (
-        f"*{name}*: the larger part of the hybrid's {number(both, 0)} m is {larger} ({number(lens, 0)} m of lenses, "
-        f"{number(rig, 0)} m of rig). "
+        f"*{name}*: the larger part of the hybrid's {both:.0f} m is {larger} ({lens:.0f} m of lenses, {rig:.0f} m of "
+        "rig). "
     )
     if lens >= LIMIT:
         text += f"More landmarks cannot bring it to {LIMIT:.0f} m: that takes better corners or more views. "
@@ -151,8 +159,8 @@ def _limits(name: str, runs: list[dict]) -> str:
         word = "are enough" if needed <= LANDMARKS else "would be needed"
         text += f"For {LIMIT:.0f} m, {needed} landmarks like these {word}, as noise averages. "
     return text + (
-        f"A perfect lens with these {LANDMARKS} landmarks would be {number(theirs / rig, 1)} times below OpenCV's "
-        "pipeline at this target."
+        f"With these {LANDMARKS} landmarks even perfect lenses would be only {theirs / rig:.1f} times below the "
+        f"{theirs:.0f} m of OpenCV's pipeline at this target."
     )
 
 

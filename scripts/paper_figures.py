@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from page import DOCS
 from paper_aims import LIMIT
 from paper_numbers import (
@@ -55,14 +57,14 @@ def _split(results: Results) -> None:
             (-0.25, lens_share, "lenses", COLOURS["20"]),
             (0.0, rig_share, "rig (landmarks' noise)", COLOURS["14"]),
         ):
-            axes.bar(place + shift, [median(value(run, m) for run in runs) for m in SHOWN], 0.24, color=colour,
+            axes.bar(place + shift, _shown(median(value(run, m) for run in runs) for m in SHOWN), 0.24, color=colour,
                      label=title)  # fmt: skip
-        total = [median(run["located"][m]["total"][-1] for run in runs) for m in SHOWN]
+        total = _shown(median(run["located"][m]["total"][-1] for run in runs) for m in SHOWN)
         axes.bar(place + 0.25, total, 0.24, color=FAINT, label="total, with the target's marks")
         axes.axhline(median(run["bound"][-1] for run in runs), color=INK, linestyle="--", linewidth=1,
                      label="marks alone")  # fmt: skip
         axes.axhline(LIMIT, color=TRUE, linestyle=":", linewidth=1.2, label="1 %")
-        axes.set_yscale("log")
+        _logarithmic(axes)
         axes.set_xticks(place, SHOWN)
         axes.tick_params(labelsize=8)
         axes.set_title(f"{name}: range error at 5 km, m", fontsize=10, loc="left")
@@ -70,6 +72,22 @@ def _split(results: Results) -> None:
         axes.set_axisbelow(True)
     _legend_below(figure, axes)
     save_png(DOCS / "paper-split.png", figure)
+
+
+def _shown(values: Iterable[float]) -> list[float]:
+    """What failed has no bar."""
+    return [value if math.isfinite(value) else math.nan for value in values]
+
+
+def _logarithmic(axes: Axes) -> None:
+    """A logarithmic axis with plain numbers, of a decade at least: small differences are to look small."""
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    wider = max(1.0, 10.0 * low / high) ** 0.5
+    axes.set_ylim(low / wider, high * wider)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _legend_below(figure: Figure, axes: Axes) -> None:
@@ -118,11 +136,13 @@ def _models(results: Results) -> None:
             axes = figure.add_subplot(len(results), 2, 2 * line + column + 1)
             values = np.array([[value(run, m) for m in models] for run in runs])
             middles = np.array([median(column) for column in values.T])
-            values[~np.isfinite(values)] = middles[~np.isfinite(middles)] = np.nan
+            values[~np.isfinite(values)] = np.nan
+            middles[~np.isfinite(middles)] = np.nan
             axes.plot(place, values.T, color=FAINT, linewidth=0.8, marker=".", markersize=4)
             axes.plot(place, middles, color=FOUND, linewidth=2, marker="o")
             axes.set_xticks(place, models)
-            axes.set_yscale("log")
+            if np.isfinite(middles).any():
+                _logarithmic(axes)
             axes.grid(axis="y", color=GRID, linewidth=0.6)
             axes.set_title(f"{name}: {title}", fontsize=10, loc="left")
     axes.set_xlabel("coefficients; grey: each draw, blue: median", fontsize=9)
@@ -136,12 +156,13 @@ def _distance(results: Results) -> None:
     for line, (name, runs) in enumerate(results.items()):
         left, right = (figure.add_subplot(len(results), 2, 2 * line + column + 1) for column in (0, 1))
         true = np.array([math.hypot(*point) for point in runs[0]["targets"]])
-        for shift, label in zip(np.linspace(-0.2, 0.2, len(SHOWN)), SHOWN, strict=True):
+        for shift, label in zip(np.linspace(-0.12, 0.12, len(SHOWN)), SHOWN, strict=True):
             pixels = np.array([reprojection(run, label) for run in runs])
             metres = np.array([[calibration(run, label, i) for i in range(len(true))] for run in runs]) / true * 100
             for axes, values in ((left, pixels), (right, metres)):
-                middles = np.array([median(column) for column in values.T])
-                bars = np.clip([middles - values.min(0), values.max(0) - middles], 0, None)
+                middles = np.array(_shown(median(column) for column in values.T))
+                values[~np.isfinite(values)] = np.nan
+                bars = np.clip([middles - np.nanmin(values, 0), np.nanmax(values, 0) - middles], 0, None)
                 axes.errorbar(
                     place + shift, middles, bars, color=COLOURS[label], marker="o", markersize=4, capsize=2,
                     linewidth=1.2, elinewidth=0.8, label=label,
@@ -149,7 +170,7 @@ def _distance(results: Results) -> None:
         noise = np.median([run["bound"] for run in runs], 0) / true * 100
         right.plot(place, noise, color=INK, linestyle="--", linewidth=1, label="marks' noise alone, σ")
         for axes, title in ((left, "reprojection error, pixels"), (right, "range error by calibration, %")):
-            axes.set_yscale("log")
+            _logarithmic(axes)
             axes.set_xticks(place, DISTANCES)
             axes.set_title(f"{name}: {title}", fontsize=10, loc="left")
             axes.grid(axis="y", color=GRID, linewidth=0.6)
@@ -163,7 +184,7 @@ def _edges(results: Results) -> None:
     for column, (name, runs) in enumerate(results.items()):
         axes = figure.add_subplot(1, len(results), column + 1)
         for shift, which, title, colour in ((-0.2, 0, "centre", FAINT), (0.2, 1, "edge", FOUND)):
-            values = [median(edge_means(run, m)[which] for run in runs) for m in SHOWN]
+            values = _shown(median(edge_means(run, m)[which] for run in runs) for m in SHOWN)
             axes.bar(place + shift, values, 0.38, color=colour, label=title)
         axes.set_xticks(place, SHOWN)
         axes.tick_params(labelsize=8)
@@ -175,7 +196,7 @@ def _edges(results: Results) -> None:
 def _map(results: Results) -> None:
     """Plan view of the first draw, with a logarithmic range: as the paper's Fig. 6 and 11."""
     panels = [("14", "integer"), ("14", "marked"), ("20", "marked"), ("hybrid", "marked")]
-    figure = new_figure(13.5, 3.3 * len(results))
+    figure = new_figure(13.5, 2.75 * len(results))
     for line, (name, runs) in enumerate(results.items()):
         for column, (label, kind) in enumerate(panels):
             axes = figure.add_subplot(len(results), len(panels), len(panels) * line + column + 1)

@@ -147,7 +147,7 @@ def by_kcal(scene: DemoScene, cameras: tuple[Camera, Camera]) -> Orient:
         try:
             # Nothing is left out: a lens model that contradicts the landmarks is to show it.
             solved = solve_rig(RigData(cameras=cameras, names=SIDES, landmarks=landmarks), JointOptions(reject=False))
-        except KcalError:
+        except (KcalError, RuntimeError):
             return lost
         rig = solved.stereo()
         locate = Triangulate(rig, pixel_sigma=MARK_SIGMA)

@@ -25,6 +25,7 @@ from paper_numbers import (
     reprojection,
     rms,
 )
+from paper_site import SURVEY_SIGMA
 
 
 def distance(results: Results) -> list[str]:
@@ -57,6 +58,8 @@ def distance(results: Results) -> list[str]:
     lines += [
         _against_paper(results, worst),
         "",
+        _by_distance(results),
+        "",
         "Range error by calibration, metres (the last column: percent at 5 km), RMS over the draws of the landmarks' "
         "noise, and for lenses alone (landmarks without noise); below, what the marks alone leave.",
         "",
@@ -83,6 +86,21 @@ def _against_paper(results: Results, worst: Callable[[dict, str], float]) -> str
     if most < 0.5 * least:
         return text + "So much is hardly a lens: a rig that is wrong, or points that are not where they are said to be."
     return text + "A lens that its model does not follow can make errors of that size."
+
+
+def _by_distance(results: Results) -> str:
+    every = [reprojection(run, "hybrid") for runs in results.values() for run in runs]
+    near, far = (median(errors[point] for errors in every) for point in (0, -1))
+    text = (
+        f"The paper's errors grow with distance. Here the hybrid's are {near:.2f} px at 100 m and {far:.2f} px at 5 km, "
+        "medians of all draws"
+    )
+    if near > far:
+        text += (
+            ": nearby, what the survey leaves open of the rig's place shows; "
+            f"{100 * SURVEY_SIGMA:g} cm are {1600 * SURVEY_SIGMA / 100:.2f} px at 100 m"
+        )
+    return f"{text}."
 
 
 def choice(results: Results) -> list[str]:

@@ -37,6 +37,8 @@ MODELS = {
 # every view may be held out for itself.
 HYBRID = HybridOptions(models=("ext20",), rivals=tuple(MODELS.values()), groups="views")
 NAN = math.nan
+# What ends one model and not the whole run; the page lists it.
+REFUSED = (KcalError, RuntimeError)
 FLAGS = cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL
 Pair = dict[str, tuple[Camera, float]]  # of both sides: a camera and its RMS
 
@@ -89,7 +91,7 @@ class _Run:
             try:
                 found = {s: calibrate_camera(seen, CalibrationOptions(model=model)) for s, seen in self.seen.items()}
                 pair = {side: (each.camera, each.rms) for side, each in found.items()}
-            except KcalError as error:
+            except REFUSED as error:
                 self.result["failed"].append(f"{label}: {error}")
         self._locate(label, pair)
 
@@ -105,7 +107,7 @@ class _Run:
                 for each in found.values():
                     for label, rms in _held_out(each).items():
                         held_out.setdefault(label, []).append(rms)
-            except KcalError as error:
+            except REFUSED as error:
                 self.result["failed"].append(f"hybrid: {error}")
         if pairs["hybrid"] is not None:
             always = dataclasses.replace(HYBRID, gate=False, rivals=())
@@ -116,7 +118,7 @@ class _Run:
                         for side, each in found.items()
                     }
                     pairs["field"] = {s: (each.calibration.camera, each.calibration.rms) for s, each in forced.items()}
-                except KcalError as error:
+                except REFUSED as error:
                     self.result["failed"].append(f"field: {error}")
         for label in (*MODELS, "hybrid", "field"):
             values = held_out.get(label, [NAN])
