@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from page import table
@@ -81,7 +82,8 @@ def distance(results: Results) -> list[str]:
 
 def _against_paper(results: Results, worst: Callable[[dict, str], float]) -> str:
     least = min(FIGURE_9.values())
-    most = max(median(worst(run, m) for run in runs) for runs in results.values() for m in SHOWN)
+    medians = [median(worst(run, m) for run in runs) for runs in results.values() for m in SHOWN]
+    most = max(filter(math.isfinite, medians), default=math.nan)
     text = f"The paper's errors are {least:g} to {max(FIGURE_9.values()):g} px; the largest median here is {most:.2f}. "
     if most < 0.5 * least:
         return text + "So much is hardly a lens: a rig that is wrong, or points that are not where they are said to be."
@@ -92,8 +94,8 @@ def _by_distance(results: Results) -> str:
     every = [reprojection(run, "hybrid") for runs in results.values() for run in runs]
     near, far = (median(errors[point] for errors in every) for point in (0, -1))
     text = (
-        f"The paper's errors grow with distance. Here the hybrid's are {near:.2f} px at 100 m and {far:.2f} px at 5 km, "
-        "medians of all draws"
+        f"The paper's errors grow with distance. Here the hybrid's are {near:.2f} px at 100 m and {far:.2f} px at 5 "
+        "km, medians of all draws"
     )
     if near > far:
         text += (
@@ -117,10 +119,10 @@ def choice(results: Results) -> list[str]:
             "14": ["14"] * len(runs),
         }
         scores = {
-            how: [100 * relative(run, label) for run, label in zip(runs, which, strict=True)]
+            how: [100 * relative(run, label) if label else math.nan for run, label in zip(runs, which, strict=True)]
             for how, which in chosen.items()
         }
-        gains += [a - b for a, b in zip(scores["views"], scores["leak"], strict=True)]
+        gains += [a - b for a, b in zip(scores["views"], scores["leak"], strict=True) if math.isfinite(a - b)]
         rows.append([name, *(middle(values, 2) for values in scores.values())])
         rows.append([f"{name}, chosen", *(", ".join(chosen[how]) for how in ("views", "checks", "leak")), "", "", ""])
     heads = ["", "held-out views", "check points", "the seven points (leak)", "hybrid", "always 20", "always 14"]
