@@ -11,14 +11,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
 import time
 from typing import Any
 
-from bench_solver import COLUMNS, MODELS, NOISE, ROWS, SIZE, SQUARE, simulate
+from bench_solver import COLUMNS, MODELS, NOISE, ROWS, SIZE, SQUARE, WEAK, simulate
+from memory import peak_megabytes
 from page import write_section
 from timing import row, show
 
@@ -42,15 +42,15 @@ def work(way: str, cameras: int, views: int, coefficients: int) -> None:
         pixels = simulate(views, seed=FIRST_SEED + number)["pixels"].tolist()
         seen = tuple(View(name=f"{i:04}", pixels=tuple(map(tuple, view))) for i, view in enumerate(pixels))
         sets.append(Observations(board=board, image_size=SIZE, views=seen))
-    options = CalibrationOptions(model=MODELS[coefficients])
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    options = CalibrationOptions(model=MODELS[coefficients], weak_prior=WEAK)
+    before = peak_megabytes()
     start = time.perf_counter()
     if way == "one call":
         found = calibrate_cameras(sets, options)
     else:
         found = [calibrate_camera(seen, options) for seen in sets]
     seconds = time.perf_counter() - start
-    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    after = peak_megabytes()
     good = [one for one in found if isinstance(one, CameraCalibrationResult)]
     print(json.dumps({
         "seconds": seconds,
@@ -89,7 +89,8 @@ def main() -> None:
         f"thread(s), median of {arguments.repeats} alternating runs. *One call*: `calibrate_cameras`; *calls*: "
         "`calibrate_camera` for each. *Ratio*: time of the calls over that of the one call (range). *Same*: cameras "
         f"whose RMS agrees to {SAME_RMS:g}; *worst*: the largest difference of RMS, relative, and of fx in standard "
-        "deviations. *MB*: how much peak memory grows by calibrating.",
+        f"deviations. Models beyond 5 coefficients with `weak_prior={WEAK}`. *MB*: how much peak memory grows by "
+        "calibrating.",
         "",
         "| coefficients | one call s | calls s | ratio | same | worst RMS | worst fx / σ | one call MB | calls MB |",
         "|---|---|---|---|---|---|---|---|---|",

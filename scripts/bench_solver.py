@@ -3,11 +3,12 @@
     python scripts/bench_solver.py                          all sizes and models, three runs each
     python scripts/bench_solver.py --views 15 50 --coefficients 5 14 --repeats 1
     KCAL_PEERS=/path/to/env/bin/python python scripts/bench_solver.py    Ceres too, from an environment with pyceres
+    KCAL_MRCAL=/usr/bin/python3 python scripts/bench_solver.py           mrcal too, from one with mrcal and cv2
 
-Every solver runs in its own process and times the calibration alone. kcal and OpenCV calibrate from nothing; Ceres
-starts from `cv2.initCameraMatrix2D` and the true tilts, without which it keeps flipped boards. The runs of all solvers
-alternate. RMS is recomputed from each solution alike. A lens that folds between the corners is no lens: such a
-solution is marked, and does not count as the best.
+Every solver runs in its own process, warmed up on a few views, and times the calibration alone. kcal and OpenCV
+calibrate from nothing; Ceres and mrcal start from `cv2.initCameraMatrix2D` and the true tilts, without which they keep
+flipped boards. The runs of all solvers alternate. RMS is recomputed from each solution alike. A lens that folds between
+the corners is no lens: such a solution is marked, and does not count as the best.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -25,7 +25,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from memory import peak_megabytes
 from page import write_section
+from timing import show
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
@@ -33,7 +35,13 @@ if TYPE_CHECKING:
 MODELS = {5: "opencv5", 8: "opencv8", 14: "opencv14", 20: "ext20"}
 SIZE, COLUMNS, ROWS, SQUARE, NOISE = (1920, 1080), 6, 7, 0.05, 0.2
 TRUTH = [-0.35, 0.15, 3e-4, -2e-4, -0.03, 0.02, -0.015, 0.005, 4e-4, -2e-4, -3e-4, 2e-4, 0.004, -0.003]
-SAME = 1e-4
+SAME, WEAK = 1e-4, 0.3
+
+
+def true_camera() -> Camera:
+    from kcal.lens.camera import Camera
+
+    return Camera.build(focal=(1600, 1600), center=(963, 536), size=SIZE, coefficients=TRUTH, model="opencv14")
 
 
 def simulate(
@@ -43,12 +51,10 @@ def simulate(
     import torch
 
     from kcal.corners.board import Board
-    from kcal.lens.camera import Camera
     from kcal.lens.pose import rotation_from_vector
 
     rng = np.random.default_rng(count if seed is None else seed)
-    if camera is None:
-        camera = Camera.build(focal=(1600, 1600), center=(963, 536), size=SIZE, coefficients=TRUTH, model="opencv14")
+    camera = camera or true_camera()
     focal = float(camera.focal[0])
     board = Board(columns=COLUMNS, rows=ROWS, square=SQUARE).points
     rotations: list[np.ndarray] = []
@@ -84,7 +90,7 @@ def flipped_views(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 # Solvers: data, number of coefficients -> (fx fy cx cy, coefficients, rotations, translations, seconds).
-def with_kcal(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...]:
+def with_kcal(data: dict[str, np.ndarray], coefficients: int, weak: float | None = None) -> tuple[Any, ...]:
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
     from kcal.corners.board import Board
     from kcal.corners.observations import Observations, View
@@ -92,11 +98,15 @@ def with_kcal(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...]
     views = tuple(View(name=f"{i:04}", pixels=tuple(map(tuple, v))) for i, v in enumerate(data["pixels"].tolist()))
     seen = Observations(board=Board(columns=COLUMNS, rows=ROWS, square=SQUARE), image_size=SIZE, views=views)
     start = time.perf_counter()
-    result = calibrate_camera(seen, CalibrationOptions(model=MODELS[coefficients]))
+    result = calibrate_camera(seen, CalibrationOptions(model=MODELS[coefficients], weak_prior=weak))
     seconds = time.perf_counter() - start
     vector = result.camera.parameters_vector.detach().numpy()
     poses = result.cam_from_board_rotation.numpy(), result.cam_from_board_translation.numpy()
     return vector[:4], vector[5:], *poses, seconds
+
+
+def with_weak_prior(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...]:
+    return with_kcal(data, coefficients, WEAK)
 
 
 def with_opencv(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...]:
@@ -115,6 +125,54 @@ def with_opencv(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ..
     rotation = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
     pinhole = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
     return pinhole, lens.ravel()[:coefficients], rotation, np.array(shifts).reshape(-1, 3), seconds
+
+
+def good_start(data: dict[str, np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Fx fy cx cy and poses (rotation vector, translation), of the two tilts the one next to the truth."""
+    import cv2
+
+    corners = [view.astype(np.float32)[:, None] for view in data["pixels"]]
+    matrix = cv2.initCameraMatrix2D([data["board"].astype(np.float32)] * len(corners), corners, SIZE)
+    poses = []
+    for view, truth in zip(data["pixels"], data["rotation"], strict=True):
+        _, turns, shifts, _ = cv2.solvePnPGeneric(data["board"], view[:, None], matrix, None, flags=cv2.SOLVEPNP_IPPE)
+        best = max(range(len(turns)), key=lambda i: np.trace(truth.T @ cv2.Rodrigues(turns[i])[0]))
+        poses.append(np.concatenate([turns[best].ravel(), shifts[best].ravel()]))
+    return matrix[[0, 1, 0, 1], [0, 1, 2, 2]], poses
+
+
+def with_mrcal(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...]:
+    import cv2
+    import mrcal
+
+    count = len(data["pixels"])
+    pinhole, poses = good_start(data)
+    lens = np.random.default_rng(0).uniform(-1e-6, 1e-6, coefficients)
+    lens[5:] *= 1e-3
+    intrinsics, frames = np.concatenate([pinhole, lens])[None], np.array(poses)
+    seen = np.ones((count, ROWS, COLUMNS, 3))
+    seen[..., :2] = data["pixels"].reshape(count, ROWS, COLUMNS, 2)
+    index = np.stack([np.arange(count), np.zeros(count), -np.ones(count)], 1).astype(np.int32)
+    start = time.perf_counter()
+    mrcal.optimize(
+        intrinsics=intrinsics,
+        extrinsics_rt_fromref=None,
+        frames_rt_toref=frames,
+        points=None,
+        observations_board=seen,
+        indices_frame_camintrinsics_camextrinsics=index,
+        observations_point=None,
+        indices_point_camintrinsics_camextrinsics=None,
+        lensmodel=f"LENSMODEL_OPENCV{coefficients}",
+        imagersizes=np.array([SIZE], np.int32),
+        calibration_object_spacing=SQUARE,
+        do_apply_outlier_rejection=False,
+        do_optimize_calobject_warp=False,
+        do_apply_regularization=False,
+    )
+    seconds = time.perf_counter() - start
+    rotation = np.array([cv2.Rodrigues(frame[:3])[0] for frame in frames])
+    return intrinsics[0, :4], intrinsics[0, 4:], rotation, frames[:, 3:], seconds
 
 
 def with_ceres(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...]:
@@ -139,14 +197,8 @@ def with_ceres(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...
                     jacobians[k][:] = derivative[:, columns].ravel()
             return True
 
-    corners = [view.astype(np.float32)[:, None] for view in data["pixels"]]
-    matrix = cv2.initCameraMatrix2D([data["board"].astype(np.float32)] * len(corners), corners, SIZE)
-    shared = np.concatenate([matrix[[0, 1, 0, 1], [0, 1, 2, 2]], np.zeros(coefficients)])
-    poses = []
-    for view, truth in zip(data["pixels"], data["rotation"], strict=True):
-        _, turns, shifts, _ = cv2.solvePnPGeneric(data["board"], view[:, None], matrix, None, flags=cv2.SOLVEPNP_IPPE)
-        best = max(range(len(turns)), key=lambda i: np.trace(truth.T @ cv2.Rodrigues(turns[i])[0]))
-        poses.append(np.concatenate([turns[best].ravel(), shifts[best].ravel()]))
+    pinhole, poses = good_start(data)
+    shared = np.concatenate([pinhole, np.zeros(coefficients)])
     start = time.perf_counter()
     problem, costs = pyceres.Problem(), [View(view) for view in data["pixels"]]
     for cost, pose in zip(costs, poses, strict=True):
@@ -161,18 +213,31 @@ def with_ceres(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...
     return shared[:4], shared[4:], rotation, np.array(poses)[:, 3:], seconds
 
 
-SOLVERS = {"kcal": with_kcal, "OpenCV": with_opencv, "Ceres": with_ceres}
+SOLVERS = {
+    "kcal": with_kcal,
+    "kcal, weak prior": with_weak_prior,
+    "OpenCV": with_opencv,
+    "Ceres": with_ceres,
+    "mrcal": with_mrcal,
+}
+# The models that each of them has; 5 coefficients have no use for the weak prior.
+KNOWN = {"kcal": (5, 8, 14, 20), "kcal, weak prior": (8, 14, 20), "OpenCV": (5, 8, 14), "Ceres": (5, 8, 14)} | {
+    "mrcal": (5, 8)
+}
+PYTHON = {"Ceres": "KCAL_PEERS", "mrcal": "KCAL_MRCAL"}
 
 
 def work(name: str, path: str, coefficients: int) -> None:
     """In a process of its own: solve once and print the outcome."""
-    if name == "kcal":
+    if name.startswith("kcal"):
         import torch
 
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     data = dict(np.load(path))
+    # What is loaded at the first call only is not counted.
+    SOLVERS[name]({key: values if key == "board" else values[:8] for key, values in data.items()}, 5)
     pinhole, lens, rotation, translation, seconds = SOLVERS[name](data, coefficients)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    peak = peak_megabytes()
     arrays = {"pinhole": pinhole, "lens": lens, "rotation": rotation, "translation": translation}
     np.savez(path.replace(".npz", f".{name}.npz"), **arrays)
     print(json.dumps({"seconds": seconds, "megabytes": peak}))
@@ -182,6 +247,7 @@ def judge(data: dict[str, np.ndarray], solution: dict[str, np.ndarray], coeffici
     """RMS, flipped views and whether the lens is one, by the same measure for all."""
     import torch
 
+    from kcal.lens.camera import Camera
     from kcal.lens.model import LensModel
     from kcal.lens.projection import project_components
 
@@ -197,11 +263,28 @@ def judge(data: dict[str, np.ndarray], solution: dict[str, np.ndarray], coeffici
     r, turns = torch.linspace(0, radius, 400).double(), torch.linspace(0, 2 * np.pi, 25).double()[:-1]
     ring = torch.stack([torch.outer(r, turns.cos()), torch.outer(r, turns.sin()), torch.ones(400, 24).double()])
     regular = bool(project_components(ring.flatten(1), parameters[0], model).regular.all())
-    return {"rms": float(error.square().sum(-1).mean().sqrt()), "flipped": int(flipped.sum()), "regular": regular}
+    rms = float(error.square().sum(-1).mean().sqrt())
+    found, truth = Camera(parameters[0], size=SIZE, model=model), true_camera()
+    distance = image_error(found, truth)
+    return {"rms": rms, "flipped": int(flipped.sum()), "regular": regular, "truth": distance}
+
+
+def image_error(found: Camera, truth: Camera) -> float:
+    """RMS over the image, in pixels, of the angle between the rays of both cameras after their best rotation."""
+    import torch
+
+    pixels = truth.grid(24, 14)
+    (ours, valid), (theirs, known) = found.unproject(pixels), truth.unproject(pixels)
+    both = valid & known
+    a = torch.nn.functional.normalize(ours[both].detach(), dim=-1)
+    b = torch.nn.functional.normalize(theirs[both].detach(), dim=-1)
+    u, _, vh = torch.linalg.svd(b.T @ a)
+    turned = a @ (u @ vh).T
+    return float(truth.focal[0]) * float((turned - b).square().sum(-1).mean().sqrt())
 
 
 def run(name: str, path: Path, coefficients: int, timeout: float) -> dict[str, Any]:
-    python = os.environ["KCAL_PEERS"] if name == "Ceres" else sys.executable
+    python = os.environ[PYTHON[name]] if name in PYTHON else sys.executable
     command = [python, __file__, "--work", name, str(path), str(coefficients)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=True)
@@ -213,9 +296,9 @@ def run(name: str, path: Path, coefficients: int, timeout: float) -> dict[str, A
     return found
 
 
-def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> list[str]:
-    """Lines of the table for one problem."""
-    names = [name for name in SOLVERS if name == "kcal" or (coefficients <= 14 and name in arguments.solvers)]
+def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> tuple[list[str], dict[str, float]]:
+    """Lines of the table for one problem, and the median seconds of each solver."""
+    names = [name for name in arguments.solvers if coefficients in KNOWN[name]]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "views.npz"
         data = simulate(views)
@@ -231,25 +314,51 @@ def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> lis
             if "failed" not in runs[name][-1]
         }
     best = min((one["rms"] for one in judged.values() if one["regular"]), default=float("nan"))
-    own = [one.get("seconds", float("nan")) for one in runs["kcal"]]
+    own = {name: [one.get("seconds", float("nan")) for one in runs[name]] for name in names if name.startswith("kcal")}
     lines = []
     for name in names:
         head = f"| {views} | {coefficients} | {name} |"
         if name not in judged:
-            lines.append(f"{head} {runs[name][-1]['failed']} | | | | | |")
+            lines.append(f"{head} {runs[name][-1]['failed']} | | | | | | | |")
             continue
         seconds = [one["seconds"] for one in runs[name]]
-        ratios = [a / b for a, b in zip(own, seconds, strict=False)]
-        spread = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})" if name != "kcal" else ""
+        cells = []
+        for mine in ("kcal", "kcal, weak prior"):
+            ratios = [a / b for a, b in zip(own.get(mine, []), seconds, strict=False)]
+            shown = ratios and not name.startswith("kcal")
+            cells.append(f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})" if shown else "")
         one = judged[name]
         excess = f"{one['rms'] / best - 1:+.1e}" if one["regular"] else "folds"
         if one["regular"] and one["rms"] / best - 1 <= SAME:
             excess = "best"
         memory = max(entry["megabytes"] for entry in runs[name])
         lines.append(
-            f"{head} {1e3 * statistics.median(seconds):.0f} | {spread} | {one['rms']:.6f} | {excess} | "
-            f"{one['flipped']} | {memory:.0f} |"
+            f"{head} {1e3 * statistics.median(seconds):.0f} | {cells[0]} | {cells[1]} | {one['rms']:.6f} | {excess} | "
+            f"{one['truth']:.2f} | {one['flipped']} | {memory:.0f} |"
         )
+    return lines, {name: statistics.median(one["seconds"] for one in runs[name]) for name in judged}
+
+
+def growth(seconds: dict[tuple[int, int], dict[str, float]]) -> list[str]:
+    """How kcal's time grows with the views and with the coefficients."""
+    lines = []
+    sizes, models = sorted({views for views, _ in seconds}), sorted({count for _, count in seconds})
+    for name in ("kcal", "kcal, weak prior"):
+        told = []
+        for count in models:
+            known = [(views, seconds[views, count][name]) for views in sizes if name in seconds[views, count]]
+            if len(known) > 1:
+                (few, quick), (many, slow) = known[-2:]
+                told.append(f"{count} coefficients {np.log(slow / quick) / np.log(many / few):.2f}")
+        if told:
+            lines.append(f"Time of *{name}* grows with the views, {few} to {many}, to the power of: {', '.join(told)}.")
+        pairs = [
+            f"{seconds[views, 20][name] / seconds[views, 14][name]:.2f} at {views}"
+            for views in sizes
+            if name in seconds.get((views, 20), {}) and name in seconds.get((views, 14), {})
+        ]
+        if pairs:
+            lines.append(f"20 coefficients take, times 14: {', '.join(pairs)} views.")
     return lines
 
 
@@ -261,31 +370,36 @@ def main() -> None:
     parser.add_argument("--views", type=int, nargs="*", default=[15, 50, 200, 800])
     parser.add_argument("--coefficients", type=int, nargs="*", default=list(MODELS), choices=list(MODELS))
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--timeout", type=float, default=120.0)
+    parser.add_argument("--timeout", type=float, default=60.0)
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
-    arguments.solvers = ["OpenCV", *(["Ceres"] if os.environ.get("KCAL_PEERS") else [])]
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    arguments.solvers = [name for name in SOLVERS if name not in PYTHON or os.environ.get(PYTHON[name])]
+    threads = os.environ.setdefault("OMP_NUM_THREADS", "1")
     lines = [
-        "## Beside other solvers",
+        f"## Beside other solvers, {threads} thread{'s' if threads != '1' else ''}",
         "",
         f"Made by `scripts/bench_solver.py`: simulated views of a {COLUMNS}x{ROWS} board, {SIZE[0]}x{SIZE[1]} px, "
-        f"noise {NOISE} px an axis, {os.environ['OMP_NUM_THREADS']} thread(s), median of {arguments.repeats} "
-        "alternating runs. kcal and OpenCV start from nothing, Ceres from a good start that is not timed. *Ratio* is "
-        "kcal's time over the other's: below 1 kcal is faster. *Excess*: RMS over the best of a lens that does not "
-        "fold between the corners; within 1e-4 counts as best. *Flipped*: boards more than 8 degrees from the truth. "
+        f"noise {NOISE} px an axis, {threads} thread(s), median of {arguments.repeats} "
+        "alternating runs after a small one. kcal and OpenCV start from nothing, Ceres and mrcal from a good start "
+        "that is not timed. "
+        f"*Weak prior*: `CalibrationOptions(weak_prior={WEAK})`. *Ratio* is kcal's time over the other's, without and "
+        "with the weak prior: below 1 kcal is faster. *Excess*: RMS over the best of a lens that does not fold between "
+        "the corners; within 1e-4 counts as best. *Truth*: RMS over the image, in pixels, between the rays of the "
+        "found and of the true camera after the best rotation. *Flipped*: boards more than 8 degrees from the truth. "
         "*Memory*: peak of the whole process, libraries included.",
         "",
-        "| views | coefficients | solver | ms | ratio (range) | RMS px | excess | flipped | memory MB |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| views | coefficients | solver | ms | ratio (range) | ratio, weak prior | RMS px | excess | truth px "
+        "| flipped | memory MB |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
+    seconds = {}
     for views in arguments.views:
         for coefficients in arguments.coefficients:
-            for line in compare(views, coefficients, arguments):
-                print(line, flush=True)
-                lines.append(line)
+            found, seconds[views, coefficients] = compare(views, coefficients, arguments)
+            lines += show(found)
+    lines += show(["", *growth(seconds)])
     if not arguments.dry:
-        write_section("solver.md", "beside other solvers", "\n".join(lines))
+        write_section("solver.md", f"beside other solvers, {threads} thread(s)", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -38,7 +38,8 @@ from kcal.solve.result import State, Status
 LADDER = {5: "opencv5", 8: "opencv8", 12: "opencv12", 14: "opencv14", 16: "ext16", 18: "ext18", 20: "ext20"} | {
     22: "ext22", 24: "ext24"
 }  # fmt: skip
-STARTED = (5, 8, 14)
+# Coefficients and weak prior.
+STARTED = ((5, None), (8, None), (14, None), (14, 0.3), (20, 0.3))
 UNITS = 1e6
 # Relative, of the RMS: what counts as the same optimum, and as not rising.
 SAME_RMS, SAME_PIXELS = 1e-6, 1e-3
@@ -62,8 +63,8 @@ def real_sets(folder: Path, names: list[str]) -> dict[str, Observations]:
     return found
 
 
-def options(coefficients: int, focal: float | None = None) -> CalibrationOptions:
-    return CalibrationOptions(model=LADDER[coefficients], weighted=False, focal=focal)
+def options(coefficients: int, focal: float | None = None, weak: float | None = None) -> CalibrationOptions:
+    return CalibrationOptions(model=LADDER[coefficients], weighted=False, focal=focal, weak_prior=weak)
 
 
 def ladder(sets: dict[str, Observations]) -> list[str]:
@@ -110,18 +111,18 @@ class End:
     status: Status
 
 
-def _public(seen: Observations, coefficients: int, focal: float | None) -> End | None:
+def _public(seen: Observations, coefficients: int, focal: float | None, weak: float | None) -> End | None:
     try:
-        result = calibrate_camera(seen, options(coefficients, focal))
+        result = calibrate_camera(seen, options(coefficients, focal, weak))
     except KcalError:
         return None
     return End(result.rms, result.residuals, result.status)
 
 
-def _in_units(seen: Observations, coefficients: int, unit: float) -> End | None:
+def _in_units(seen: Observations, coefficients: int, unit: float, weak: float | None) -> End | None:
     """Lengths, and with them all translations, in other units."""
     board = seen.board.model_copy(update={"square": seen.board.square * unit})
-    return _public(seen.model_copy(update={"board": board}), coefficients, None)
+    return _public(seen.model_copy(update={"board": board}), coefficients, None, weak)
 
 
 def _alone(
@@ -156,22 +157,25 @@ def starts(sets: dict[str, Observations], count: int) -> list[str]:
         "|---|---|---|---|---|---|---|",
     ])  # fmt: skip
     for name, seen in sets.items():
-        for coefficients in STARTED:
+        for coefficients, weak in STARTED:
             draw = np.random.default_rng(coefficients)
             model = LensModel.named(LADDER[coefficients])
-            solution = calibrate_camera(seen, options(coefficients))
+            solution = calibrate_camera(seen, options(coefficients, weak=weak))
             focal = float(solution.camera.focal[0])
             runs: dict[str, list[End | None]] = {}
             took: dict[str, float] = {}
             clock = time.process_time()
             runs["focal length given wrongly, factor 1/2 to 2"] = [
-                _public(seen, coefficients, focal * 2.0 ** draw.uniform(-1, 1)) for _ in range(count)
+                _public(seen, coefficients, focal * 2.0 ** draw.uniform(-1, 1), weak) for _ in range(count)
             ]
             took["focal length given wrongly, factor 1/2 to 2"] = (time.process_time() - clock) / count
             clock = time.process_time()
-            runs["lengths in units of 1e6 and 1e-6"] = [_in_units(seen, coefficients, u) for u in (UNITS, 1 / UNITS)]
+            runs["lengths in units of 1e6 and 1e-6"] = [
+                _in_units(seen, coefficients, unit, weak) for unit in (UNITS, 1 / UNITS)
+            ]
             took["lengths in units of 1e6 and 1e-6"] = (time.process_time() - clock) / 2
-            for label, unit in (("solver alone", False), ("solver alone, parameters in units 1e-6 to 1e6", True)):
+            alone = (("solver alone", False), ("solver alone, parameters in units 1e-6 to 1e6", True))
+            for label, unit in () if weak else alone:
                 clock = time.process_time()
                 runs[label] = [_alone(seen, model, solution, draw, unit) for _ in range(count)]
                 took[label] = (time.process_time() - clock) / count
@@ -183,8 +187,9 @@ def starts(sets: dict[str, Observations], count: int) -> list[str]:
                         for e in found]  # fmt: skip
                 good = sum(abs(r) <= SAME_RMS and p <= SAME_PIXELS for r, p in gaps)
                 worst = [f"{max(g[k] for g in gaps):{form}}" if gaps else "-" for k, form in ((0, "+.1e"), (1, ".1e"))]
+                prior = ", weak prior" if weak else ""
                 lines += show([
-                    f"| {name} | {coefficients} | {label} | {good} of {len(ends)} | {worst[0]} | {worst[1]} | "
+                    f"| {name} | {coefficients}{prior} | {label} | {good} of {len(ends)} | {worst[0]} | {worst[1]} | "
                     f"{took[label]:.2f} |"
                 ])  # fmt: skip
     return lines

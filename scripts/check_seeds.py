@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from bench_solver import COLUMNS, MODELS, ROWS, SIZE, SQUARE, flipped_views, simulate
+from bench_solver import COLUMNS, MODELS, ROWS, SIZE, SQUARE, flipped_views, image_error, simulate
 from page import write_section
 from timing import show
 
@@ -75,18 +75,6 @@ def random_camera(rng: np.random.Generator, model: LensModel) -> Camera:
         camera = Camera.build(focal=focals, center=centre, size=SIZE, coefficients=coefficients, model=model)
         if bool(camera.covers_image()):
             return camera
-
-
-def image_error(found: Camera, truth: Camera) -> float:
-    """RMS over the image, in pixels, of the angle between the rays of both cameras after their best rotation."""
-    pixels = truth.grid(24, 14)
-    (ours, valid), (theirs, known) = found.unproject(pixels), truth.unproject(pixels)
-    both = valid & known
-    a = torch.nn.functional.normalize(ours[both].detach(), dim=-1)
-    b = torch.nn.functional.normalize(theirs[both].detach(), dim=-1)
-    u, _, vh = torch.linalg.svd(b.T @ a)
-    turned = a @ (u @ vh).T
-    return float(truth.focal[0]) * float((turned - b).square().sum(-1).mean().sqrt())
 
 
 def judge(seed: int, views: int, model: LensModel) -> Outcome:

@@ -35,7 +35,7 @@ from kcal.solve.result import Result, State, Status, pick, stack
 _SCOUT = LMOptions(max_iterations=150, tolerance=1e-9, flatness=1e-5)
 _KEPT = 4
 # Where the smaller model leaves more than this (pixels), the lens may be too wide for it.
-_SUSPICIOUS_RMS = 2.0
+SUSPICIOUS_RMS = 2.0
 # How much χ² a lens that folds inside the image must gain on one that does not: 20 is far beyond chance for the few
 # parameters that a step of the ladder adds.
 _FOLD_PRICE = 20.0
@@ -48,9 +48,11 @@ _RUNGS = ("opencv8", "opencv12", "opencv14", "ext16", "ext18", "ext20", "ext22")
 # Those of them that are solved on all views on the way.
 _LANDINGS = ("opencv14", "ext20", "ext22")
 # With more corners than this, valleys are not followed from the solution: a batch of starts would take too long.
-_MANY_CORNERS = 4000
+MANY_CORNERS = 4000
 # How far all boards together may be turned against the first model's at a lower minimum, radians.
 _MOST_TURN = math.radians(7.0)
+# Of a corner, pixels, where priors count against it.
+LEAST_NOISE = 1e-3
 # Enough to tell the minima apart and to come near the best one.
 _SEARCH = LMOptions(max_iterations=60, tolerance=1e-7, initial_damping=1e-6)
 # Height of the wall before a fold, in units of the noise.
@@ -152,7 +154,7 @@ def climb(
     if len(models) == 1:
         result = yield Solve(views.problem(small), first, options)
         return Minimum(result=result, iterations=0)
-    if views.corner_count <= _FEW_CORNERS or views.rms(first, small) > _SUSPICIOUS_RMS:
+    if views.corner_count <= _FEW_CORNERS or views.rms(first, small) > SUSPICIOUS_RMS:
         return (yield from _climb_wholly(views, first, cold, models, options, progress))
     return (yield from _climb_folded(views, first, models, options, progress))
 
@@ -194,7 +196,7 @@ def _climb_folded(
         if not float(result.cost) <= float(problem.cost(nested)):
             result = yield Solve(problem, nested, options)
             spent += int(result.iterations)
-        if views.corner_count <= _MANY_CORNERS and views.rules.mild is None:
+        if views.corner_count <= MANY_CORNERS and views.rules.mild is None:
             result, steps = yield from _lower(views, problem, large, first, result, options)
             spent += steps
         reached, landed = result.state, large
@@ -204,7 +206,7 @@ def _climb_folded(
             folded = fold(views.problem(large, poses_only=True), result.state, observed)
         progress(str(large))
     others = [(embed(first[0], models[0], small), *first[1:]), *ends[1:]]
-    return _minimum(views, result, terms, small, others, spent)
+    return minimum_of(views, result, terms, small, others, spent)
 
 
 def _lower(
@@ -230,7 +232,7 @@ def _lower(
     return found, int(found.iterations)
 
 
-def _minimum(
+def minimum_of(
     views: Views, result: Result, terms: tuple[Term, ...], model: LensModel, others: list[State], spent: int
 ) -> Minimum:
     """A ladder's end, its cost without the wall; told `AT_BOUND` where the wall matters."""
@@ -270,13 +272,16 @@ def _climb_wholly(
         spent += int(found.iterations.max()) + int(result.iterations)
         kept[0] = result.state
         small = large
-        if last and terms and views.corner_count <= _MANY_CORNERS and views.rules.mild is None:
+        if views.rules.informed:
+            # Against the noise of a lens that fits badly priors would count far too much.
+            views = dataclasses.replace(views, prior_noise=max(views.noise(kept[0], large), LEAST_NOISE))
+        if last and terms and views.corner_count <= MANY_CORNERS and views.rules.mild is None:
             result, steps = yield from _lower(views, views.problem(large, terms=terms), large, first, result, options)
             spent += steps
             kept[0] = result.state
         progress(str(large))
     others = [(embed(first[0], models[0], small), *first[1:]), *kept[1:]]
-    return _minimum(views, result, terms, small, others, spent)
+    return minimum_of(views, result, terms, small, others, spent)
 
 
 def _price(cost: float, residual_count: int) -> float:
@@ -284,7 +289,7 @@ def _price(cost: float, residual_count: int) -> float:
     return _FOLD_PRICE * max(cost / residual_count, 1e-6)
 
 
-def _walls(views: Views, state: State, model: LensModel, radius: float) -> tuple[Term, ...]:
+def walls(views: Views, state: State, model: LensModel, radius: float) -> tuple[Term, ...]:
     """The wall at a radius, if `state` stands behind it."""
     wall = RadialBound(model, radius, _WALL * views.noise(state, model))
     return (wall,) if bool(torch.isfinite(wall.rows(torch.cat([state[0], state[1]]))).all()) else ()
@@ -301,7 +306,7 @@ def _finish(views: Views, start: State, model: LensModel, options: LMOptions) ->
     price = _price(before, plain.residual_count)
     ends: list[tuple[float, Result, tuple[Term, ...]]] = []
     for radius in (views.seen_radius(start), views.regular_radius(start, model)):
-        terms = _walls(views, start, model, radius)
+        terms = walls(views, start, model, radius)
         problem = views.problem(model, terms=terms)
         result = yield Solve(problem, start, options)
         trouble, cost = views.trouble(result.state, model), float(plain.cost(result.state))
@@ -340,7 +345,7 @@ def _scout(
     """Solve for `large` from all starts side by side, with a limited number of steps."""
     starts = [*carried, plain]
     if large.denominator >= 2 and small.denominator == 0 and large.numerator >= 2:
-        if views.rms(carried[0], large) > _SUSPICIOUS_RMS:
+        if views.rms(carried[0], large) > SUSPICIOUS_RMS:
             starts += wide_starts(views, large)
         largest = float(views.observed_radius(carried[0])) ** 2
         starts += [(near_cancelling(carried[0][0], large, largest, b), *carried[0][1:]) for b in _BUMPS]

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from kcal.calibrate.mild import Mild
+from kcal.calibrate.mild import Mild, is_rich
 from kcal.calibrate.options import CalibrationOptions
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.settle import RecordedProblem, settle
@@ -168,7 +168,7 @@ def calibrate_views(
     def problem_of(values: Sequence[Tensor], kind: type[BoardProblem] = BoardProblem) -> BoardProblem:
         corners, board, mean = values
         terms: list[Term] = [Prior(torch.tensor(known), mean, weights)] if known else []
-        if options.weak_prior is not None:
+        if options.weak_prior is not None and options.camera is None and is_rich(options.lens):
             mild = Mild(options.weak_prior, reach)
             terms.append(mild.prior(options.lens, corner_sigma, {*options.fixed, *options.priors}))
         return kind(

@@ -51,3 +51,8 @@ class Mild:
         index = [offset + i for i in sorted(shift) if names[offset + i] not in without]
         weight = torch.tensor([noise * shift[i - offset] / self.width for i in index], dtype=torch.float64)
         return Prior(torch.tensor(index, dtype=torch.long), torch.zeros_like(weight), weight)
+
+
+def is_rich(model: LensModel) -> bool:
+    """Whether a lens model has coefficients that can do each other's work."""
+    return model.denominator > 0 or model.prism > 0 or model.tilt

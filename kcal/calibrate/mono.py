@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.covariance import Uncertainty, uncertainty_of
-from kcal.calibrate.ladder import Progress
-from kcal.calibrate.opinion import is_rich, mild_term, second_opinion
+from kcal.calibrate.ladder import LEAST_NOISE, Progress
+from kcal.calibrate.mild import is_rich
+from kcal.calibrate.opinion import mild_term, second_opinion
 from kcal.calibrate.options import CalibrationOptions, CameraCalibrationResult
 from kcal.calibrate.outliers import (
     OutlierRejection,
@@ -26,7 +27,7 @@ from kcal.calibrate.outliers import (
 )
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.rules import Free
-from kcal.calibrate.single import LEAST_NOISE, Solved, corner_problem, solve
+from kcal.calibrate.single import Solved, corner_problem, solve
 from kcal.calibrate.terms import Prior, Term
 from kcal.calibrate.together import Solve, Steps, alone, together
 from kcal.calibrate.verdict import check_focal, opinion_warnings, rival_warnings, standing_out, warnings_of
@@ -286,6 +287,7 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
             if name in slot or name in held
         },
         fixed=held,
+        led_by_prior=_led_by_prior(found, camera.names, slot, uncertainty),
         status=status,
         iterations=found.spent,
         covariance=_by_parameter(uncertainty, free, len(camera.names)),
@@ -318,6 +320,20 @@ def _uncertainty(
     mild = problem_with(*known, mild_term(found.views, start, model, noise))
     opinion = second_opinion(found.views, mild, plain, start, state, own)
     return (own, []) if opinion is None else (opinion.uncertainty, opinion_warnings(opinion))
+
+
+def _led_by_prior(
+    found: Solved, names: Sequence[str], slot: Mapping[str, int], uncertainty: Uncertainty
+) -> tuple[str, ...]:
+    """Parameters whose variance would more than double without their prior."""
+    led = []
+    for term in found.minimum.terms:
+        if isinstance(term, Prior):
+            spread = found.views.prior_noise / term.weight
+            for index, sigma in zip(term.index.tolist(), spread.tolist(), strict=True):
+                if float(uncertainty.sigma[slot[names[index]]]) ** 2 > 0.5 * sigma**2:
+                    led.append(names[index])
+    return tuple(led)
 
 
 def _by_parameter(uncertainty: Uncertainty, free: Free, count: int) -> Tensor:

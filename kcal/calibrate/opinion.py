@@ -66,11 +66,6 @@ class Opinion(NamedTuple):
     explained: bool
 
 
-def is_rich(model: LensModel) -> bool:
-    """Whether a lens model has coefficients that can do each other's work."""
-    return model.denominator > 0 or model.prism > 0 or model.tilt
-
-
 def mild_term(views: Views, start: State, model: LensModel, noise: float) -> Prior:
     """The weak prior of `WIDTH` for the radius that is seen from a start, beside corners of `noise` pixels."""
     known = {*views.rules.fixed, *views.rules.priors}

@@ -42,10 +42,12 @@ class CalibrationOptions:
         free: names that are estimated although they are held by default: "skew".
         priors: Gaussian knowledge by name, as {"fx": (1600, 5)}: mean and standard deviation. It counts against the
             corners by their noise, which is taken from the residuals.
-        weak_prior: how far a lens is expected to be from a pinhole, or None: every coefficient gets the mean zero and
-            the standard deviation with which its term would shift the outermost corner by this share of its radius (by
-            a thirtieth of it for decentring, prism and tilt; `kcal.calibrate.mild`). 0.3 hardly changes what the views
-            tell, and keeps rich models from what they do not tell (docs/solver.md has figures).
+        weak_prior: how far a rich lens (with a denominator, prism or tilt) is expected to be from a pinhole: every
+            coefficient gets the mean zero and the standard deviation with which its term would shift the outermost
+            corner by this share of its radius (by a thirtieth of it for decentring, prism and tilt;
+            `kcal.calibrate.mild`). 0.3 hardly changes what the views tell, and keeps rich models from what they do not
+            tell: one minimum, found fast, with a σ that holds (docs/solver.md has figures). None, the default: the
+            corners alone decide, as in OpenCV, and their minima are searched for the lowest.
         camera: a known camera: all its parameters are held but those that `free` names, and only the board's poses (and
             its warp) are found, from one view on. Its lens model takes the place of `model`.
         solver: options of the Levenberg-Marquardt solver.
@@ -133,6 +135,8 @@ class CameraCalibrationResult:
         iterations: trial steps of the solver, all starts and models together.
         warnings: sentences about what the user should doubt.
         fixed: names of the parameters that the options held.
+        led_by_prior: names of the parameters of which a prior knows more than the views do: without it their σ would be
+            more than 1.4 times as large.
         rejected_corners: corners of the views that were used, left out by `CalibrationOptions.reject`.
         rejected_views: views left out likewise.
     """
@@ -151,6 +155,7 @@ class CameraCalibrationResult:
     iterations: int
     warnings: tuple[str, ...]
     fixed: tuple[str, ...] = ()
+    led_by_prior: tuple[str, ...] = ()
     rejected_corners: tuple[RejectedCorner, ...] = ()
     rejected_views: tuple[RejectedView, ...] = ()
 

@@ -8,38 +8,36 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from kcal.calibrate.first import first_model, posed
 from kcal.calibrate.init import (
-    homographies,
-    intrinsics_candidates,
-    poses_from_homographies,
-    radial_start,
     spread_out,
 )
-from kcal.calibrate.ladder import Minimum, Progress, climb, steps_to
-from kcal.calibrate.mild import Mild
+from kcal.calibrate.ladder import LEAST_NOISE, Minimum, Progress, climb, steps_to
+from kcal.calibrate.mild import Mild, is_rich
 from kcal.calibrate.options import CalibrationOptions
-from kcal.calibrate.poses import refining, unflipping
+from kcal.calibrate.poses import unflipping
 from kcal.calibrate.problem import BoardProblem
+from kcal.calibrate.step import step
 from kcal.calibrate.together import Solve, Steps
 from kcal.calibrate.views import Views
 from kcal.calibrate.weights import whitening
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera
-from kcal.lens.model import LensModel
-from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Result, State, Status
+from kcal.solve.result import Result, Status
 from kcal.solve.robust import RobustLoss
 
 _MINIMUM_VIEWS = 3
 _MINIMUM_CORNERS = 6
 # RMS distance in pixels of a view's corners from the line that fits them best, below which they show no plane.
 _MINIMUM_WIDTH = 0.5
-# A first fit worse than this many pixels is retried from other focal lengths.
-_SUSPICIOUS_RMS = 2.0
 
-# Of a corner, pixels; and how often it is measured anew beside priors.
-LEAST_NOISE, _NOISE_ROUNDS = 1e-3, 3
+# How often what priors refer to is measured anew, and its relative change from which on that is worth it: of the
+# solution it moves less than 1e-4 standard deviations.
+_PRIOR_ROUNDS, _SAME = 5, 1e-4
+# Of a solve that begins next to its solution.
+_NEAR_DAMPING = 1e-8
+# For a first model from which the last one is reached in one step.
+_ROUGH = LMOptions(max_iterations=100, tolerance=1e-5)
 
 
 class BoardPoints(Protocol):
@@ -101,11 +99,17 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
     _check(observations, pixels, len(rules.parameters(model)), options.board_warp, fewest)
 
     solver = options.solver
-    ladder = [step for step in steps_to(model) if rules.allows(step)] if options.camera is None else [model]
+    mild = options.weak_prior is not None and options.camera is None and is_rich(model)
+    ladder = [lens for lens in steps_to(model) if rules.allows(lens)] if options.camera is None else [model]
     if options.camera is None:
-        first, cold, spent = yield from _first(board, pixels, observations.image_size, ladder[0], options)
+        rough = _ROUGH if mild and len(ladder) > 1 else solver
+        first, cold, spent = yield from first_model(board, pixels, observations.image_size, ladder[0], options, rough)
     else:
-        first = cold = yield from _known(observations, pixels, options.camera)
+        if options.camera.size != observations.image_size:
+            raise InputError(
+                f"the known camera is of {options.camera.size} px, the observations of {observations.image_size} px"
+            )
+        first = cold = yield from posed(board, pixels, observations.names, options.camera)
         spent = 0
     progress(f"start ({ladder[0]})")
     seen = pixels[:, None]
@@ -117,12 +121,16 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
         rules=rules,
     )
     reach = float(views.observed_radius(first))
-    if options.weak_prior is not None:
+    if mild and options.weak_prior is not None:
         rules = dataclasses.replace(rules, mild=Mild(options.weak_prior, reach))
         views = dataclasses.replace(views, rules=rules)
     if rules.informed:
         views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), LEAST_NOISE))
-    minimum = yield from climb(views, first, cold, ladder, solver, progress)
+    minimum = None
+    if rules.mild is not None and len(ladder) > 1:
+        minimum = yield from step(views, first, ladder[0], model, progress)
+    if minimum is None:
+        minimum = yield from climb(views, first, cold, ladder, solver, progress)
     spent += minimum.iterations
 
     # The first model's poses were looked at; look once more under another lens.
@@ -138,11 +146,18 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
             result = yield Solve(problem, state, solver)
             spent += int(result.iterations)
     if rules.informed:
-        # The noise, against which priors count, is that of this solution.
-        for _ in range(_NOISE_ROUNDS):
-            views = dataclasses.replace(views, prior_noise=max(views.noise(result.state, model), LEAST_NOISE))
+        # The noise, against which priors count, is that of this solution, and so is the outermost corner.
+        for turn in range(_PRIOR_ROUNDS):
+            noise = max(views.noise(result.state, model), LEAST_NOISE)
+            reach = float(views.observed_radius(result.state))
+            known = rules.mild is None or abs(reach - rules.mild.reach) <= _SAME * reach
+            if turn and known and abs(noise - views.prior_noise) <= _SAME * noise:
+                break
+            if rules.mild is not None:
+                rules = dataclasses.replace(rules, mild=dataclasses.replace(rules.mild, reach=reach))
+            views = dataclasses.replace(views, prior_noise=noise, rules=rules)
             problem = views.problem(model, terms=minimum.terms)
-            result = yield Solve(problem, result.state, solver)
+            result = yield Solve(problem, result.state, dataclasses.replace(solver, initial_damping=_NEAR_DAMPING))
             spent += int(result.iterations)
         rivals = tuple((float(views.problem(model).cost(state)), state) for _, state in minimum.rivals)
         terms = (*minimum.terms, *rules.terms(model, views.prior_noise))
@@ -219,81 +234,3 @@ def _check(observations: Corners, pixels: Tensor, count: int, warp: bool, fewest
         raise DegenerateError(
             f"{int(seen.sum())} corners cannot determine {unknowns} parameters: add views or choose a smaller model"
         )
-
-
-def _first(
-    board: Tensor, pixels: Tensor, size: tuple[int, int], model: LensModel, options: CalibrationOptions
-) -> Steps[tuple[State, State, int]]:
-    """The first model's solution, a start without distortion, both from the closed forms, and the trials spent."""
-    homography = homographies(board, pixels)
-    spent = 0
-    best: tuple[float, State, State] | None = None
-    candidates = intrinsics_candidates(homography, size)
-    rules, focal = options.rules(size), options.start_focal(size)
-    if focal is not None:
-        centre = [(size[0] - 1) / 2, (size[1] - 1) / 2]
-        candidates.insert(0, torch.tensor([focal, focal, *centre], dtype=torch.float64))
-    views = Views(board_points=board, pixels=pixels[:, None], size=size, free_warp=options.board_warp, rules=rules)
-    for candidate in candidates:
-        zero = torch.zeros(len(INTRINSICS) + model.size, dtype=torch.float64)
-        zero[:4] = candidate
-        zero = rules.impose(zero, model)
-        intrinsics = zero[:4]
-        rotation, translation = poses_from_homographies(homography, intrinsics)
-        lens = zero.clone()
-        if model.numerator >= 2:
-            k1, k2 = (len(INTRINSICS) + i for i in model.numerator_index[:2])
-            lens[[k1, k2]] = radial_start(board, pixels, intrinsics, rotation, translation)
-        lens = rules.impose(lens, model)
-        rest = (
-            torch.zeros(2, dtype=torch.float64),
-            torch.zeros(0, 3, 3, dtype=torch.float64),
-            torch.zeros(0, 3, dtype=torch.float64),
-            rotation,
-            translation,
-        )
-        problem = views.problem(model)
-        cold: State = (zero, *rest)
-        for start in ((lens, *rest), cold):
-            result = yield Solve(problem, start, options.solver)
-            spent += int(result.iterations)
-            if result.status != Status.BAD_START:
-                break
-        state, flipped = yield from unflipping(board, pixels[:, None], [model], result.state)
-        if flipped:
-            result = yield Solve(problem, state, options.solver)
-            spent += int(result.iterations)
-        cost = float(result.cost)
-        if cost == cost and (best is None or cost < best[0]):
-            best = (cost, result.state, cold)
-        if best is not None and _rms(best[0], pixels) < _SUSPICIOUS_RMS:
-            break
-    if best is None:
-        raise InputError("no start explains the corners: are all views of this board and from this camera?")
-    return best[1], best[2], spent
-
-
-def _known(observations: Corners, pixels: Tensor, camera: Camera) -> Steps[State]:
-    """Board poses under a known camera, refined one by one, both tilts of each tried."""
-    if camera.size != observations.image_size:
-        raise InputError(f"the known camera is of {camera.size} px, the observations of {observations.image_size} px")
-    board, seen = observations.board.points, torch.isfinite(pixels).all(-1)
-    camera = Camera(camera.parameters_vector.detach().double().cpu(), size=camera.size, model=camera.model)
-    rays, valid = camera.unproject(torch.nan_to_num(pixels))
-    used = seen & valid & (rays[..., 2] > 0)
-    ideal = torch.where(used[..., None], rays[..., :2] / rays[..., 2:], torch.nan)
-    poor = (~spread_out(board, ideal)).nonzero()[:, 0].tolist()
-    if poor:
-        raise InputError(f"view {observations.names[poor[0]]!r}: the known camera gives its corners too few rays")
-    pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    poses = poses_from_homographies(homographies(board, ideal), pinhole)
-    empty = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
-    state: State = (camera.parameters_vector, torch.zeros(2, dtype=torch.float64), *empty, *poses)
-    views = pixels[:, None]
-    state, _ = yield from refining(board, views, [camera.model], state, LMOptions(max_iterations=30))
-    state, _ = yield from unflipping(board, views, [camera.model], state)
-    return state
-
-
-def _rms(cost: float, pixels: Tensor) -> float:
-    return float((2.0 * cost / int(torch.isfinite(pixels).all(-1).sum())) ** 0.5)

@@ -46,7 +46,7 @@ def calibrate(
     ] = None,
     weak_prior: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", help="Expect a lens this close to a pinhole: 0.3 keeps rich models tame."),
+        typer.Option(metavar="SHARE", help="Expect a rich lens this close to a pinhole: 0.3 keeps it tame, and fast."),
     ] = None,
     camera: Annotated[
         Path | None,
@@ -103,7 +103,7 @@ def calibrate(
 
         for option, given in (
             ("--fix", fix), ("--tie", tie), ("--free", free), ("--prior", prior), ("--loss", loss),
-            ("--reject", reject), ("--weak-prior", weak_prior), ("--camera", camera),
+            ("--reject", reject), ("--weak-prior", weak_prior is not None), ("--camera", camera),
         ):  # fmt: skip
             if given:
                 raise InputError(f"{option} does not go with --model hybrid")
@@ -259,5 +259,7 @@ def _table(result: CameraCalibrationResult) -> Table:
         digits = 3 if name in ("fx", "fy", "cx", "cy") else 6
         unknown = "fixed" if name in result.fixed else "not determined"
         spread = unknown if sigma is None else f"{sigma:.{digits}f}"
+        if name in result.led_by_prior:
+            spread += " (by its prior)"
         table.add_row(name, f"{values[name]:.{digits}f}", spread)
     return table

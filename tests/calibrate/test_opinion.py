@@ -7,9 +7,8 @@ import torch
 from calibrate_scenes import camera, motions, observe, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.mild import Mild
+from kcal.calibrate.mild import Mild, is_rich
 from kcal.calibrate.mono import CalibrationOptions, CameraCalibrationResult, calibrate_camera
-from kcal.calibrate.opinion import is_rich
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel

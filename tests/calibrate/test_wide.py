@@ -39,13 +39,14 @@ def test_a_rational_lens_follows_the_curve(model: str, curve) -> None:
     assert LensModel.named(model).size == len(lens)
 
 
-def test_a_simulated_wide_lens_without_a_guess() -> None:
+@pytest.mark.parametrize("weak_prior", [None, 0.3])
+def test_a_simulated_wide_lens_without_a_guess(weak_prior: float | None) -> None:
     lens = rational_curve(equidistant, LensModel.named("opencv8"), math.radians(84))
     truth = Camera.build(
         focal=(330, 331), center=(318, 243), size=(640, 480), coefficients=lens.tolist(), model="opencv8"
     )
     pixels = pixels_of(truth, motions(truth, 20, 3, fill=0.7), noise=0.1, seed=3)
-    result = calibrate_camera(observe(pixels, board=BOARD), CalibrationOptions(model="opencv8"))
+    result = calibrate_camera(observe(pixels, board=BOARD), CalibrationOptions(model="opencv8", weak_prior=weak_prior))
     # 0.1 px an axis is 0.141 px as RMS over points.
     assert result.rms < 0.15
     assert float(result.camera.focal[0]) == pytest.approx(330, rel=0.01)
