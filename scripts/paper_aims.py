@@ -111,7 +111,8 @@ def split(results: Results) -> list[str]:
         f"{LANDMARKS} landmarks' noise ({100 * SURVEY_SIGMA:g} cm, {MARK_SIGMA:g} px) adds. *Calibration*: both. "
         f"*Marks*: the target's own marks ({MARK_SIGMA:g} px), with all else exact. *All over the image*: by "
         f"calibration, of points 5 km away on a grid. *{MIXED}*: the cameras of `cv2.calibrateCamera`, oriented by "
-        "`solve_rig` and triangulated by kcal, so that nothing but corners and lens is OpenCV's.",
+        "`solve_rig` and triangulated by kcal, so that nothing but corners and lens is OpenCV's. *Failed*: somewhere a "
+        "lens has no ray for a pixel; kcal says so, where OpenCV returns a number.",
         "",
     ]
     for name, runs in results.items():

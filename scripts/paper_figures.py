@@ -15,6 +15,8 @@ from page import DOCS
 from paper_aims import LIMIT
 from paper_numbers import (
     DISTANCES,
+    HALF_CENTRE,
+    MIDDLE,
     SHOWN,
     TABLE_3,
     Results,
@@ -64,12 +66,14 @@ def _split(results: Results) -> None:
         axes.axhline(median(run["bound"][-1] for run in runs), color=INK, linestyle="--", linewidth=1,
                      label="marks alone")  # fmt: skip
         axes.axhline(LIMIT, color=TRUE, linestyle=":", linewidth=1.2, label="1 %")
-        _logarithmic(axes)
+        axes.set_yscale("log")
         axes.set_xticks(place, SHOWN)
         axes.tick_params(labelsize=8)
         axes.set_title(f"{name}: range error at 5 km, m", fontsize=10, loc="left")
         axes.grid(axis="y", color=GRID, linewidth=0.6)
         axes.set_axisbelow(True)
+    # All share it: its limits must count every bar.
+    _logarithmic(axes)
     _legend_below(figure, axes)
     save_png(DOCS / "paper-split.png", figure)
 
@@ -179,10 +183,11 @@ def _distance(results: Results) -> None:
 
 
 def _edges(results: Results) -> None:
-    figure = new_figure(4.6 * len(results), 4.0)
+    figure = new_figure(4.6 * (len(results) + 1), 4.0)
     place = np.arange(len(SHOWN))
-    for column, (name, runs) in enumerate(results.items()):
-        axes = figure.add_subplot(1, len(results), column + 1)
+    _where(figure.add_subplot(1, len(results) + 1, 1), next(iter(results.values()))[0]["target_pixels"])
+    for column, (name, runs) in enumerate(results.items(), 2):
+        axes = figure.add_subplot(1, len(results) + 1, column)
         for shift, which, title, colour in ((-0.2, 0, "centre", FAINT), (0.2, 1, "edge", FOUND)):
             values = _shown(median(edge_means(run, m)[which] for run in runs) for m in SHOWN)
             axes.bar(place + shift, values, 0.38, color=colour, label=title)
@@ -191,6 +196,20 @@ def _edges(results: Results) -> None:
         axes.set_title(f"{name}: mean reprojection error, pixels", fontsize=10, loc="left")
     _legend_below(figure, axes)
     save_png(DOCS / "paper-edges.png", figure)
+
+
+def _where(axes: Axes, pixels: list[list[float]]) -> None:
+    """The paper's Fig. 7: what counts as the centre, and where the seven points are seen."""
+    axes.add_patch(Rectangle((-0.5, -0.5), 1920, 1080, fill=False, edgecolor=INK))
+    axes.add_patch(Rectangle((MIDDLE - HALF_CENTRE, -0.5), 2 * HALF_CENTRE, 1080, color=GRID))
+    for number, (u, v) in enumerate(pixels, 1):
+        axes.scatter(u, v, color=TRUE, s=22)
+        axes.annotate(str(number), (u, v), textcoords="offset points", xytext=(4, 3), fontsize=8, color=TRUE)
+    axes.set_xlim(-40, 1960)
+    axes.set_ylim(1120, -40)
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=8)
+    axes.set_title("the seven points in the left image, shaded: centre", fontsize=10, loc="left")
 
 
 def _map(results: Results) -> None:

@@ -23,6 +23,8 @@ FIGURE_9 = {"14": 10.62, "20": 7.21, "hybrid": 6.93}
 SHOWN = ("14", "20", "24", "hybrid", "field", "OpenCV")
 # Their lenses, everything else by kcal.
 MIXED = "OpenCV, kcal's rig"
+# Columns: the image's middle, and half the width of what counts as its centre.
+MIDDLE, HALF_CENTRE = 959.5, 480.0
 # Errors closer than this share are alike: the draws of the landmarks' noise tell no more.
 ALIKE = 0.02
 
@@ -110,7 +112,7 @@ def reprojection(run: dict, label: str) -> list[float]:
 
 def edge_means(run: dict, label: str) -> tuple[float, float]:
     """Mean reprojection error of the points in the middle half of the image, and of the others."""
-    central = [abs(pixel[0] - 959.5) < 480 for pixel in run["target_pixels"]]
+    central = [abs(pixel[0] - MIDDLE) < HALF_CENTRE for pixel in run["target_pixels"]]
     errors = reprojection(run, label)
     groups = [[e for e, inside in zip(errors, central, strict=True) if inside == wanted] for wanted in (True, False)]
     return statistics.fmean(groups[0]), statistics.fmean(groups[1])

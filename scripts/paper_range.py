@@ -124,7 +124,15 @@ def choice(results: Results) -> list[str]:
         }
         gains += [a - b for a, b in zip(scores["views"], scores["leak"], strict=True) if math.isfinite(a - b)]
         rows.append([name, *(middle(values, 2) for values in scores.values())])
-        rows.append([f"{name}, chosen", *(", ".join(chosen[how]) for how in ("views", "checks", "leak")), "", "", ""])
+        rows.append(
+            [
+                f"{name}, chosen",
+                *(", ".join(each or "–" for each in chosen[how]) for how in ("views", "checks", "leak")),
+                "",
+                "",
+                "",
+            ]
+        )
     heads = ["", "held-out views", "check points", "the seven points (leak)", "hybrid", "always 20", "always 14"]
     return [
         "## Choosing the model, and what the leak is worth",
@@ -146,7 +154,7 @@ def edges(results: Results) -> list[str]:
     lines = [
         "## Fig. 7 and 10: centre and edge",
         "",
-        "![Reprojection error at the centre and at the edge](paper-edges.png)",
+        "![The seven points in the image, and reprojection error at the centre and at the edge](paper-edges.png)",
         "",
         "Centre: the middle half of the image's width. Mean reprojection error of the seven points there, and of the "
         "others, pixels:",
