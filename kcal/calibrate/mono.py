@@ -30,7 +30,14 @@ from kcal.calibrate.rules import Free
 from kcal.calibrate.single import Solved, corner_problem, solve
 from kcal.calibrate.terms import Prior, Term
 from kcal.calibrate.together import Solve, Steps, alone, together
-from kcal.calibrate.verdict import check_focal, opinion_warnings, rival_warnings, standing_out, warnings_of
+from kcal.calibrate.verdict import (
+    check_focal,
+    contradicted,
+    opinion_warnings,
+    rival_warnings,
+    standing_out,
+    warnings_of,
+)
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
@@ -146,6 +153,7 @@ def _calibrating(
 def _judge(observations: Observations, solved: Solved, options: CalibrationOptions) -> CameraCalibrationResult:
     found = _result(observations, solved, options)
     doubts = rival_warnings(found.camera, found.sigma, solved.minimum, solved.plain_cost, solved.problem.residual_count)
+    doubts += contradicted(solved.minimum.terms, solved.result.state, solved.views.prior_noise)
     doubts += standing_out(observations.names, _weighted_residuals(solved.problem, solved.result.state))
     return dataclasses.replace(found, warnings=(*found.warnings, *doubts))
 

@@ -5,20 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+import torch
 from torch import Tensor
 
 from kcal.calibrate.ladder import Minimum
 from kcal.calibrate.opinion import Opinion
 from kcal.calibrate.outliers import corners_beyond
+from kcal.calibrate.terms import Prior, Term
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
-from kcal.solve.result import Status
+from kcal.solve.result import State, Status
 
 # A focal length known to worse than this is not a calibration: 5 % of range at every distance.
 _MAX_FOCAL_SIGMA = 0.05
 # A rival that is worse by less χ² than this cannot be ruled out: the gain that chance gives 14 more parameters.
 _CLOSE_RIVAL = 25.0
+# Mean square of what priors are missed by, in their standard deviations, from which on they are contradicted.
+_CONTRADICTION = 3.0
 # A corner this many times farther off than noise explains is told of.
 _GROSS = 2.0
 
@@ -37,6 +41,26 @@ def check_focal(sigma: Mapping[str, float], parameters: Tensor) -> None:
             f"the views determine the focal length {known}: they are parallel to the image or too much alike; add "
             "views with the board tilted by 30 to 45 degrees in different directions, or choose a smaller model"
         )
+
+
+def contradicted(terms: Sequence[Term], state: State, noise: float) -> list[str]:
+    """A warning where parameters lie much farther from where priors expect them than the priors allow for.
+
+    Args:
+        terms: the priors among them are looked at.
+        state: the solution.
+        noise: pixels, beside which the priors counted.
+    """
+    values = torch.cat([state[0], state[1]])
+    rows = [term.rows(values)[-1] for term in terms if isinstance(term, Prior)]
+    squared = sum(float((row / noise).square().sum()) for row in rows)
+    count = sum(len(row) for row in rows)
+    if squared <= _CONTRADICTION * count:
+        return []
+    return [
+        f"the views contradict the priors: the parameters lie {(squared / count) ** 0.5:.1f} of their standard "
+        "deviations away; give wider ones, for a strong lens a larger weak prior or none"
+    ]
 
 
 def rival_warnings(

@@ -69,3 +69,17 @@ def test_exact_corners_are_hardly_moved() -> None:
     """Priors count as beside corners of a thousandth of a pixel at least."""
     seen = observe(pixels_of(TRUTH, motions(TRUTH, 25, 3)))
     assert calibrate_camera(seen, CalibrationOptions(model="opencv14", weak_prior=0.3)).rms < 5e-4
+
+
+def test_a_prior_that_the_views_contradict_is_told_of() -> None:
+    seen = observe(pixels_of(TRUTH, motions(TRUTH, 20, 5), noise=0.05))
+    contradicted = [
+        any("contradict" in text for text in calibrate_camera(seen, options).warnings)
+        for options in (
+            CalibrationOptions(model="opencv14", weak_prior=0.3),
+            CalibrationOptions(model="opencv14", weak_prior=0.002),
+            CalibrationOptions(priors={"fx": (500.0, 5.0)}),
+            CalibrationOptions(priors={"fx": (520.0, 5.0)}),
+        )
+    ]
+    assert contradicted == [False, True, False, True]
