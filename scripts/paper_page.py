@@ -71,7 +71,7 @@ def _head(results: Results, views: int) -> list[str]:
         "cameras and rig is wrong. Six more surveyed points are kept out of everything, to choose models by.",
         "",
         "**The models.** 14 to 24: coefficients, as in the paper. *hybrid*: a residual field on top of "
-        f"{' or '.join(map(str, HYBRID.models))} (`calibrate_hybrid`), as kcal returns it, which is a parametric "
+        f"{_bases()} coefficients (`calibrate_hybrid`), as kcal returns it, which is a parametric "
         "camera wherever held-out views do not say that the field is better. *field*: the same with the field in any "
         f"case. {_kept(results)}",
     ]
@@ -87,6 +87,11 @@ def _cameras() -> str:
         f"reverse telephoto of {vision} pieces of glass, f 1600 px, 60 degrees, put together well. Every draw has its "
         "own lenses. A tenth of the pupil's wander is kept."
     )
+
+
+def _bases() -> str:
+    """How many coefficients the lenses have that a field may correct."""
+    return " or ".join("".join(filter(str.isdigit, str(model))) for model in HYBRID.models)
 
 
 def _look(name: str) -> str:
