@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+from timing import row
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -19,3 +22,15 @@ def write_section(page: str, name: str, text: str) -> None:
     else:
         whole = f"{whole.rstrip()}\n\n{block}\n"
     path.write_text(whole, encoding="utf-8")
+
+
+def read_section(page: str, name: str) -> str:
+    """What `write_section` put there; empty if it never did."""
+    whole = (DOCS / page).read_text(encoding="utf-8")
+    begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
+    return whole.split(begin)[1].split(end)[0].strip() if begin in whole else ""
+
+
+def table(heads: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]:
+    """A Markdown table."""
+    return [row(*heads), row(*["---"] * len(heads)), *(row(*cells) for cells in rows)]

@@ -1,16 +1,33 @@
-"""The pictures of docs/paper.md: coverage, models, distance, centre and edge, map."""
+"""The pictures of docs/paper.md: error by source, coverage, models, distance, centre and edge, map."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from page import DOCS
-from paper_numbers import DISTANCES, SHOWN, TABLE_3, Results, edge_means, labels, median, rms
-from paper_site import KINDS
+from paper_aims import LIMIT
+from paper_numbers import (
+    DISTANCES,
+    HALF_CENTRE,
+    MIDDLE,
+    SHOWN,
+    TABLE_3,
+    Results,
+    calibration,
+    edge_means,
+    lens_share,
+    median,
+    position,
+    reprojection,
+    rig_share,
+)
 
 from kcal.corners.observations import Observations
 from kcal.report.figures import new_figure, save_png
@@ -19,16 +36,69 @@ COLOURS = {
     "14": "#dd7a1f", "16": "#b7791f", "18": "#8a5a00", "20": "#2b6cb0", "24": "#6b46c1", "hybrid": "#2f855a",
     "field": "#9f1239", "OpenCV": "#6b7280",
 }  # fmt: skip
-TRUE, FOUND, FAINT, INK = "#c02a6b", "#2b6cb0", "#9aa3af", "#111827"
+TRUE, FOUND, FAINT, INK, GRID = "#c02a6b", "#2b6cb0", "#9aa3af", "#111827", "#e5e7eb"
 
 
 def write_figures(results: Results, work: Path, views: int) -> None:
-    rigs = {name: runs for name, runs in results.items() if name in KINDS}
-    _coverage(work, next(iter(rigs)), views)
-    _models(rigs)
-    _distance(rigs)
-    _edges(rigs)
-    _map(rigs)
+    _split(results)
+    _coverage(work, next(iter(results)), views)
+    _models(results)
+    _distance(results)
+    _edges(results)
+    _map(results)
+
+
+def _split(results: Results) -> None:
+    """Medians of the parts of the error at 5 km, side by side: they add up in squares."""
+    figure = new_figure(4.6 * len(results), 4.2)
+    first = None
+    for column, (name, runs) in enumerate(results.items()):
+        axes = first = figure.add_subplot(1, len(results), column + 1, sharey=first)
+        place = np.arange(len(SHOWN))
+        for shift, value, title, colour in (
+            (-0.25, lens_share, "lenses", COLOURS["20"]),
+            (0.0, rig_share, "rig (landmarks' noise)", COLOURS["14"]),
+        ):
+            axes.bar(place + shift, _shown(median(value(run, m) for run in runs) for m in SHOWN), 0.24, color=colour,
+                     label=title)  # fmt: skip
+        total = _shown(median(run["located"][m]["total"][-1] for run in runs) for m in SHOWN)
+        axes.bar(place + 0.25, total, 0.24, color=FAINT, label="total, with the target's marks")
+        axes.axhline(median(run["bound"][-1] for run in runs), color=INK, linestyle="--", linewidth=1,
+                     label="marks alone")  # fmt: skip
+        axes.axhline(LIMIT, color=TRUE, linestyle=":", linewidth=1.2, label="1 %")
+        axes.set_yscale("log")
+        axes.set_xticks(place, SHOWN)
+        axes.tick_params(labelsize=8)
+        axes.set_title(f"{name}: range error at 5 km, m", fontsize=10, loc="left")
+        axes.grid(axis="y", color=GRID, linewidth=0.6)
+        axes.set_axisbelow(True)
+    # All share it: its limits must count every bar.
+    _logarithmic(axes)
+    _legend_below(figure, axes)
+    save_png(DOCS / "paper-split.png", figure)
+
+
+def _shown(values: Iterable[float]) -> list[float]:
+    """What failed has no bar."""
+    return [value if math.isfinite(value) else math.nan for value in values]
+
+
+def _logarithmic(axes: Axes) -> None:
+    """A logarithmic axis with plain numbers, of a decade at least: small differences are to look small."""
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    wider = max(1.0, 10.0 * low / high) ** 0.5
+    axes.set_ylim(low / wider, high * wider)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _legend_below(figure: Figure, axes: Axes) -> None:
+    handles, titles = axes.get_legend_handles_labels()
+    height = 0.35 / figure.get_size_inches()[1]
+    figure.tight_layout(rect=(0, height, 1, 1))
+    figure.legend(handles, titles, loc="lower center", ncols=len(titles), fontsize=9, frameon=False)
 
 
 def _coverage(work: Path, name: str, views: int) -> None:
@@ -57,87 +127,98 @@ def _turbo(share: float) -> tuple[float, float, float, float]:
     return colormaps["turbo"](share)
 
 
-def _models(rigs: Results) -> None:
-    figure = new_figure(11.0, 4.2 * len(rigs))
-    for line, (name, runs) in enumerate(rigs.items()):
-        models = labels(runs, [*TABLE_3, "hybrid", "field"])
-        place = np.arange(len(models))
-        for column, (title, value) in enumerate(
-            (
-                (
-                    "RMS position error of seven points by calibration, m",
-                    lambda r, m: rms(r["located"][m]["position_error"]),
-                ),
-                ("RMS of held-out views, pixels", lambda r, m: r["held_out"][m]),
-            )
-        ):
-            axes = figure.add_subplot(len(rigs), 2, 2 * line + column + 1)
+def _models(results: Results) -> None:
+    figure = new_figure(11.0, 3.6 * len(results))
+    models = [*TABLE_3, "hybrid", "field"]
+    panels = (
+        ("RMS position error of seven points by calibration, m", position),
+        ("RMS of held-out views, pixels", lambda run, label: run["held_out"][label]),
+    )
+    place = np.arange(len(models))
+    for line, (name, runs) in enumerate(results.items()):
+        for column, (title, value) in enumerate(panels):
+            axes = figure.add_subplot(len(results), 2, 2 * line + column + 1)
             values = np.array([[value(run, m) for m in models] for run in runs])
+            middles = np.array([median(column) for column in values.T])
             values[~np.isfinite(values)] = np.nan
-            axes.plot(place, values.T, color=FAINT, linewidth=0.8)
-            axes.plot(place, np.nanmedian(values, 0), color=FOUND, linewidth=2, marker="o")
+            middles[~np.isfinite(middles)] = np.nan
+            axes.plot(place, values.T, color=FAINT, linewidth=0.8, marker=".", markersize=4)
+            axes.plot(place, middles, color=FOUND, linewidth=2, marker="o")
             axes.set_xticks(place, models)
-            axes.set_yscale("log")
+            if np.isfinite(middles).any():
+                _logarithmic(axes)
+            axes.grid(axis="y", color=GRID, linewidth=0.6)
             axes.set_title(f"{name}: {title}", fontsize=10, loc="left")
-            axes.set_xlabel("coefficients; grey: each draw, blue: median", fontsize=9)
+    axes.set_xlabel("coefficients; grey: each draw, blue: median", fontsize=9)
     figure.tight_layout()
     save_png(DOCS / "paper-models.png", figure)
 
 
-def _distance(rigs: Results) -> None:
-    figure = new_figure(12.0, 4.6 * len(rigs))
-    for line, (name, runs) in enumerate(rigs.items()):
-        left, right = (figure.add_subplot(len(rigs), 2, 2 * line + column + 1) for column in (0, 1))
-        place = np.arange(len(DISTANCES))
+def _distance(results: Results) -> None:
+    figure = new_figure(12.0, 4.2 * len(results))
+    place = np.arange(len(DISTANCES))
+    for line, (name, runs) in enumerate(results.items()):
+        left, right = (figure.add_subplot(len(results), 2, 2 * line + column + 1) for column in (0, 1))
         true = np.array([math.hypot(*point) for point in runs[0]["targets"]])
-        models = labels(runs, SHOWN)
-        for shift, label in zip(np.linspace(-0.18, 0.18, len(models)), models, strict=True):
-            pixels = np.array([run["located"][label]["reprojection"] for run in runs])
-            metres = np.abs([run["located"][label]["range_error"] for run in runs]) / true * 100
+        for shift, label in zip(np.linspace(-0.12, 0.12, len(SHOWN)), SHOWN, strict=True):
+            pixels = np.array([reprojection(run, label) for run in runs])
+            metres = np.array([[calibration(run, label, i) for i in range(len(true))] for run in runs]) / true * 100
             for axes, values in ((left, pixels), (right, metres)):
-                middle = np.nanmedian(values, 0)
-                bars = [middle - np.nanmin(values, 0), np.nanmax(values, 0) - middle]
+                middles = np.array(_shown(median(column) for column in values.T))
+                values[~np.isfinite(values)] = np.nan
+                bars = np.clip([middles - np.nanmin(values, 0), np.nanmax(values, 0) - middles], 0, None)
                 axes.errorbar(
-                    place + shift, middle, bars, color=COLOURS[label], marker="o", markersize=4, capsize=2,
+                    place + shift, middles, bars, color=COLOURS[label], marker="o", markersize=4, capsize=2,
                     linewidth=1.2, elinewidth=0.8, label=label,
                 )  # fmt: skip
         noise = np.median([run["bound"] for run in runs], 0) / true * 100
         right.plot(place, noise, color=INK, linestyle="--", linewidth=1, label="marks' noise alone, σ")
         for axes, title in ((left, "reprojection error, pixels"), (right, "range error by calibration, %")):
-            axes.set_yscale("log")
+            _logarithmic(axes)
             axes.set_xticks(place, DISTANCES)
-            axes.set_title(f"{name}: {title}; median, smallest, largest of {len(runs)}", fontsize=10, loc="left")
-            axes.grid(axis="y", color="#e5e7eb", linewidth=0.6)
-        right.legend(fontsize=8)
-    figure.tight_layout()
+            axes.set_title(f"{name}: {title}", fontsize=10, loc="left")
+            axes.grid(axis="y", color=GRID, linewidth=0.6)
+    _legend_below(figure, right)
     save_png(DOCS / "paper-distance.png", figure)
 
 
-def _edges(rigs: Results) -> None:
-    figure = new_figure(5.5 * len(rigs), 4.0)
-    for column, (name, runs) in enumerate(rigs.items()):
-        axes = figure.add_subplot(1, len(rigs), column + 1)
-        models = labels(runs, SHOWN)
-        place = np.arange(len(models))
+def _edges(results: Results) -> None:
+    figure = new_figure(4.6 * (len(results) + 1), 4.0)
+    place = np.arange(len(SHOWN))
+    _where(figure.add_subplot(1, len(results) + 1, 1), next(iter(results.values()))[0]["target_pixels"])
+    for column, (name, runs) in enumerate(results.items(), 2):
+        axes = figure.add_subplot(1, len(results) + 1, column)
         for shift, which, title, colour in ((-0.2, 0, "centre", FAINT), (0.2, 1, "edge", FOUND)):
-            values = [median(edge_means(run, m)[which] for run in runs) for m in models]
+            values = _shown(median(edge_means(run, m)[which] for run in runs) for m in SHOWN)
             axes.bar(place + shift, values, 0.38, color=colour, label=title)
-        axes.set_xticks(place, models)
-        axes.set_ylabel("mean reprojection error, pixels")
-        axes.set_title(f"{name}: median over draws (the paper's Fig. 10)", fontsize=10, loc="left")
-        axes.legend(fontsize=9)
-    figure.tight_layout()
+        axes.set_xticks(place, SHOWN)
+        axes.tick_params(labelsize=8)
+        axes.set_title(f"{name}: mean reprojection error, pixels", fontsize=10, loc="left")
+    _legend_below(figure, axes)
     save_png(DOCS / "paper-edges.png", figure)
 
 
-def _map(rigs: Results) -> None:
+def _where(axes: Axes, pixels: list[list[float]]) -> None:
+    """The paper's Fig. 7: what counts as the centre, and where the seven points are seen."""
+    axes.add_patch(Rectangle((-0.5, -0.5), 1920, 1080, fill=False, edgecolor=INK))
+    axes.add_patch(Rectangle((MIDDLE - HALF_CENTRE, -0.5), 2 * HALF_CENTRE, 1080, color=GRID))
+    for number, (u, v) in enumerate(pixels, 1):
+        axes.scatter(u, v, color=TRUE, s=22)
+        axes.annotate(str(number), (u, v), textcoords="offset points", xytext=(4, 3), fontsize=8, color=TRUE)
+    axes.set_xlim(-40, 1960)
+    axes.set_ylim(1120, -40)
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=8)
+    axes.set_title("the seven points in the left image, shaded: centre", fontsize=10, loc="left")
+
+
+def _map(results: Results) -> None:
     """Plan view of the first draw, with a logarithmic range: as the paper's Fig. 6 and 11."""
-    figure = new_figure(13.5, 2.7 * len(rigs))
-    for line, (name, runs) in enumerate(rigs.items()):
-        last = "field" if "field" in runs[0]["located"] else "24"
-        panels = [("14", "integer"), ("14", "marked"), ("20", "marked"), (last, "marked")]
+    panels = [("14", "integer"), ("14", "marked"), ("20", "marked"), ("hybrid", "marked")]
+    figure = new_figure(13.5, 2.75 * len(results))
+    for line, (name, runs) in enumerate(results.items()):
         for column, (label, kind) in enumerate(panels):
-            axes = figure.add_subplot(len(rigs), 4, 4 * line + column + 1)
+            axes = figure.add_subplot(len(results), len(panels), len(panels) * line + column + 1)
             title = {"integer": "whole pixels", "marked": "sub-pixel marks"}[kind]
             _plan(axes, runs[0]["targets"], runs[0]["located"][label][kind])
             axes.set_title(f"{name}: {label}, {title}", fontsize=10)

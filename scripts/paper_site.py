@@ -1,4 +1,4 @@
-"""The paper's rig for `reproduce_paper.py`: its two kinds of lenses, its images, and the corners found in them.
+"""The paper's rig for `reproduce_paper.py`: its three kinds of lenses, its images, and the corners found in them.
 
 Images are rendered through a ray-traced lens, get noise, a gamma and JPEG's losses, and go through kcal's detector and
 through OpenCV's; nothing that is calibrated ever sees the truth.
@@ -18,7 +18,7 @@ import torch
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
 from kcal.corners.observations import Failure, Observations, View
-from kcal.sim.captures import PAPER_BOARD, drawn_lens
+from kcal.sim.captures import PAPER_BOARD
 from kcal.sim.poses import sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
 from kcal.sim.scene import DemoScene, Places
@@ -49,8 +49,8 @@ class Kind(NamedTuple):
 KINDS = {
     "glass": Kind("wide glass lens, poorly centred", "surveillance", 3.0),
     "plastic": Kind("plastic aspheres", "webcam", 1.0, field=0.7),
+    "vision": Kind("machine vision lens", "machine-vision", 1.0, look="vision", field=0.88),
 }
-EXTRA = {"vision": Kind("machine vision lens", "machine-vision", 1.0, look="vision")}
 
 
 def paper_scene(kind: Kind, seed: int) -> DemoScene:
@@ -75,17 +75,14 @@ def paper_scene(kind: Kind, seed: int) -> DemoScene:
 
 
 def lenses(name: str, seed: int) -> dict[str, TruthLens]:
-    """The cameras of a kind: left and right of a rig, or one alone."""
-    if name in EXTRA:
-        kind = EXTRA[name]
-        return {"left": drawn_lens(kind.lens, kind.strength, 900 + seed)}
+    """The two cameras of a kind's rig."""
     rig: Any = paper_scene(KINDS[name], seed).rig
     return {"left": rig.left, "right": rig.right}
 
 
 def observe(folder: Path, name: str, seed: int, side: str, lens: TruthLens, views: int) -> dict[str, float]:
     """Render, spoil and search the images of one camera; the corners go to files, the times come back."""
-    kind = (KINDS | EXTRA)[name]
+    kind = KINDS[name]
     # Streams of their own for poses and noise, whatever else was drawn.
     generator = torch.Generator().manual_seed(1_000_003 * (seed + 1) + 17 * len(name) + (side == "right"))
     poses = sample_board_poses(lens, PAPER_BOARD, views, generator, fill=(0.25, 0.8))

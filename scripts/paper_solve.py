@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
-import torch
-from paper_site import KINDS, MARK_SIGMA, SURVEY_SIGMA, lenses, observe, paper_scene
-from torch import Tensor
+from paper_locate import bound, by_kcal, by_opencv, judge, nowhere
+from paper_site import KINDS, lenses, observe, paper_scene
 
-from kcal.calibrate.align import pose_alone
-from kcal.calibrate.hybrid import HybridOptions, calibrate_hybrid
+from kcal.calibrate.hybrid import HybridOptions, HybridResult, calibrate_hybrid
 from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
-from kcal.calibrate.rig import JointOptions, solve_rig
-from kcal.calibrate.rig_sources import Landmarks, RigData
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
-from kcal.locate.stereo import Triangulate
 from kcal.sim.infinity import error_at_infinity
-from kcal.sim.scene import DemoScene
-from kcal.solve.lm import LMOptions
+from kcal.sim.truth import TruthLens
 
-SIDES = ("left", "right")
 # What the paper calls 14, 16, 18, 20, 20 (its second one), 22 and 24 parameters.
 MODELS = {
     "14": "opencv14",
@@ -37,212 +32,152 @@ MODELS = {
     "20b": "ext20b",
     "22": "ext22",
     "24": "ext24",
-    "hybrid": "hybrid",
-    "field": "field",
 }
+# Every model of Table 3 is a rival, so that one call holds views out for all. Poses are drawn and have no neighbours:
+# every view may be held out for itself.
+HYBRID = HybridOptions(models=("ext20",), rivals=tuple(MODELS.values()), groups="views")
 NAN = math.nan
-DRAWS = 100  # of the marks' noise
+# What ends one model and not the whole run; the page lists it.
+REFUSED = (KcalError, RuntimeError)
 FLAGS = cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL
+Pair = dict[str, tuple[Camera, float]]  # of both sides: a camera and its RMS
 
 
 def run_seed(folder: Path, name: str, seed: int, views: int) -> dict[str, Any]:
     """Everything of one seed of one kind of camera; what is in the folder is not made again."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "result.json"
-    known = json.loads(path.read_text()) if path.exists() else {}
-    result: dict[str, Any] = {"name": name, "seed": seed, "spent": {}, "cameras": {}, "held_out": {}, "located": {}}
-    result["failed"] = []
-    result |= known
-    spent = result["spent"]
-    true = lenses(name, seed)
-    for side, lens in true.items():
-        if not all((folder / f"{side}.{who}.json").exists() for who in ("kcal", "opencv")):
-            for stage, seconds in observe(folder, name, seed, side, lens, views).items():
-                spent[stage] = spent.get(stage, 0.0) + seconds
-    seen = {side: Observations.load(folder / f"{side}.kcal.json") for side in true}
-    result["views"] = {side: len(observations.views) for side, observations in seen.items()}
-    is_rig = name in KINDS
-    scene = paper_scene(KINDS[name], seed) if is_rig else None
-    for label, model in MODELS.items() if is_rig else [("14", MODELS["14"])]:
-        if label in result["cameras"]:
-            continue
-        path.write_text(json.dumps(result))
-        start = time.process_time()
-        try:
-            pair = {side: fit(seen[side], model) for side in true}
-        except KcalError as error:
-            result["failed"].append(f"{label}: {error}")
-            result["cameras"][label] = {
-                side: dict.fromkeys(("rms", "fx", "infinity", "infinity_max"), NAN) for side in true
-            }
-            if scene is not None:
-                result["held_out"][label], result["located"][label] = NAN, nowhere(len(scene.targets.names))
-            continue
-        spent[f"calibrate, {label}"] = time.process_time() - start
-        result["cameras"][label] = {side: describe(*pair[side], true[side]) for side in true}
-        if scene is not None:
-            start = time.process_time()
+    return _Run(folder, name, seed, views).everything()
+
+
+class _Run:
+    """One draw; results go to the folder's `result.json` after every model."""
+
+    def __init__(self, folder: Path, name: str, seed: int, views: int) -> None:
+        self.folder, self.seed, self.name = folder, seed, name
+        self.true: dict[str, TruthLens] = lenses(name, seed)
+        self.scene = paper_scene(KINDS[name], seed)
+        self.path = folder / "result.json"
+        self.result: dict[str, Any] = {
+            "name": name, "seed": seed, "spent": {}, "cameras": {}, "held_out": {}, "located": {}, "kept": {},
+            "failed": [],
+        }  # fmt: skip
+        if self.path.exists():
+            self.result |= json.loads(self.path.read_text())
+        for side, lens in self.true.items():
+            if not all((folder / f"{side}.{who}.json").exists() for who in ("kcal", "opencv")):
+                for stage, seconds in observe(folder, name, seed, side, lens, views).items():
+                    self.result["spent"][stage] = self.result["spent"].get(stage, 0.0) + seconds
+                self._keep()
+        self.seen = {side: Observations.load(folder / f"{side}.kcal.json") for side in self.true}
+        self.plain = {side: Observations.load(folder / f"{side}.opencv.json") for side in self.true}
+
+    def everything(self) -> dict[str, Any]:
+        self.result["views"] = {side: len(seen.views) for side, seen in self.seen.items()}
+        self.result["bound"] = bound(self.scene)
+        self.result["targets"] = self.scene.targets.enu.tolist()
+        self.result["target_pixels"] = self.scene.target_marks.true_left.tolist()
+        for label, model in MODELS.items():
+            if label not in self.result["located"]:
+                self._model(label, model)
+        if not {"hybrid", "field"} <= set(self.result["located"]):
+            self._hybrid()
+        if not {"OpenCV", "OpenCV, kcal's rig"} <= set(self.result["located"]):
+            self._opencv()
+        return self.result
+
+    def _model(self, label: str, model: str) -> None:
+        pair = None
+        with self._stage(f"calibrate, {label}"):
             try:
-                result["held_out"][label] = held_out(seen, model)
-            except KcalError as error:
-                result["failed"].append(f"{label}, held-out views: {error}")
-                result["held_out"][label] = NAN
-            spent[f"held-out views, {label}"] = time.process_time() - start
-            start = time.process_time()
-            both = pair["left"][0], pair["right"][0]
-            alone = located(scene, both, noise=False)["range_error"]
-            result["located"][label] = located(scene, both) | {"lens_error": alone}
-            spent[f"rig and positions, {label}"] = time.process_time() - start
-    if "OpenCV" not in result["cameras"]:
+                found = {s: calibrate_camera(seen, CalibrationOptions(model=model)) for s, seen in self.seen.items()}
+                pair = {side: (each.camera, each.rms) for side, each in found.items()}
+            except REFUSED as error:
+                self.result["failed"].append(f"{label}: {error}")
+        self._locate(label, pair)
+
+    def _hybrid(self) -> None:
+        """The hybrid as kcal returns it, and the field in any case; where the first has one they are the same."""
+        pairs: dict[str, Pair | None] = {"hybrid": None, "field": None}
+        held_out: dict[str, list[float]] = {}
+        with self._stage("calibrate, hybrid"):
+            try:
+                found = {side: calibrate_hybrid(seen, HYBRID) for side, seen in self.seen.items()}
+                pairs["hybrid"] = {s: (each.calibration.camera, each.calibration.rms) for s, each in found.items()}
+                self.result["kept"] = {side: each.kept for side, each in found.items()}
+                for each in found.values():
+                    for label, rms in _held_out(each).items():
+                        held_out.setdefault(label, []).append(rms)
+            except REFUSED as error:
+                self.result["failed"].append(f"hybrid: {error}")
+        if pairs["hybrid"] is not None:
+            always = dataclasses.replace(HYBRID, gate=False, rivals=())
+            with self._stage("calibrate, field"):
+                try:
+                    forced = {
+                        side: each if each.kept else calibrate_hybrid(self.seen[side], always)
+                        for side, each in found.items()
+                    }
+                    pairs["field"] = {s: (each.calibration.camera, each.calibration.rms) for s, each in forced.items()}
+                except REFUSED as error:
+                    self.result["failed"].append(f"field: {error}")
+        for label in (*MODELS, "hybrid", "field"):
+            values = held_out.get(label, [NAN])
+            self.result["held_out"][label] = math.sqrt(sum(value**2 for value in values) / len(values))
+        for label, pair in pairs.items():
+            self._locate(label, pair)
+
+    def _opencv(self) -> None:
+        with self._stage("calibrate, OpenCV"):
+            theirs = {side: opencv_camera(seen) for side, seen in self.plain.items()}
+        pair = {side: (as_camera(matrix, lens, self.plain[side]), rms) for side, (rms, matrix, lens) in theirs.items()}
+        # Their lenses with kcal's rig and rays tell what of the difference is not lenses.
+        self._locate("OpenCV, kcal's rig", pair)
+        self.result["cameras"]["OpenCV"] = self.result["cameras"]["OpenCV, kcal's rig"]
+        with self._stage("rig and positions, OpenCV"):
+            raw_cameras = {side: (matrix, lens) for side, (_, matrix, lens) in theirs.items()}
+            self.result["located"]["OpenCV"] = judge(self.scene, by_opencv(raw_cameras))
+        self._keep()
+
+    def _locate(self, label: str, pair: Pair | None) -> None:
+        if pair is None:
+            none = dict.fromkeys(("rms", "fx", "infinity", "infinity_max"), NAN)
+            self.result["cameras"][label] = dict.fromkeys(self.true, none)
+            self.result["located"][label] = nowhere(self.scene)
+        else:
+            with self._stage(f"rig and positions, {label}"):
+                self.result["cameras"][label] = {s: describe(*pair[s], lens) for s, lens in self.true.items()}
+                cameras = pair["left"][0], pair["right"][0]
+                self.result["located"][label] = judge(self.scene, by_kcal(self.scene, cameras))
+        self._keep()
+
+    @contextmanager
+    def _stage(self, stage: str) -> Iterator[None]:
         start = time.process_time()
-        plain = {side: Observations.load(folder / f"{side}.opencv.json") for side in true}
-        theirs = {side: opencv_camera(plain[side]) for side in true}
-        spent["calibrate, OpenCV"] = time.process_time() - start
-        result["cameras"]["OpenCV"] = {
-            side: describe(as_camera(matrix, lens, plain[side]), rms, true[side])
-            for side, (rms, matrix, lens) in theirs.items()
-        }
-        if scene is not None:
-            alone = located_by_opencv(scene, theirs, noise=False)["range_error"]
-            result["located"]["OpenCV"] = located_by_opencv(scene, theirs) | {"lens_error": alone}
-    if scene is not None:
-        pixels = scene.target_marks.true_left
-        result["bound"], result["target_pixels"] = bound(scene), pixels.tolist()
-        result["targets"] = scene.targets.enu.tolist()
-    path.write_text(json.dumps(result))
-    return result
+        yield
+        self.result["spent"][stage] = time.process_time() - start
+
+    def _keep(self) -> None:
+        part = self.path.with_suffix(".part")
+        part.write_text(json.dumps(self.result))
+        part.replace(self.path)
 
 
-def fit(seen: Observations, model: str) -> tuple[Camera, float]:
-    """Calibrate with a model of `MODELS`.
-
-    The hybrid is the paper's: a field on top of 20 coefficients. "hybrid" is what kcal returns, which is a parametric
-    camera where held-out views do not say that the field is better; "field" has the field in any case. Drawn poses
-    have no neighbours, so that every view may be held out for itself.
-    """
-    if model == "hybrid":
-        found = calibrate_hybrid(seen, HybridOptions(models=("ext20",), groups="views")).calibration
-    elif model == "field":
-        found = calibrate_hybrid(
-            seen, HybridOptions(models=("ext20",), groups="views", gate=False, rivals=())
-        ).calibration
-    else:
-        found = calibrate_camera(seen, CalibrationOptions(model=model))
-    return found.camera, found.rms
+def _held_out(result: HybridResult) -> dict[str, float]:
+    """RMS of views that were held out, by the labels of this script; what is returned has the returned model's."""
+    found = {label: result.held_out[model] for label, model in MODELS.items()}
+    found["field"] = result.held_out["hybrid"]
+    returned = str(result.calibration.camera.model)
+    found["hybrid"] = found["field"] if result.kept else result.held_out[returned]
+    return found
 
 
-def describe(camera: Camera, rms: float, truth: Any) -> dict[str, float]:
+def describe(camera: Camera, rms: float, truth: TruthLens) -> dict[str, float]:
     found = error_at_infinity(camera, truth)
     return {"rms": rms, "fx": float(camera.focal[0]), "infinity": found.rms, "infinity_max": found.maximum}
 
 
-def held_out(seen: dict[str, Observations], model: str) -> float:
-    """RMS of every third view, from a calibration on the others; its pose is solved with the camera as it is."""
-    squares, count = 0.0, 0
-    for observations in seen.values():
-        names = list(observations.names)
-        camera, _ = fit(observations.subset([n for i, n in enumerate(names) if i % 3]), model)
-        board, pixels = observations.board.points, observations.subset(names[::3]).pixels()
-        poses, _ = pose_alone(board, pixels, camera, LMOptions())
-        seen_at, valid = camera.project(board @ poses.rotation.transpose(-1, -2) + poses.translation[:, None])
-        some = torch.isfinite(pixels).all(-1)
-        if bool((some & ~valid).any()):
-            return math.inf  # a corner that the lens does not reach
-        squares += float((seen_at - pixels)[some].square().sum())
-        count += int(some.sum())
-    return math.sqrt(squares / count)
-
-
-# --- positions ---------------------------------------------------------------------------------------------------
-
-
-def located(scene: DemoScene, cameras: tuple[Camera, Camera], noise: bool = True) -> dict[str, Any]:
-    """Orient the cameras by the landmarks, and locate the seven points; without noise only the lenses are wrong."""
-    points, left, right = oriented_by(scene, noise)
-    landmarks = Landmarks(
-        names=scene.landmarks.names,
-        points=points,
-        sigma=torch.full_like(points, SURVEY_SIGMA),
-        pixels=torch.stack([left, right], 1),
-        pixel_sigma=MARK_SIGMA,
-    )
-    # Nothing is left out: a lens model that contradicts the landmarks is to show it.
-    solved = solve_rig(RigData(cameras=cameras, names=SIDES, landmarks=landmarks), JointOptions(reject=False))
-    rig = solved.stereo()
-    locate = Triangulate(rig, pixel_sigma=MARK_SIGMA)
-
-    def place(left: Tensor, right: Tensor) -> Tensor:
-        found = locate(left, right)
-        enu = found.points @ solved.rotation[0] + solved.centre[0]
-        return torch.where((found.status == 0)[..., None], enu, torch.nan)
-
-    def project(enu: Tensor) -> tuple[Tensor, Tensor]:
-        left, right, valid = rig((enu - solved.centre[0]) @ solved.rotation[0].T)
-        return torch.where(valid[:, None], left, torch.nan), torch.where(valid[:, None], right, torch.nan)
-
-    return judge(scene, place, project)
-
-
-def nowhere(count: int) -> dict[str, Any]:
-    """What is recorded where there is no camera."""
-    lines = ("reprojection", "range_error", "lens_error", "position_error", "total_rms", "check_reprojection")
-    return {name: [NAN] * count for name in lines} | {
-        name: [[NAN] * 3] * count for name in ("marked", "exact", "integer")
-    }
-
-
-def oriented_by(scene: DemoScene, noise: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Places of the landmarks, and their pixels left and right, as surveyed and marked, or as they truly are."""
-    marks = scene.landmark_marks
-    if noise:
-        return scene.surveyed(scene.landmarks).enu, marks.left, marks.right
-    return scene.landmarks.enu, marks.true_left, marks.true_right
-
-
-def judge(scene: DemoScene, place: Any, project: Any) -> dict[str, Any]:
-    """Positions and reprojection errors of the seven points, and of the check points."""
-    targets, marks = scene.targets.enu, scene.target_marks
-    exact, marked = place(marks.true_left, marks.true_right), place(marks.left, marks.right)
-    whole = place(marks.left.round(), marks.right.round())
-    generator = scene.generator(-50)
-    noise = MARK_SIGMA * torch.randn((2, DRAWS, *marks.left.shape), dtype=torch.float64, generator=generator)
-    drawn = torch.stack([place(marks.true_left + a, marks.true_right + b) for a, b in zip(*noise, strict=True)])
-    check = scene.check_marks
-    return {
-        "reprojection": pixel_errors(project(targets), (marks.true_left, marks.true_right)),
-        "range_error": (exact.norm(dim=-1) - targets.norm(dim=-1)).tolist(),
-        "position_error": (exact - targets).norm(dim=-1).tolist(),
-        "total_rms": (drawn.norm(dim=-1) - targets.norm(dim=-1)).square().nanmean(0).sqrt().tolist(),
-        "marked": marked.tolist(),
-        "exact": exact.tolist(),
-        "integer": whole.tolist(),
-        "check_reprojection": pixel_errors(project(scene.surveyed(scene.checks).enu), (check.left, check.right)),
-    }
-
-
-def pixel_errors(seen: tuple[Tensor, Tensor], true: tuple[Tensor, Tensor]) -> list[float]:
-    """The larger of the two cameras' errors for each point, pixels; NaN where a model has no pixel."""
-    return torch.stack([(a - b).norm(dim=-1) for a, b in zip(seen, true, strict=True)]).amax(0).tolist()
-
-
-def bound(scene: DemoScene) -> list[float]:
-    """Standard deviation of each range that the marks' noise alone leaves, with the rig known exactly, metres."""
-    points = scene.points_rig(scene.targets)
-    columns = []
-    for axis in torch.eye(3, dtype=torch.float64):
-        step = 1e-5 * points.norm(dim=-1, keepdim=True) * axis
-        ahead, behind = (torch.cat(scene.rig(points + sign * step)[:2], -1) for sign in (1, -1))
-        columns.append((ahead - behind) / (2e-5 * points.norm(dim=-1, keepdim=True)))
-    jacobian = torch.stack(columns, -1)
-    covariance = torch.linalg.inv(jacobian.transpose(-1, -2) @ jacobian) * MARK_SIGMA**2
-    sight = torch.nn.functional.normalize(points, dim=-1)
-    return torch.einsum("ni,nij,nj->n", sight, covariance, sight).sqrt().tolist()
-
-
-# --- OpenCV ------------------------------------------------------------------------------------------------------
-
-
 def opencv_camera(seen: Observations) -> tuple[float, Any, Any]:
+    """RMS, matrix and 14 coefficients by `cv2.calibrateCamera`."""
     board = [seen.board.points.float().numpy()] * len(seen.views)
     pixels = [view.float().numpy() for view in seen.pixels()]
     rms, matrix, lens, *_ = cv2.calibrateCamera(board, pixels, seen.image_size, None, None, flags=FLAGS)
@@ -257,32 +192,3 @@ def as_camera(matrix: Any, lens: Any, seen: Observations) -> Camera:
         coefficients=lens.tolist(),
         model="opencv14",
     )
-
-
-def located_by_opencv(
-    scene: DemoScene, cameras: dict[str, tuple[float, Any, Any]], noise: bool = True
-) -> dict[str, Any]:
-    """`solvePnP` on the landmarks, `undistortPoints` and `triangulatePoints`, as a user of OpenCV would."""
-    points, *marks = oriented_by(scene, noise)
-    surveyed, poses = points.numpy(), {}
-    for side, pixels in zip(SIDES, marks, strict=True):
-        _, matrix, lens = cameras[side]
-        _, turn, shift = cv2.solvePnP(surveyed, pixels.numpy(), matrix, lens, flags=cv2.SOLVEPNP_SQPNP)
-        poses[side] = cv2.solvePnPRefineLM(surveyed, pixels.numpy(), matrix, lens, turn, shift)
-    projections = [np.hstack([cv2.Rodrigues(turn)[0], shift]) for turn, shift in poses.values()]
-
-    def place(left: Tensor, right: Tensor) -> Tensor:
-        plane = [
-            cv2.undistortPoints(pixels.numpy()[:, None], cameras[side][1], cameras[side][2])[:, 0].T
-            for side, pixels in zip(SIDES, (left, right), strict=True)
-        ]
-        homogeneous = cv2.triangulatePoints(projections[0], projections[1], plane[0], plane[1])
-        return torch.from_numpy((homogeneous[:3] / homogeneous[3]).T.astype(float))
-
-    def project(enu: Tensor) -> tuple[Tensor, Tensor]:
-        pixels = [
-            cv2.projectPoints(enu.numpy(), *poses[side], cameras[side][1], cameras[side][2])[0][:, 0] for side in SIDES
-        ]
-        return torch.from_numpy(pixels[0]), torch.from_numpy(pixels[1])
-
-    return judge(scene, place, project)

@@ -23,11 +23,6 @@ from kcal.solve.robust import RobustLoss
 
 Intrinsics = Literal["fixed", "prior", "free"]
 Source = Literal["boards", "landmarks", "features", "baselines", "positions"]
-# Chance that any good item at all is taken for a wrong one.
-_FALSE_ALARM = 1e-3
-# Of fewer boards nobody can say what is typical where lenses are not quite their models; one does not belong then if
-# its residuals are so many times as large as their noise.
-_FEW_BOARDS, _WORSE_BOARD = 4, 3.0
 # px; of a corner.
 _LEAST_SIGMA = 1e-3
 # The kinds of items, in the order of masks.
@@ -140,16 +135,6 @@ class Adjustment:
             whole[mask] = group.counts - group.size
             found.append(whole)
         return found
-
-    def limits(self, squares: Sequence[Tensor], freedom: Sequence[Tensor]) -> list[Tensor]:
-        """χ² beyond which items do not belong: where all of a kind fit worse than stated, they are judged by that."""
-        total = sum(int((f > 0).sum()) for f in freedom)
-        level = 1.0 - _FALSE_ALARM / max(total, 1)
-        each = [(max(1.0, typical_excess(s, f)), f.double()) for s, f in zip(squares, freedom, strict=True)]
-        boards, *others = [excess * chi2_quantile(dof, level) for excess, dof in each]
-        if int((freedom[0] > 0).sum()) < _FEW_BOARDS:
-            boards = torch.maximum(boards, _WORSE_BOARD**2 * freedom[0])
-        return [boards, *others]
 
     def fit_corners(self, masks: Sequence[Tensor], *, robust: bool = False) -> None:
         """Set the corners' sigma from the boards' residuals, unless it was given.

@@ -136,7 +136,8 @@ def _reason(work: Adjustment, kind: Source, pixels: Sequence[float | None], sigm
         return f"its marks are off the surveyed place by {text} ({sigmas:.0f} sigma): a wrong mark or survey"
     if kind == "features":
         return f"its marks do not meet: off by {text} ({sigmas:.0f} sigma): not the same thing, or it moved"
-    return f"it does not fit the other boards: {text} ({sigmas:.1f} times typical): not taken at the same moment?"
+    why = "not taken at the same moment, or where a lens is not its model?"
+    return f"it does not fit the other boards: {text} ({sigmas:.1f} times typical): {why}"
 
 
 def _measured(work: Adjustment) -> list[ItemResidual]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
-from kcal.calibrate.rig_adjust import KINDS, Adjustment, chi2_quantile, typical_excess
+from kcal.calibrate.rig_adjust import KINDS, Adjustment, typical_excess
+from kcal.calibrate.rig_limits import excess
 from kcal.errors import InputError
 from kcal.solve.lm import LMOptions
 from kcal.solve.robust import RobustLoss
@@ -34,30 +34,26 @@ def reject_wrong(work: Adjustment, masks: list[Tensor], reasons: list[dict[int, 
                 f"the {word} contradict each other or the rest: typically they are {times:.0f} times as far off as "
                 "their sigmas say; check names, units, heights, sigmas and that the cameras are these"
             )
-    for mask, square, limit in zip(masks, squares, work.limits(squares, freedom), strict=True):
-        mask &= ~(square > limit)
+    for mask, over in zip(masks, excess(work, masks, squares), strict=True):
+        mask &= ~(over > 1.0)
     _refuse_many(work, masks, possible)
     returned: set[tuple[int, int]] = set()
     for _ in range(_ROUNDS):
         work.solve(masks, solver)
         work.fit_corners(masks)
-        falls, freedom = work.deletions(masks), work.freedom(masks)
         # What is typical is told by the items' own squares: leverage is no misfit.
-        limits = work.limits(work.squares(masks), freedom)
-        excess = [torch.where(m, s / lim, 0.0) for m, s, lim in zip(masks, falls, limits, strict=True)]
-        kind = max(range(3), key=lambda k: float(excess[k].max()) if len(excess[k]) else 0.0)
-        if len(excess[kind]) and float(excess[kind].max()) > 1.0:
-            masks[kind][int(excess[kind].argmax())] = False
+        found = excess(work, masks, work.deletions(masks))
+        kind = max(range(3), key=lambda k: float(found[k].max()) if len(found[k]) else 0.0)
+        if len(found[kind]) and float(found[kind].max()) > 1.0:
+            masks[kind][int(found[kind].argmax())] = False
             _refuse_many(work, masks, possible)
             continue
         # Cameras stay where they are now; what was left out is asked again.
         outside = [p & ~m for p, m in zip(possible, masks, strict=True)]
         work.solve(outside, solver, held=True)
         again = False
-        squares, freedom = work.squares(outside), work.freedom(outside)
-        for k, (square, limit) in enumerate(zip(squares, work.limits(squares, freedom), strict=True)):
-            limit = chi2_quantile(freedom[k].double(), 0.999) if len(limit) else limit
-            for i in (outside[k] & (square < limit)).nonzero()[:, 0].tolist():
+        for k, over in enumerate(excess(work, outside, work.squares(outside), 0.999)):
+            for i in (outside[k] & (over < 1.0)).nonzero()[:, 0].tolist():
                 if (k, i) not in returned:
                     returned.add((k, i))
                     masks[k][i] = again = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from functools import partial
 from pathlib import Path
@@ -165,6 +166,16 @@ def _solve(sources: Sources, output: Path) -> tuple[RigSolution, Mounting]:
     return solution, there
 
 
+def _held(located: Located, scene: DemoScene) -> int:
+    """How many intervals hold the true range."""
+    return sum(
+        position.range_low_m is not None
+        and position.range_low_m <= float(true.norm()) <= (position.range_high_m or math.inf)
+        for position, true in zip(located.positions, scene.targets.enu, strict=True)
+        if position.enu is not None
+    )
+
+
 def _write_summary(
     output: Path,
     scene: DemoScene,
@@ -186,8 +197,10 @@ def _write_summary(
             text=(
                 f"{located.count} of {len(located.positions)} targets were located from one pair of pixels each. Their "
                 f"pixels were marked with {scene.mark_sigma:g} px of noise, and at long range that decides: a tenth of "
-                "a pixel of disparity is 156 m at 5 km. The interval should hold the true range in 19 cases of 20. The "
-                "last column is the error that is left when the marks have no noise: what the calibration itself does.",
+                "a pixel of disparity is 156 m at 5 km. The interval should hold the true range in 19 cases of 20; "
+                f"here it does in {_held(located, scene)} of {located.count}. 'Across' is the error across the line of "
+                "sight. The last column is the error that is left when the marks have no noise: what the calibration "
+                "itself does.",
             ),
             table=tuple(map(tuple, table)),
         ),

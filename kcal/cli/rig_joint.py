@@ -126,7 +126,7 @@ def read_boards(pairs: tuple[Path, Path], match: Path | None) -> Boards:
     return Boards(
         board=seen[0].board,
         pixels=torch.stack([side.pixels() for side in sides], 1),
-        names=tuple(f"{pair[0]} {pair[1]}" for pair in matched),
+        names=tuple(" ".join(dict.fromkeys(pair)) for pair in matched),
         covariance=torch.stack(known, 1) if len(known) == 2 else None,
     )
 

@@ -25,6 +25,7 @@ from rig_scenes import (
 )
 from torch import Tensor
 
+from kcal.calibrate import rig_limits
 from kcal.calibrate.resection import consensus_pose, poses_from_three
 from kcal.calibrate.rig import JointOptions, solve_rig
 from kcal.calibrate.rig_groups import BoardGroup, FeatureGroup, Group, LandmarkGroup
@@ -423,6 +424,20 @@ class TestWrong:
         shown.pixels[5, 1] += tensor(1.0, 0.0)
         found = solve_rig(data(boards=shown))
         assert [item.name for item in found.left_out] == ["pair 5"]
+
+    def test_lenses_that_are_not_quite_their_models_make_no_board_wrong(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """They bend some boards more than others, by much more than corners that are this good would ever be off."""
+        shown = boards(count=8, noise=0.01)
+        u, v = shown.pixels.unbind(-1)
+        shown.pixels[..., 1] += 0.3 * ((u - 1000.0) / 900.0).clamp_min(0.0) ** 2 * torch.sin(v / 60.0)
+        assert solve_rig(data(boards=shown)).left_out == ()
+        with monkeypatch.context() as without:
+            for name in ("_LENS", "_BETWEEN"):
+                without.setattr(rig_limits, name, 0.0)
+            assert len(solve_rig(data(boards=shown)).left_out) > 0
+        # One that moved is found all the same.
+        shown.pixels[5, 1] += tensor(1.0, 0.0)
+        assert [item.name for item in solve_rig(data(boards=shown)).left_out] == ["pair 5"]
 
     def test_names_mixed_up_are_refused_as_a_whole(self) -> None:
         marks = landmarks(noise=0.1, error=0.02)
