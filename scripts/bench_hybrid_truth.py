@@ -8,7 +8,8 @@ for every seed; views of the paper's board (6 x 7 corners, 5 cm) with Gaussian c
 the truth each camera sees infinitely distant points, all over the image, after the best rotation; pixels, RMS and
 largest. `hybrid` is what the gate returns, `field` the hybrid whether it wins or not. `14 of a 14`: the error of 14
 coefficients where the truth has no more, which is the lens of 14 that fits the exact corners best, with the same poses
-and noise: what these views can tell, so that no model can be far below it. Rules were made on seeds from 100 on.
+and noise: what these views can tell, so that no model can be far below it. The gate's rule was picked on seeds from
+100 on.
 """
 
 from __future__ import annotations

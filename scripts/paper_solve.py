@@ -35,7 +35,7 @@ MODELS = {
 }
 # Every model of Table 3 is a rival, so that one call holds views out for all. Poses are drawn and have no neighbours:
 # every view may be held out for itself.
-HYBRID = HybridOptions(models=("ext20",), rivals=tuple(MODELS.values()), groups="views")
+HYBRID = HybridOptions(rivals=tuple(MODELS.values()), groups="views")
 NAN = math.nan
 # What ends one model and not the whole run; the page lists it.
 REFUSED = (KcalError, RuntimeError)
