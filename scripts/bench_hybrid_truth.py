@@ -213,7 +213,7 @@ def main() -> None:
     work = cell
     if args.more:
         known = {(r["lens"], r["views"], r["sigma"], r["seed"]) for r in done if r["model"] in MORE}
-        todo, work = sorted(have - known), more_models
+        todo, work = [which for which in sorted(have - known) if which[1] in args.views], more_models
     start, whole = time.process_time(), sum(views for _, views, *_ in todo)
     for i, which in enumerate(todo):
         records = work(*which)
