@@ -172,12 +172,13 @@ def table(done: list[Record]) -> list[str]:
             m: [r for r in done if (r["lens"], r["sigma"], r["views"], r["model"]) == (lens, sigma, views, m)]
             for m in MODELS
         }
+        own = {r["seed"]: r["rms"] for r in of["hybrid"]}
         found = {
             m: f"{statistics.median(r['rms'] for r in of[m]):.4f} ({statistics.median(r['max'] for r in of[m]):.3f})"
             for m in MODELS
-            if of[m]
+            # Of the same draws as the others, or not at all.
+            if len(of[m]) == len(own)
         }
-        own = {r["seed"]: r["rms"] for r in of["hybrid"]}
         ratio = [r["rms"] / own[r["seed"]] for r in of["opencv14"] if r["seed"] in own]
         lines.append(
             row(
