@@ -17,7 +17,7 @@ import sys
 import time
 from typing import Any
 
-from bench_solver import COLUMNS, MODELS, NOISE, ROWS, SIZE, SQUARE, WEAK, simulate
+from bench_solver import COLUMNS, MODELS, NOISE, ROWS, SIZE, WEAK, observed, simulate
 from memory import peak_megabytes
 from page import write_section
 from timing import row, show
@@ -32,16 +32,11 @@ def work(way: str, cameras: int, views: int, coefficients: int) -> None:
     import torch
 
     from kcal.calibrate.mono import CalibrationOptions, CameraCalibrationResult, calibrate_camera, calibrate_cameras
-    from kcal.corners.board import Board
-    from kcal.corners.observations import Observations, View
 
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
-    board = Board(columns=COLUMNS, rows=ROWS, square=SQUARE)
     sets = []
     for number in range(cameras):
-        pixels = simulate(views, seed=FIRST_SEED + number)["pixels"].tolist()
-        seen = tuple(View(name=f"{i:04}", pixels=tuple(map(tuple, view))) for i, view in enumerate(pixels))
-        sets.append(Observations(board=board, image_size=SIZE, views=seen))
+        sets.append(observed(simulate(views, seed=FIRST_SEED + number)["pixels"].tolist()))
     options = CalibrationOptions(model=MODELS[coefficients], weak_prior=WEAK)
     before = peak_megabytes()
     start = time.perf_counter()

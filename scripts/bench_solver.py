@@ -30,6 +30,7 @@ from page import write_section
 from timing import show
 
 if TYPE_CHECKING:
+    from kcal.corners.observations import Observations
     from kcal.lens.camera import Camera
 
 MODELS = {5: "opencv5", 8: "opencv8", 14: "opencv14", 20: "ext20"}
@@ -83,6 +84,15 @@ def simulate(
     }
 
 
+def observed(pixels: list[list[list[float]]]) -> Observations:
+    """Corners (V, N, 2) of the benchmark's board as observations."""
+    from kcal.corners.board import Board
+    from kcal.corners.observations import Observations, View
+
+    views = tuple(View(name=f"{i:04}", pixels=tuple((u, v) for u, v in view)) for i, view in enumerate(pixels))
+    return Observations(board=Board(columns=COLUMNS, rows=ROWS, square=SQUARE), image_size=SIZE, views=views)
+
+
 def flipped_views(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Which of V boards, rotations (V, 3, 3), are more than 8 degrees from the truth."""
     turn = np.einsum("vij,vij->v", found, truth)
@@ -92,11 +102,8 @@ def flipped_views(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 # Solvers: data, number of coefficients -> (fx fy cx cy, coefficients, rotations, translations, seconds).
 def with_kcal(data: dict[str, np.ndarray], coefficients: int, weak: float | None = None) -> tuple[Any, ...]:
     from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
-    from kcal.corners.board import Board
-    from kcal.corners.observations import Observations, View
 
-    views = tuple(View(name=f"{i:04}", pixels=tuple(map(tuple, v))) for i, v in enumerate(data["pixels"].tolist()))
-    seen = Observations(board=Board(columns=COLUMNS, rows=ROWS, square=SQUARE), image_size=SIZE, views=views)
+    seen = observed(data["pixels"].tolist())
     start = time.perf_counter()
     result = calibrate_camera(seen, CalibrationOptions(model=MODELS[coefficients], weak_prior=weak))
     seconds = time.perf_counter() - start

@@ -16,15 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from bench_solver import COLUMNS, MODELS, ROWS, SIZE, SQUARE, flipped_views, image_error, simulate
+from bench_solver import MODELS, SIZE, flipped_views, image_error, observed, simulate
 from page import write_section
 from timing import show
 
 from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
 from kcal.calibrate.problem import BoardProblem
 from kcal.calibrate.views import free_parameters
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimise
@@ -81,16 +79,11 @@ def judge(seed: int, views: int, model: LensModel) -> Outcome:
     rng = np.random.default_rng(seed)
     truth, noise = random_camera(rng, model), rng.uniform(0.1, 0.3)
     data = simulate(views, truth, noise=noise, seed=seed)
-    board = Board(columns=COLUMNS, rows=ROWS, square=SQUARE)
-    seen = Observations(
-        board=board,
-        image_size=SIZE,
-        views=tuple(View(name=f"{i:04}", pixels=tuple(map(tuple, v))) for i, v in enumerate(data["pixels"].tolist())),
-    )
+    seen = observed(data["pixels"].tolist())
     clock = time.process_time()
     result = calibrate_camera(seen, CalibrationOptions(model=model))
     seconds = time.process_time() - clock
-    problem = BoardProblem(board.points, seen.pixels()[:, None], [model], [free_parameters(model)])
+    problem = BoardProblem(seen.board.points, seen.pixels()[:, None], [model], [free_parameters(model)])
     none = torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
     poses = torch.from_numpy(data["rotation"]), torch.from_numpy(data["translation"])
     start = (truth.parameters_vector.detach(), torch.zeros(2).double(), *none, *poses)

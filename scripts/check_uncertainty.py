@@ -13,14 +13,12 @@ import math
 from typing import NamedTuple
 
 import torch
-from bench_solver import COLUMNS, MODELS, NOISE, ROWS, SIZE, SQUARE, simulate
+from bench_solver import COLUMNS, MODELS, NOISE, ROWS, SIZE, observed, simulate
 from page import write_section
 from timing import show
 from torch import Tensor
 
 from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import step_rows
@@ -57,9 +55,7 @@ class Fit(NamedTuple):
 
 def refit(pixels: Tensor, options: CalibrationOptions, truth: Camera, rays: Tensor) -> Fit:
     """Calibrate one capture; `rays` (P + G, 3) are those of the places, then of a grid over the image."""
-    board = Board(columns=COLUMNS, rows=ROWS, square=SQUARE)
-    views = tuple(View(name=f"{i:04}", pixels=tuple(map(tuple, v))) for i, v in enumerate(pixels.tolist()))
-    result = calibrate_camera(Observations(board=board, image_size=SIZE, views=views), options)
+    result = calibrate_camera(observed(pixels.tolist()), options)
     wanted, _ = truth.project(rays)
     names, model = list(range(len(result.camera.names))), result.camera.model
     seen = project_components(rays.T, result.camera.parameters_vector, model, names)
