@@ -1,4 +1,4 @@
-"""kcal: camera calibration and long-range stereo localisation for PyTorch.
+"""kcal: camera calibration and long-range stereo localization for PyTorch.
 
 The names below are loaded when they are first used, so that `import kcal` and `kcal --help` do not wait for torch.
 Everything else is found in its folder, for example `kcal.locate.positions.locate`.
@@ -10,14 +10,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from kcal.calibrate.drift import measure_drift
-    from kcal.calibrate.hybrid import HybridOptions, calibrate_hybrid
-    from kcal.calibrate.inverse_fit import train_inverse
-    from kcal.calibrate.layer import CalibrationLayer
-    from kcal.calibrate.mono import CalibrationOptions, calibrate_camera, calibrate_cameras
-    from kcal.calibrate.rig import JointOptions, solve_rig
-    from kcal.calibrate.rig_sources import RigData
-    from kcal.calibrate.stereo import RigOptions, calibrate_rig
+    from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera, calibrate_cameras
+    from kcal.calibrate.camera.layer import CalibrationLayer
+    from kcal.calibrate.lensfit.hybrid import HybridOptions, calibrate_hybrid
+    from kcal.calibrate.rig.drift import measure_drift
+    from kcal.calibrate.rig.from_boards import RigOptions, calibrate_rig
+    from kcal.calibrate.rig.solve import JointOptions, solve_rig
+    from kcal.calibrate.rig.sources import RigData
     from kcal.corners.board import Board
     from kcal.corners.detect import detect_images
     from kcal.corners.observations import Observations
@@ -28,17 +27,18 @@ if TYPE_CHECKING:
     from kcal.lens.camera import Camera
     from kcal.lens.hybrid import HybridCamera
     from kcal.lens.images import Undistort, undistort_maps
-    from kcal.lens.inverse_net import InverseNet
     from kcal.lens.lookup import LookupCamera
     from kcal.lens.model import LensModel
     from kcal.lens.modules import Unproject
     from kcal.lens.pinhole import new_pinhole
     from kcal.lens.rig import StereoRig
-    from kcal.locate.errors import RigCovariance
+    from kcal.locate.covariances import RigCovariance
     from kcal.locate.geodesy import Origin
     from kcal.locate.localizer import StereoLocalizer
+    from kcal.locate.multiview import TriangulateViews
     from kcal.locate.stereo import Triangulate
-    from kcal.locate.views import TriangulateViews
+    from kcal.nets.inverse import InverseNet
+    from kcal.nets.inverse_fit import train_inverse
     from kcal.solve.lm import LevenbergMarquardt, LMOptions
 
 __version__ = "0.1.0"
@@ -87,13 +87,13 @@ __all__ = [
 
 _HOME = {
     "Board": "kcal.corners.board",
-    "CalibrationLayer": "kcal.calibrate.layer",
-    "CalibrationOptions": "kcal.calibrate.mono",
+    "CalibrationLayer": "kcal.calibrate.camera.layer",
+    "CalibrationOptions": "kcal.calibrate.camera.calibrate",
     "Camera": "kcal.lens.camera",
     "HybridCamera": "kcal.lens.hybrid",
-    "HybridOptions": "kcal.calibrate.hybrid",
-    "InverseNet": "kcal.lens.inverse_net",
-    "JointOptions": "kcal.calibrate.rig",
+    "HybridOptions": "kcal.calibrate.lensfit.hybrid",
+    "InverseNet": "kcal.nets.inverse",
+    "JointOptions": "kcal.calibrate.rig.solve",
     "KcalError": "kcal.errors",
     "LMOptions": "kcal.solve.lm",
     "LensModel": "kcal.lens.model",
@@ -101,29 +101,29 @@ _HOME = {
     "LookupCamera": "kcal.lens.lookup",
     "Observations": "kcal.corners.observations",
     "Origin": "kcal.locate.geodesy",
-    "RigCovariance": "kcal.locate.errors",
-    "RigData": "kcal.calibrate.rig_sources",
-    "RigOptions": "kcal.calibrate.stereo",
+    "RigCovariance": "kcal.locate.covariances",
+    "RigData": "kcal.calibrate.rig.sources",
+    "RigOptions": "kcal.calibrate.rig.from_boards",
     "StereoLocalizer": "kcal.locate.localizer",
     "StereoRig": "kcal.lens.rig",
     "Triangulate": "kcal.locate.stereo",
-    "TriangulateViews": "kcal.locate.views",
+    "TriangulateViews": "kcal.locate.multiview",
     "Undistort": "kcal.lens.images",
     "Unproject": "kcal.lens.modules",
     "bake": "kcal.lens.bake",
-    "calibrate_camera": "kcal.calibrate.mono",
-    "calibrate_cameras": "kcal.calibrate.mono",
-    "calibrate_hybrid": "kcal.calibrate.hybrid",
-    "calibrate_rig": "kcal.calibrate.stereo",
+    "calibrate_camera": "kcal.calibrate.camera.calibrate",
+    "calibrate_cameras": "kcal.calibrate.camera.calibrate",
+    "calibrate_hybrid": "kcal.calibrate.lensfit.hybrid",
+    "calibrate_rig": "kcal.calibrate.rig.from_boards",
     "detect_images": "kcal.corners.detect",
     "load_camera": "kcal.io.camera_file",
     "load_rig": "kcal.io.rig_file",
-    "measure_drift": "kcal.calibrate.drift",
+    "measure_drift": "kcal.calibrate.rig.drift",
     "new_pinhole": "kcal.lens.pinhole",
     "save_camera": "kcal.io.camera_file",
     "save_rig": "kcal.io.rig_file",
-    "solve_rig": "kcal.calibrate.rig",
-    "train_inverse": "kcal.calibrate.inverse_fit",
+    "solve_rig": "kcal.calibrate.rig.solve",
+    "train_inverse": "kcal.nets.inverse_fit",
     "undistort_maps": "kcal.lens.images",
 }
 

@@ -1,6 +1,6 @@
 """Make what lies in assets/: boards to print, the demonstration's pictures, a sample rig with marks.
 
-    python scripts/make_assets.py
+    python -m scripts.make_assets
 
 Everything comes from kcal's own commands: `kcal board` and `kcal demo`.
 """

@@ -1,4 +1,4 @@
-"""docs/conventions.md: conventions of more than one floor, and every test that the page names exists."""
+"""docs/reference/conventions.md: conventions of more than one floor, and every test that the page names exists."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from kcal.calibrate.mono import calibrate_camera
+from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
@@ -18,7 +18,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 
 TESTS = Path(__file__).parent
-PAGE = (TESTS.parent / "docs" / "conventions.md").read_text(encoding="utf-8")
+PAGE = (TESTS.parent / "docs" / "reference" / "conventions.md").read_text(encoding="utf-8")
 NAMED = sorted(set(re.findall(r"`([\w/]+\.py(?:::\w+)*)`", PAGE)))
 
 

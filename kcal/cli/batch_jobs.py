@@ -20,7 +20,7 @@ from typing import ClassVar
 import kcal
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
-from kcal.corners.images import decode_grey, expand_images, read_bytes, unique_names
+from kcal.corners.images import decode_gray, expand_images, read_bytes, unique_names
 from kcal.corners.observations import Covariance, Failure, Observations, Pixel, View
 from kcal.corners.refine import Refinement
 from kcal.errors import FileError, InputError, KcalError
@@ -155,7 +155,7 @@ def detect_image(path: str, board: Board, options: BatchOptions) -> Detected:
     """Find the board in one image."""
     with _time_limit(options.time_limit):
         try:
-            image = decode_grey(read_bytes(path), path)
+            image = decode_gray(read_bytes(path), path)
         except FileError as error:
             return Detected(reason=str(error).removeprefix(f"{path}: "))
         found = detect_board(image, board, options.refine)
@@ -198,7 +198,7 @@ def observations_of(job: CameraJob, pieces: list[Detected], digests: list[str], 
 
 def calibrate_observations(seen: Observations, name: str, model: str, options: BatchOptions) -> Calibrated:
     """Calibrate one camera."""
-    from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
+    from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
     from kcal.cli.calibrate import record
 
     with _time_limit(options.time_limit):

@@ -57,7 +57,7 @@ def budget(
     try:
         far = [float(value) for value in distances.split(",")]
     except ValueError:
-        raise InputError(f"distances {distances!r}: write numbers of metres, for example 250,1000,5000") from None
+        raise InputError(f"distances {distances!r}: write numbers of meters, for example 250,1000,5000") from None
     errors = BudgetErrors(
         disparity_px=disparity, yaw_deg=yaw, baseline_m=baseline_error, timing_s=timing, speed_mps=speed
     )
@@ -89,7 +89,7 @@ def _table(far: list[float], found: dict[str, RangeError], labels: dict[str, str
     rows = [["range m", "error", "nearer m", "farther m", "first order m"]]
     for i, distance in enumerate(far):
         for name, error in found.items():
-            values = (_metres(float(value[i])) for value in error)
+            values = (_meters(float(value[i])) for value in error)
             rows.append([f"{distance:g}", labels[name], *values])
     widths = [max(len(row[column]) for row in rows) for column in range(5)]
     lines = []
@@ -100,7 +100,7 @@ def _table(far: list[float], found: dict[str, RangeError], labels: dict[str, str
     return lines
 
 
-def _metres(value: float) -> str:
+def _meters(value: float) -> str:
     if value == float("inf"):
         return "∞"
     return f"{value:+.3f}" if abs(value) < 1 else f"{value:+.2f}" if abs(value) < 100 else f"{value:+.1f}"

@@ -10,7 +10,7 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from kcal.calibrate.mono import CameraCalibrationResult
+    from kcal.calibrate.camera.calibrate import CameraCalibrationResult
     from kcal.corners.observations import Observations
     from kcal.io.camera_file import CameraFile, Exclusion
 
@@ -72,7 +72,7 @@ def calibrate(
 ) -> None:
     """Calibrate one camera: intrinsics, lens and error bars.
 
-    Minimises the reprojection error of all corners over all parameters. Rich lens models are reached through the
+    Minimizes the reprojection error of all corners over all parameters. Rich lens models are reached through the
     models nested in them, so that more coefficients never end with a larger RMS. A small RMS is not yet accuracy:
     look at the σ of the parameters, and prefer the smaller model, or a weak prior, where they are large.
 
@@ -119,9 +119,9 @@ def calibrate(
         known = load_camera(camera)
         lens = known.model
 
-    from kcal.calibrate.ladder import steps_to
-    from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
-    from kcal.calibrate.outliers import OutlierRejection
+    from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+    from kcal.calibrate.camera.outliers import OutlierRejection
+    from kcal.calibrate.search.model_ladder import steps_to
     from kcal.corners.observations import Observations
     from kcal.solve.robust import RobustLoss
 
@@ -254,7 +254,7 @@ def _table(result: CameraCalibrationResult) -> Table:
     table.add_column("parameter", no_wrap=True)
     table.add_column("value", justify="right", no_wrap=True)
     table.add_column("± σ", justify="right", no_wrap=True)
-    values = dict(zip(result.camera.names, result.camera.parameters_vector.tolist(), strict=True))
+    values = dict(zip(result.camera.names, result.camera.params.tolist(), strict=True))
     for name, sigma in result.sigma.items():
         digits = 3 if name in ("fx", "fy", "cx", "cy") else 6
         unknown = "fixed" if name in result.fixed else "not determined"

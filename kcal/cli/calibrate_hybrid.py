@@ -19,7 +19,7 @@ def calibrate_hybrid_file(
     """Calibrate, print how the models compare on held-out views, and write the camera and its pictures."""
     from rich.table import Table
 
-    from kcal.calibrate.hybrid import HybridOptions, calibrate_hybrid
+    from kcal.calibrate.lensfit.hybrid import HybridOptions, calibrate_hybrid
     from kcal.cli.calibrate import record
     from kcal.cli.console import err, out, steps
     from kcal.corners.observations import Observations

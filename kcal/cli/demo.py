@@ -12,7 +12,7 @@ from kcal.cli.demo_tables import print_diagonals, print_results
 if TYPE_CHECKING:
     import torch
 
-    from kcal.calibrate.mono import CameraCalibrationResult
+    from kcal.calibrate.camera.calibrate import CameraCalibrationResult
     from kcal.corners.board import Board
     from kcal.corners.observations import Observations
     from kcal.locate.geodesy import Origin
@@ -138,7 +138,7 @@ def detect(paths: list[Path], board: Board, target: Path) -> Observations:
 
 def calibrate(seen: Observations, side: str, output: Path) -> CameraCalibrationResult:
     """Calibrate a camera; its file and its picture go to a folder."""
-    from kcal.calibrate.mono import calibrate_camera
+    from kcal.calibrate.camera.calibrate import calibrate_camera
     from kcal.cli.calibrate import record
     from kcal.cli.console import err, out, steps
     from kcal.report.calibration import save_calibration_picture
@@ -158,8 +158,8 @@ def _solve_rig(
     left: Observations, right: Observations, output: Path
 ) -> tuple[tuple[tuple[str, str], ...], torch.Tensor]:
     """Solve the rig of the two camera files in `output`; returns the pairs used and their corners."""
-    from kcal.calibrate.pairs import pair_by_name
-    from kcal.calibrate.stereo import calibrate_rig
+    from kcal.calibrate.rig.from_boards import calibrate_rig
+    from kcal.calibrate.rig.pairs import pair_by_name
     from kcal.cli.console import err, out
     from kcal.cli.rig import rig_record
     from kcal.io.camera_file import CameraFile

@@ -12,8 +12,8 @@ from kcal.cli.demo import SIDES, calibrate, detect, write_marks
 from kcal.cli.demo_tables import print_results, print_truth, truth_rows
 
 if TYPE_CHECKING:
-    from kcal.calibrate.mono import CameraCalibrationResult
-    from kcal.calibrate.rig_result import RigSolution
+    from kcal.calibrate.camera.calibrate import CameraCalibrationResult
+    from kcal.calibrate.rig.result import RigSolution
     from kcal.cli.rig_joint import Sources
     from kcal.corners.observations import Observations
     from kcal.locate.mounting import Mounting
@@ -28,7 +28,7 @@ def simulated(output: Path, seed: int) -> None:
     from kcal.cli.console import out
     from kcal.corners.board import Board
     from kcal.io.rig_file import load_rig
-    from kcal.locate.errors import RigCovariance
+    from kcal.locate.covariances import RigCovariance
     from kcal.locate.export import write_positions
     from kcal.locate.positions import locate
     from kcal.report.map_page import save_map
@@ -145,7 +145,7 @@ def _write_sources(scene: DemoScene, output: Path) -> Sources:
 
 
 def _solve(sources: Sources, output: Path) -> tuple[RigSolution, Mounting]:
-    from kcal.calibrate.rig import solve_rig
+    from kcal.calibrate.rig.solve import solve_rig
     from kcal.cli.console import steps
     from kcal.cli.rig_joint import gather, mounting, record, show
     from kcal.errors import DegenerateError
@@ -215,7 +215,7 @@ def _write_summary(
             text=(
                 f"A board was photographed {scene.near_views} times by each camera; it was found in {found['near']} of "
                 f"{2 * scene.near_views} pictures. What the lens model leaves over is small: {rms}. The truth is a "
-                "lens traced ray by ray through seven pieces of glass that are not quite centred.",
+                "lens traced ray by ray through seven pieces of glass that are not quite centered.",
             ),
             pictures=(
                 (output / "images" / "left-near" / "near-02.png", "One of the pictures"),

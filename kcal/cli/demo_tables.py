@@ -48,7 +48,7 @@ def truth_rows(located: Located, exact: Located, truth: torch.Tensor) -> list[li
 
 
 def _along_and_across(position: Position, true: torch.Tensor) -> tuple[float, float]:
-    """Error along the line of sight, signed, and across it, metres."""
+    """Error along the line of sight, signed, and across it, meters."""
     error = true.new_tensor(position.enu) - true
     sight = true / true.norm()
     along = float(error @ sight)

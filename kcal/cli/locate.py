@@ -18,7 +18,7 @@ def locate(
         str | None,
         typer.Option(
             metavar="LAT,LON,HEIGHT",
-            help="Left camera: degrees, degrees, metres above the WGS84 ellipsoid. From the rig file if it has it.",
+            help="Left camera: degrees, degrees, meters above the WGS84 ellipsoid. From the rig file if it has it.",
         ),
     ] = None,
     heading: Annotated[
@@ -97,8 +97,8 @@ def locate(
     from kcal.errors import DegenerateError, InputError
     from kcal.files import check_writable
     from kcal.io.rig_file import RigFile
+    from kcal.locate.covariances import RigCovariance, mounting_covariance
     from kcal.locate.datum import find_geoid, true_from_grid
-    from kcal.locate.errors import RigCovariance, mounting_covariance
     from kcal.locate.export import check_format, write_positions
     from kcal.locate.geodesy import Origin
     from kcal.locate.marks import read_marks
@@ -195,7 +195,7 @@ def _table(located: Located, off: list[tuple[float, float, bool] | None] | None 
         rows[0][-1:-1] = ["off level m", "off in range m", "in interval"]
         for row, miss in zip(rows[1:], off, strict=True):
             row[-1:-1] = (
-                ["", "", ""] if miss is None else [_metres(miss[0]), f"{miss[1]:+.1f}", "yes" if miss[2] else "no"]
+                ["", "", ""] if miss is None else [_meters(miss[0]), f"{miss[1]:+.1f}", "yes" if miss[2] else "no"]
             )
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     lines = []
@@ -214,12 +214,12 @@ def _row(position: Position) -> list[str]:
             f"{position.lat:.7f}",
             f"{position.lon:.7f}",
             f"{position.height:.1f}",
-            _metres(position.range_m or 0),
+            _meters(position.range_m or 0),
         ]
-    interval = "" if low is None or high is None else f"{_metres(low)} – {_metres(high)}"
+    interval = "" if low is None or high is None else f"{_meters(low)} – {_meters(high)}"
     status = position.status.name.lower().replace("_", " ")
     return [position.name, *numbers, interval, f"{status} *" if position.reason else status]
 
 
-def _metres(value: float) -> str:
+def _meters(value: float) -> str:
     return "∞" if value == float("inf") else f"{value:.1f}" if value < 1000 else f"{value:.0f}"

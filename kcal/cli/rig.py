@@ -12,7 +12,7 @@ from kcal.cli.rig_check import check
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
-    from kcal.calibrate.stereo import RigCalibrationResult
+    from kcal.calibrate.rig.from_boards import RigCalibrationResult
     from kcal.cli.rig_joint import Sources
     from kcal.io.camera_file import CameraFile
     from kcal.io.rig_file import RigFile
@@ -55,7 +55,7 @@ def solve(
         typer.Option(
             metavar="CSV",
             help="Far things matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or "
-            "beyond (metres), if known.",
+            "beyond (meters), if known.",
         ),
     ] = None,
     positions: Annotated[
@@ -143,7 +143,7 @@ def _from_all(
     *,
     reject: bool,
 ) -> None:
-    from kcal.calibrate.rig import JointOptions, solve_rig
+    from kcal.calibrate.rig.solve import JointOptions, solve_rig
     from kcal.cli.console import out, steps
     from kcal.cli.rig_joint import gather, mounting, record, show
     from kcal.io.camera_file import CameraFile
@@ -176,8 +176,8 @@ def _from_boards(
 ) -> None:
     import math
 
-    from kcal.calibrate.pairs import pair_by_name, read_pairs
-    from kcal.calibrate.stereo import RigOptions, calibrate_rig
+    from kcal.calibrate.rig.from_boards import RigOptions, calibrate_rig
+    from kcal.calibrate.rig.pairs import pair_by_name, read_pairs
     from kcal.cli.console import err, out, steps
     from kcal.corners.observations import Observations
     from kcal.io.camera_file import CameraFile
@@ -254,7 +254,7 @@ def _name(pair: tuple[str, str]) -> str:
 
 
 def _along(result: RigCalibrationResult) -> float:
-    """σ of the baseline's length, metres, from the σ of the translation along it."""
+    """σ of the baseline's length, meters, from the σ of the translation along it."""
     direction = result.rig.right_from_left_translation / result.rig.baseline
     return float(((direction * result.sigma_translation) ** 2).sum().sqrt())
 

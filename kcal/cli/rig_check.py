@@ -10,8 +10,8 @@ import typer
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
-    from kcal.calibrate.drift import Drift
-    from kcal.calibrate.rig_sources import Features, Landmarks
+    from kcal.calibrate.rig.drift import Drift
+    from kcal.calibrate.rig.sources import Features, Landmarks
     from kcal.io.rig_file import RigFile
     from kcal.locate.marks import Marks
 
@@ -47,7 +47,7 @@ def check(
 
     `kcal rig check rig.json --landmarks survey.csv --marks now.csv --relock`
     """
-    from kcal.calibrate.drift import measure_drift
+    from kcal.calibrate.rig.drift import measure_drift
     from kcal.cli.console import err, out
     from kcal.files import check_writable
     from kcal.io.rig_file import RigFile
@@ -88,7 +88,7 @@ def check(
 def _features(then: Marks, now: Marks, sigma: float) -> Features:
     import torch
 
-    from kcal.calibrate.rig_sources import Features
+    from kcal.calibrate.rig.sources import Features
 
     common = [name for name in then.names if name in now.names]
     if not common:

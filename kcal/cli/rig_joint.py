@@ -12,8 +12,8 @@ from kcal.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from kcal.calibrate.rig_result import RigSolution
-    from kcal.calibrate.rig_sources import Baseline, Boards, MeasuredPosition, RigData
+    from kcal.calibrate.rig.result import RigSolution
+    from kcal.calibrate.rig.sources import Baseline, Boards, MeasuredPosition, RigData
     from kcal.io.camera_file import CameraFile
     from kcal.io.rig_file import RigFile
     from kcal.locate.geodesy import Origin
@@ -49,20 +49,20 @@ class Sources:
 
 
 def parse_baseline(text: str) -> Baseline:
-    """`"10.02±0.005"` or `"10.02+-0.005"`, metres."""
-    from kcal.calibrate.rig_sources import Baseline
+    """`"10.02±0.005"` or `"10.02+-0.005"`, meters."""
+    from kcal.calibrate.rig.sources import Baseline
 
     parts = text.replace("+-", "±").split("±")
     try:
         length, sigma = (float(part) for part in parts)
     except ValueError:
-        raise InputError(f"baseline {text!r}: write LENGTH±SIGMA in metres, for example 10.02±0.005") from None
+        raise InputError(f"baseline {text!r}: write LENGTH±SIGMA in meters, for example 10.02±0.005") from None
     return Baseline(first=0, second=1, length=length, sigma=sigma)
 
 
 def gather(cameras: tuple[CameraFile, CameraFile], sources: Sources, *, prior: bool) -> tuple[RigData, Origin | None]:
     """Read everything into one frame."""
-    from kcal.calibrate.rig_sources import RigData
+    from kcal.calibrate.rig.sources import RigData
     from kcal.cli.console import err
     from kcal.locate.geodesy import Origin
     from kcal.locate.marks import read_marks
@@ -79,7 +79,7 @@ def gather(cameras: tuple[CameraFile, CameraFile], sources: Sources, *, prior: b
     if sources.landmarks is not None and sources.marks is not None:
         survey = read_survey(sources.landmarks, origin)
         if sources.positions is not None and survey.origin != origin:
-            raise InputError("landmarks and positions: one has latitudes, the other local metres; give an --origin")
+            raise InputError("landmarks and positions: one has latitudes, the other local meters; give an --origin")
         origin = survey.origin
         found = match_landmarks(survey, read_marks(sources.marks, single=True), sources.mark_sigma)
         landmarks = found.landmarks
@@ -111,8 +111,8 @@ def read_boards(pairs: tuple[Path, Path], match: Path | None) -> Boards:
     """Boards seen by both cameras, paired by name or by a CSV."""
     import torch
 
-    from kcal.calibrate.pairs import pair_by_name, read_pairs
-    from kcal.calibrate.rig_sources import Boards
+    from kcal.calibrate.rig.pairs import pair_by_name, read_pairs
+    from kcal.calibrate.rig.sources import Boards
     from kcal.corners.observations import Observations
 
     seen = [Observations.load(path) for path in pairs]
@@ -152,7 +152,7 @@ def mounting(solution: RigSolution, origin: Origin | None) -> Mounting | None:
     covariance = solution.mounting_covariance(0)
     if not bool(torch.isfinite(covariance).all()):
         return None
-    return mounting_of(solution.rotation[0], solution.centre[0], covariance, origin, solution.mounting_link())
+    return mounting_of(solution.rotation[0], solution.center[0], covariance, origin, solution.mounting_link())
 
 
 def record(
@@ -248,7 +248,7 @@ def show(solution: RigSolution, there: Mounting | None) -> None:
 
 
 def _along(solution: RigSolution) -> float:
-    """σ of the baseline's length, metres."""
+    """σ of the baseline's length, meters."""
     rig = solution.stereo()
     direction = rig.right_from_left_translation / rig.baseline
     return math.sqrt(float(direction @ solution.relative_covariance()[3:, 3:] @ direction))

@@ -37,7 +37,7 @@ def undistort(
 ) -> None:
     """Remove the lens's distortion from images.
 
-    Writes NAME.png for each image (8 or 16 bits, grey or colour as the source) and CAMERA_undistorted.json, the
+    Writes NAME.png for each image (8 or 16 bits, gray or color as the source) and CAMERA_undistorted.json, the
     pinhole camera of the new images, into the folder. Straight lines become straight; where the source shows nothing
     the images are black. EXIF orientation is ignored: pixels count as the sensor wrote them.
 
@@ -81,7 +81,7 @@ def undistort(
         write_png(mask_path, (module.mask.byte() * 255).numpy())
 
     width, height = module.new_camera.size
-    fx, fy, cx, cy = module.new_camera.parameters_vector[:4].tolist()
+    fx, fy, cx, cy = module.new_camera.params[:4].tolist()
     share = float(module.mask.double().mean())
     out.print(f"{len(paths) - len(failures)} of {len(paths)} images undistorted, {width}x{height} px")
     out.print(f"new camera: fx {fx:.2f}, fy {fy:.2f}, cx {cx:.2f}, cy {cy:.2f}; {100 * share:.1f} % of pixels valid")
@@ -120,12 +120,12 @@ def _prepare(folder: Path, files: list[Path]) -> None:
 def _convert(path: Path, target: Path, module: Undistort) -> None:
     import torch
 
-    from kcal.corners.images import decode_grey, read_bytes
+    from kcal.corners.images import decode_gray, read_bytes
     from kcal.io.images import decode_image, write_png
 
     data = read_bytes(path)
-    # Refuses damaged files, which a decoder alone would fill with grey.
-    decode_grey(data, path)
+    # Refuses damaged files, which a decoder alone would fill with gray.
+    decode_gray(data, path)
     image = torch.from_numpy(decode_image(data, path))
     (height, width), size = image.shape[:2], module.camera.size
     if (width, height) != size:

@@ -21,17 +21,17 @@ _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 class Board(pydantic.BaseModel):
     """A checkerboard, described by its inner corners.
 
-    Convention: corner `row * columns + column` lies at `(column * square, row * square, 0)` metres; x runs along a
+    Convention: corner `row * columns + column` lies at `(column * square, row * square, 0)` meters; x runs along a
     row, y down the columns, z into the board, so that a board seen from its front has z pointing away from the
     camera. The square diagonally outside corner 0 is black (dark).
 
     Args:
         columns: inner corners in a row (one less than the squares).
         rows: inner corners in a column.
-        square: side of a square in metres.
+        square: side of a square in meters.
         dictionary: for a ChArUco board, the name of OpenCV's dictionary (`4x4_50`) whose markers lie in the light
             squares, numbered row by row; None for a plain checkerboard.
-        marker: side of a marker in metres, for a ChArUco board.
+        marker: side of a marker in meters, for a ChArUco board.
 
     Example:
         >>> Board(columns=9, rows=6, square=0.025).points.shape
@@ -112,7 +112,7 @@ class Board(pydantic.BaseModel):
 
     @property
     def points(self) -> Tensor:
-        """Corner positions on the flat board, (corners, 3) float64 metres, row by row."""
+        """Corner positions on the flat board, (corners, 3) float64 meters, row by row."""
         y, x = torch.meshgrid(
             torch.arange(self.rows, dtype=torch.float64),
             torch.arange(self.columns, dtype=torch.float64),
@@ -133,7 +133,7 @@ class Board(pydantic.BaseModel):
 
 
 def _length(name: str, text: str) -> float:
-    """A length with its unit in metres."""
+    """A length with its unit in meters."""
     length = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)\s*([a-z]*)\s*", text)
     try:
         value = float(length.group(1)) if length else float("nan")

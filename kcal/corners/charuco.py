@@ -57,7 +57,7 @@ def free_side(pixels: Tensor, board: Board) -> Tensor:
     if board.marker is None:
         raise InputError(f"{board}: not a ChArUco board")
     side = local_side(pixels, board.columns, board.rows)
-    # A corner without a neighbour takes the typical side of the others.
+    # A corner without a neighbor takes the typical side of the others.
     known = torch.isfinite(side)
     side = torch.where(known, side, side[known].median() if bool(known.any()) else 1.0)
     free = (board.square - board.marker) / board.square / math.sqrt(2.0)

@@ -1,4 +1,4 @@
-"""Two blurred edges that cross: the grey levels of four squares round a corner, and their derivatives.
+"""Two blurred edges that cross: the gray levels of four squares round a corner, and their derivatives.
 
 A step edge blurred by a Gaussian is an error function of the distance from the edge. Two crossing edges blurred
 together are E[sign(X₁) sign(X₂)] for two normal variables whose correlation is the cosine between the edges' normals:
@@ -28,7 +28,7 @@ class Beside(NamedTuple):
 
     Args:
         distance: (..., 2, 2, K) pixels from each edge to the next line, on the side of its normal and on the other, at
-            each place where grey levels are wanted.
+            each place where gray levels are wanted.
         turn: (..., 2, 2, 1) what the edge's sign does there: 1 where squares alternate once more, 0.5 where the light
             margin of the board begins, 0 where nothing is known.
     """
@@ -38,14 +38,14 @@ class Beside(NamedTuple):
 
 
 def crossing(parameters: Tensor, where: Tensor, bend: Tensor, beside: Beside | None = None) -> tuple[Tensor, Tensor]:
-    """Grey levels of crossing edges and their Jacobian.
+    """Gray levels of crossing edges and their Jacobian.
 
     Args:
-        parameters: (..., 10): the centre (dx, dy) in pixels, the directions of both edges in radians, the logarithm of
-            the blur's sigma in pixels, mean grey level, half the contrast (its sign says which squares are light),
+        parameters: (..., 10): the center (dx, dy) in pixels, the directions of both edges in radians, the logarithm of
+            the blur's sigma in pixels, mean gray level, half the contrast (its sign says which squares are light),
             a ramp of illumination (by which share light grows a pixel), and by how much edges are lighter than the mean
             (a camera's tone curve bends the profile of a blurred edge).
-        where: (..., K, 2) pixels at which the grey levels are wanted.
+        where: (..., K, 2) pixels at which the gray levels are wanted.
         bend: (..., 2) curvature of each edge, 1 / pixels, positive towards its normal (direction + 90°, x to y).
         beside: the lines next to the edges, if their blur reaches here.
 

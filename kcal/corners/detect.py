@@ -18,7 +18,7 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.corners.charuco import MIN_CORNERS, enough, find_charuco, free_side
 from kcal.corners.grid import MIN_SHARPNESS, grid_trouble, local_side, sharpness
-from kcal.corners.images import Grey, decode_grey, read_bytes, to_8bit, unique_names
+from kcal.corners.images import Gray, decode_gray, read_bytes, to_8bit, unique_names
 from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.order import canonical_order
@@ -57,7 +57,7 @@ class Detection(NamedTuple):
     covariance: Tensor | None = None
 
 
-def detect_board(image: Grey, board: Board, refine: Refinement = "erf") -> Detection:
+def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detection:
     """Find the inner corners of a checkerboard, or those of a ChArUco board that are seen.
 
     OpenCV's `findChessboardCorners` searches first; where it fails, `findChessboardCornersSB` (A. Duda and U. Frese,
@@ -74,7 +74,7 @@ def detect_board(image: Grey, board: Board, refine: Refinement = "erf") -> Detec
         The corners, or None with a reason that a person can act on.
 
     Raises:
-        InputError: not a grey uint8 or uint16 image, a board with 2 inner corners in a row, an unknown `refine`.
+        InputError: not a gray uint8 or uint16 image, a board with 2 inner corners in a row, an unknown `refine`.
 
     Example:
         >>> y, x = np.mgrid[:120, :160]
@@ -109,7 +109,7 @@ def detect_board(image: Grey, board: Board, refine: Refinement = "erf") -> Detec
     return Detection(refined.pixels, covariance=refined.covariance)
 
 
-def _detect_charuco(image: Grey, board: Board, refine: Refinement) -> Detection:
+def _detect_charuco(image: Gray, board: Board, refine: Refinement) -> Detection:
     pixels = find_charuco(to_8bit(image), board)
     if pixels is None:
         return Detection(None, f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on a line")
@@ -172,7 +172,7 @@ def detect_images(
         for name, file in zip(names, files, strict=True):
             try:
                 data = read_bytes(file)
-                image = decode_grey(data, file)
+                image = decode_gray(data, file)
             except FileError as error:
                 failures.append(Failure(name=name, reason=str(error).removeprefix(f"{file}: ")))
             else:
@@ -240,12 +240,12 @@ def _search(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor | None, 
     return None, 1.0, reason
 
 
-def _find_classic(image: Grey, board: Board) -> Tensor | None:
+def _find_classic(image: Gray, board: Board) -> Tensor | None:
     found, corners = cv2.findChessboardCorners(image, (board.columns, board.rows), flags=_CLASSIC)
     return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
 
 
-def _find_sector(image: Grey, board: Board) -> Tensor | None:
+def _find_sector(image: Gray, board: Board) -> Tensor | None:
     # It draws from OpenCV's random numbers, whose state is a thread's own: in a new thread the same image gives the
     # same corners, whatever was called before, and the caller's state is left alone.
     with ThreadPoolExecutor(1) as fresh:
@@ -255,7 +255,7 @@ def _find_sector(image: Grey, board: Board) -> Tensor | None:
     return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
 
 
-def _climb(image: Grey, pixels: Tensor, board: Board, factor: float) -> Tensor:
+def _climb(image: Gray, pixels: Tensor, board: Board, factor: float) -> Tensor:
     """Bring corners found on an image `factor` times smaller near enough for refinement at full size.
 
     The first steps are on images four and two times smaller still, because OpenCV leaves single corners 3 px off
@@ -280,7 +280,7 @@ def _climb(image: Grey, pixels: Tensor, board: Board, factor: float) -> Tensor:
     return pixels
 
 
-def _shrunk(image: Grey, factor: float, whole: tuple[int, int]) -> tuple[Grey, Tensor]:
+def _shrunk(image: Gray, factor: float, whole: tuple[int, int]) -> tuple[Gray, Tensor]:
     """What was once `whole` (width, height) made `factor` times smaller by averaging, and the exact scale back."""
     width, height = whole
     if factor <= 1:
@@ -291,11 +291,11 @@ def _shrunk(image: Grey, factor: float, whole: tuple[int, int]) -> tuple[Grey, T
 
 
 def _scaled(pixels: Tensor, scale: Tensor) -> Tensor:
-    """Pixels of a shrunk image as pixels of the image: edges coincide at -0.5, not the centres of the first pixels."""
+    """Pixels of a shrunk image as pixels of the image: edges coincide at -0.5, not the centers of the first pixels."""
     return (pixels + 0.5) * scale - 0.5
 
 
-def _size(image: Grey) -> tuple[int, int]:
+def _size(image: Gray) -> tuple[int, int]:
     return image.shape[1], image.shape[0]
 
 
@@ -303,7 +303,7 @@ def _sizes_differ(files: list[Path], names: list[str]) -> str:
     by_size: dict[tuple[int, int], list[str]] = {}
     for name, file in zip(names, files, strict=True):
         try:
-            by_size.setdefault(_size(decode_grey(read_bytes(file), file)), []).append(name)
+            by_size.setdefault(_size(decode_gray(read_bytes(file), file)), []).append(name)
         except FileError:
             continue
     groups = []
@@ -320,7 +320,7 @@ def _hint(files: list[Path], board: Board) -> str:
     fewer = Board(columns=board.columns - 1, rows=board.rows - 1, square=board.square)
     for file in files[:3]:
         try:
-            image = decode_grey(read_bytes(file), file)
+            image = decode_gray(read_bytes(file), file)
         except FileError:
             continue
         if _search(to_8bit(image), fewer)[0] is not None:

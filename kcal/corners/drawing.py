@@ -11,13 +11,13 @@ from xml.sax.saxutils import escape
 
 from kcal.errors import InputError
 
-_POINT = 72 / 25.4  # PDF points in a millimetre
+_POINT = 72 / 25.4  # PDF points in a millimeter
 _FONTS = "Helvetica, Arial, sans-serif"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rectangle:
-    """A filled black rectangle; millimetres from the page's top left corner."""
+    """A filled black rectangle; millimeters from the page's top left corner."""
 
     x: float
     y: float
@@ -27,7 +27,7 @@ class Rectangle:
 
 @dataclass(frozen=True, kw_only=True)
 class Text:
-    """A line of text whose baseline begins at (x, y) millimetres from the top left corner."""
+    """A line of text whose baseline begins at (x, y) millimeters from the top left corner."""
 
     x: float
     y: float
@@ -37,7 +37,7 @@ class Text:
 
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """A page and what is on it, in millimetres."""
+    """A page and what is on it, in millimeters."""
 
     width: float
     height: float
@@ -47,7 +47,7 @@ class Drawing:
 
 
 def to_svg(drawing: Drawing) -> str:
-    """The drawing as SVG 1.1, one user unit a millimetre.
+    """The drawing as SVG 1.1, one user unit a millimeter.
 
     Example:
         >>> page = Drawing(width=10, height=5, title="t", rectangles=(Rectangle(x=1, y=1, width=2.5, height=3),))
@@ -124,7 +124,7 @@ def to_pdf(drawing: Drawing) -> bytes:
 
 
 def _number(value: float) -> str:
-    """A number to 0.1 micrometre, without a needless fraction."""
+    """A number to 0.1 micrometer, without a needless fraction."""
     return f"{value:.4f}".rstrip("0").rstrip(".")
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from kcal.checks import as_points
 from kcal.corners.erf_fit import Fit, fit_crossings
-from kcal.corners.grid import Neighbours
+from kcal.corners.grid import Neighbors
 from kcal.corners.saddle import MAX_MOVE, MOVE_SHARE, Refined, Status, check_arguments
 from kcal.errors import InputError
 
@@ -35,7 +35,7 @@ def erf_saddle(
     side: Tensor | float,
     *,
     bend: Tensor | None = None,
-    around: Neighbours | None = None,
+    around: Neighbors | None = None,
     levels: tuple[float, float] | None = None,
 ) -> Refined:
     """Fit two blurred edges that cross at each corner.
@@ -44,15 +44,15 @@ def erf_saddle(
     with respect to `image` by the implicit function theorem; the covariance and the blur carry no gradient.
 
     Args:
-        image: (..., H, W) grey levels, floating point or uint8.
+        image: (..., H, W) gray levels, floating point or uint8.
         pixels: (..., N, 2) starts; NaN where a corner was not seen.
         side: the smallest side in pixels of the squares round each corner, (..., N) or one number.
         bend: (..., N, 2, 2) curvature vectors in 1 / pixels of the lines through each corner along the board's rows
             and columns (`kcal.corners.grid.line_bend`), which a distorting lens bends by enough to shift the corner.
             Straight if not given.
-        around: the steps to the next corners (`kcal.corners.grid.neighbours`): where blur is a good part of a square,
+        around: the steps to the next corners (`kcal.corners.grid.neighbors`): where blur is a good part of a square,
             the lines through them reach into the window. Not allowed for if not given.
-        levels: the darkest and brightest grey level there can be in an image of whole numbers, to find saturated
+        levels: the darkest and brightest gray level there can be in an image of whole numbers, to find saturated
             corners; not looked for if None.
 
     Returns:
@@ -76,8 +76,8 @@ def erf_saddle(
         bend = bend.reshape(-1, 2, 2)
     if around is not None:
         if around.step.shape != (*pixels.shape[:-1], 4, 2) or around.outer.shape != (*pixels.shape[:-1], 4):
-            raise InputError(f"around: steps of shape {(*pixels.shape[:-1], 4, 2)} are needed, see `neighbours`")
-        around = Neighbours(
+            raise InputError(f"around: steps of shape {(*pixels.shape[:-1], 4, 2)} are needed, see `neighbors`")
+        around = Neighbors(
             around.step.detach().reshape(-1, 4, 2),
             around.change.detach().reshape(-1, 4, 2),
             around.outer.reshape(-1, 4),
@@ -94,17 +94,17 @@ def erf_saddle(
     whole = levels is not None or image.dtype == torch.uint8
     rounding = 1.0 / 12.0 if whole else 0.0
     fit = fit_crossings(images, grouped, side.reshape(grouped.shape[:2]), bend, around, rounding)
-    result = start.round() + fit.centre.reshape(start.shape)
+    result = start.round() + fit.center.reshape(start.shape)
 
     shape = side.shape
     x, y = result.detach().unbind(-1)
     margin = fit.window.radius.reshape(shape)
     inside = (x >= margin) & (x <= width - 1 - margin) & (y >= margin) & (y <= height - 1 - margin)
-    moved = torch.linalg.vector_norm(fit.centre.detach() - fit.window.offset, dim=-1)
+    moved = torch.linalg.vector_norm(fit.center.detach() - fit.window.offset, dim=-1)
     limit = (side.reshape(-1) * MOVE_SHARE).clamp(max=MAX_MOVE)
     low, high = levels or (-math.inf, math.inf)
-    grey = fit.window.levels
-    saturated = torch.maximum(_share(grey <= low, fit.window.weight), _share(grey >= high, fit.window.weight))
+    gray = fit.window.levels
+    saturated = torch.maximum(_share(gray <= low, fit.window.weight), _share(gray >= high, fit.window.weight))
     blur = fit.parameters[:, 4].exp()
     status = torch.zeros(shape, dtype=torch.int64, device=image.device)
     for code, passed in (  # the most basic trouble last, so that it is the one reported

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from kcal.corners.crossing import PARAMETERS, Beside, crossing
 from kcal.corners.erf_window import Window
-from kcal.corners.grid import Neighbours
+from kcal.corners.grid import Neighbors
 
 # A ramp of illumination looks like a shift of the corner where the window is hardly wider than the blur. A prior keeps
-# it near that of the whole board: it counts at most as so many pixels one pixel away from the centre.
+# it near that of the whole board: it counts at most as so many pixels one pixel away from the center.
 RAMP_WEIGHT = 3000.0
 UNKNOWN_RAMP = 1e-3  # share a pixel, where there are too few corners to know: a third of the light over 300 pixels
 _LIGHT_CORNERS = 12  # fewer do not tell a quadratic from their noise
@@ -30,7 +30,7 @@ class Prior(NamedTuple):
 
     @staticmethod
     def of(parameters: Tensor, slope: Tensor, doubt: Tensor, noise: Tensor) -> Prior:
-        """From a slope and its error (`light_slope`), and the variance of the grey levels (M,)."""
+        """From a slope and its error (`light_slope`), and the variance of the gray levels (M,)."""
         most = RAMP_WEIGHT * parameters[:, 5:7].square().sum(-1)
         # A normal error on either side. Where nothing is known, none is better than a ramp made up of noise.
         known = (doubt > 0) & (doubt < UNKNOWN_RAMP)
@@ -77,8 +77,8 @@ def light_slope(light: Tensor, place: Tensor, side: Tensor, usable: Tensor) -> t
     """
     light, place = torch.where(usable, light, 0.0), torch.where(usable[..., None], place, 0.0)
     count = usable.sum(-1).clamp_min(1)[:, None]
-    centre = (place * usable[..., None]).sum(1) / count
-    away = (place - centre[:, None]) * usable[..., None]
+    center = (place * usable[..., None]).sum(1) / count
+    away = (place - center[:, None]) * usable[..., None]
     size = (away.square().sum((1, 2)) / count[:, 0]).sqrt().clamp_min(1.0)[:, None]
     x, y = (away / size[..., None]).unbind(-1)
     design = torch.stack([usable.to(x), x, y, x * x, x * y, y * y], -1)
@@ -141,15 +141,15 @@ def _directions(parameters: Tensor) -> Tensor:
     return torch.stack([parameters[:, 2:4].cos(), parameters[:, 2:4].sin()], -1)
 
 
-def lines_beside(around: Neighbours, parameters: Tensor) -> Lines:
-    """The lines through the neighbours across each edge."""
+def lines_beside(around: Neighbors, parameters: Tensor) -> Lines:
+    """The lines through the neighbors across each edge."""
     direction = _directions(parameters)
     normal = torch.stack([-direction[..., 1], direction[..., 0]], -1)
     # (M, edge, row or column, back and forth)
     across, along = (torch.einsum("mei,mki->mek", v, around.step).unflatten(-1, (2, 2)) for v in (normal, direction))
     change = torch.einsum("mei,mki->mek", normal, around.change).unflatten(-1, (2, 2))
     outer = around.outer.unflatten(-1, (2, 2))[:, None].expand(across.shape)
-    # The neighbours along an edge lie on it; those of the other line are across. `row` is the edge along the rows.
+    # The neighbors along an edge lie on it; those of the other line are across. `row` is the edge along the rows.
     size = across.abs().nansum(-1)
     swapped = (size[:, 0, 0] + size[:, 1, 1] > size[:, 0, 1] + size[:, 1, 0])[:, None, None]
 

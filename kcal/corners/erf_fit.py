@@ -16,7 +16,7 @@ from kcal.corners.crossing import ODD, PARAMETERS, Beside, crossing
 from kcal.corners.erf_board import Prior, curvatures, light_at, light_slope, line_spread, lines_beside
 from kcal.corners.erf_spread import spread
 from kcal.corners.erf_window import Window, look
-from kcal.corners.grid import Neighbours
+from kcal.corners.grid import Neighbors
 
 MIN_ANGLE = math.radians(25.0)  # between the edges; below, the series of `crossing` ends too early
 SHARE = 0.5  # of the smallest square side: the radius of the window
@@ -36,17 +36,17 @@ class Fit(NamedTuple):
     """What was fitted to each of M corners.
 
     Args:
-        centre: (M, 2) pixels from the pixel the start is in; differentiable with respect to the image.
+        center: (M, 2) pixels from the pixel the start is in; differentiable with respect to the image.
         parameters: (M, 10), see `crossing`.
         window: the pixels used.
-        noise: (M,) variance of the grey levels.
+        noise: (M,) variance of the gray levels.
         covariance: (M, 2, 2) px².
         crosses: (M,) whether there are two edges.
         still: (M,) whether the last step was small.
         near: (M,) whether the next lines were fitted, too.
     """
 
-    centre: Tensor
+    center: Tensor
     parameters: Tensor
     window: Window
     noise: Tensor
@@ -57,7 +57,7 @@ class Fit(NamedTuple):
 
 
 def fit_crossings(
-    image: Tensor, start: Tensor, side: Tensor, bend: Tensor | None, around: Neighbours | None, least_noise: float
+    image: Tensor, start: Tensor, side: Tensor, bend: Tensor | None, around: Neighbors | None, least_noise: float
 ) -> Fit:
     """Fit two crossing edges to the surroundings of each corner.
 
@@ -67,7 +67,7 @@ def fit_crossings(
         side: (B, N) smallest sides of the squares.
         bend: (M, 2, 2) curvature vectors of the lines through each corner, M = B N.
         around: steps to the next corners, (M, 4, 2), or None.
-        least_noise: variance that the grey levels have at least.
+        least_noise: variance that the gray levels have at least.
     """
     base = start.round()
     offset = (start - base).reshape(-1, 2)
@@ -79,7 +79,7 @@ def fit_crossings(
     nothing = torch.zeros_like(first[:, :2])
     prior = Prior.of(first, nothing, torch.zeros_like(side).reshape(-1), nothing[:, 0])
     # What the first steps find is enough to know how light falls on the board, and which lines reach into windows.
-    parameters, cost, still = _minimise(first, window, curves, prior, None, _FIRST_STEPS)
+    parameters, cost, still = _minimize(first, window, curves, prior, None, _FIRST_STEPS)
     usable = crosses & torch.isfinite(cost)
     beside = None
     near = torch.zeros_like(crosses)
@@ -105,7 +105,7 @@ def fit_crossings(
         noise = cost / window.weight.sum(-1)
         prior = Prior.of(parameters, slope, doubt, noise)
         chosen = None if others is None else Beside(*(value[some] for value in others))
-        done = _minimise(parameters[some], window.of(some), curves[some], prior.of_some(some), chosen, _STEPS)
+        done = _minimize(parameters[some], window.of(some), curves[some], prior.of_some(some), chosen, _STEPS)
         parameters, cost, still = (
             value.index_copy(0, some, new) for value, new in zip((parameters, cost, still), done, strict=True)
         )
@@ -114,13 +114,13 @@ def fit_crossings(
     learn = (crosses & still).reshape(side.shape)
     noise, covariance = _spread(parameters, window, curves, prior, beside, learn, least_noise)
     still = still & torch.isfinite(covariance).all(-1).all(-1)
-    centre = parameters[:, :2]
+    center = parameters[:, :2]
     if patches.requires_grad:
-        centre = _with_gradient(parameters, window, curves, prior, beside, patches)
-    return Fit(centre, parameters, window, noise, covariance, crosses, still, near)
+        center = _with_gradient(parameters, window, curves, prior, beside, patches)
+    return Fit(center, parameters, window, noise, covariance, crosses, still, near)
 
 
-def _minimise(
+def _minimize(
     parameters: Tensor, window: Window, bend: Tensor, prior: Prior, beside: Beside | None, steps: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Levenberg-Marquardt for all corners at once: parameters, cost, and whether the last step was small."""
@@ -247,7 +247,7 @@ def _spread(
 def _with_gradient(
     parameters: Tensor, window: Window, bend: Tensor, prior: Prior, beside: Beside | None, patches: Tensor
 ) -> Tensor:
-    """The centre as a function of the grey levels: at the minimum g(p, levels) = 0, so dp = -(∂g/∂p)⁻¹ ∂g."""
+    """The center as a function of the gray levels: at the minimum g(p, levels) = 0, so dp = -(∂g/∂p)⁻¹ ∂g."""
     if beside is None:
         nowhere = torch.full((len(parameters), 2, 2, 1), _NOWHERE, dtype=torch.float64, device=parameters.device)
         beside = Beside(nowhere, torch.zeros_like(nowhere))

@@ -1,4 +1,4 @@
-"""How far a fitted corner can be off: the noise of the grey levels, as far as it can move a corner.
+"""How far a fitted corner can be off: the noise of the gray levels, as far as it can move a corner.
 
 Turned by 180° round a corner, four squares are what they were, and so is everything that is wrong with the model in
 both places alike (blur that is no Gaussian, a camera's tone curve): it cannot move the corner. So the noise is taken
@@ -27,22 +27,22 @@ def spread(
     weight: Tensor,
     jacobian: Tensor,
     inverse: Tensor,
-    centre: Tensor,
+    center: Tensor,
     usable: Tensor,
     least_noise: float,
 ) -> Tensor:
     """The covariance of the first two parameters.
 
     With residuals e = noise - J H⁻¹ JᵀW noise, the parameters' error is G noise, G = H⁻¹ JᵀW, and its covariance is
-    G R Gᵀ, R being the noise's covariance. The weights W only shape the window. Fitting itself makes neighbouring
+    G R Gᵀ, R being the noise's covariance. The weights W only shape the window. Fitting itself makes neighboring
     residuals differ; what it would make of white noise is subtracted from the correlation found.
 
     Args:
-        residual: (B, N, P, P) grey levels, for all corners of B images.
+        residual: (B, N, P, P) gray levels, for all corners of B images.
         weight: (B, N, P, P).
         jacobian: (B, N, p, P, P), of the parameters that are odd round the corner only.
         inverse: (B, N, p, p), of H⁻¹ the same.
-        centre: (B, N, 2) pixels from the middle of the patch.
+        center: (B, N, 2) pixels from the middle of the patch.
         usable: (B, N) corners from which the image's noise is learned.
         least_noise: that of rounding, 1/12: flat black and white are rounded alike everywhere and show less of it than
             there is at edges.
@@ -54,7 +54,7 @@ def spread(
     outer = torch.einsum("bniyx,bnjyx->bnij", gain, gain)  # G Gᵀ
     smeared = torch.einsum("bnij,bnjyx->bniyx", outer, jacobian)
     moving, white = gain[:, :, :2], outer[..., :2, :2]
-    odd, pair = _odd(residual, weight, centre)
+    odd, pair = _odd(residual, weight, center)
 
     def found_and_made(down: int, right: int) -> tuple[Tensor, Tensor, Tensor]:
         """Sums over pairs of pixels: of the products found, of what fitting makes of white noise, and of the pairs."""
@@ -87,11 +87,11 @@ def _sum(values: Tensor, usable: Tensor) -> Tensor:
     return torch.where(usable, values, 0.0).sum(-1)
 
 
-def _odd(residual: Tensor, weight: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
+def _odd(residual: Tensor, weight: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
     """What is odd round the corner, of the variance of the whole if that is noise, and the weight of both places."""
     size = residual.shape[-1]
     # To half a pixel, so that pixels fall on pixels.
-    twice = (2.0 * centre).round().nan_to_num().long() + 2 * (size // 2)
+    twice = (2.0 * center).round().nan_to_num().long() + 2 * (size // 2)
     axis = torch.arange(size, device=residual.device)
     columns, rows = twice[..., :1] - axis, twice[..., 1:] - axis
     inside = ((columns >= 0) & (columns < size))[..., None, :] & ((rows >= 0) & (rows < size))[..., :, None]

@@ -14,7 +14,7 @@ class Window:
     """The pixels round each of M corners, and how much each counts: 1 inside the radius, falling to 0 within a pixel.
 
     Args:
-        levels: (M, K) grey levels of the pixels on a disc.
+        levels: (M, K) gray levels of the pixels on a disc.
         offset: (M, 2) starts relative to the patch's middle.
         radius: (M,) pixels.
         places: (K,) which of a patch's pixels these are, row by row.
@@ -42,7 +42,7 @@ class Window:
 
 
 def look(image: Tensor, base: Tensor, offset: Tensor, radius: Tensor) -> tuple[Window, Tensor]:
-    """The windows, and their grey levels with gradients."""
+    """The windows, and their gray levels with gradients."""
     most = float(radius.max()) if radius.numel() else 1.0
     half = math.ceil(most + 1.0)
     axis = torch.arange(-half, half + 1, device=radius.device)

@@ -1,4 +1,4 @@
-"""What a detected grid of corners must look like: sizes of its squares, their colours, and whether it is a board."""
+"""What a detected grid of corners must look like: sizes of its squares, their colors, and whether it is a board."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 
-MAX_BEND = 0.25  # of a square: how far a corner may lie from its neighbours' homography; a wrong grid is off by 1
+MAX_BEND = 0.25  # of a square: how far a corner may lie from its neighbors' homography; a wrong grid is off by 1
 MAX_RATIO = 1.7  # of one square's side to the next along a row: perspective needs a board 3 squares away for this
-MIN_ALTERNATING = 0.9  # share of neighbouring squares that differ as they must; glare may spoil a few
+MIN_ALTERNATING = 0.9  # share of neighboring squares that differ as they must; glare may spoil a few
 GOES_ON = 0.75  # of the contrast across a corner: an outer corner of the board's edge has half, one more row all
 MIN_SHARPNESS = 0.58  # see `sharpness`: a blur of 0.22 of the square's side
 MIN_SIDE = 5.0  # pixels: below this, blur decides where the corner seems to be
@@ -35,10 +35,10 @@ def as_grid(pixels: Tensor, columns: int, rows: int) -> Tensor:
 
 
 def local_side(pixels: Tensor, columns: int, rows: int) -> Tensor:
-    """The distance in pixels from each corner to the nearest of its neighbours in the grid, (rows * columns,).
+    """The distance in pixels from each corner to the nearest of its neighbors in the grid, (rows * columns,).
 
     This is what a refinement window must be measured by: a fixed one swallows the next corner of a distant board.
-    Neighbours that were not seen (NaN) do not count; a corner that has none gets infinity.
+    Neighbors that were not seen (NaN) do not count; a corner that has none gets infinity.
 
     Example:
         >>> corners = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [3.0, 4.0]])
@@ -57,7 +57,7 @@ def local_side(pixels: Tensor, columns: int, rows: int) -> Tensor:
 
 
 def cell_levels(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> Tensor:
-    """Mean grey level in the middle of each square between four corners, (rows - 1, columns - 1) float64.
+    """Mean gray level in the middle of each square between four corners, (rows - 1, columns - 1) float64.
 
     Sampled at 25 points over the middle half of the square, so that corners off by a few pixels change nothing.
     """
@@ -71,9 +71,9 @@ def cell_levels(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, ro
 
 
 def first_square_dark(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> tuple[bool, float]:
-    """Whether the square diagonally outside corner 0 is dark, and the share of neighbouring squares that agree.
+    """Whether the square diagonally outside corner 0 is dark, and the share of neighboring squares that agree.
 
-    Colours alternate, so that square has the colour of the first one inside.
+    Colors alternate, so that square has the color of the first one inside.
     """
     differences = _alternating(cell_levels(image, pixels, columns, rows))
     lighter = float((differences > 0).double().mean())
@@ -81,7 +81,7 @@ def first_square_dark(image: npt.NDArray[np.generic], pixels: Tensor, columns: i
 
 
 def sharpness(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> float:
-    """How square the squares still are: 1 if their colour reaches their edges, 0.5 if blur has made them waves.
+    """How square the squares still are: 1 if their color reaches their edges, 0.5 if blur has made them waves.
 
     The median over the squares between the corners of the contrast a quarter of a square inside their corners, over
     that in their middle. A Gaussian blur of 0.2 of the square's side gives 0.64, one of 0.25 gives 0.54; from there on
@@ -130,7 +130,7 @@ def goes_on(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: 
 
     Detectors do return parts: asked for 8x6, OpenCV finds such a part on most views of a 9x6 board, and not the same
     part for each camera. One step beyond each side, four squares meet again only if there is another row of corners;
-    on the board's own edge three of the four places have one colour.
+    on the board's own edge three of the four places have one color.
     """
     grid = as_grid(pixels, columns, rows)
     sides = (grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0))
@@ -138,7 +138,7 @@ def goes_on(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: 
 
 
 def _alternating(levels: Tensor) -> Tensor:
-    """How much lighter light squares are than dark neighbours, if the first is dark: uneven light hardly matters."""
+    """How much lighter light squares are than dark neighbors, if the first is dark: uneven light hardly matters."""
     rows, columns = levels.shape
     i, j = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
     sign = 1.0 - 2.0 * ((i + j) % 2)
@@ -168,7 +168,7 @@ def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
 
 
 def _levels(image: npt.NDArray[np.generic], where: Tensor) -> Tensor:
-    """Grey levels at the pixels nearest to `where` (..., 2), (...) float64; the image's edge goes on outside."""
+    """Gray levels at the pixels nearest to `where` (..., 2), (...) float64; the image's edge goes on outside."""
     x, y = where.round().long().unbind(-1)
     x, y = x.clamp(0, image.shape[1] - 1), y.clamp(0, image.shape[0] - 1)
     return torch.from_numpy(image[y.numpy(), x.numpy()].astype(np.float64))
@@ -204,8 +204,8 @@ def _bend(grid: Tensor) -> Tensor:
         torch.linalg.vector_norm(blocks.diff(dim=3), dim=1).amin((1, 2)),
     )
     flat = blocks.flatten(2).transpose(1, 2)
-    centre = flat.mean(1, keepdim=True)
-    u, v = ((flat - centre) / side[:, None, None]).unbind(-1)
+    center = flat.mean(1, keepdim=True)
+    u, v = ((flat - center) / side[:, None, None]).unbind(-1)
     y, x = torch.meshgrid(torch.arange(high).double() - 1, torch.arange(wide).double() - 1, indexing="ij")
     x, y = x.reshape(1, -1).expand_as(u), y.reshape(1, -1).expand_as(u)
     one, zero = torch.ones_like(u), torch.zeros_like(u)
@@ -257,11 +257,11 @@ def _smooth(values: Tensor) -> Tensor:
     return (design @ solution).reshape(values.shape)
 
 
-class Neighbours(NamedTuple):
+class Neighbors(NamedTuple):
     """Where the next corners are: left, right, up and down in the board's order.
 
     Args:
-        step: (..., N, 4, 2) pixels from each corner to its neighbour. At the board's border it leads to where the outer
+        step: (..., N, 4, 2) pixels from each corner to its neighbor. At the board's border it leads to where the outer
             square ends; there and where none was seen it follows from the two corners on the other side, NaN without.
         change: (..., N, 4, 2) by how much that step differs from one corner to the next along the other line: along
             rows for the steps up and down.
@@ -273,19 +273,19 @@ class Neighbours(NamedTuple):
     outer: Tensor
 
 
-def neighbours(pixels: Tensor, columns: int, rows: int) -> Neighbours:
+def neighbors(pixels: Tensor, columns: int, rows: int) -> Neighbors:
     """The steps from each corner of a board to the corners next to it.
 
     Example:
         >>> corners = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [3.0, 4.0]])
-        >>> around = neighbours(corners, 2, 2)
+        >>> around = neighbors(corners, 2, 2)
         >>> around.step[0].tolist(), around.outer[0].tolist()
         ([[-3.0, 0.0], [3.0, 0.0], [0.0, -4.0], [0.0, 4.0]], [True, False, True, False])
     """
     grid = as_grid(pixels, columns, rows)
     across, down = _steps(grid), [value.transpose(0, 1) for value in _steps(grid.transpose(0, 1))]
     step, change, outer = (torch.cat(both, 2) for both in zip(across, down, strict=True))
-    return Neighbours(step.reshape(-1, 4, 2), change.reshape(-1, 4, 2), outer.reshape(-1, 4))
+    return Neighbors(step.reshape(-1, 4, 2), change.reshape(-1, 4, 2), outer.reshape(-1, 4))
 
 
 def _steps(lines: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -320,7 +320,7 @@ def _beyond(step: Tensor, following: Tensor) -> Tensor:
 
 
 def _slope(values: Tensor) -> Tensor:
-    """Change from one to the next along dim 0, central where both neighbours are known, else one-sided."""
+    """Change from one to the next along dim 0, central where both neighbors are known, else one-sided."""
     after = torch.full_like(values, float("nan"))
     before = after.clone()
     after[:-1] = values.diff(dim=0)

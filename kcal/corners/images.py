@@ -1,4 +1,4 @@
-"""Image files to grey pixels, or a reason why not; and which files the user meant.
+"""Image files to gray pixels, or a reason why not; and which files the user meant.
 
 Pixels are always in the order in which the sensor wrote them: an EXIF orientation tag is ignored, because a phone that
 was turned between two shots would otherwise swap width and height, and the lens does not turn with the tag.
@@ -22,13 +22,13 @@ import numpy.typing as npt
 
 from kcal.errors import FileError, InputError
 
-Grey = npt.NDArray[np.uint8 | np.uint16]
+Gray = npt.NDArray[np.uint8 | np.uint16]
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm", ".jp2"})
 MIN_SIDE = 16
 
 _decoding = threading.Lock()
-# libjpeg paints what it could not decode in grey and only mutters. Spare bytes before the end mark (0xd9) are harmless
+# libjpeg paints what it could not decode in gray and only mutters. Spare bytes before the end mark (0xd9) are harmless
 # and usual in frames of web cameras.
 _BROKEN_JPEG = re.compile(
     rb"(Corrupt JPEG data: (?!\d+ extraneous bytes before marker 0xd9)[^\r\n]*|Premature end of JPEG[^\r\n]*)"
@@ -50,15 +50,15 @@ def read_bytes(path: str | Path) -> bytes:
     return data
 
 
-def decode_grey(data: bytes, source: str | Path) -> Grey:
-    """Decode an image file's bytes to grey levels, (H, W) uint8 or uint16 as stored; `source` names it in errors.
+def decode_gray(data: bytes, source: str | Path) -> Gray:
+    """Decode an image file's bytes to gray levels, (H, W) uint8 or uint16 as stored; `source` names it in errors.
 
-    Colours become grey by OpenCV's weights (ITU-R BT.601). The EXIF orientation is ignored: row 0 is the row the
+    Colors become gray by OpenCV's weights (ITU-R BT.601). The EXIF orientation is ignored: row 0 is the row the
     sensor read first.
 
     Raises:
-        FileError: not an image, truncated or corrupt (also where the decoder would fill the rest with grey), pixels
-            other than 8 or 16 bit unsigned, smaller than 16 pixels, or one flat grey.
+        FileError: not an image, truncated or corrupt (also where the decoder would fill the rest with gray), pixels
+            other than 8 or 16 bit unsigned, smaller than 16 pixels, or one flat gray.
     """
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image, complaints = _imdecode(data, flags)
@@ -75,12 +75,12 @@ def decode_grey(data: bytes, source: str | Path) -> Grey:
     if min(height, width) < MIN_SIDE:
         raise FileError(f"{source}: {width}x{height} pixels are too few; {MIN_SIDE} each way are needed")
     if image.min() == image.max():
-        raise FileError(f"{source}: every pixel has the same grey level; the image shows nothing")
+        raise FileError(f"{source}: every pixel has the same gray level; the image shows nothing")
     return image
 
 
-def read_grey(path: str | Path) -> Grey:
-    """Read an image file to grey levels, (H, W) uint8 or uint16 as stored; see `decode_grey`.
+def read_gray(path: str | Path) -> Gray:
+    """Read an image file to gray levels, (H, W) uint8 or uint16 as stored; see `decode_gray`.
 
     Raises:
         FileError: missing, empty, not an image, corrupt, or of no use.
@@ -89,14 +89,14 @@ def read_grey(path: str | Path) -> Grey:
         >>> import cv2, numpy as np, tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = cv2.imwrite(f"{folder}/ramp.png", np.arange(65536, dtype=np.uint16).reshape(256, 256))
-        ...     image = read_grey(f"{folder}/ramp.png")
+        ...     image = read_gray(f"{folder}/ramp.png")
         >>> image.dtype, image.shape
         (dtype('uint16'), (256, 256))
     """
-    return decode_grey(read_bytes(path), path)
+    return decode_gray(read_bytes(path), path)
 
 
-def to_8bit(image: Grey) -> npt.NDArray[np.uint8]:
+def to_8bit(image: Gray) -> npt.NDArray[np.uint8]:
     """Eight bits a pixel for detectors; refinement should use the full depth.
 
     uint8 is returned as it is. uint16 is stretched linearly so that its 0.1 % darkest pixels become 0 and its 0.1 %

@@ -50,7 +50,7 @@ class Matches(NamedTuple):
         covariance: (N, 2, 2) px², from the noise that the fit left; NaN where not good. Too small by up to half where
             noise is as strong as texture, because the image's slopes are noisy too.
         status: (N,) int64 of `MatchStatus`.
-        score: (N,) best normalised correlation along the line, -1 to 1; NaN where none was computed.
+        score: (N,) best normalized correlation along the line, -1 to 1; NaN where none was computed.
         off_line: (N,) px, distance from the epipolar line, NaN where not good.
     """
 
@@ -67,8 +67,8 @@ class MatchOptions:
 
     Args:
         half: the patch has (2 half + 1)² pixels.
-        nearest: metres, nearest distance in front of the left camera that is searched; 10 baselines if None.
-        min_score: normalised correlation that is needed.
+        nearest: meters, nearest distance in front of the left camera that is searched; 10 baselines if None.
+        min_score: normalized correlation that is needed.
         max_rival: share of the best score that another place may have.
         max_off_line: pixels.
 
@@ -86,7 +86,7 @@ class MatchOptions:
         if not 2 <= self.half <= 100:
             raise InputError("match option half: 2 to 100 pixels are needed")
         if self.nearest is not None and not 0 < self.nearest < math.inf:
-            raise InputError("match option nearest: a positive distance in metres is needed")
+            raise InputError("match option nearest: a positive distance in meters is needed")
         if not 0 < self.min_score < 1 or not 0 < self.max_rival <= 1 or not self.max_off_line > 0:
             raise InputError("match options: min_score and max_rival lie between 0 and 1, max_off_line is positive")
 
@@ -107,8 +107,8 @@ def match_points(
 
     Args:
         rig: the calibrated cameras.
-        left: (H, W) grey levels of the left camera.
-        right: (H, W) grey levels of the right camera.
+        left: (H, W) gray levels of the left camera.
+        right: (H, W) gray levels of the right camera.
         pixels_left: (N, 2).
         options: see `MatchOptions`.
 
@@ -234,7 +234,7 @@ def _refine(
 
 
 def _covariance(design: Tensor, residual: Tensor) -> Tensor:
-    """Of the shift, allowing for the blur that makes neighbours' noise alike.
+    """Of the shift, allowing for the blur that makes neighbors' noise alike.
 
     The estimate is A n with A = (JᵀJ)⁻¹Jᵀ; blurred white noise has the covariance s² B Bᵀ, so A's rows are blurred
     once more, and the residual's variance is s² times the sum of the kernel's squares.
@@ -268,7 +268,7 @@ def _tangent(places: Tensor, best: int) -> Tensor:
 
 
 def _correlation(samples: Tensor, template: Tensor) -> Tensor:
-    """Normalised correlation (C,) of samples (C, K) with a template (K,)."""
+    """Normalized correlation (C,) of samples (C, K) with a template (K,)."""
     a = samples - samples.mean(-1, keepdim=True)
     b = template - template.mean()
     norm = torch.linalg.vector_norm(a, dim=-1) * torch.linalg.vector_norm(b)

@@ -22,7 +22,7 @@ class View(pydantic.BaseModel):
     Args:
         name: unique name in the file, usually the image's file name; views of two cameras are paired by it.
         pixels: one (u, v) a board corner in the board's order, or None where a corner was not seen. Integer
-            coordinates are centres of pixels.
+            coordinates are centers of pixels.
         covariance: one (uu, uv, vv) in px² a board corner, None where not seen; or None where it is not known.
         image: where the image was read from, relative or absolute.
         sha256: of the image file's bytes, so that a changed image is noticed.

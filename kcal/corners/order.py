@@ -16,12 +16,12 @@ def canonical_order(image: npt.NDArray[np.generic], pixels: Tensor, board: Board
 
     The order never is a mirror image: seen from the front, x along a row to y down a column is a clockwise quarter
     turn in the image. Among the orders that remain, those whose square diagonally outside corner 0 is dark (decided
-    from the image, by majority of neighbouring squares) go first. For boards with an odd sum of columns and rows this
+    from the image, by majority of neighboring squares) go first. For boards with an odd sum of columns and rows this
     leaves one. Other boards look the same turned by 180°, and then the order nearest to upright in the image is taken:
     it may differ between two cameras, so such boards cannot be trusted for stereo (`Board.unambiguous`).
 
     Args:
-        image: (H, W) grey levels in which the corners were found.
+        image: (H, W) gray levels in which the corners were found.
         pixels: (corners, 2) in any of the board's eight orders; a board of other columns than rows has four.
         board: the board.
 

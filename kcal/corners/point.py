@@ -29,7 +29,7 @@ class Enlarged:
     """A crop of an image, `factor` times larger.
 
     Args:
-        patch: (h * factor, w * factor) grey levels, bilinear.
+        patch: (h * factor, w * factor) gray levels, bilinear.
         left: column of the image at which the crop begins.
         top: row at which it begins.
         factor: of enlargement.
@@ -43,7 +43,7 @@ class Enlarged:
     def to_image(self, marks: Tensor) -> Tensor:
         """Positions (..., 2) on the patch as pixels of the image.
 
-        The *edges* of pixels coincide, not their centres: pixel x of the image covers [x - 0.5, x + 0.5], which is ten
+        The *edges* of pixels coincide, not their centers: pixel x of the image covers [x - 0.5, x + 0.5], which is ten
         pixels of the patch. So u = (x + 0.5) / factor - 0.5 + left; dividing by the factor alone is 0.45 px wrong.
 
         Example:
@@ -78,7 +78,7 @@ def enlarge(image: Tensor, pixel: Tensor, half: int = HALF, factor: int = FACTOR
     """Crop an image round a pixel and enlarge it bilinearly, for marking by eye.
 
     Args:
-        image: (H, W) grey levels.
+        image: (H, W) gray levels.
         pixel: (2,) where to crop; the crop stays inside the image and is smaller at its border.
         half: pixels of the crop on each side of the middle one.
         factor: of enlargement.
@@ -109,11 +109,11 @@ def refine_point(image: Tensor, pixel: Tensor) -> RefinedPoint:
     """Move a roughly marked corner (of a roof, a mast, a board) to where its edges meet.
 
     On the enlarged crop, the point is sought from which all edges nearby are seen end-on: W. Förstner and E. Gülch,
-    "A fast operator for detection and precise location of distinct points, corners and centres of circular features",
+    "A fast operator for detection and precise location of distinct points, corners and centers of circular features",
     1987. For corners of checkerboards `kcal.corners.erf.erf_saddle` is several times better.
 
     Args:
-        image: (H, W) grey levels.
+        image: (H, W) gray levels.
         pixel: (2,) within about 2 px of the corner and at least 5 px inside the image.
 
     Raises:
@@ -158,7 +158,7 @@ def refine_point(image: Tensor, pixel: Tensor) -> RefinedPoint:
     else:
         raise InputError("the point does not settle: several corners are close together; mark another one")
     miss = (gradient * (where - place)).sum(-1)
-    # Neighbours on the enlarged patch say the same: only one in factor² is a measurement of its own.
+    # Neighbors on the enlarged patch say the same: only one in factor² is a measurement of its own.
     effective = weight.sum() / factor**2
     noise = (weight * miss.square()).sum() / weight.sum() * effective / (effective - 2.0).clamp_min(1.0)
     covariance = noise * factor**2 * torch.linalg.inv(normal)

@@ -10,7 +10,7 @@ from kcal.corners.charuco import marker_cells
 from kcal.corners.drawing import Drawing, Rectangle, Text
 from kcal.errors import InputError
 
-# Millimetres, upright; ISO 216 and the North American sizes.
+# Millimeters, upright; ISO 216 and the North American sizes.
 PAGES: dict[str, tuple[float, float]] = {
     "A5": (148.0, 210.0),
     "A4": (210.0, 297.0),
@@ -43,7 +43,7 @@ def board_sheet(board: Board, page: str = "auto") -> Sheet:
     """Lay a board out on a page, in the board's own order: corner 0 at the top left, its outer square black.
 
     Below the board are a ruler of 100 mm, to measure after printing, and a caption with the board's size. The board is
-    centred above them; the page lies upright or across, whichever leaves more white. One square of white all
+    centered above them; the page lies upright or across, whichever leaves more white. One square of white all
     round is what detectors like best.
 
     Args:

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.corners.erf import erf_saddle
-from kcal.corners.grid import line_bend, neighbours
-from kcal.corners.images import Grey
+from kcal.corners.grid import line_bend, neighbors
+from kcal.corners.images import Gray
 from kcal.corners.saddle import MAX_MOVE, MOVE_SHARE, SQUARE_SHARE, Refined, Status, saddle
 from kcal.errors import InputError
 
@@ -24,7 +24,7 @@ _OPENCV_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
 
 def refine_corners(
-    image: Grey,
+    image: Gray,
     pixels: Tensor,
     side: Tensor,
     method: Refinement = "erf",
@@ -132,28 +132,28 @@ def _fit(
     grid: tuple[int, int] | None,
 ) -> _Full:
     bend = line_bend(known, *grid) if grid is not None else None
-    around = neighbours(known, *grid) if grid is not None else None
+    around = neighbors(known, *grid) if grid is not None else None
     fit = erf_saddle(light, start, side, bend=bend, around=around, levels=levels)
     assert fit.covariance is not None
     assert fit.blur is not None
     return _Full(fit.pixels, fit.status, fit.covariance, fit.blur)
 
 
-def _extremes(image: Grey) -> tuple[float, float]:
-    """The grey levels at which a pixel is saturated; a camera's 10, 12 or 14 bits may fill 16 or not."""
+def _extremes(image: Gray) -> tuple[float, float]:
+    """The gray levels at which a pixel is saturated; a camera's 10, 12 or 14 bits may fill 16 or not."""
     brightest = int(image.max())
     full = max(255, 2 ** brightest.bit_length() - 1)
     return 0.0, float(brightest if brightest > 0.999 * full else full)
 
 
-def _opencv(image: Grey, start: Tensor, half: int) -> Tensor:
+def _opencv(image: Gray, start: Tensor, half: int) -> Tensor:
     corners = np.ascontiguousarray(start.numpy(), dtype=np.float32)
     depth = image if image.dtype == np.uint8 else image.astype(np.float32)
     found = cv2.cornerSubPix(depth, corners, (half, half), (-1, -1), _OPENCV_STOP)
     return torch.from_numpy(found.reshape(-1, 2).astype(np.float64))
 
 
-def _skimage(image: Grey, start: Tensor, half: int) -> Tensor:
+def _skimage(image: Gray, start: Tensor, half: int) -> Tensor:
     rows_columns = np.rint(start.numpy()[:, ::-1]).astype(np.int64)
     found = corner_subpix(image.astype(np.float64), rows_columns, window_size=2 * half + 1)
     return torch.from_numpy(np.ascontiguousarray(found[:, ::-1], dtype=np.float64))

@@ -1,8 +1,8 @@
 """Sub-pixel corners of a checkerboard as saddle points of a quadratic, in torch, for gradients and for batches.
 
 Where four squares meet, the blurred image is a saddle. A quadratic is fitted to it by least squares on a small disc,
-the centre moves to the quadratic's stationary point, and this is repeated until it stands still. The fit is linear
-algebra with one constant matrix: no orientation, no start values, no window that swallows the neighbour.
+the center moves to the quadratic's stationary point, and this is repeated until it stands still. The fit is linear
+algebra with one constant matrix: no orientation, no start values, no window that swallows the neighbor.
 After L. Lucchese and S. K. Mitra, "Using saddle points for subpixel feature detection in camera calibration targets",
 APCCAS 2002.
 """
@@ -24,7 +24,7 @@ REPEATS = 6
 MAX_MOVE = 2.0  # pixels from the start
 SQUARE_SHARE = 0.35  # of the smallest square side: the disc never reaches further
 MOVE_SHARE = 0.3  # of the smallest square side: a corner never moves further
-MIN_FIT = 0.85  # share of the grey levels' variance that the quadratic must explain; 0.98 to 0.999 on real corners
+MIN_FIT = 0.85  # share of the gray levels' variance that the quadratic must explain; 0.98 to 0.999 on real corners
 STILL = 0.02  # pixels: a last step below this has converged
 
 _HALF = 12  # of the patch: 0.5 rounding + MAX_MOVE + RADIUS + 1 bilinear + 3 sigma of blur, rounded up
@@ -36,11 +36,11 @@ class Status(IntEnum):
     GOOD = 0
     MISSING = 1  # the start was NaN
     OUTSIDE = 2  # the disc and its blur leave the image
-    NO_SADDLE = 3  # the grey levels form a hill, a hollow or an edge, or fit no quadratic: something covers the corner
+    NO_SADDLE = 3  # the gray levels form a hill, a hollow or an edge, or fit no quadratic: something covers the corner
     MOVED = 4  # further from its start than it may
     RESTLESS = 5  # still moving after the last repeat
-    SATURATED = 6  # too many grey levels at the end of the scale
-    OCCLUDED = 7  # the grey levels are not those of four squares: something covers the corner
+    SATURATED = 6  # too many gray levels at the end of the scale
+    OCCLUDED = 7  # the gray levels are not those of four squares: something covers the corner
     BLURRED = 8  # the edges are too wide for the squares
 
 
@@ -68,7 +68,7 @@ def saddle(image: Tensor, pixels: Tensor, side: Tensor | float) -> Refined:
     differentiable with respect to `image`, through the repeats.
 
     Args:
-        image: (..., H, W) grey levels, floating point or uint8, of any scale.
+        image: (..., H, W) gray levels, floating point or uint8, of any scale.
         pixels: (..., N, 2) starts, within 2 px and 0.3 of the square; NaN where a corner was not seen.
         side: the smallest side in pixels of the squares round each corner, (..., N) or one number.
 
@@ -106,7 +106,7 @@ def saddle(image: Tensor, pixels: Tensor, side: Tensor | float) -> Refined:
         step, is_saddle = _stationary(samples @ inverse.T)
         is_saddle = is_saddle & _fits(samples, samples @ inverse.T @ design.T)
         step = step * flat_scale
-        # A bounded step, and a centre whose disc stays on the patch; both bounds are out of reach of a good corner.
+        # A bounded step, and a center whose disc stays on the patch; both bounds are out of reach of a good corner.
         step = step * (RADIUS / 2 * flat_scale / _length(step)).clamp(max=1.0)
         move = where + step - offset
         where = offset + move * (MAX_MOVE / _length(move)).clamp(max=1.0)
@@ -182,7 +182,7 @@ def _disc(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def cut_patches(image: Tensor, base: Tensor, half: int) -> Tensor:
-    """Cut (2 half + 1)² grey levels round whole pixels `base` (B, N, 2) from (B, H, W): (B N, P, P) float64.
+    """Cut (2 half + 1)² gray levels round whole pixels `base` (B, N, 2) from (B, H, W): (B N, P, P) float64.
 
     Outside the image its edge goes on.
     """
@@ -207,7 +207,7 @@ def _blurred_patches(image: Tensor, base: Tensor, scale: Tensor) -> Tensor:
 
 
 def _bilinear(patches: Tensor, where: Tensor) -> Tensor:
-    """Sample (M, P, P) patches at `where` (M, K, 2) pixels from their centres: (M, K)."""
+    """Sample (M, P, P) patches at `where` (M, K, 2) pixels from their centers: (M, K)."""
     grid = (where / _HALF)[:, None]
     return nn.functional.grid_sample(patches[:, None], grid, mode="bilinear", align_corners=True)[:, 0, 0]
 

@@ -35,7 +35,7 @@ _PEAK = 3  # frames on each side than which a frame must not be less sharp
 
 
 class Frame(NamedTuple):
-    """A frame of a video: its number from 0 and grey levels (H, W) uint8."""
+    """A frame of a video: its number from 0 and gray levels (H, W) uint8."""
 
     number: int
     image: npt.NDArray[np.uint8]
@@ -65,7 +65,7 @@ def source_name(source: str | Path) -> str:
 
 
 def read_frames(source: str | Path, duration: float | None = None) -> Iterator[Frame]:
-    """The frames of a video file or a live stream, grey, turned as the sensor wrote them.
+    """The frames of a video file or a live stream, gray, turned as the sensor wrote them.
 
     Args:
         source: a video file, or a live source as in `is_stream`.
@@ -91,8 +91,8 @@ def read_frames(source: str | Path, duration: float | None = None) -> Iterator[F
             if not done:
                 break
             number += 1
-            grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-            yield Frame(number, np.asarray(grey, np.uint8))
+            gray = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+            yield Frame(number, np.asarray(gray, np.uint8))
         if number < 0:
             raise FileError(f"{name}: no frame that can be decoded")
     finally:
@@ -109,7 +109,7 @@ def _open(stream: str) -> cv2.VideoCapture:
 def sharpest(frames: Iterator[Frame]) -> Iterator[Frame]:
     """Of every seven frames in a row at most the sharpest: while the board or the camera moves, all are blurred.
 
-    Sharpness is the mean squared difference of neighbouring pixels, which also grows with noise: it compares frames of
+    Sharpness is the mean squared difference of neighboring pixels, which also grows with noise: it compares frames of
     one moment with each other, nothing else.
 
     Example:

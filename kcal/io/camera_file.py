@@ -110,7 +110,7 @@ class ValidRegion(Record):
 
 
 class BoardRecord(Record):
-    """The board as plain fields: inner corners, and the side of a square in metres."""
+    """The board as plain fields: inner corners, and the side of a square in meters."""
 
     columns: pydantic.PositiveInt
     rows: pydantic.PositiveInt
@@ -127,7 +127,7 @@ class CameraCalibration(Record):
         per_view_rms: view name -> RMS in pixels, for the views used.
         excluded: views, and corners of the views used, that were left out, with the reason.
         board: the board that was shown.
-        board_warp: height of the board's bend in x and y, metres; None if it was not estimated.
+        board_warp: height of the board's bend in x and y, meters; None if it was not estimated.
         stop_reason: why the solver stopped.
         iterations: of the solver.
         observations: name of the observations file, if there was one.
@@ -158,7 +158,7 @@ class CameraCalibration(Record):
 class CameraFile(NativeFile):
     """One camera (file kind `camera`, version 1).
 
-    Convention: pixels as in `Camera`: (0, 0) is the centre of the first pixel, y down. Coefficients are stored by
+    Convention: pixels as in `Camera`: (0, 0) is the center of the first pixel, y down. Coefficients are stored by
     name in the order of `LensModel.names`; a reader goes by the names, since JSON objects have no order of their own.
 
     Args:
@@ -317,7 +317,7 @@ def camera_to_file(
         >>> camera_to_file(camera, standard_deviations={"fx": 0.5}).standard_deviations["fy"] is None
         True
     """
-    values = camera.parameters_vector.detach()
+    values = camera.params.detach()
     if values.ndim != 1:
         raise InputError(f"a camera file holds one camera, got a batch of shape {tuple(values.shape[:-1])}")
     if standard_deviations is not None:

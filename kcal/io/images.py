@@ -1,6 +1,6 @@
-"""Images in colour or grey: PNG files written, any image file's bytes to pixels.
+"""Images in color or gray: PNG files written, any image file's bytes to pixels.
 
-Whether a file is whole (JPEG decoders only mutter about damage) is found out by `kcal.corners.images.decode_grey`.
+Whether a file is whole (JPEG decoders only mutter about damage) is found out by `kcal.corners.images.decode_gray`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from kcal.files import write_atomic
 
 
 def decode_image(data: bytes, source: str | Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Decode an image file's bytes as stored: grey (H, W), RGB (H, W, 3) or RGBA (H, W, 4), uint8 or uint16.
+    """Decode an image file's bytes as stored: gray (H, W), RGB (H, W, 3) or RGBA (H, W, 4), uint8 or uint16.
 
     The EXIF orientation is ignored: row 0 is the row the sensor read first, because the lens does not turn with it.
 
@@ -25,8 +25,8 @@ def decode_image(data: bytes, source: str | Path) -> NDArray[np.uint8] | NDArray
         FileError: not an image, or pixels other than 8 or 16 bits unsigned; `source` names it.
 
     Example:
-        >>> colours = np.zeros((4, 6, 3), np.uint16) + np.array([1, 2, 65535], np.uint16)
-        >>> decode_image(encode_png(colours), "memory")[0, 0].tolist()
+        >>> colors = np.zeros((4, 6, 3), np.uint16) + np.array([1, 2, 65535], np.uint16)
+        >>> decode_image(encode_png(colors), "memory")[0, 0].tolist()
         [1, 2, 65535]
     """
     try:
@@ -41,7 +41,7 @@ def decode_image(data: bytes, source: str | Path) -> NDArray[np.uint8] | NDArray
 
 
 def encode_png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    """A PNG file's bytes of an image: grey (H, W), RGB (H, W, 3) or RGBA (H, W, 4), 8 or 16 bit.
+    """A PNG file's bytes of an image: gray (H, W), RGB (H, W, 3) or RGBA (H, W, 4), 8 or 16 bit.
 
     Raises:
         InputError: another dtype or shape.
@@ -71,8 +71,8 @@ def write_png(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_png(Path(folder, "grey.png"), np.full((4, 6), 128, np.uint8)).name
-        'grey.png'
+        ...     write_png(Path(folder, "gray.png"), np.full((4, 6), 128, np.uint8)).name
+        'gray.png'
     """
     return write_atomic(path, encode_png(image))
 

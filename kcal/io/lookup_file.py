@@ -23,7 +23,7 @@ sum over the coefficients [j - 1 + m, i - 1 + n], m and n from 0 to 3, times b_m
 
 `unproject` takes a pixel and gives a position (p, q) of the stereographic chart: with s = (p² + q²) / 4, the ray is
 (p, q, 1 - s) / (1 + s). `project` takes (p, q) = 2 (X, Y) / (√(X² + Y² + Z²) + Z) and gives the pixel; it is valid if
-it also lies in the image, from -0.5 to width - 0.5 and height - 0.5. Pixel (0, 0) is the centre of the first pixel;
+it also lies in the image, from -0.5 to width - 0.5 and height - 0.5. Pixel (0, 0) is the center of the first pixel;
 x right, y down, z forward.
 """
 

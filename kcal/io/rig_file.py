@@ -25,7 +25,7 @@ Triple = tuple[float, float, float]
 
 
 class RigPose(Record):
-    """`points_right = rotation @ points_left + translation`, metres."""
+    """`points_right = rotation @ points_left + translation`, meters."""
 
     rotation: tuple[Triple, Triple, Triple]
     translation: Triple
@@ -62,13 +62,13 @@ class RigMounting(Record):
     """Where the left camera stands on the Earth and where it looks.
 
     Args:
-        lat: of its projection centre, degrees (WGS84).
+        lat: of its projection center, degrees (WGS84).
         lon: degrees.
-        height: metres above the ellipsoid.
+        height: meters above the ellipsoid.
         heading_deg: of its axis, clockwise from true north.
         pitch_deg: of its axis, positive up.
         roll_deg: clockwise as seen from behind.
-        covariance: (6, 6) of east, north, up of the centre (metres) and of turns about these axes (radians).
+        covariance: (6, 6) of east, north, up of the center (meters) and of turns about these axes (radians).
         link: (P, 6) covariance of the rig's P quantities (`RigFile.covariance`) with these six.
     """
 
@@ -89,7 +89,7 @@ class RigMounting(Record):
 
 
 class RigSource(Record):
-    """One kind of data that a rig was solved from; see `kcal.calibrate.rig_result.SourceResidual`."""
+    """One kind of data that a rig was solved from; see `kcal.calibrate.rig.result.SourceResidual`."""
 
     name: str
     used: pydantic.NonNegativeInt
@@ -112,7 +112,7 @@ class RigCalibration(Record):
         excluded: pairs, landmarks and matches left out, with the reason.
         sources: what the rig was solved from, where that is more than boards.
         relocked: when only the cameras' attitudes were solved again, and from what.
-        baseline_m: distance between the cameras' centres, metres; must be the length of the translation.
+        baseline_m: distance between the cameras' centers, meters; must be the length of the translation.
         frame: what the rig's frame is.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
         created: when, with its time zone.
@@ -147,7 +147,7 @@ class RigFile(NativeFile):
         right: the second camera, whole.
         right_from_left: where the right camera stands.
         covariance: of both cameras' parameters and the relative pose together, in the order of
-            `kcal.locate.errors.RigCovariance`; what was held has zeros.
+            `kcal.locate.covariances.RigCovariance`; what was held has zeros.
         mounting: where the rig stands on the Earth, if that was solved.
         calibration: how the rig was solved, if it was.
 
@@ -185,7 +185,7 @@ class RigFile(NativeFile):
         elif self.mounting is not None and self.mounting.link is not None:
             raise ValueError("the mounting's link needs the rig's covariance")
         length = math.hypot(*self.right_from_left.translation)
-        # A thousandth of a millimetre in a metre: more is not rounding but another rig.
+        # A thousandth of a millimeter in a meter: more is not rounding but another rig.
         if self.calibration and not math.isclose(self.calibration.baseline_m, length, rel_tol=1e-6):
             raise ValueError(f"baseline_m is {self.calibration.baseline_m:g}, but the translation is {length:g} m long")
         return self

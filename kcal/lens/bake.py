@@ -66,10 +66,8 @@ def bake(camera: Camera, tolerance: float = 1e-3) -> LookupCamera:
         >>> max(lookup.bound) <= 1e-4, lookup.coverage
         (True, (1.0, 1.0))
     """
-    if camera.parameters_vector.ndim != 1:
-        raise InputError(
-            f"bake: a single camera is needed, got a batch of {tuple(camera.parameters_vector.shape[:-1])}"
-        )
+    if camera.params.ndim != 1:
+        raise InputError(f"bake: a single camera is needed, got a batch of {tuple(camera.params.shape[:-1])}")
     if not (math.isfinite(tolerance) and tolerance >= 1e-8):
         raise InputError(f"bake: the tolerance must be at least 1e-8 px, got {tolerance}")
     width, height = camera.size
@@ -92,9 +90,9 @@ def bake(camera: Camera, tolerance: float = 1e-3) -> LookupCamera:
     def in_pixels(_: Tensor, pixels: Tensor, exact: Tensor) -> Tensor:
         return torch.linalg.vector_norm(pixels - exact, dim=-1)
 
-    seen = _chart_box(to_chart, image, camera.parameters_vector)
-    inverse = _fit("unproject", to_chart, back_in_pixels, image, tolerance, camera.parameters_vector)
-    forward = _fit("project", to_pixels, in_pixels, seen, tolerance, camera.parameters_vector)
+    seen = _chart_box(to_chart, image, camera.params)
+    inverse = _fit("unproject", to_chart, back_in_pixels, image, tolerance, camera.params)
+    forward = _fit("project", to_pixels, in_pixels, seen, tolerance, camera.params)
     return LookupCamera(
         size=camera.size,
         pixels_from_chart=forward.spline,

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from kcal.checks import as_points, keep_float64, require_finite
 from kcal.errors import InputError
 from kcal.lens.distortion import distort_components
-from kcal.lens.eager import finite_or, in_chunks, is_differentiated, known_true, separate
 from kcal.lens.inverse import Inverse, InverseStart, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
 from kcal.lens.outline import area, image_outline
@@ -21,12 +20,13 @@ from kcal.lens.plane import plane_from_points, rays_from_plane
 from kcal.lens.projection import INTRINSICS, from_pixels, parameter_names, to_pixels
 from kcal.lens.region import Region, in_region, surely_in_region
 from kcal.lens.residual import Field
+from kcal.lens.tracing import finite_or, in_chunks, is_differentiated, known_true, separate
 
 
 class Camera(nn.Module):
     """A camera that maps points to pixels (`project`) and pixels to rays (`unproject`).
 
-    Convention: camera frame x right, y down, z forward; pixel (0, 0) is the centre of the first pixel; metres.
+    Convention: camera frame x right, y down, z forward; pixel (0, 0) is the center of the first pixel; meters.
     Geometry is float64 whatever `.half()`, `.float()` or the inputs are: lower precision is promoted. Parameters do
     not require gradients until asked (`camera.free("fx", "k1")`), so that training a network around a camera leaves its
     calibration alone. Where the lens is valid is measured when the camera is made and when a state is loaded; after
@@ -51,7 +51,7 @@ class Camera(nn.Module):
         True
     """
 
-    parameters_vector: Tensor
+    params: Tensor
     free_mask: Tensor
     valid_radius: Tensor
     valid_edge: Tensor
@@ -67,7 +67,7 @@ class Camera(nn.Module):
             raise InputError("focal lengths must be positive pixels")
         if min(self.size) < 1:
             raise InputError(f"image size {self.size}: width and height must be positive")
-        self.parameters_vector = nn.Parameter(parameters.detach().clone(), requires_grad=False)
+        self.params = nn.Parameter(parameters.detach().clone(), requires_grad=False)
         everything = torch.ones(5 + self.model.size, dtype=torch.bool, device=parameters.device)
         self.register_buffer("free_mask", everything)
         # Follow from the parameters, so they are no part of the state that is saved.
@@ -102,14 +102,14 @@ class Camera(nn.Module):
     @property
     def values(self) -> Tensor:
         """(..., 5 + P) the parameters, with gradients only to those that are free."""
-        if not self.parameters_vector.requires_grad:
-            return self.parameters_vector
-        return torch.where(self.free_mask, self.parameters_vector, self.parameters_vector.detach())
+        if not self.params.requires_grad:
+            return self.params
+        return torch.where(self.free_mask, self.params, self.params.detach())
 
     @property
     def free_names(self) -> tuple[str, ...]:
         """Names of the parameters that receive gradients; empty while the camera is frozen."""
-        if not self.parameters_vector.requires_grad:
+        if not self.params.requires_grad:
             return ()
         return tuple(name for name, free in zip(self.names, self.free_mask.tolist(), strict=True) if free)
 
@@ -125,7 +125,7 @@ class Camera(nn.Module):
         Example:
             >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480)).free("fx", "k1")
             >>> camera.project(torch.tensor([[1.0, 1.0, 4.0]]))[0].sum().backward()
-            >>> [name for name, g in zip(camera.names, camera.parameters_vector.grad) if g != 0]
+            >>> [name for name, g in zip(camera.names, camera.params.grad) if g != 0]
             ['fx', 'k1']
         """
         unknown = [name for name in names if name not in self.names]
@@ -161,7 +161,7 @@ class Camera(nn.Module):
     @property
     def fingerprint(self) -> str:
         """Twelve hex digits that change with any parameter, the model or the image size."""
-        text = repr((self.size, self.model.names, self.parameters_vector.detach().flatten().tolist()))
+        text = repr((self.size, self.model.names, self.params.detach().flatten().tolist()))
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     @property
@@ -181,19 +181,19 @@ class Camera(nn.Module):
     def valid_polygon(self) -> Tensor:
         """The part of the image whose pixels have a ray, as a polygon (V, 2) of pixels; clockwise as one sees it.
 
-        The whole image of an ordinary camera: its four corners, half a pixel beyond the outermost pixel centres.
+        The whole image of an ordinary camera: its four corners, half a pixel beyond the outermost pixel centers.
         Where the lens folds inside the image, the fold's outline at 256 directions; empty if no pixel has a ray.
 
         Raises:
             InputError: a batch of cameras.
         """
-        if self.parameters_vector.ndim != 1:
+        if self.params.ndim != 1:
             raise InputError(f"one camera has one polygon, this is a batch of {tuple(self.valid_radius.shape)}")
-        return image_outline(self._to_sensor, self.parameters_vector.detach(), self.model, self.valid_region, self.size)
+        return image_outline(self._to_sensor, self.params.detach(), self.model, self.valid_region, self.size)
 
     def _measure(self) -> dict[str, Tensor]:
         with torch.no_grad():
-            values = self.parameters_vector.detach()
+            values = self.params.detach()
             width, height = self.size
             corners = values.new_tensor([[-0.5, -0.5], [width, -0.5], [-0.5, height], [width, height]])
             x, y = from_pixels(corners[:, 0], corners[:, 1], values)
@@ -318,7 +318,7 @@ class Camera(nn.Module):
         return self._in_chunks(one, pixels)
 
     def inside(self, pixels: Tensor) -> Tensor:
-        """Whether pixels (..., N, 2) lie on the image, whose edges are half a pixel beyond the outer centres."""
+        """Whether pixels (..., N, 2) lie on the image, whose edges are half a pixel beyond the outer centers."""
         pixels = as_points("pixels", pixels, 2)
         width, height = self.size
         u, v = pixels.unbind(-1)
@@ -327,7 +327,7 @@ class Camera(nn.Module):
     def grid(self, columns: int, rows: int) -> Tensor:
         """Pixels (rows, columns, 2) spread evenly over the image, its outermost pixels included."""
         width, height = self.size
-        kind, place = torch.float64, self.parameters_vector.device
+        kind, place = torch.float64, self.params.device
         u = torch.linspace(0, width - 1, columns, dtype=kind, device=place)
         v = torch.linspace(0, height - 1, rows, dtype=kind, device=place)
         return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
@@ -346,7 +346,7 @@ class Camera(nn.Module):
     def extra_repr(self) -> str:
         """Model, size and focal length for `repr`."""
         text = f"model={self.model}, size={self.size}, focal={self.focal.tolist()}"
-        if self.parameters_vector.ndim > 1:
+        if self.params.ndim > 1:
             return text
         share = area(self.valid_polygon()) / (self.size[0] * self.size[1])
         return f"{text}, valid={'whole image' if share > 1 - 1e-9 else f'{share:.1%} of the image'}"

@@ -27,7 +27,7 @@ class HybridCamera(Camera):
     stages, first the field's (always possible), then the lens's; so the valid region is that of the lens. One camera,
     no batch of them; `vmap` maps over several.
 
-    Its parameters mean nothing without its field: `parameters_vector` alone is not the camera. Formats that know no
+    Its parameters mean nothing without its field: `params` alone is not the camera. Formats that know no
     field refuse it.
 
     Args:
@@ -62,19 +62,19 @@ class HybridCamera(Camera):
         residual: FieldResidual | None = None,
     ) -> None:
         super().__init__(parameters, size=size, model=model)
-        if self.parameters_vector.ndim != 1:
+        if self.params.ndim != 1:
             raise InputError(f"HybridCamera: one camera, not a batch of {tuple(self.valid_radius.shape)}")
         self.residual = residual or FieldResidual(FieldGrid())
 
     @classmethod
     def of(cls, camera: Camera, residual: FieldResidual) -> Self:
         """A camera whose lens is followed by a field."""
-        return cls(camera.parameters_vector, size=camera.size, model=camera.model, residual=residual)
+        return cls(camera.params, size=camera.size, model=camera.model, residual=residual)
 
     @property
     def parametric(self) -> Camera:
         """The camera without its field. It is another camera: nothing was fitted with these parameters alone."""
-        return Camera(self.parameters_vector, size=self.size, model=self.model)
+        return Camera(self.params, size=self.size, model=self.model)
 
     @property
     def field(self) -> Field | None:
@@ -103,7 +103,7 @@ class HybridCamera(Camera):
         own = [name for name in names if name != WEIGHTS]
         super().free(*own)
         if names and not own:
-            self.parameters_vector.requires_grad_(False)
+            self.params.requires_grad_(False)
         self.residual.weights.requires_grad_(not names or WEIGHTS in names)
         return self
 
@@ -114,7 +114,7 @@ class HybridCamera(Camera):
 
     def correction(self, pixels: Tensor) -> Tensor:
         """By how many pixels (..., N, 2) the field moves what is seen at pixels (..., N, 2)."""
-        values = self.parameters_vector.detach()
+        values = self.params.detach()
         u, v = as_points("pixels", pixels, 2).unbind(-1)
         x, y, _ = self._from_sensor(u, v, values)
         return pixels - torch.stack(to_pixels(x, y, values), -1)

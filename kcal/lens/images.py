@@ -45,7 +45,7 @@ def undistort_maps(camera: Camera, new_camera: Camera | None = None) -> Undistor
     """Maps for `cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR)`.
 
     Convention: new pixel (column x, row y) takes the source's value at (map_x[y, x], map_y[y, x]); whole numbers are
-    centres of pixels. The mask is False, and both maps are -10000, where the source shows nothing: outside the centres
+    centers of pixels. The mask is False, and both maps are -10000, where the source shows nothing: outside the centers
     of its outer pixels, or beyond the fold of the lens. With OpenCV's default border those pixels become black.
 
     Args:
@@ -78,7 +78,7 @@ def undistort_maps(camera: Camera, new_camera: Camera | None = None) -> Undistor
 class Undistort(nn.Module):
     """Resample images as another camera, usually a pinhole, would have taken them.
 
-    Bilinear, by kornia's `remap` with `align_corners=True`: integer coordinates are centres of pixels, and nothing is
+    Bilinear, by kornia's `remap` with `align_corners=True`: integer coordinates are centers of pixels, and nothing is
     stretched. Where the source shows nothing the image is 0 and the mask False (see `undistort_maps`).
 
     The maps are computed once and kept, for one precision at a time; they follow when a camera's parameters are
@@ -181,7 +181,7 @@ class Undistort(nn.Module):
         return self.grid_x, self.grid_y, self.mask
 
     def _grid(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions as `grid_sample` wants them, -1 and 1 at the centres of the outer pixels, rounded once."""
+        """Positions as `grid_sample` wants them, -1 and 1 at the centers of the outer pixels, rounded once."""
         pixels, mask = _source_positions(self.camera, self.new_camera)
         last = torch.tensor(self.camera.size, dtype=pixels.dtype, device=pixels.device) - 1
         x, y = (2 * pixels / last - 1).to(precision).unbind(-1)
@@ -201,7 +201,7 @@ def _source_positions(camera: Camera, new_camera: Camera) -> tuple[Tensor, Tenso
     width, height = new_camera.size
     if min(width, height, *camera.size) < 2:
         raise InputError(f"images of {camera.size} and {new_camera.size}: at least 2 pixels each way are needed")
-    shapes = [tuple(c.parameters_vector.shape[:-1]) for c in (camera, new_camera)]
+    shapes = [tuple(c.params.shape[:-1]) for c in (camera, new_camera)]
     try:
         torch.broadcast_shapes(*shapes)
     except RuntimeError as error:

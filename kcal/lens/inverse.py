@@ -1,8 +1,8 @@
 """From distorted back to undistorted coordinates: Newton's method that says where it failed, and where it may be asked.
 
-Most points need three steps from the start of `kcal.lens.start`. The few that do not arrive, near a fold or without a
-preimage at all, go to `kcal.lens.hard`. Where Python may not look at values (compile, export, vmap) all points take
-the same number of steps, and what has not arrived by then is flagged.
+Most points need three steps from the start of `kcal.lens.inverse_start`. The few that do not arrive, near a fold or
+without a preimage at all, go to `kcal.lens.inverse_safeguarded`. Where Python may not look at values (compile, export,
+vmap) all points take the same number of steps, and what has not arrived by then is flagged.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.lens.distortion import Distorted, check_coefficients, distort_components
-from kcal.lens.eager import finite_or, in_chunks, is_differentiated, known_true, may_branch
-from kcal.lens.hard import solve_hard
+from kcal.lens.inverse_safeguarded import solve_hard
+from kcal.lens.inverse_start import fit_start, start_from, without_tilt
 from kcal.lens.model import LensModel
 from kcal.lens.region import Region, in_region, valid_radius, valid_region
-from kcal.lens.start import fit_start, start_from, without_tilt
+from kcal.lens.tracing import finite_or, in_chunks, is_differentiated, known_true, may_branch
 
 __all__ = ["Inverse", "InverseStart", "prepare_inverse", "undistort", "undistort_components", "valid_radius"]
 
@@ -40,8 +40,8 @@ InverseStart = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 class Inverse(NamedTuple):
     """What is known of a lens beforehand: where it is valid, and where Newton starts.
 
-    `guess` stands in for the start of `kcal.lens.start`. However bad it is, it costs time and no more: what Newton
-    does not bring home from there is begun anew.
+    `guess` stands in for the start of `kcal.lens.inverse_start`. However bad it is, it costs time and no more: what
+    Newton does not bring home from there is begun anew.
     """
 
     region: Region

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from kcal.checks import as_points, keep_float64
 from kcal.errors import InputError
-from kcal.lens.eager import finite_or, in_chunks, is_differentiated
 from kcal.lens.spline import Spline, evaluate_spline
+from kcal.lens.tracing import finite_or, in_chunks, is_differentiated
 
 _PARTS = Spline._fields
 
@@ -19,7 +19,7 @@ _PARTS = Spline._fields
 class LookupCamera(nn.Module):
     """A camera as bicubic tables of both directions; made by `kcal.lens.bake.bake`.
 
-    Convention: as `Camera` (x right, y down, z forward; pixel (0, 0) is a centre). Directions are tabulated on the
+    Convention: as `Camera` (x right, y down, z forward; pixel (0, 0) is a center). Directions are tabulated on the
     stereographic chart, where (X, Y, Z) with R = √(X² + Y² + Z²) lies at p = 2 X / (R + Z), q = 2 Y / (R + Z): one step
     on it is about one step in the image for every lens, and 90° off axis is no special place. Back, with
     s = (p² + q²) / 4, the direction is (p, q, 1 - s) / (1 + s). Float64 like every camera; the tables are part of the
@@ -128,7 +128,7 @@ class LookupCamera(nn.Module):
         return in_chunks(one, pixels, 1, differentiated=is_differentiated(pixels))
 
     def inside(self, pixels: Tensor) -> Tensor:
-        """Whether pixels (..., N, 2) lie on the image, whose edges are half a pixel beyond the outer centres."""
+        """Whether pixels (..., N, 2) lie on the image, whose edges are half a pixel beyond the outer centers."""
         u, v = as_points("pixels", pixels, 2).unbind(-1)
         width, height = self.size
         return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)

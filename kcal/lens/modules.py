@@ -5,10 +5,19 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 from torch import Tensor, nn
 
 from kcal.lens.camera import Camera
-from kcal.lens.inverse_net import InverseNet
+
+
+class LearnedStart(Protocol):
+    """A learned start for the inverse, such as `kcal.nets.inverse.InverseNet`; an `nn.Module`."""
+
+    def guess(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Roughly the undistorted coordinates of distorted ones (..., N)."""
+        ...
 
 
 class Unproject(nn.Module):
@@ -31,7 +40,7 @@ class Unproject(nn.Module):
         ([[0.0, 0.0, 1.0]], [True])
     """
 
-    def __init__(self, camera: Camera, start: InverseNet | None = None) -> None:
+    def __init__(self, camera: Camera, start: LearnedStart | None = None) -> None:
         super().__init__()
         self.camera = camera
         self.start = start

@@ -40,7 +40,7 @@ def image_outline(
 
 
 def clip_to_image(polygon: Tensor, size: tuple[int, int]) -> Tensor:
-    """Cut a polygon (V, 2) to the image, whose edges lie half a pixel beyond the outer centres.
+    """Cut a polygon (V, 2) to the image, whose edges lie half a pixel beyond the outer centers.
 
     One edge of the image after the other, as Sutherland and Hodgman (1974) do.
 

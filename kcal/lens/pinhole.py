@@ -14,7 +14,7 @@ from torch import Tensor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 
-# Source positions this far outside the outer pixel centres still count, in pixels: an undistorted pixel that should
+# Source positions this far outside the outer pixel centers still count, in pixels: an undistorted pixel that should
 # lie exactly on the image's edge must not be lost to rounding.
 SLACK = 1e-6
 _SAMPLES = 129
@@ -31,8 +31,8 @@ def source_pixels(camera: Camera, points_cam: Tensor) -> tuple[Tensor, Tensor]:
         points_cam: (..., N, 3), rays for example.
 
     Returns:
-        pixels (..., N, 2) and seen (..., N): before the lens folds, and between the centres of the outer pixels, so
-        that bilinear interpolation has all its neighbours. Pixels within 1e-6 px of that are moved onto it.
+        pixels (..., N, 2) and seen (..., N): before the lens folds, and between the centers of the outer pixels, so
+        that bilinear interpolation has all its neighbors. Pixels within 1e-6 px of that are moved onto it.
 
     Example:
         >>> camera = Camera.build(focal=(100, 100), center=(50, 40), size=(101, 81), model="pinhole")
@@ -51,7 +51,7 @@ def source_pixels(camera: Camera, points_cam: Tensor) -> tuple[Tensor, Tensor]:
 def new_pinhole(camera: Camera, alpha: float = 0.0, size: tuple[int, int] | None = None) -> Camera:
     """The pinhole camera for undistorted images, chosen as OpenCV's `getOptimalNewCameraMatrix` does.
 
-    Convention: the centres of the outer pixels lie on the rectangle's sides. Between 0 and 1, focal lengths and
+    Convention: the centers of the outer pixels lie on the rectangle's sides. Between 0 and 1, focal lengths and
     principal point are interpolated linearly. As with OpenCV, fx and fy differ even where the source's are equal,
     because the rectangle need not have the image's shape. OpenCV looks at 9 x 9 points; here the extremes along the
     image's border are narrowed down, and alpha 0 is checked at every border pixel of the new image.
@@ -71,7 +71,7 @@ def new_pinhole(camera: Camera, alpha: float = 0.0, size: tuple[int, int] | None
 
     Raises:
         InputError: alpha not from 0 to 1, or an image less than two pixels wide or high.
-        DegenerateError: the ray of the image's centre is not valid, or nothing round it is.
+        DegenerateError: the ray of the image's center is not valid, or nothing round it is.
 
     Example:
         >>> camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.2])
@@ -86,7 +86,7 @@ def new_pinhole(camera: Camera, alpha: float = 0.0, size: tuple[int, int] | None
     if min(width, height, *camera.size) < 2:
         raise InputError(f"images of {camera.size} and ({width}, {height}): at least 2 pixels each way are needed")
 
-    values = torch.zeros_like(camera.parameters_vector[..., :5])
+    values = torch.zeros_like(camera.params[..., :5])
     if alpha < 1:
         values = values + (1 - alpha) * _pinhole(*_inner(camera, (width, height)), (width, height))
     if alpha > 0:
@@ -97,7 +97,7 @@ def new_pinhole(camera: Camera, alpha: float = 0.0, size: tuple[int, int] | None
 def _pinhole(low: Tensor, high: Tensor, size: tuple[int, int]) -> Tensor:
     """The rectangle from low (..., 2) to high (..., 2) over an image: (..., 5) fx, fy, cx, cy and no skew."""
     if not bool((high > low).all()):
-        raise DegenerateError("no valid pixels round the image's centre; check the camera's coefficients")
+        raise DegenerateError("no valid pixels round the image's center; check the camera's coefficients")
     last = torch.tensor(size, dtype=low.dtype, device=low.device) - 1
     focal = last / (high - low)
     return torch.cat([focal, -focal * low, torch.zeros_like(focal[..., :1])], -1)
@@ -122,7 +122,7 @@ def _extremes(camera: Camera, outermost: bool) -> Tensor:
 
     A side none of whose pixels has a ray is infinite.
     """
-    vector = camera.parameters_vector
+    vector = camera.params
     last = torch.tensor(camera.size, dtype=vector.dtype, device=vector.device) - 1
     step = torch.linspace(0, 1, _SAMPLES, dtype=vector.dtype, device=vector.device)
     # Inward is +x on the left and -x on the right.
@@ -148,7 +148,7 @@ def _extremes(camera: Camera, outermost: bool) -> Tensor:
 
 def _inner(camera: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """The rectangle of which every pixel of a new image of this size has a source."""
-    vector = camera.parameters_vector
+    vector = camera.params
     shape = torch.tensor(size, dtype=vector.dtype, device=vector.device) - 1
     # A side without rays lies beyond the fold: there the rectangle of the image's shape in the valid disc ends it.
     disc = torch.linalg.vector_norm(_rim(camera), dim=-1).amin(-1, keepdim=True) * shape / shape.norm()
@@ -159,32 +159,32 @@ def _inner(camera: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     middle = (torch.tensor(camera.size, dtype=vector.dtype, device=vector.device) - 1) / 2
     rays, valid = camera.unproject(middle[None])
     ray, valid = rays[..., 0, :], valid[..., 0]
-    centre = ray[..., :2] / ray[..., 2:]
-    if not bool((valid & (ray[..., 2] > 0) & (centre > low).all(-1) & (centre < high).all(-1)).all()):
-        raise DegenerateError("the image's centre has no valid ray; check the camera, or build the new one by hand")
+    center = ray[..., :2] / ray[..., 2:]
+    if not bool((valid & (ray[..., 2] > 0) & (center > low).all(-1) & (center < high).all(-1)).all()):
+        raise DegenerateError("the image's center has no valid ray; check the camera, or build the new one by hand")
 
     columns, rows = (torch.linspace(0, 1, n, dtype=vector.dtype, device=vector.device) for n in size)
     longest = max(size)
     along = torch.stack([torch.nn.functional.pad(t, (0, longest - t.numel())) for t in (rows, rows, columns, columns)])
 
     def clear(scale: Tensor) -> Tensor:
-        """Whether all pixels along the border have a source when the rectangle shrinks towards the centre."""
-        border = _border(*_towards(centre, low, high, scale), along)
+        """Whether all pixels along the border have a source when the rectangle shrinks towards the center."""
+        border = _border(*_towards(center, low, high, scale), along)
         return source_pixels(camera, _points(border.flatten(-3, -2)))[1].all(-1)
 
-    good, bad = torch.zeros_like(centre[..., 0]), torch.ones_like(centre[..., 0])
+    good, bad = torch.zeros_like(center[..., 0]), torch.ones_like(center[..., 0])
     good = torch.where(clear(bad), bad, good)
     while bool((bad - good > 1e-9).any()):
         trial = (good + bad) / 2
         passed = clear(trial) | (good == bad)
         good, bad = torch.where(passed, trial, good), torch.where(passed, bad, trial)
-    return _towards(centre, low, high, good)
+    return _towards(center, low, high, good)
 
 
-def _towards(centre: Tensor, low: Tensor, high: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+def _towards(center: Tensor, low: Tensor, high: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
     """The rectangle shrunk towards a point: scale 1 leaves it, 0 is the point."""
     scale = scale[..., None]
-    return centre + scale * (low - centre), centre + scale * (high - centre)
+    return center + scale * (low - center), center + scale * (high - center)
 
 
 def _outer(camera: Camera) -> tuple[Tensor, Tensor]:
@@ -201,7 +201,7 @@ def _outer(camera: Camera) -> tuple[Tensor, Tensor]:
 
 def _rim(camera: Camera) -> Tensor:
     """The last valid points of the plane z = 1 along 1440 directions from the axis, (..., 1440, 2)."""
-    vector = camera.parameters_vector
+    vector = camera.params
     turn = torch.arange(_RIM, dtype=vector.dtype, device=vector.device) * (2 * math.pi / _RIM)
     circle = torch.stack([torch.cos(turn), torch.sin(turn)], -1)
     low, high = torch.zeros_like(turn), torch.full_like(turn, _WIDEST)

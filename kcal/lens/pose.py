@@ -1,6 +1,6 @@
 """Rigid motions as a rotation matrix and a translation, moved by small steps from the left.
 
-A step is six numbers: a rotation vector ω (radians) and a translation v (metres), R ← exp([ω]×) R, t ← t + v.
+A step is six numbers: a rotation vector ω (radians) and a translation v (meters), R ← exp([ω]×) R, t ← t + v.
 """
 
 from __future__ import annotations

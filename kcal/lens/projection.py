@@ -69,7 +69,7 @@ def project_components(
     """Project points given as (..., 3, N), with derivatives by the point and the wanted camera parameters.
 
     Args:
-        points: (..., 3, N) in the camera frame, metres.
+        points: (..., 3, N) in the camera frame, meters.
         parameters: (..., 5 + P), broadcast against the leading shape of `points`.
         model: the lens model.
         wanted: indices of camera parameters for `by_camera`; None: no derivative at all is formed, and `by_point`

@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 
 from kcal.lens.distortion import Distorted, check_coefficients, distort_components, unbind_last
-from kcal.lens.eager import known_true
 from kcal.lens.model import LensModel
 from kcal.lens.plane import largest_radius
+from kcal.lens.tracing import known_true
 
 DIRECTIONS = 64
 _HARMONICS = 6

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from kcal.checks import as_points, keep_float64, require_finite
 from kcal.errors import InputError
-from kcal.lens.eager import is_differentiated, known_true, may_branch
+from kcal.lens.tracing import is_differentiated, known_true, may_branch
 
 # Distance of the units of a grid, in widths. A denser grid says nothing that this one cannot.
 SPACING = 0.8
@@ -90,7 +90,7 @@ class FieldGrid:
 
     @classmethod
     def covering(cls, low: Sequence[float], high: Sequence[float], widths: Sequence[float]) -> FieldGrid:
-        """Grids over the rectangle from `low` to `high` (x, y), centred on it, no side left uncovered."""
+        """Grids over the rectangle from `low` to `high` (x, y), centered on it, no side left uncovered."""
         scales = []
         for width in widths:
             step = SPACING * width

@@ -17,13 +17,13 @@ class StereoRig(nn.Module):
     """Two cameras, rigidly joined.
 
     Convention: the rig frame is the left camera's frame, and `points_right = rotation @ points_left + translation`
-    (metres). "Left" is only the first camera's name.
+    (meters). "Left" is only the first camera's name.
 
     Args:
         left: the first camera.
         right: the second camera.
         right_from_left_rotation: (3, 3) rotation matrix.
-        right_from_left_translation: (3,) metres.
+        right_from_left_translation: (3,) meters.
 
     Raises:
         InputError: wrong shapes, values that are not finite, or a matrix that is no rotation.
@@ -61,7 +61,7 @@ class StereoRig(nn.Module):
 
     @property
     def baseline(self) -> Tensor:
-        """Distance between the cameras' centres, metres."""
+        """Distance between the cameras' centers, meters."""
         return torch.linalg.vector_norm(self.right_from_left_translation)
 
     def right_from_left(self, points_left: Tensor) -> Tensor:

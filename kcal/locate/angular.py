@@ -3,7 +3,7 @@
 Two rays that do not meet are each turned into a common plane through both cameras, where they do. The plane that makes
 the sum of squared sines of the two angles smallest is an eigenvector of a 2x2 matrix, so that the whole is some fifty
 multiplications a point. More than two rays give three linear equations in the position, weighed so that angles and not
-metres are made small. Both work in a local frame and stay regular for points at infinity.
+meters are made small. Both work in a local frame and stay regular for points at infinity.
 
 Unlike the mid-point of the two lines, which a vertical error between the rays pulls nearer, neither is biased by what
 the rays miss each other across the epipolar plane.
@@ -18,8 +18,8 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
-from kcal.lens.eager import CHUNK, is_differentiated, is_traced, known_true
 from kcal.lens.pose import side_axes
+from kcal.lens.tracing import CHUNK, is_differentiated, is_traced, known_true
 
 # Sine of the angle between a ray and the baseline: below, both rays meet everywhere on the line through the cameras.
 _EPIPOLE = 1e-9
@@ -42,7 +42,7 @@ def triangulate_pairs(rays_left: Tensor, rays_right: Tensor, right_from_left: tu
     Args:
         rays_left: (..., N, 3) in the left camera's frame, any length but zero.
         rays_right: (..., N, 3) in the right camera's frame, likewise.
-        right_from_left: rotation (3, 3) and translation (3,), metres; the cameras must not stand in the same place.
+        right_from_left: rotation (3, 3) and translation (3,), meters; the cameras must not stand in the same place.
 
     Returns:
         Points in the left camera's frame; zeros where not valid. Gradients are exact, and zero there.
@@ -125,7 +125,7 @@ def triangulate_angular(cam_from_world: Tensor, rays: Tensor) -> Found:
         rays: (..., N, C, 3) directions in each camera's frame, any length but zero.
 
     Returns:
-        Points in the world frame; the first camera's centre where not valid.
+        Points in the world frame; the first camera's center where not valid.
 
     Raises:
         InputError: wrong shapes or dtypes.
@@ -170,7 +170,7 @@ def checked_views(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _several(world: list[Tensor], shifts: Tensor) -> tuple[Tensor, Tensor]:
-    """Points from the first camera; `shifts` (..., 1, C, 3) lead from each centre to the first one."""
+    """Points from the first camera; `shifts` (..., 1, C, 3) lead from each center to the first one."""
     spread = torch.linalg.vector_norm(shifts, dim=-1).amax(-1)
     spread = torch.where(spread > 0, spread, 1.0)
     shifts = shifts / spread[..., None, None]

@@ -48,7 +48,7 @@ class BudgetErrors:
 
 
 class RangeError(NamedTuple):
-    """Change of the range in metres, (D,) for D distances: nearer is negative; infinite where the rays diverge.
+    """Change of the range in meters, (D,) for D distances: nearer is negative; infinite where the rays diverge.
 
     Attributes:
         nearer: by the sign of the error that brings the point nearer.
@@ -71,7 +71,7 @@ def planned_rig(
         10.0
     """
     if not 0 < baseline_m < math.inf:
-        raise InputError(f"baseline {baseline_m}: a positive number of metres is needed")
+        raise InputError(f"baseline {baseline_m}: a positive number of meters is needed")
     center = ((size[0] - 1) / 2, (size[1] - 1) / 2)
     camera = Camera.build(focal=(focal_px, focal_px), center=center, size=size, model="pinhole")
     shift = torch.tensor([-baseline_m, 0.0, 0.0], dtype=torch.float64)
@@ -89,7 +89,7 @@ def range_errors(
 
     Args:
         rig: planned or calibrated.
-        distances: (D,) true ranges from the left camera, metres.
+        distances: (D,) true ranges from the left camera, meters.
         errors: what to apply.
         pixel: where in the left image; the direction in which both cameras' axes look, if left out.
 
@@ -104,7 +104,7 @@ def range_errors(
     errors = errors or BudgetErrors()
     far = torch.as_tensor(distances, dtype=torch.float64).reshape(-1)
     if not len(far) or not bool(((far > 0) & torch.isfinite(far)).all()):
-        raise InputError("distances: positive numbers of metres are needed")
+        raise InputError("distances: positive numbers of meters are needed")
     with torch.no_grad():
         ray = _direction(rig, pixel)
         points = far[:, None] * ray
@@ -154,8 +154,8 @@ def _direction(rig: StereoRig, pixel: Sequence[float] | None) -> Tensor:
 
 def _crossing(rig: StereoRig, ray: Tensor) -> Tensor:
     """Unit vector along the baseline, across the line of sight: motion along it looks like disparity."""
-    centre = -rig.right_from_left_translation @ rig.right_from_left_rotation
-    across = centre - (centre @ ray) * ray
+    center = -rig.right_from_left_translation @ rig.right_from_left_rotation
+    across = center - (center @ ray) * ray
     length = torch.linalg.vector_norm(across)
     if not float(length) > 0:
         raise InputError("the view runs along the baseline: no range can be measured there")
@@ -171,7 +171,7 @@ def _epipolar_direction(rig: StereoRig, points: Tensor) -> Tensor:
 
 def _turned(rig: StereoRig, yaw: float) -> StereoRig:
     turn = rotation_from_vector(torch.tensor([0.0, yaw, 0.0], dtype=torch.float64))
-    # About its own centre: the centre stays where it is.
+    # About its own center: the center stays where it is.
     return StereoRig(rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation)
 
 

@@ -25,12 +25,12 @@ def circular_error(enu: Tensor, covariance: Tensor, shares: tuple[float, ...] = 
     """Radii of the horizontal circles about an estimate that hold the true position with the given probabilities.
 
     Args:
-        enu: (..., 3) estimates, metres from the camera that ranges are measured from.
+        enu: (..., 3) estimates, meters from the camera that ranges are measured from.
         covariance: (..., 3, 3) to first order, as `Localization.covariance`.
         shares: probabilities: CEP50 and CEP95.
 
     Returns:
-        (..., K) metres; infinite where the covariance is not finite or so large a share may lie at infinity.
+        (..., K) meters; infinite where the covariance is not finite or so large a share may lie at infinity.
 
     Raises:
         InputError: wrong shapes, or a share that is no probability.

@@ -14,7 +14,7 @@ from kcal.locate.stereo import Status, Triangulate
 
 
 class Sides(NamedTuple):
-    """Triangulated distances between neighbouring corners, metres: their mean and standard deviation."""
+    """Triangulated distances between neighboring corners, meters: their mean and standard deviation."""
 
     mean: float
     spread: float

@@ -22,7 +22,7 @@ def to_cot(located: Located, *, time: datetime.datetime | None = None, stale_s: 
     """One event for each position, in an `events` element; send them one by one.
 
     `hae` is the ellipsoidal height. `ce` is the radius of the horizontal circle that holds the true position with
-    95 %, `le` half the vertical 95 % interval, both in metres; the format's definition names no probability, so that
+    95 %, `le` half the vertical 95 % interval, both in meters; the format's definition names no probability, so that
     the remark in each event states it. Pairs without a position are left out.
 
     Args:

@@ -56,7 +56,7 @@ def find_geoid(path: str | Path | None = None) -> Geoid | None:
 
 
 def geoid_heights(geoid: Geoid, places: Sequence[tuple[float, float]]) -> list[float | None]:
-    """Height of the geoid above the WGS84 ellipsoid at (latitude, longitude), metres; None outside the grid.
+    """Height of the geoid above the WGS84 ellipsoid at (latitude, longitude), meters; None outside the grid.
 
     Height above the geoid, which is close to height above mean sea level, is ellipsoidal height minus this.
 

@@ -1,7 +1,7 @@
-"""WGS84 in closed form: geodetic, Earth-centred (ECEF) and local east-north-up coordinates, in torch, differentiable.
+"""WGS84 in closed form: geodetic, Earth-centered (ECEF) and local east-north-up coordinates, in torch, differentiable.
 
-ECEF coordinates are millions of metres and hold 1e-9 m in float64; float32 would hold half a metre, so everything here
-is float64. Geodetic coordinates are latitude, longitude in degrees and metres above the ellipsoid, in this order.
+ECEF coordinates are millions of meters and hold 1e-9 m in float64; float32 would hold half a meter, so everything here
+is float64. Geodetic coordinates are latitude, longitude in degrees and meters above the ellipsoid, in this order.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcal.checks import as_points
 
-# Semi-major axis in metres and flattening of WGS84 (NIMA TR8350.2).
+# Semi-major axis in meters and flattening of WGS84 (NIMA TR8350.2).
 SEMI_MAJOR = 6378137.0
 FLATTENING = 1.0 / 298.257223563
 SEMI_MINOR = SEMI_MAJOR * (1.0 - FLATTENING)
@@ -21,14 +21,14 @@ SEMI_MINOR = SEMI_MAJOR * (1.0 - FLATTENING)
 _E2 = FLATTENING * (2.0 - FLATTENING)
 _E2_SECOND = _E2 / (1.0 - _E2)
 # Bowring's formula starts from an error of latitude of 1e-3 rad at most; each pass multiplies it by about 1e-6 near
-# the ground: one is good to a nanometre there, the second to heights of satellites.
+# the ground: one is good to a nanometer there, the second to heights of satellites.
 _PASSES = 2
-# Metres from the Earth's axis: closer points are at a pole, where a longitude has no gradient.
+# Meters from the Earth's axis: closer points are at a pole, where a longitude has no gradient.
 _AT_POLE = 1e-6
 
 
 def geodetic_to_ecef(geodetic: Tensor) -> Tensor:
-    """Latitude, longitude (degrees), ellipsoidal height (metres) (..., 3) to ECEF metres (..., 3).
+    """Latitude, longitude (degrees), ellipsoidal height (meters) (..., 3) to ECEF meters (..., 3).
 
     Source: EPSG method 9602.
 
@@ -45,10 +45,10 @@ def geodetic_to_ecef(geodetic: Tensor) -> Tensor:
 
 
 def ecef_to_geodetic(ecef: Tensor) -> Tensor:
-    """ECEF metres (..., 3) to latitude, longitude (degrees, -180 to 180), ellipsoidal height (metres).
+    """ECEF meters (..., 3) to latitude, longitude (degrees, -180 to 180), ellipsoidal height (meters).
 
     Bowring's formula, twice: no iteration, no branch, and finite gradients at the poles too (a longitude has none
-    there). Good to a nanometre from 10 km below the ellipsoid to the height of satellites; not meant for the Earth's
+    there). Good to a nanometer from 10 km below the ellipsoid to the height of satellites; not meant for the Earth's
     core.
 
     Source: Bowring (1976), Survey Review 23 (181), 323-327.
@@ -92,6 +92,6 @@ def ecef_from_enu_rotation(lat_deg: float, lon_deg: float) -> Tensor:
 
 
 def mean_radius(lat_deg: float) -> float:
-    """Gaussian mean radius √(M N) of the ellipsoid at a latitude, metres."""
+    """Gaussian mean radius √(M N) of the ellipsoid at a latitude, meters."""
     sine = math.sin(math.radians(lat_deg))
     return SEMI_MINOR / (1.0 - _E2 * sine * sine)

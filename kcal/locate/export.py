@@ -17,7 +17,7 @@ from kcal.locate.region import REGION_SHARE, cut_at_antimeridian, region_rings
 
 
 def to_geojson(located: Located) -> dict[str, Any]:
-    """A FeatureCollection after RFC 7946: coordinates are [longitude, latitude, ellipsoidal WGS84 height in metres].
+    """A FeatureCollection after RFC 7946: coordinates are [longitude, latitude, ellipsoidal WGS84 height in meters].
 
     The cameras come first (`kind` is "camera"), then one feature for each pair of marks (`kind` is "point"), and last
     a polygon for each position (`kind` is "region"): where it lies with 95 %, a long and slightly skewed ellipse. A
@@ -74,7 +74,7 @@ def _feature(place: tuple[float, float, float] | None, properties: dict[str, Any
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-# Of east, north, up in square metres; the first letters of the two axes.
+# Of east, north, up in square meters; the first letters of the two axes.
 _COVARIANCE = ("cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2")
 
 
@@ -104,8 +104,8 @@ def _row(position: Position) -> dict[str, Any]:
         **dict(zip(_COVARIANCE, _upper(position), strict=True)),
         "cep50_m": position.cep50_m,
         "cep95_m": position.cep95_m,
-        "range_m_per_px": position.metres_per_pixel,
-        "range_m_per_deg_yaw": position.metres_per_degree,
+        "range_m_per_px": position.meters_per_pixel,
+        "range_m_per_deg_yaw": position.meters_per_degree,
         "azimuth_deg": position.azimuth_deg,
         "elevation_deg": position.elevation_deg,
         "reprojection_left_px": left,

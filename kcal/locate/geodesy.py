@@ -2,7 +2,7 @@
 
 Conventions, all of them pinned by tests:
 
-* ENU: x east, y north, z up, tangent to the WGS84 ellipsoid at the origin, metres. Up is not height: at 5 km the
+* ENU: x east, y north, z up, tangent to the WGS84 ellipsoid at the origin, meters. Up is not height: at 5 km the
   ellipsoid has fallen 1.96 m below the tangent plane, and the conversion here accounts for it.
 * Heights are ellipsoidal (WGS84, what GNSS receivers call HAE), not above mean sea level; the two differ by up to
   100 m (`kcal.locate.datum` has the difference where a geoid grid is at hand).
@@ -76,12 +76,12 @@ def azimuth_elevation(enu: Tensor) -> Tensor:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Origin:
-    """Where ENU is anchored: for a rig the projection centre of its left camera.
+    """Where ENU is anchored: for a rig the projection center of its left camera.
 
     Args:
         lat: geodetic latitude in degrees, -90 to 90.
         lon: longitude in degrees, -180 to 180.
-        height: metres above the WGS84 ellipsoid, not above sea level.
+        height: meters above the WGS84 ellipsoid, not above sea level.
 
     Raises:
         InputError: a value out of range; swapped latitude and longitude are named where they can be told.
@@ -105,11 +105,11 @@ class Origin:
             hint = f"; write {self.lon - 360:g}" if 180 < self.lon <= 360 else ""
             raise InputError(f"origin: longitude {self.lon:g} is outside -180 to 180{hint}")
         if not -1000 <= self.height <= 100_000:
-            raise InputError(f"origin: height {self.height:g} m is outside -1000 to 100000; metres are needed")
+            raise InputError(f"origin: height {self.height:g} m is outside -1000 to 100000; meters are needed")
 
     @classmethod
     def parse(cls, text: str) -> Origin:
-        """Read `"LAT,LON,HEIGHT"`: degrees, degrees, metres above the WGS84 ellipsoid.
+        """Read `"LAT,LON,HEIGHT"`: degrees, degrees, meters above the WGS84 ellipsoid.
 
         Raises:
             InputError: not three numbers, or a value out of range.
@@ -130,10 +130,10 @@ class Origin:
 
 
 def enu_to_geodetic(enu: Tensor, origin: Origin) -> Tensor:
-    """Latitude, longitude (degrees) and ellipsoidal WGS84 height (metres) of ENU points, differentiable.
+    """Latitude, longitude (degrees) and ellipsoidal WGS84 height (meters) of ENU points, differentiable.
 
     Args:
-        enu: (..., 3) metres.
+        enu: (..., 3) meters.
         origin: where (0, 0, 0) is.
 
     Returns:
@@ -167,7 +167,7 @@ def place_enu(enu: Tensor, ecef_from_enu: Tensor, ecef_of_origin: Tensor) -> Ten
 
 
 def geodetic_to_enu(geodetic: Tensor, origin: Origin) -> Tensor:
-    """ENU metres of (..., 3) latitude, longitude (degrees), ellipsoidal WGS84 height (metres); differentiable.
+    """ENU meters of (..., 3) latitude, longitude (degrees), ellipsoidal WGS84 height (meters); differentiable.
 
     Raises:
         InputError: wrong shape, less than float64 (a float32 degree is rounded by up to 0.8 m), a value that is
@@ -181,7 +181,7 @@ def geodetic_to_enu(geodetic: Tensor, origin: Origin) -> Tensor:
     """
     checked = as_points("geodetic", geodetic, 3)
     if geodetic.dtype != torch.float64:
-        raise InputError(f"geodetic: float64 is needed; {geodetic.dtype} has already rounded degrees by up to a metre")
+        raise InputError(f"geodetic: float64 is needed; {geodetic.dtype} has already rounded degrees by up to a meter")
     require_finite("geodetic", checked)
     if bool((checked[..., 0].abs() > 90).any()):
         raise InputError("geodetic: a latitude is outside -90 to 90; the order is latitude, longitude, height")

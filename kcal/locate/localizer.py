@@ -11,13 +11,13 @@ from torch import Tensor, nn
 
 from kcal.checks import as_points, keep_float64
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.eager import CHUNK, is_differentiated, is_traced, known_true
 from kcal.lens.rig import StereoRig
+from kcal.lens.tracing import CHUNK, is_differentiated, is_traced, known_true
+from kcal.locate.covariances import RigCovariance, checked_covariance, checked_link
 from kcal.locate.ellipsoid import mean_radius
-from kcal.locate.errors import RigCovariance, checked_covariance, checked_link
 from kcal.locate.geodesy import Origin, anchor, enu_from_cam, place_enu
+from kcal.locate.max_likelihood import Fit, Sight, by_pose, refine
 from kcal.locate.ranges import BEARING_SIGMAS, QUANTILE
-from kcal.locate.refine import Fit, Sight, by_pose, refine
 from kcal.locate.stereo import Status, sight_lines
 
 
@@ -25,17 +25,17 @@ class Localization(NamedTuple):
     """Result of `StereoLocalizer`; nothing in it is NaN, whatever went in. Look at `status` before anything else.
 
     Attributes:
-        enu: (..., N, 3) metres east, north, up of the left camera; zeros unless the status is OK.
+        enu: (..., N, 3) meters east, north, up of the left camera; zeros unless the status is OK.
         covariance: (..., N, 3, 3) of `enu`, to first order; an infinite diagonal unless OK. At long range a position
             is skewed along the line of sight: quote the range interval.
-        geodetic: (..., N, 3) latitude, longitude (degrees), ellipsoidal WGS84 height (metres); the origin unless OK.
-        range_low: (..., N) metres from the left camera, lower end of the 95 % interval.
+        geodetic: (..., N, 3) latitude, longitude (degrees), ellipsoidal WGS84 height (meters); the origin unless OK.
+        range_low: (..., N) meters from the left camera, lower end of the 95 % interval.
         range_high: (..., N) upper end, infinite where the point may be at infinity. The interval is 0 to infinity
             where nothing is known, infinite at both ends where the rays diverge by more than the noise explains.
         status: (..., N) int8, codes of `Status`. BEARING_ONLY: the parallax is below three of its sigmas, so that a
             range would be noise; PARALLEL: it is not positive. Both have a bearing and an interval.
         bearing: (..., N, 3) unit vector east, north, up; zeros where nothing is known.
-        inverse_range: (..., N) one over metres; negative where the rays diverge. Unlike the range its errors are
+        inverse_range: (..., N) one over meters; negative where the rays diverge. Unlike the range its errors are
             Gaussian at any distance: the quantity for losses and filters.
         inverse_range_sigma: (..., N) its standard deviation; zero where nothing is known.
         reprojection: (..., N, 2) distance in px between mark and reprojected point, left and right.
@@ -57,13 +57,13 @@ class Sensitivity(NamedTuple):
     """Slopes of the range, infinite where there is none; at long range they hold for small errors only.
 
     Attributes:
-        metres_per_pixel: (..., N) by a shift of one of the two marks in its worst direction.
-        metres_per_degree: (..., N) by a turn of the right camera about its worst axis: relative yaw, for a rig whose
+        meters_per_pixel: (..., N) by a shift of one of the two marks in its worst direction.
+        meters_per_degree: (..., N) by a turn of the right camera about its worst axis: relative yaw, for a rig whose
             cameras stand side by side.
     """
 
-    metres_per_pixel: Tensor
-    metres_per_degree: Tensor
+    meters_per_pixel: Tensor
+    meters_per_degree: Tensor
 
 
 class StereoLocalizer(nn.Module):
@@ -76,11 +76,11 @@ class StereoLocalizer(nn.Module):
 
     Covariances: the marks' noise, the calibration (`calibration`, a joint covariance of cameras and rig) and the
     mounting (`mounting`) are added up. What the calibration does to several points it does to them together: errors
-    of neighbouring points are not independent, and averaging over frames does not reduce them.
+    of neighboring points are not independent, and averaging over frames does not reduce them.
 
     Args:
         rig: two cameras and their relative pose.
-        origin: position of the left camera's projection centre.
+        origin: position of the left camera's projection center.
         heading_deg: of the left camera's axis, clockwise from true north; see `enu_from_cam`.
         pitch_deg: of the same axis, positive up.
         roll_deg: of the left camera, positive clockwise as seen from behind.
@@ -163,7 +163,7 @@ class StereoLocalizer(nn.Module):
         """Locate pixel pairs.
 
         Args:
-            pixels_left: (..., N, 2), integer coordinates at pixel centres.
+            pixels_left: (..., N, 2), integer coordinates at pixel centers.
             pixels_right: (..., N, 2), the same things in the right image.
             cov: covariance of (u_left, v_left, u_right, v_right), (..., N, 4, 4) or broadcastable to it;
                 `pixel_sigma` squared times the identity if left out.

@@ -22,7 +22,7 @@ class Marks(NamedTuple):
 
     Attributes:
         names: one a pair, unique; the row's number where the file has no names.
-        left: (N, 2) float64 pixels in the left image, integer coordinates at pixel centres.
+        left: (N, 2) float64 pixels in the left image, integer coordinates at pixel centers.
         right: (N, 2) likewise in the right image.
     """
 

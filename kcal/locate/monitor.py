@@ -1,4 +1,4 @@
-"""What a drift of the cameras does to positions, in metres."""
+"""What a drift of the cameras does to positions, in meters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kcal.locate.stereo import Status, sight_lines
 
 
 class DriftEffect(NamedTuple):
-    """What an old rig makes of things that a turned one sees, (D,) metres for D distances.
+    """What an old rig makes of things that a turned one sees, (D,) meters for D distances.
 
     Attributes:
         distance: true range from the left camera.
@@ -38,7 +38,7 @@ def drift_effect(
         old: what is believed.
         new: what is.
         turn_covariance: (3, 3) of the relative turn about the right camera's axes, radians².
-        distances: metres.
+        distances: meters.
 
     Example:
         >>> from kcal.locate.budget import planned_rig
@@ -51,7 +51,7 @@ def drift_effect(
     """
     far = torch.tensor(list(distances), dtype=torch.float64)
     if not bool(((far > 0) & torch.isfinite(far)).all()):
-        raise InputError("distances: positive numbers of metres are needed")
+        raise InputError("distances: positive numbers of meters are needed")
     with torch.no_grad():
         axis = new.right_from_left_rotation[2] + new.right_from_left_rotation.new_tensor([0.0, 0.0, 1.0])
         points = far[:, None] * axis / torch.linalg.vector_norm(axis)
@@ -68,7 +68,7 @@ def drift_effect(
 
 
 def _slope(old: StereoRig, new: StereoRig, points: Tensor, far: Tensor, axis: int) -> Tensor:
-    """Metres of range by a radian about one axis of the right camera."""
+    """Meters of range by a radian about one axis of the right camera."""
     ends = []
     for sign in (-1.0, 1.0):
         turn = rotation_from_vector(sign * 1e-8 * torch.eye(3, dtype=torch.float64)[axis])

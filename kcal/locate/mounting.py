@@ -16,11 +16,11 @@ class Mounting(NamedTuple):
     """How a camera stands; angles as in `kcal.locate.geodesy.enu_from_cam`.
 
     Attributes:
-        origin: of the camera's projection centre.
+        origin: of the camera's projection center.
         heading_deg: clockwise from true north, 0 to 360.
         pitch_deg: positive up.
         roll_deg: clockwise as seen from behind.
-        covariance: (6, 6) of east, north, up (metres) and of turns about these axes (radians), all at the camera.
+        covariance: (6, 6) of east, north, up (meters) and of turns about these axes (radians), all at the camera.
         link: (P, 6) covariance of other quantities with these six.
     """
 
@@ -51,17 +51,17 @@ def attitude(enu_from_cam: Tensor) -> tuple[float, float, float]:
 
 
 def mounting_of(
-    cam_from_enu: Tensor, centre: Tensor, covariance: Tensor, origin: Origin, link: Tensor | None = None
+    cam_from_enu: Tensor, center: Tensor, covariance: Tensor, origin: Origin, link: Tensor | None = None
 ) -> Mounting:
     """How a camera with a pose in the frame of `origin` stands where it is.
 
-    North and up at the camera are not those at the origin: a kilometre apart they differ by 0.01° (up), and by that
+    North and up at the camera are not those at the origin: a kilometer apart they differ by 0.01° (up), and by that
     times the tangent of the latitude (north).
 
     Args:
         cam_from_enu: (3, 3).
-        centre: (3,) metres.
-        covariance: (6, 6) of the centre and of turns of the camera, both about the frame's axes.
+        center: (3,) meters.
+        covariance: (6, 6) of the center and of turns of the camera, both about the frame's axes.
         origin: of the frame.
         link: (P, 6) covariance of anything else with these six.
 
@@ -72,7 +72,7 @@ def mounting_of(
         >>> round(there.heading_deg, 9), round(there.origin.height, 6)
         (35.0, 14.0)
     """
-    lat, lon, height = enu_to_geodetic(centre, origin).tolist()
+    lat, lon, height = enu_to_geodetic(center, origin).tolist()
     here = Origin(lat=lat, lon=lon, height=height)
     turn = ecef_from_enu_rotation(lat, lon).T @ ecef_from_enu_rotation(origin.lat, origin.lon)
     both = torch.block_diag(turn, turn)

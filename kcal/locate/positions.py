@@ -14,8 +14,8 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.locate.cep import circular_error
+from kcal.locate.covariances import RigCovariance
 from kcal.locate.datum import Geoid, geoid_heights
-from kcal.locate.errors import RigCovariance
 from kcal.locate.geodesy import Origin, azimuth_elevation, enu_from_cam, enu_to_geodetic
 from kcal.locate.localizer import Localization, StereoLocalizer
 from kcal.locate.stereo import Status
@@ -36,9 +36,9 @@ _REASONS = {
 class Position:
     """One pair of marks, located or not; what is not known is None.
 
-    Latitude, longitude (degrees) and the ellipsoidal WGS84 `height` (metres), `enu` and the best estimate `range_m`
+    Latitude, longitude (degrees) and the ellipsoidal WGS84 `height` (meters), `enu` and the best estimate `range_m`
     are there only if the status is `OK`. Azimuth and elevation in degrees and the range interval are also there if
-    it is `BEARING_ONLY` or `PARALLEL`, the interval only if some range explains the marks. Ranges are metres from the
+    it is `BEARING_ONLY` or `PARALLEL`, the interval only if some range explains the marks. Ranges are meters from the
     left camera; `range_high_m` may be infinite. The interval covers 95 % of the errors that `Located.interval_note`
     names. `reason` is empty, says why there is no position, or warns of one that looks wrong.
 
@@ -59,8 +59,8 @@ class Position:
     covariance: tuple[tuple[float, float, float], ...] | None = None
     cep50_m: float | None = None
     cep95_m: float | None = None
-    metres_per_pixel: float | None = None
-    metres_per_degree: float | None = None
+    meters_per_pixel: float | None = None
+    meters_per_degree: float | None = None
     range_m: float | None = None
     range_low_m: float | None = None
     range_high_m: float | None = None
@@ -75,8 +75,8 @@ class Viewpoint:
 
     Args:
         name: "left" or "right".
-        enu: metres; zeros for the left camera.
-        geodetic: latitude, longitude in degrees, ellipsoidal WGS84 height in metres.
+        enu: meters; zeros for the left camera.
+        geodetic: latitude, longitude in degrees, ellipsoidal WGS84 height in meters.
         azimuths_deg: of the left and right ends of the image's middle row, or None if the lens model has no ray there.
     """
 
@@ -120,7 +120,7 @@ class Located:
 
     @property
     def enu(self) -> Tensor:
-        """East, north, up in metres, (N, 3) float64; NaN where there is no position."""
+        """East, north, up in meters, (N, 3) float64; NaN where there is no position."""
         nowhere = (math.nan,) * 3
         rows = [nowhere if position.enu is None else position.enu for position in self.positions]
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, 3)
@@ -148,9 +148,9 @@ def locate(
 
     Args:
         rig: the calibrated rig.
-        pixels_left: (N, 2) marks in the left image, integer coordinates at pixel centres.
+        pixels_left: (N, 2) marks in the left image, integer coordinates at pixel centers.
         pixels_right: (N, 2) the same things in the right image.
-        origin: position of the left camera's projection centre.
+        origin: position of the left camera's projection center.
         heading_deg: of the left camera's optical axis, clockwise from true north; see `enu_from_cam`.
         pitch_deg: of the same axis, positive up.
         roll_deg: of the left camera, positive clockwise as seen from behind.
@@ -218,8 +218,8 @@ def locate(
         if status == Status.OK:
             position = _placed(position, result, i)
             position = dataclasses.replace(
-                position, cep50_m=circles[i][0], cep95_m=circles[i][1], metres_per_pixel=slopes[0][i],
-                metres_per_degree=slopes[1][i],
+                position, cep50_m=circles[i][0], cep95_m=circles[i][1], meters_per_pixel=slopes[0][i],
+                meters_per_degree=slopes[1][i],
             )  # fmt: skip
         positions.append(position)
     if geoid is not None:

@@ -23,7 +23,7 @@ BEARING_SIGMAS = 3.0
 
 
 class RangeInterval(NamedTuple):
-    """Ends of the 95 % interval in metres from the left camera, (..., N) each.
+    """Ends of the 95 % interval in meters from the left camera, (..., N) each.
 
     Attributes:
         low: nearest range; infinite if the rays diverge by more than the noise explains.
@@ -40,12 +40,12 @@ def range_from_parallax(baseline: Tensor | float, bearing: Tensor, parallax: Ten
     """Range from the left camera by the law of sines; infinite where the rays do not meet in front.
 
     Args:
-        baseline: distance of the cameras in metres.
+        baseline: distance of the cameras in meters.
         bearing: (..., N) angle at the left camera between its ray and the direction to the right camera, radians.
         parallax: (..., N) angle by which the right ray turns towards the left one, radians: the angle at the point.
 
     Returns:
-        (..., N) metres, baseline * sin(bearing + parallax) / sin(parallax); the angle at the right camera is
+        (..., N) meters, baseline * sin(bearing + parallax) / sin(parallax); the angle at the right camera is
         what the other two leave of π. Gradients are finite everywhere.
 
     Example:
@@ -66,7 +66,7 @@ def range_interval(
     """The 95 % interval of the range, from the interval parallax ± 1.96 sigma. It covers the marks' noise only.
 
     Args:
-        baseline: distance of the cameras in metres.
+        baseline: distance of the cameras in meters.
         bearing: (..., N) angle at the left camera between its ray and the direction to the right camera, radians;
             its own noise is neglected, as it moves the range by no more than the point moves sideways.
         parallax: (..., N) radians, negative where the rays diverge.

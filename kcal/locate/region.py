@@ -1,4 +1,4 @@
-"""Where a position lies with 95 %, as a ring on the map: an ellipse in inverse range, skewed outward in metres."""
+"""Where a position lies with 95 %, as a ring on the map: an ellipse in inverse range, skewed outward in meters."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def region_outline(enu: Tensor, covariance: Tensor, share: float = REGION_SHARE)
     The ellipse is drawn where errors are Gaussian, in X / |X|² of the horizontal position, and carried back.
 
     Args:
-        enu: (3,) metres from the left camera.
+        enu: (3,) meters from the left camera.
         covariance: (3, 3) to first order.
         share: probability.
 
     Returns:
-        (72, 2) east, north in metres, counterclockwise.
+        (72, 2) east, north in meters, counterclockwise.
 
     Example:
         >>> spread = torch.diag(torch.tensor([0.1, 200.0, 0.1], dtype=torch.float64) ** 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.drift import Drift
+from kcal.calibrate.rig.drift import Drift
 from kcal.io.rig_file import RigFile, RigMounting, RigPose
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.mounting import attitude

@@ -1,4 +1,4 @@
-"""Pixel pairs of a stereo rig to points in metres, with a status for each: the module `Triangulate`."""
+"""Pixel pairs of a stereo rig to points in meters, with a status for each: the module `Triangulate`."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ class Triangulation(NamedTuple):
     """Result of `Triangulate`; no tensor holds NaN, whatever went in.
 
     Attributes:
-        points: (..., N, 3) metres in the rig frame (the left camera's); zeros unless the status is OK.
+        points: (..., N, 3) meters in the rig frame (the left camera's); zeros unless the status is OK.
         status: (..., N) int8, codes of `Status` (never BEARING_ONLY: the geometry alone cannot tell; nor the last two,
             which speak of what `StereoLocalizer` is given besides).
         rays: (..., N, 3) unit rays of the left camera; its optical axis where the lens has none.
         reprojection: (..., N, 2) distance in px between mark and reprojected point, left and right; zeros unless OK.
         parallax: (..., N) radians by which the rays converge in the epipolar plane, negative where they diverge.
         parallax_sigma: (..., N) its standard deviation from the marks' noise; carries no gradient.
-        range_low: (..., N) metres from the left camera, lower end of the 95 % interval of the marks' noise.
+        range_low: (..., N) meters from the left camera, lower end of the 95 % interval of the marks' noise.
         range_high: (..., N) its upper end, infinite where the point may be at infinity. The interval is 0 to infinity
             unless the status is OK or PARALLEL.
         bearing_only: (..., N) true where the parallax is below three sigma: trust the bearing, not the range.
@@ -109,7 +109,7 @@ class Triangulate(nn.Module):
         self.pixel_sigma = float(pixel_sigma)
 
     def forward(self, pixels_left: Tensor, pixels_right: Tensor) -> Triangulation:
-        """Triangulate matched pixels, both (..., N, 2), integer coordinates at pixel centres.
+        """Triangulate matched pixels, both (..., N, 2), integer coordinates at pixel centers.
 
         Raises:
             InputError: not floating point, or shapes that are wrong or unlike.

@@ -1,7 +1,7 @@
 """What was surveyed or is known of the surroundings of a rig, from CSV files into its local frame.
 
-Latitudes and longitudes go through Earth-centred coordinates, so that curvature is in them; heights are above the WGS84
-ellipsoid. Local metres are east, north, up of the same origin.
+Latitudes and longitudes go through Earth-centered coordinates, so that curvature is in them; heights are above the
+WGS84 ellipsoid. Local meters are east, north, up of the same origin.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig_sources import Features, Landmarks, MeasuredPosition, inverse_range_beyond
+from kcal.calibrate.rig.sources import Features, Landmarks, MeasuredPosition, inverse_range_beyond
 from kcal.errors import FileError, InputError
 from kcal.locate.geodesy import Origin, geodetic_to_enu
 from kcal.locate.marks import PIXELS, Marks, pixel_of
@@ -22,7 +22,7 @@ from kcal.locate.tables import Row, read_rows
 
 _EARTH, _LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
 _PLACES = ("name", *_EARTH, *_LOCAL, "sigma", "sigma_up", "note")
-# One over metres: the inverse range of a star is known to this.
+# One over meters: the inverse range of a star is known to this.
 _INFINITY_SIGMA = 1e-12
 
 
@@ -31,9 +31,9 @@ class Survey(NamedTuple):
 
     Attributes:
         names: one each.
-        points: (N, 3) metres east, north, up of `origin`.
-        sigma: (N, 3) metres.
-        origin: where the frame is anchored; None if the file holds local metres and no origin was given.
+        points: (N, 3) meters east, north, up of `origin`.
+        sigma: (N, 3) meters.
+        origin: where the frame is anchored; None if the file holds local meters and no origin was given.
     """
 
     names: tuple[str, ...]
@@ -45,7 +45,7 @@ class Survey(NamedTuple):
 def read_survey(path: str | Path, origin: Origin | None = None, *, measured: bool = True) -> Survey:
     r"""Read surveyed places: `name,lat,lon,height,sigma` or `name,east,north,up,sigma`, and if need be `sigma_up`.
 
-    Degrees, metres above the WGS84 ellipsoid, metres; `sigma` holds along each axis, `sigma_up` upward where that
+    Degrees, meters above the WGS84 ellipsoid, meters; `sigma` holds along each axis, `sigma_up` upward where that
     differs.
 
     Args:
@@ -94,7 +94,7 @@ def _columns(row: Row, path: str | Path) -> tuple[str, str, str]:
 def _sigma(row: Row) -> tuple[float, float, float]:
     level = row.positive("sigma")
     if level is None or not math.isfinite(level):
-        raise FileError(f"{row.where}: sigma is empty; write how well the place is known, metres")
+        raise FileError(f"{row.where}: sigma is empty; write how well the place is known, meters")
     up = row.positive("sigma_up") or level
     return level, level, up
 
@@ -135,7 +135,7 @@ def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float) -> MarkedL
 def read_features(path: str | Path, pixel_sigma: float) -> Features:
     r"""Read matched far features: `name,left_u,left_v,right_u,right_v` and what is known of their range, if anything.
 
-    `range` and `range_sigma` in metres from the rig, `range` alone `inf` for a star; or `beyond`, a distance that the
+    `range` and `range_sigma` in meters from the rig, `range` alone `inf` for a star; or `beyond`, a distance that the
     feature is farther away than; or nothing, and then it only ties the epipolar geometry.
 
     Raises:
@@ -173,7 +173,7 @@ def _inverse_range(row: Row) -> tuple[float, float]:
     if math.isinf(distance):
         return 0.0, _INFINITY_SIGMA
     if sigma is None:
-        raise FileError(f"{row.where}: the range needs its range_sigma, metres")
+        raise FileError(f"{row.where}: the range needs its range_sigma, meters")
     return 1.0 / distance, sigma / distance**2
 
 

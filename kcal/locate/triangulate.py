@@ -8,7 +8,7 @@ from torch import Tensor
 from kcal.locate.angular import checked_views
 
 # Below this gap of the squared singular values (the rays have unit length, the cameras a spread of one) the answer
-# is not determined: all rays lie along the line through the camera centres.
+# is not determined: all rays lie along the line through the camera centers.
 _GAP = 1e-18
 # Points farther than this many baselines are at infinity for float64.
 _HORIZON = 1e12
@@ -19,7 +19,7 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Te
 
     For each camera the three rows of `ray x (R X + t) = 0` are stacked. Eq. 9 has the first two of them in pixels;
     with unit rays all pixels of a wide lens weigh alike, and the third row keeps rays far off axis well determined.
-    Before the decomposition the world is moved to the middle of the camera centres and scaled by their spread, so
+    Before the decomposition the world is moved to the middle of the camera centers and scaled by their spread, so
     that a far origin (ECEF) or an unlike unit costs no digits.
 
     Derivatives do not come from the decomposition's own backward pass, which divides by differences of *all*
@@ -33,7 +33,7 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Te
 
     Returns:
         points (..., N, 3) in the world frame, float64, and valid (..., N): true where the point is finite, determined
-        and in front of every camera along its ray. Points that are not valid are the middle of the camera centres.
+        and in front of every camera along its ray. Points that are not valid are the middle of the camera centers.
 
     Raises:
         InputError: wrong shapes or dtypes.
@@ -80,7 +80,7 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Te
 
 
 def _null_vector(system: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vector h minimising |system h|, and whether it is unique; differentiable twice.
+    """Unit vector h minimizing |system h|, and whether it is unique; differentiable twice.
 
     G(h) = (M - λ(h)) h with M = systemᵀ system and λ the Rayleigh quotient vanishes at the answer. In the basis of
     the other singular vectors its Jacobian is diag(λ_i - λ), held fixed at the known root (a chord step).

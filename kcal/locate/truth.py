@@ -38,7 +38,7 @@ def read_truth(path: str | Path, located: Located) -> Tensor:
 def misses(located: Located, truth: Tensor) -> list[tuple[float, float, bool] | None]:
     """How far off each position is; None where position or truth is unknown.
 
-    For each its level distance from the truth and its range minus the true one (metres), and whether the range interval
+    For each its level distance from the truth and its range minus the true one (meters), and whether the range interval
     holds the true range.
 
     Example:

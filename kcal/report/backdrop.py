@@ -23,7 +23,7 @@ _LONGER_SIDE = 2048
 # TIFF tags of GeoTIFF 1.1 (OGC 19-008r4).
 _SCALE, _TIES, _MATRIX, _KEYS = 33550, 33922, 34264, 34735
 _GEOGRAPHIC, _PROJECTED, _RASTER_TYPE = 2048, 3072, 1025
-_POINT_IS_CENTRE = 2
+_POINT_IS_CENTER = 2
 Box = tuple[float, float, float, float]
 
 
@@ -119,7 +119,7 @@ def _placing(path: Path, tags: dict[int, Any]) -> tuple[NDArray[np.float64], pyp
         matrix = np.array([[sx, 0.0, x - i * sx], [0.0, -sy, y + j * sy]])
     else:
         raise InputError(f"{path}: a GeoTIFF without a scale and tie point, or a transformation")
-    if code.get(_RASTER_TYPE) == _POINT_IS_CENTRE:
+    if code.get(_RASTER_TYPE) == _POINT_IS_CENTER:
         matrix[:, 2] -= 0.5 * matrix[:, :2].sum(1)
     try:
         return matrix, pyproj.CRS.from_epsg(epsg)

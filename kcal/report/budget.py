@@ -10,14 +10,14 @@ from torch import Tensor
 from kcal.locate.budget import RangeError
 from kcal.report.figures import new_figure, save_png
 
-_COLOURS = {"disparity": "#2b6cb0", "yaw": "#c02a6b", "baseline": "#4b5563", "timing": "#dd7a1f"}
+_COLORS = {"disparity": "#2b6cb0", "yaw": "#c02a6b", "baseline": "#4b5563", "timing": "#dd7a1f"}
 
 
 def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]) -> Figure:
     """Lines for each source: outward solid, inward dotted, the slope of the first order thin and dashed.
 
     Args:
-        distances: (D,) metres.
+        distances: (D,) meters.
         found: from `range_errors`.
         labels: what each source's line is called.
     """
@@ -25,13 +25,13 @@ def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[
     axes = figure.add_subplot()
     far = distances.numpy()
     for name, error in found.items():
-        colour = _COLOURS.get(name, "#111827")
+        color = _COLORS.get(name, "#111827")
         outward = error.farther.clone()
         # Infinity is not drawn: the line leaves the picture there.
         outward[~outward.isfinite()] = float("nan")
-        axes.plot(far, outward.numpy(), color=colour, linewidth=2.0, label=labels.get(name, name))
-        axes.plot(far, error.nearer.abs().numpy(), color=colour, linewidth=1.4, linestyle=":")
-        axes.plot(far, error.first_order.numpy(), color=colour, linewidth=0.8, linestyle=(0, (6, 4)), alpha=0.8)
+        axes.plot(far, outward.numpy(), color=color, linewidth=2.0, label=labels.get(name, name))
+        axes.plot(far, error.nearer.abs().numpy(), color=color, linewidth=1.4, linestyle=":")
+        axes.plot(far, error.first_order.numpy(), color=color, linewidth=0.8, linestyle=(0, (6, 4)), alpha=0.8)
     axes.plot([], [], color="#6b7280", linewidth=1.4, linestyle=":", label="inward")
     axes.plot([], [], color="#6b7280", linewidth=0.8, linestyle=(0, (6, 4)), label="first order")
     axes.set(xscale="log", yscale="log", xlim=(far.min(), far.max()), xlabel="range, m", ylabel="error of the range, m")

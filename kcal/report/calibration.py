@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from kcal.calibrate.mono import CameraCalibrationResult
+from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.corners.observations import Observations
 from kcal.report.figures import new_figure, save_png
 
@@ -77,7 +77,7 @@ def _coverage(axes: Axes, observations: Observations, result: CameraCalibrationR
     axes.set_aspect("equal")
     axes.set_xlabel("u, pixels")
     axes.set_ylabel("v, pixels")
-    axes.set_title(f"Corners, one colour a view; arrows: observed minus modelled, x {scale:g}", fontsize=10, loc="left")
+    axes.set_title(f"Corners, one color a view; arrows: observed minus modeled, x {scale:g}", fontsize=10, loc="left")
 
 
 def _scatter(axes: Axes, result: CameraCalibrationResult) -> None:
@@ -103,9 +103,9 @@ def _scatter(axes: Axes, result: CameraCalibrationResult) -> None:
 def _views(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
     rms = result.per_view_rms.numpy()
     typical = float(np.nanmedian(rms))
-    colours = [_WARN if value > 2 * typical else _ACCENT for value in rms]
+    colors = [_WARN if value > 2 * typical else _ACCENT for value in rms]
     place = np.arange(len(rms))
-    axes.bar(place, rms, color=colours, width=0.8)
+    axes.bar(place, rms, color=colors, width=0.8)
     axes.axhline(typical, color=_INK, linewidth=0.8)
     axes.set_ylabel("RMS, pixels")
     axes.set_title("RMS of each view; line: median", fontsize=10, loc="left")

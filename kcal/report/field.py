@@ -20,7 +20,7 @@ _NEAR = 0.03
 
 
 def field_figure(observations: Observations, camera: Camera) -> Figure:
-    """Draw the correction in pixels: its size in colour, its direction as magnified arrows, support outlined.
+    """Draw the correction in pixels: its size in color, its direction as magnified arrows, support outlined.
 
     Args:
         observations: what was calibrated.

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from kcal.corners.images import read_grey, to_8bit
+from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError
 from kcal.report.figures import new_figure, save_png
@@ -30,7 +30,7 @@ def gallery_figure(observations: Observations) -> Figure:
     views are shown; images that gave none are listed with their reasons.
 
     Args:
-        observations: with the paths of their images; a view whose image is not there is drawn on grey.
+        observations: with the paths of their images; a view whose image is not there is drawn on gray.
     """
     order = sorted(range(len(observations.views)), key=lambda i: _badness(observations.views[i]), reverse=True)
     shown = order[:_MOST]
@@ -58,7 +58,7 @@ def gallery_figure(observations: Observations) -> Figure:
 
 
 def coverage_figure(observations: Observations) -> Figure:
-    """Draw where corners were seen, one colour a view (the paper's Fig. 1), over how often each part was reached.
+    """Draw where corners were seen, one color a view (the paper's Fig. 1), over how often each part was reached.
 
     Parts of the image that no corner reached are hatched: there the lens model extrapolates.
     """
@@ -80,7 +80,7 @@ def coverage_figure(observations: Observations) -> Figure:
     axes = figure.add_subplot()
     figure.subplots_adjust(left=0.07, right=0.99, bottom=0.09, top=0.9)
     axes.imshow(
-        cells, cmap="Greys", vmin=0, vmax=2.5 * max(cells.max(), 1), extent=(-0.5, width - 0.5, height - 0.5, -0.5)
+        cells, cmap="Grays", vmin=0, vmax=2.5 * max(cells.max(), 1), extent=(-0.5, width - 0.5, height - 0.5, -0.5)
     )
     for row, column in np.argwhere(cells == 0):
         axes.add_patch(
@@ -152,15 +152,15 @@ def _draw_view(axes: Axes, observations: Observations, view: View) -> None:
 
 
 def _thumbnail(view: View, size: tuple[int, int]) -> npt.NDArray[np.uint8]:
-    """The view's image, every so many pixels, or grey where the file is not there any more."""
-    grey = np.full((2, 2), 200, np.uint8)
+    """The view's image, every so many pixels, or gray where the file is not there any more."""
+    gray = np.full((2, 2), 200, np.uint8)
     if view.image is None:
-        return grey
+        return gray
     try:
-        image = to_8bit(read_grey(view.image))
+        image = to_8bit(read_gray(view.image))
     except FileError:
-        return grey
+        return gray
     if (image.shape[1], image.shape[0]) != size:
-        return grey
+        return gray
     step = max(1, max(image.shape) // _THUMB)
     return image[step // 2 :: step, step // 2 :: step]

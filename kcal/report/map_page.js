@@ -37,8 +37,8 @@
     }
   };
   for (const view of data.cameras) {
-    if (view.fan) L.polygon(view.fan, {color: view.colour, weight: 1, opacity: 0.7, fillOpacity: 0.06, smoothFactor: 0.2, interactive: false}).addTo(layer("fields of view"));
-    label(L.circleMarker(view.place, {radius: 6, color: "#fff", weight: 1.5, fillColor: view.colour, fillOpacity: 1})
+    if (view.fan) L.polygon(view.fan, {color: view.color, weight: 1, opacity: 0.7, fillOpacity: 0.06, smoothFactor: 0.2, interactive: false}).addTo(layer("fields of view"));
+    label(L.circleMarker(view.place, {radius: 6, color: "#fff", weight: 1.5, fillColor: view.color, fillOpacity: 1})
       .addTo(layer("cameras")), view.name, view.side);
   }
   for (const arc of data.arcs) {

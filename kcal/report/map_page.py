@@ -25,7 +25,7 @@ from kcal.locate.stereo import Status
 from kcal.report.backdrop import local_image, local_tiles
 
 ARCS_M = (250.0, 1000.0, 5000.0)
-_COLOURS = ("#2b6cb0", "#dd7a1f")
+_COLORS = ("#2b6cb0", "#dd7a1f")
 _ONLINE = {
     "url": "https://tile.openstreetmap.org/{z}/{x}/{y}.png",
     "attribution": '&copy; <a href="https://www.openstreetmap.org/copyright">OpenStreetMap</a> contributors',
@@ -58,7 +58,7 @@ def map_page(
 
     Args:
         located: from `kcal.locate.positions.locate`.
-        truth: (N, 3) true east, north, up in metres, NaN where unknown; an arrow leads from each to its estimate.
+        truth: (N, 3) true east, north, up in meters, NaN where unknown; an arrow leads from each to its estimate.
         tiles: a folder of map tiles `z/x/y.png` (or .jpg, .webp) in Web Mercator; those in view are embedded.
         image: a GeoTIFF to lie below, for example an orthophoto; embedded, at 2048 pixels along its longer side.
         online: also load tiles of OpenStreetMap when the page is opened with a network.
@@ -145,7 +145,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
     ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
     reach = 1.15 * max([*ranges, 300.0])
     cameras, edges = [], []
-    for view, colour, side in zip(located.cameras, _COLOURS, _label_sides(located), strict=True):
+    for view, color, side in zip(located.cameras, _COLORS, _label_sides(located), strict=True):
         outline = None
         if view.azimuths_deg is not None:
             first, last = view.azimuths_deg
@@ -154,7 +154,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
             outline = places(torch.cat([foot, fan(view.enu, sweep, reach)]))
             edges += [(float(a) - located.heading_deg + 180) % 360 - 180 for a in sweep[[0, -1]]]
         place = (view.geodetic[0], near(view.geodetic[1], located.origin.lon))
-        cameras.append({"name": view.name, "place": place, "fan": outline, "colour": colour, "side": side})
+        cameras.append({"name": view.name, "place": place, "fan": outline, "color": color, "side": side})
     low, high = (min(edges), max(edges)) if edges else (-180.0, 180.0)
     sweep = torch.linspace(low, high, 90, dtype=torch.float64) + located.heading_deg
     arcs = [
@@ -207,8 +207,8 @@ def _rows(position: Position) -> list[tuple[str, str]]:
         ("range", f"{position.range_m:.1f} m"),
         ("95 % interval", f"{position.range_low_m:.1f} to {position.range_high_m:.1f} m"),
         ("CEP50, CEP95", f"{position.cep50_m:.1f}, {position.cep95_m:.1f} m"),
-        ("a pixel is", f"{position.metres_per_pixel:.1f} m"),
-        ("0.01° of yaw is", f"{0.01 * (position.metres_per_degree or 0.0):.1f} m"),
+        ("a pixel is", f"{position.meters_per_pixel:.1f} m"),
+        ("0.01° of yaw is", f"{0.01 * (position.meters_per_degree or 0.0):.1f} m"),
     ]
     return [*rows, ("", position.reason)] if position.reason else rows
 

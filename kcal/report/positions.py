@@ -37,7 +37,7 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
 
     Args:
         located: from `kcal.locate.positions.locate`.
-        truth: (N, 3) true east, north, up in metres, NaN where unknown; an arrow leads from each to its estimate.
+        truth: (N, 3) true east, north, up in meters, NaN where unknown; an arrow leads from each to its estimate.
 
     Returns:
         A matplotlib figure that belongs to no window and no global state.
@@ -77,7 +77,7 @@ def save_positions_picture(path: str | Path, located: Located, truth: Tensor | N
 
 
 class _RangeScale:
-    """ENU metres to the plane of the map: azimuth kept, range turned into log(1 + range / r0), the rim at 1."""
+    """ENU meters to the plane of the map: azimuth kept, range turned into log(1 + range / r0), the rim at 1."""
 
     def __init__(self, located: Located, true_enu: Array | None) -> None:
         ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
@@ -90,20 +90,20 @@ class _RangeScale:
         self.nearest, self.rim = min(ranges), 1.25 * reach
         self._r0 = max(self.nearest / 2.0, self.rim / 1000.0)
 
-    def radius(self, metres: float | Array) -> Array:
-        return np.asarray(np.log1p(np.minimum(metres, self.rim) / self._r0) / math.log1p(self.rim / self._r0))
+    def radius(self, meters: float | Array) -> Array:
+        return np.asarray(np.log1p(np.minimum(meters, self.rim) / self._r0) / math.log1p(self.rim / self._r0))
 
     def place(self, enu: Array) -> Array:
-        """(..., 2 or more) east, north in metres to map coordinates (..., 2)."""
+        """(..., 2 or more) east, north in meters to map coordinates (..., 2)."""
         distance = np.hypot(enu[..., 0], enu[..., 1])[..., None]
         return np.asarray(enu[..., :2] / np.maximum(distance, 1e-9) * self.radius(distance))
 
-    def polar(self, azimuth_deg: float | Array, metres: float | Array) -> Array:
+    def polar(self, azimuth_deg: float | Array, meters: float | Array) -> Array:
         azimuth = np.radians(azimuth_deg)
-        return np.stack([np.sin(azimuth) * self.radius(metres), np.cos(azimuth) * self.radius(metres)], -1)
+        return np.stack([np.sin(azimuth) * self.radius(meters), np.cos(azimuth) * self.radius(meters)], -1)
 
     def arcs(self) -> list[float]:
-        """Round ranges far enough from each other to be labelled."""
+        """Round ranges far enough from each other to be labeled."""
         chosen: list[float] = []
         for arc in _ARCS:
             apart = all(abs(self.radius(arc) - self.radius(other)) > 0.09 for other in chosen)
@@ -116,8 +116,8 @@ def _xy(place: Array) -> tuple[float, float]:
     return float(place[0]), float(place[1])
 
 
-def _length(metres: float) -> str:
-    return f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
+def _length(meters: float) -> str:
+    return f"{meters / 1000:g} km" if meters >= 1000 else f"{meters:g} m"
 
 
 def _draw_plan(axes: Axes, located: Located, true_enu: Array | None, shown: list[int], scale: _RangeScale) -> None:
@@ -142,20 +142,20 @@ def _draw_plan(axes: Axes, located: Located, true_enu: Array | None, shown: list
             place[0], place[1], _length(arc), fontsize=8.5, color="#4b5563", rotation=turn, rotation_mode="anchor",
             ha="left" if outward else "right", va="center",
         )  # fmt: skip
-    for camera, colour in zip(located.cameras, (_LEFT, _RIGHT), strict=True):
+    for camera, color in zip(located.cameras, (_LEFT, _RIGHT), strict=True):
         foot = np.asarray(camera.enu[:2])
         if camera.azimuths_deg is not None:
             first, last = camera.azimuths_deg
             fan = np.radians(np.linspace(first, first + (last - first) % 360, 120))
             rim = foot + scale.rim * np.stack([np.sin(fan), np.cos(fan)], -1)
-            # Straight lines from a camera beside the centre are curved on a logarithmic map: follow them.
+            # Straight lines from a camera beside the center are curved on a logarithmic map: follow them.
             steps = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 60)])[:, None]
             outline = np.concatenate([foot + steps * (rim[0] - foot), rim, (foot + steps * (rim[-1] - foot))[::-1]])
             wedge = scale.place(outline)
             extent.append(wedge)
-            axes.fill(*wedge.T, facecolor=colour, alpha=0.07, edgecolor="none", zorder=0)
-            axes.plot(*wedge.T, color=colour, alpha=0.55, linewidth=0.9, zorder=1)
-        axes.plot(*scale.place(foot), "o", color=colour, markersize=7, zorder=6, label=f"{camera.name} camera")
+            axes.fill(*wedge.T, facecolor=color, alpha=0.07, edgecolor="none", zorder=0)
+            axes.plot(*wedge.T, color=color, alpha=0.55, linewidth=0.9, zorder=1)
+        axes.plot(*scale.place(foot), "o", color=color, markersize=7, zorder=6, label=f"{camera.name} camera")
     for i in shown:
         position = located.positions[i]
         _draw_sight(axes, position, scale)
@@ -194,13 +194,13 @@ def _draw_sight(axes: Axes, position: Position, scale: _RangeScale) -> None:
     tilt = math.cos(math.radians(position.elevation_deg or 0.0))
     known = position.status == Status.OK
     start, end = scale.polar(azimuth, low * tilt), scale.polar(azimuth, min(high * tilt, scale.rim))
-    colour = _POINT if known else _UNSURE
+    color = _POINT if known else _UNSURE
     style = {"linewidth": 2.6, "alpha": 0.45} if known else {"linewidth": 1.4, "linestyle": (0, (3, 2))}
-    axes.plot(*np.stack([start, end]).T, color=colour, solid_capstyle="butt", zorder=3, **style)
+    axes.plot(*np.stack([start, end]).T, color=color, solid_capstyle="butt", zorder=3, **style)
     if high * tilt > scale.rim:
         axes.annotate(
             "", _xy(end), _xy(start + 0.97 * (end - start)), zorder=3,
-            arrowprops={"arrowstyle": "-|>", "color": colour, "alpha": 0.8, "shrinkA": 0, "shrinkB": 0},
+            arrowprops={"arrowstyle": "-|>", "color": color, "alpha": 0.8, "shrinkA": 0, "shrinkB": 0},
         )  # fmt: skip
 
 
@@ -228,8 +228,8 @@ def _draw_names(axes: Axes, located: Located, shown: list[int], scale: _RangeSca
         others = [other - anchor for other in anchors if other is not anchor]
         crowded = any(0 < other[0] < 0.2 and abs(other[1]) < 0.03 for other in others)
         from_labels = (labels_deg - (located.positions[i].azimuth_deg or 0.0) + 180) % 360 - 180
-        labelled = 0 < from_labels < 15 and math.cos(math.radians(labels_deg)) > 0
-        side = -1 if crowded or labelled else 1
+        labeled = 0 < from_labels < 15 and math.cos(math.radians(labels_deg)) > 0
+        side = -1 if crowded or labeled else 1
         axes.annotate(
             located.positions[i].name, _xy(anchor), (8 * side, 0), textcoords="offset points", fontsize=9, zorder=9,
             ha="left" if side > 0 else "right", va="center", path_effects=_HALO,
@@ -245,11 +245,11 @@ def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: li
     limit = min(max([0.02, *finite]) * 1.3, 2.0)
     for row, (i, (low, high, true)) in enumerate(zip(order, spans, strict=True)):
         position = located.positions[i]
-        colour = _POINT if position.status == Status.OK else _UNSURE
+        color = _POINT if position.status == Status.OK else _UNSURE
         ends = max(low, -limit), min(high, limit)
-        axes.plot(ends, [row, row], color=colour, linewidth=5, alpha=0.4, solid_capstyle="butt")
+        axes.plot(ends, [row, row], color=color, linewidth=5, alpha=0.4, solid_capstyle="butt")
         if high > limit:
-            axes.plot(limit, row, ">", color=colour, markersize=7, clip_on=False)
+            axes.plot(limit, row, ">", color=color, markersize=7, clip_on=False)
         if position.range_m is not None:
             axes.plot(0.0, row, "o", color=_POINT, markerfacecolor="white", markersize=6, zorder=3)
         if true is not None:

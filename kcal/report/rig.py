@@ -12,12 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from kcal.calibrate.rig_result import ItemResidual, RigSolution
+from kcal.calibrate.rig.result import ItemResidual, RigSolution
 from kcal.report.figures import new_figure, save_png
 
 Array = NDArray[np.float64]
 
-_COLOURS = {
+_COLORS = {
     "boards": "#4b5563",
     "landmarks": "#2b6cb0",
     "features": "#0f766e",
@@ -36,7 +36,7 @@ def rig_figure(solution: RigSolution) -> Figure:
     In the plan distances from the rig are drawn as log(1 + range / r0), directions as they are.
 
     Args:
-        solution: from `kcal.calibrate.rig.solve_rig`.
+        solution: from `kcal.calibrate.rig.solve.solve_rig`.
 
     Returns:
         A matplotlib figure that belongs to no window and no global state.
@@ -86,10 +86,10 @@ def _places(solution: RigSolution) -> dict[str, tuple[Array, list[str], list[boo
 
 
 def _draw_plan(axes: Axes, solution: RigSolution) -> None:
-    centres = _flat(solution, solution.centre.numpy())
-    middle = centres.mean(0)
+    centers = _flat(solution, solution.center.numpy())
+    middle = centers.mean(0)
     places = _places(solution)
-    spans = [np.hypot(*(centres - middle).T)] + [np.hypot(*(xy - middle).T) for xy, _, _ in places.values()]
+    spans = [np.hypot(*(centers - middle).T)] + [np.hypot(*(xy - middle).T) for xy, _, _ in places.values()]
     reach = max(float(np.max(span)) for span in spans) * 1.15
     nearest = min((float(np.min(span)) for span in spans[1:]), default=reach)
     unit = max(nearest / 2.0, reach / 1000.0)
@@ -114,23 +114,23 @@ def _draw_plan(axes: Axes, solution: RigSolution) -> None:
         style: dict[str, Any] = {
             "linestyle": "none",
             "markersize": 6,
-            "color": _COLOURS[kind],
+            "color": _COLORS[kind],
             "markerfacecolor": "white",
         }
         axes.plot(*drawn[good].T, marker=marker, label=kind, **style)
         axes.plot(*drawn[~good].T, marker="x", color=_WRONG, linestyle="none", markersize=8, markeredgewidth=1.8)
         for xy, name, fine in zip(drawn, names, used, strict=True):
             if not fine or (kind == "landmarks" and len(names) <= 30):
-                colour = _COLOURS[kind] if fine else _WRONG
+                color = _COLORS[kind] if fine else _WRONG
                 axes.annotate(
-                    name, (float(xy[0]), float(xy[1])), (6, 0), textcoords="offset points", fontsize=8, color=colour,
+                    name, (float(xy[0]), float(xy[1])), (6, 0), textcoords="offset points", fontsize=8, color=color,
                     va="center",
                 )  # fmt: skip
     if any(not item.used for item in solution.items):
         axes.plot([], [], "x", color=_WRONG, markeredgewidth=1.8, label="left out")
     looks = solution.rotation[:, 2].numpy()
     for c, name in enumerate(solution.names):
-        here = place(centres[c])
+        here = place(centers[c])
         ahead = _flat(solution, looks[c])
         ahead = ahead / max(float(np.hypot(*ahead)), 1e-9)
         axes.annotate(
@@ -138,7 +138,7 @@ def _draw_plan(axes: Axes, solution: RigSolution) -> None:
             arrowprops={"arrowstyle": "-|>", "color": "#111827", "linewidth": 1.2},
         )  # fmt: skip
         axes.plot(*here, "o", color=_CAMERAS[c % len(_CAMERAS)], markersize=6, zorder=5, label=f"{name} camera")
-    seen = np.concatenate([place(centres), *(place(points) for points, _, _ in places.values())])
+    seen = np.concatenate([place(centers), *(place(points) for points, _, _ in places.values())])
     low, high = seen.min(0) - 0.1, seen.max(0) + 0.15
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axes.axis("off")
@@ -157,7 +157,7 @@ def _draw_items(axes: Axes, solution: RigSolution) -> None:
     limit = max([3.5, *(min(item.sigmas, 8.0) for item in items)]) * 1.05
     for row, item in enumerate(items):
         length = min(item.sigmas, limit)
-        axes.barh(row, length, color=_COLOURS[item.source] if item.used else _WRONG, height=0.7, alpha=0.85)
+        axes.barh(row, length, color=_COLORS[item.source] if item.used else _WRONG, height=0.7, alpha=0.85)
         if item.sigmas > limit:
             axes.text(limit * 0.99, row, f"{item.sigmas:.0f} ▸", ha="right", va="center", fontsize=7.5, color="white")
     axes.axvline(1.0, color="#374151", linewidth=0.9, linestyle=(0, (4, 3)))

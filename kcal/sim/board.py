@@ -1,4 +1,4 @@
-"""The simulator's checkerboard: its size, its pose, its true corners, and its colours averaged over small areas."""
+"""The simulator's checkerboard: its size, its pose, its true corners, and its colors averaged over small areas."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ class RigLike(Protocol):
 
     @property
     def right_from_left_translation(self) -> Tensor:
-        """(3,) metres."""
+        """(3,) meters."""
 
     @property
     def baseline(self) -> Tensor:
-        """Distance between the cameras, metres."""
+        """Distance between the cameras, meters."""
 
     def right_from_left(self, points_left: Tensor) -> Tensor:
         """Move points (..., N, 3) from the left camera's frame into the right camera's."""
@@ -62,7 +62,7 @@ class RigLike(Protocol):
 
 
 class BoardLike(Protocol):
-    """Anything that says how many inner corners a board has and how large its squares are, in metres."""
+    """Anything that says how many inner corners a board has and how large its squares are, in meters."""
 
     @property
     def columns(self) -> int:
@@ -74,11 +74,11 @@ class BoardLike(Protocol):
 
     @property
     def square(self) -> float:
-        """Side of a square in metres."""
+        """Side of a square in meters."""
 
 
 class BoardSize(NamedTuple):
-    """A checkerboard with `columns` x `rows` inner corners and squares of `square` metres."""
+    """A checkerboard with `columns` x `rows` inner corners and squares of `square` meters."""
 
     columns: int
     rows: int
@@ -86,7 +86,7 @@ class BoardSize(NamedTuple):
 
 
 class BoardPose(NamedTuple):
-    """cam_from_board: `points_cam = rotation @ points_board + translation`; (3, 3) and (3,) float64 metres."""
+    """cam_from_board: `points_cam = rotation @ points_board + translation`; (3, 3) and (3,) float64 meters."""
 
     rotation: Tensor
     translation: Tensor
@@ -123,7 +123,7 @@ def check_pose(cam_from_board: tuple[Tensor, Tensor]) -> BoardPose:
 
 
 def board_points(board: BoardLike, border: int = 0) -> Tensor:
-    """Corner positions on the board, row by row: (columns * rows, 3) float64 metres, corner 0 at the origin.
+    """Corner positions on the board, row by row: (columns * rows, 3) float64 meters, corner 0 at the origin.
 
     With `border` the grid goes on by so many squares on every side; 1 reaches the outer edge of the outer squares.
 
@@ -169,14 +169,14 @@ def project_board(camera: LensLike, cam_from_board: tuple[Tensor, Tensor], board
     return pixels, valid & camera.inside(pixels)
 
 
-class Colours(NamedTuple):
+class Colors(NamedTuple):
     """Shares (0 to 1) of a small area that are paper (board and its white margin), and that are black squares."""
 
     paper: Tensor
     black: Tensor
 
 
-def area_colours(a: Tensor, b: Tensor, width_a: Tensor, width_b: Tensor, board: BoardLike, margin: int) -> Colours:
+def area_colors(a: Tensor, b: Tensor, width_a: Tensor, width_b: Tensor, board: BoardLike, margin: int) -> Colors:
     """The pattern averaged over boxes around board positions: exact integrals, so that edges never move.
 
     The black share of a checkerboard is (1 + q(a) q(b)) / 2 with a square wave q along each axis. Box averages of
@@ -194,7 +194,7 @@ def area_colours(a: Tensor, b: Tensor, width_a: Tensor, width_b: Tensor, board: 
     Example:
         >>> a = torch.tensor([-0.5, 0.5, 0.0], dtype=torch.float64)
         >>> narrow = torch.full_like(a, 0.1)
-        >>> area_colours(a, a[:1], narrow, narrow[:1], BoardSize(9, 6, 0.05), 1).black.round(decimals=9).abs().tolist()
+        >>> area_colors(a, a[:1], narrow, narrow[:1], BoardSize(9, 6, 0.05), 1).black.round(decimals=9).abs().tolist()
         [1.0, 0.0, 0.5]
     """
 
@@ -208,4 +208,4 @@ def area_colours(a: Tensor, b: Tensor, width_a: Tensor, width_b: Tensor, board: 
 
     paper_a, squares_a, wave_a = averages(a, width_a, board.columns)
     paper_b, squares_b, wave_b = averages(b, width_b, board.rows)
-    return Colours(paper_a * paper_b, 0.5 * (squares_a * squares_b + wave_a * wave_b))
+    return Colors(paper_a * paper_b, 0.5 * (squares_a * squares_b + wave_a * wave_b))

@@ -28,8 +28,8 @@ class Capture(NamedTuple):
         pixels: (V, N, 2) corners with noise, in the order of `board_points`.
         true_pixels: (V, N, 2) without.
         rotation: (V, 3, 3) cam_from_board.
-        translation: (V, 3) metres.
-        points: (N, 3) corners on the board, metres.
+        translation: (V, 3) meters.
+        points: (N, 3) corners on the board, meters.
     """
 
     pixels: Tensor
@@ -42,7 +42,7 @@ class Capture(NamedTuple):
 def drawn_lens(name: str, strength: float, seed: int, *, focal: float | None = None, wander: float = 0.1) -> TruthLens:
     """A ray-traced lens that was put together as badly as `strength` says: 1 is ordinary, 3 poor, 0 perfect.
 
-    For a strength of 1, one sigma along each axis: glass is decentred by the prescription's tolerance (22 µm of 2.8 mm
+    For a strength of 1, one sigma along each axis: glass is decentered by the prescription's tolerance (22 µm of 2.8 mm
     for the surveillance lens, with 0.2 degrees of tilt), the sensor is tilted by 0.2 degrees, and the axis meets it
     8 px from its middle.
 

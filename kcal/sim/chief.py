@@ -23,7 +23,7 @@ class Lines(NamedTuple):
     """The line of sight of each pixel: the points (x, y) + z (slope_x, slope_y) at every depth z.
 
     Attributes:
-        origins: (N, 2) metres, where it crosses the plane z = 0.
+        origins: (N, 2) meters, where it crosses the plane z = 0.
         slopes: (N, 2).
     """
 
@@ -45,14 +45,14 @@ class Lines(NamedTuple):
 class ChiefRays:
     """A lens with its sensor; see `build`.
 
-    Convention: the camera frame (x right, y down, z forward, metres) has its origin in the front vertex.
+    Convention: the camera frame (x right, y down, z forward, meters) has its origin in the front vertex.
 
     Args:
-        surfaces: of the lens, in metres.
+        surfaces: of the lens, in meters.
         stop: place of the aperture stop among them.
         sensor: its vertex (3,) and rotation (3, 3) in the lens's frame.
         axis: (2,) pixel at that vertex.
-        pitch: metres per pixel.
+        pitch: meters per pixel.
         name: for messages.
     """
 
@@ -73,7 +73,7 @@ class ChiefRays:
         misalignment: Misalignment,
         sensor_tilt: tuple[float, float],
     ) -> ChiefRays:
-        """A lens of `focal_mm` millimetres before a sensor on which that is `focal` pixels."""
+        """A lens of `focal_mm` millimeters before a sensor on which that is `focal` pixels."""
         scale = 1e-3 * focal_mm / focal_length(prescription)
         surfaces = place(prescription, 1e-3 * focal_mm, scale, misalignment)
         # Pieces of glass are moved, the barrel is not.

@@ -57,7 +57,7 @@ def error_at_infinity(camera: LensLike, truth: LensLike, *, columns: int = 49, r
         >>> from kcal.lens.camera import Camera
         >>> truth = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
         >>> camera = Camera.build(focal=(800, 800), center=(329.5, 239.5), size=(640, 480))
-        >>> found = error_at_infinity(camera, truth)  # a shifted centre is a rotation, nearly
+        >>> found = error_at_infinity(camera, truth)  # a shifted center is a rotation, nearly
         >>> round(found.rms, 2), round(found.maximum, 2), found.valid
         (0.62, 1.52, 1.0)
     """

@@ -109,7 +109,7 @@ def sample_pair_poses(
         board: its size.
         count: how many poses.
         generator: source of the draws; the same state gives the same poses.
-        distance: nearest and farthest distance of the board's centre from the left camera, metres.
+        distance: nearest and farthest distance of the board's center from the left camera, meters.
         options: limits of tilt, roll and margins.
 
     Returns:
@@ -175,8 +175,8 @@ def _draw(
         rays, _ = camera.unproject(aim)
     near, far = distance
     depth = near * (far / near) ** random[:, 2]
-    centre = rays * depth[:, None]
-    sight = centre - eye if eye is not None else centre
+    center = rays * depth[:, None]
+    sight = center - eye if eye is not None else center
     # Between a quarter of the largest tilt and all of it: boards square to the sight say nothing of the focal length.
     tilt, towards = options.max_tilt * (0.25 + 0.75 * random[:, 3]), 2 * math.pi * random[:, 4]
     roll = options.max_roll * (2 * random[:, 5] - 1)
@@ -186,7 +186,7 @@ def _draw(
     rotation = rotation @ rotation_from_vector(torch.stack([zero, zero, roll], -1))
     points = board_points(board)
     middle = 0.5 * (points[0] + points[-1])
-    translation = centre - rotation @ middle
+    translation = center - rotation @ middle
     features = [
         tilt / max(options.max_tilt, 1e-9) * torch.cos(towards),
         tilt / max(options.max_tilt, 1e-9) * torch.sin(towards),

@@ -1,7 +1,7 @@
 """Lens prescriptions: radii, thicknesses and refractive indices of real designs, and their paraxial properties.
 
 A prescription is what a lens designer publishes. Scaled to a focal length and traced ray by ray
-(`kcal.sim.raytrace`), it distorts as glass does, and no polynomial of kcal is in it. Lengths are millimetres and light
+(`kcal.sim.raytrace`), it distorts as glass does, and no polynomial of kcal is in it. Lengths are millimeters and light
 travels along +z, as in the literature; indices are those of the helium d line (587.6 nm).
 """
 
@@ -19,11 +19,11 @@ class Surface:
     """One refracting surface, z = c r² / (1 + sqrt(1 - (1 + conic) c² r²)) + even[0] r⁴ + even[1] r⁶ + ...
 
     Args:
-        radius: of curvature at the vertex, millimetres; positive if the centre lies behind it; infinite for a plane.
-        thickness: distance along the axis to the next surface, millimetres.
+        radius: of curvature at the vertex, millimeters; positive if the center lies behind it; infinite for a plane.
+        thickness: distance along the axis to the next surface, millimeters.
         index: refractive index behind the surface.
         conic: conic constant; 0 is a sphere.
-        even: aspheric coefficients of r⁴, r⁶ and on, in millimetres to the power of -3, -5 and on.
+        even: aspheric coefficients of r⁴, r⁶ and on, in millimeters to the power of -3, -5 and on.
     """
 
     radius: float
@@ -49,7 +49,7 @@ class Prescription:
             media.
         stop: its place in `surfaces`.
         focal: focal length in pixels with which its image covers 1920 x 1080.
-        tolerance: how well such lenses are put together: decentring of a piece of glass, one sigma along each axis, as
+        tolerance: how well such lenses are put together: decentering of a piece of glass, one sigma along each axis, as
             a share of the focal length. Strong aspheres forgive far less than spheres.
 
     Raises:
@@ -109,18 +109,18 @@ def system_matrix(prescription: Prescription) -> tuple[float, float, float, floa
 
 
 def focal_length(prescription: Prescription) -> float:
-    """Effective focal length, millimetres."""
+    """Effective focal length, millimeters."""
     return -1.0 / system_matrix(prescription)[2]
 
 
 def back_focus(prescription: Prescription) -> float:
-    """Distance from the last vertex to the image of a point at infinity, millimetres."""
+    """Distance from the last vertex to the image of a point at infinity, millimeters."""
     a, _, c, _ = system_matrix(prescription)
     return -a / c
 
 
 _PLANE = math.inf
-# Refractive indices at the d line, from the makers' catalogues.
+# Refractive indices at the d line, from the makers' catalogs.
 _N_SK4, _SF1 = 1.61272, 1.71736
 _N_SK10, _SK15, _BASF2, _FK3, _SF15, _N_LAK12 = 1.62278, 1.62299, 1.66446, 1.46450, 1.69895, 1.67790
 

@@ -1,4 +1,4 @@
-"""Sequential ray tracing through tilted and decentred surfaces, in float64 and for any number of rays at once.
+"""Sequential ray tracing through tilted and decentered surfaces, in float64 and for any number of rays at once.
 
 Each surface has its own frame: its vertex and a rotation. A ray is moved into that frame, meets the conic in closed
 form (aspheres by Newton's method) and is bent by Snell's law in vector form: with unit direction d, unit normal n
@@ -27,7 +27,7 @@ from kcal.sim.prescription import Prescription, Surface
 
 _NEWTON = 30
 _SETTLED = 1e-15
-# Tilt that goes with a decentring of one focal length, radians.
+# Tilt that goes with a decentering of one focal length, radians.
 _TILT = 0.436
 
 
@@ -54,17 +54,17 @@ class Misalignment:
     """How a lens was put together: per piece of glass, in the order of `Prescription.elements`.
 
     Args:
-        decentre: shift of each piece along x and y, in shares of the focal length.
+        decenter: shift of each piece along x and y, in shares of the focal length.
         tilt: turn of each piece about x and y through its first vertex, radians.
 
     Example:
         >>> from kcal.sim.prescription import PRESCRIPTIONS
         >>> drawn = Misalignment.draw(PRESCRIPTIONS["surveillance"], 1.0, torch.Generator().manual_seed(0))
-        >>> len(drawn.decentre), len(drawn.tilt)
+        >>> len(drawn.decenter), len(drawn.tilt)
         (7, 7)
     """
 
-    decentre: tuple[tuple[float, float], ...] = ()
+    decenter: tuple[tuple[float, float], ...] = ()
     tilt: tuple[tuple[float, float], ...] = ()
 
     @staticmethod
@@ -78,7 +78,7 @@ class Misalignment:
         shape = (2, len(prescription.elements), 2)
         drawn = strength * prescription.tolerance * torch.randn(shape, dtype=torch.float64, generator=generator)
         shifts, turns = drawn[0].tolist(), (_TILT * drawn[1]).tolist()
-        return Misalignment(decentre=tuple(map(tuple, shifts)), tilt=tuple(map(tuple, turns)))
+        return Misalignment(decenter=tuple(map(tuple, shifts)), tilt=tuple(map(tuple, turns)))
 
 
 def place(prescription: Prescription, focal: float, scale: float, misalignment: Misalignment) -> list[Placed]:
@@ -86,15 +86,15 @@ def place(prescription: Prescription, focal: float, scale: float, misalignment: 
 
     Args:
         prescription: of the lens.
-        focal: focal length after scaling; decentrings are shares of it.
-        scale: millimetres of the prescription are multiplied by it.
+        focal: focal length after scaling; decenterings are shares of it.
+        scale: millimeters of the prescription are multiplied by it.
         misalignment: empty, or one entry for each piece of glass.
 
     Raises:
         InputError: a misalignment for another number of pieces.
     """
     elements = prescription.elements
-    for name, entries in (("decentre", misalignment.decentre), ("tilt", misalignment.tilt)):
+    for name, entries in (("decenter", misalignment.decenter), ("tilt", misalignment.tilt)):
         if entries and len(entries) != len(elements):
             raise InputError(f"misalignment {name}: {len(entries)} entries for {len(elements)} pieces of glass")
     placed, z, before = [], 0.0, 1.0
@@ -111,7 +111,7 @@ def place(prescription: Prescription, focal: float, scale: float, misalignment: 
         z += scaled.thickness
         before = surface.index
     for i, (first, last) in enumerate(elements):
-        shift = torch.tensor([*misalignment.decentre[i], 0.0] if misalignment.decentre else [0.0] * 3).double() * focal
+        shift = torch.tensor([*misalignment.decenter[i], 0.0] if misalignment.decenter else [0.0] * 3).double() * focal
         turn = torch.tensor([*misalignment.tilt[i], 0.0] if misalignment.tilt else [0.0] * 3).double()
         rotation, pivot = rotation_from_vector(turn), placed[first].vertex
         for k in range(first, last + 1):

@@ -16,29 +16,29 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.sim.board import BoardLike, BoardPose, area_colours, board_points, check_board, check_pose
+from kcal.sim.board import BoardLike, BoardPose, area_colors, board_points, check_board, check_pose
 from kcal.sim.rectangle import Window, grow, pixel_axes
 from kcal.sim.window import AnyLens, invert_window
 
 _FAR = 1e9  # squares: nothing is painted there
-_REACH = 0.625  # pixels from a pixel's centre to where its outermost samples end
+_REACH = 0.625  # pixels from a pixel's center to where its outermost samples end
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions:
-    """How a rendered image looks; grey levels are 0 to 255.
+    """How a rendered image looks; gray levels are 0 to 255.
 
     Args:
-        black: grey level of the black squares.
+        black: gray level of the black squares.
         white: of the white squares and the margin.
         background: mean level around the board; it varies slowly by a fifth.
         margin: width of the white margin in squares.
         blur: sigma of the optics' Gaussian in pixels, on top of the averaging over the pixel's area; below 0.13 it is
             0.13.
-        noise: sigma of the sensor's noise in grey levels.
+        noise: sigma of the sensor's noise in gray levels.
         vignetting: share of light lost in the image's corners.
-        gamma: of the camera: grey levels are 255 times the share of light to the power of 1 / gamma. Blur and
-            vignetting act on light, noise on grey levels.
+        gamma: of the camera: gray levels are 255 times the share of light to the power of 1 / gamma. Blur and
+            vignetting act on light, noise on gray levels.
 
     Raises:
         InputError: a value out of range.
@@ -56,7 +56,7 @@ class RenderOptions:
     def __post_init__(self) -> None:
         for name in ("black", "white", "background"):
             if not 0 <= getattr(self, name) <= 255:
-                raise InputError(f"render option {name}: a grey level from 0 to 255 is needed")
+                raise InputError(f"render option {name}: a gray level from 0 to 255 is needed")
         for name, high in (("blur", 20.0), ("noise", 255.0), ("vignetting", 1.0)):
             if not 0 <= getattr(self, name) <= high:
                 raise InputError(f"render option {name}: a value from 0 to {high:g} is needed")
@@ -85,7 +85,7 @@ def render_board(
 
     Args:
         camera: a single camera, or a true lens.
-        cam_from_board: rotation (3, 3) and translation (3,) in metres.
+        cam_from_board: rotation (3, 3) and translation (3,) in meters.
         board: columns, rows and square.
         options: how the image looks.
         generator: source of the noise; needed when `options.noise` is not zero.
@@ -121,7 +121,7 @@ def render_light(
     board: BoardLike,
     options: RenderOptions | None = None,
 ) -> Tensor:
-    """The image as it falls on the sensor, before noise and rounding: (height, width) float64 grey levels.
+    """The image as it falls on the sensor, before noise and rounding: (height, width) float64 gray levels.
 
     Arguments and errors are those of `render_board`.
 
@@ -134,7 +134,7 @@ def render_light(
         [44.244125, 84.751421, 170.248754, 210.755908]
     """
     options = _in_light(options or RenderOptions())
-    if isinstance(camera, Camera) and camera.parameters_vector.ndim != 1:
+    if isinstance(camera, Camera) and camera.params.ndim != 1:
         raise InputError("render_board: a single camera is needed, got a batch")
     check_board(board)
     pose = check_pose(cam_from_board)
@@ -160,7 +160,7 @@ def _in_light(options: RenderOptions) -> RenderOptions:
 
 
 def _light(camera: AnyLens, pose: BoardPose, board: BoardLike, window: Window, options: RenderOptions) -> Tensor:
-    """The scene in grey levels, before the optics: (2 height, 2 width), four samples in each pixel of a window.
+    """The scene in gray levels, before the optics: (2 height, 2 width), four samples in each pixel of a window.
 
     Along x and y, a sample is the average over half a pixel, and of two such averages a quarter of a pixel apart: what
     sampling folds back is then too little to move a corner.
@@ -181,7 +181,7 @@ def _light(camera: AnyLens, pose: BoardPose, board: BoardLike, window: Window, o
     rows, columns = ((edge_a | edge_b) & near).nonzero(as_tuple=True)
     a, b, a_x, a_y, b_x, b_y, around = (value[rows, columns] for value in (a, b, a_x, a_y, b_x, b_y, around))
     # Boxes with the variance of a square of a quarter pixel along the board's axes: exact for straight edges along the
-    # pixels, and never off centre.
+    # pixels, and never off center.
     width_a = 0.25 * torch.hypot(a_x, a_y).clamp_min(1e-9)
     width_b = 0.25 * torch.hypot(b_x, b_y).clamp_min(1e-9)
     for i, j in itertools.product((0, 1), repeat=2):
@@ -202,8 +202,8 @@ def _slopes(grown: Tensor) -> tuple[Tensor, Tensor]:
 def _paint(
     a: Tensor, b: Tensor, width_a: Tensor, width_b: Tensor, board: BoardLike, options: RenderOptions, around: Tensor
 ) -> Tensor:
-    """Grey levels of boxes around board positions, where the background has the grey levels `around`."""
-    paper, black = area_colours(a, b, width_a, width_b, board, options.margin)
+    """Gray levels of boxes around board positions, where the background has the gray levels `around`."""
+    paper, black = area_colors(a, b, width_a, width_b, board, options.margin)
     return around + (options.white - around) * paper - (options.white - options.black) * black
 
 
@@ -246,7 +246,7 @@ def _paper_window(camera: AnyLens, pose: BoardPose, board: BoardLike, margin: in
 
 
 def _outline(board: BoardLike, border: int) -> Tensor:
-    """Points around the rectangle that lies `border` squares outside the inner corners, (4 * 64, 3) metres."""
+    """Points around the rectangle that lies `border` squares outside the inner corners, (4 * 64, 3) meters."""
     corners = board_points(board, border)
     columns = board.columns + 2 * border
     ring = corners[[0, columns - 1, -1, -columns, 0]]

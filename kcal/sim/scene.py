@@ -1,7 +1,7 @@
 """A simulated site with known truth: a rig of two CCTV cameras, its boards, landmarks and far targets.
 
 Its lenses are ray-traced, so that no lens model of kcal is the truth. What the calibration can do and what the marks
-allow is in docs/paper.md: with 0.05 px of noise in each image, marks alone leave 2 % of range at 5 km.
+allow is in docs/measured/paper.md: with 0.05 px of noise in each image, marks alone leave 2 % of range at 5 km.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from kcal.sim.poses import PoseOptions, rig_pose, sample_board_poses, sample_pai
 from kcal.sim.render import RenderOptions, render_board
 from kcal.sim.true_rig import TrueRig, drawn_rig
 
-# Name, horizontal distance in metres, degrees to the right of the heading, metres above the rig.
+# Name, horizontal distance in meters, degrees to the right of the heading, meters above the rig.
 _TARGETS = (
     ("gate", 100.0, -8.0, -9.0),
     ("shed", 250.0, 14.0, -7.0),
@@ -61,7 +61,7 @@ Places = tuple[tuple[str, float, float, float], ...]
 
 
 class NamedPoints(NamedTuple):
-    """Names, and positions (N, 3) in metres east, north and up of the left camera."""
+    """Names, and positions (N, 3) in meters east, north and up of the left camera."""
 
     names: tuple[str, ...]
     enu: Tensor
@@ -111,15 +111,15 @@ def demo_rig() -> TrueRig:
 class DemoScene:
     """Everything the demonstration is made of; the same seed gives the same bytes.
 
-    Convention: the rig frame is the left camera's; ENU has its origin in the left camera's centre. Rotations are in
+    Convention: the rig frame is the left camera's; ENU has its origin in the left camera's center. Rotations are in
     degrees here, as a site plan has them.
 
     Args:
         seed: of poses, noise and marks.
         rig: the true cameras.
-        lat: of the left camera's centre, degrees (WGS 84); a salt flat without anything in the way.
+        lat: of the left camera's center, degrees (WGS 84); a salt flat without anything in the way.
         lon: degrees east.
-        height: metres above the ellipsoid.
+        height: meters above the ellipsoid.
         heading_deg: azimuth of the left camera's axis, degrees clockwise from true north.
         pitch_deg: of that axis above the horizon, degrees.
         roll_deg: turn of the left camera about its axis, degrees, clockwise as seen from behind it.
@@ -127,12 +127,12 @@ class DemoScene:
         near_views: how many per camera.
         pair_board: for views of both cameras at once; every square is seen larger than 15 px.
         pair_views: how many.
-        pair_distance: nearest and farthest distance of that board, metres.
+        pair_distance: nearest and farthest distance of that board, meters.
         render: how images look.
         mark_sigma: noise of marks in pixels, for each axis and image.
-        survey_sigma: error of surveyed positions in metres, along each axis.
-        targets_at: what is to be located: name, distance in metres, bearing in degrees to the right of the heading,
-            height in metres.
+        survey_sigma: error of surveyed positions in meters, along each axis.
+        targets_at: what is to be located: name, distance in meters, bearing in degrees to the right of the heading,
+            height in meters.
         landmarks_at: the same of what was surveyed to orient the rig.
         checks_at: the same of what was surveyed to check it, and must not be used for anything else.
 
@@ -243,7 +243,7 @@ def mark_points(rig: RigLike, points_rig: Tensor, sigma: float, generator: torch
 
     Args:
         rig: two cameras.
-        points_rig: (N, 3) metres in the left camera's frame.
+        points_rig: (N, 3) meters in the left camera's frame.
         sigma: standard deviation in pixels, for each axis and image.
         generator: source of the noise.
 

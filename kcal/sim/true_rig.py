@@ -20,7 +20,7 @@ class TrueRig:
         left: the first camera, whose frame is the rig's.
         right: the second camera.
         right_from_left_rotation: (3, 3).
-        right_from_left_translation: (3,) metres.
+        right_from_left_translation: (3,) meters.
     """
 
     left: TruthLens
@@ -30,7 +30,7 @@ class TrueRig:
 
     @property
     def baseline(self) -> Tensor:
-        """Distance between the cameras' origins, metres."""
+        """Distance between the cameras' origins, meters."""
         return torch.linalg.vector_norm(self.right_from_left_translation)
 
     def right_from_left(self, points_left: Tensor) -> Tensor:
@@ -60,10 +60,10 @@ def drawn_rig(lens: str, strength: float, seed: int) -> TrueRig:
         (10.0, (1920, 1080))
     """
     rotation = rotation_from_vector(torch.tensor([0.003, 0.006, -0.008], dtype=torch.float64))
-    centre = torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64)
+    center = torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64)
     return TrueRig(
         left=drawn_lens(lens, strength, 2 * seed),
         right=drawn_lens(lens, strength, 2 * seed + 1),
         right_from_left_rotation=rotation,
-        right_from_left_translation=-rotation @ centre,
+        right_from_left_translation=-rotation @ center,
     )

@@ -1,8 +1,8 @@
 """`TruthLens`: a camera behind a ray-traced lens, for simulations in which no model of kcal may be the truth.
 
 Every pixel has its chief ray, and with it a line in front of the camera (`kcal.sim.chief`). These lines do not meet in
-one point: the entrance pupil wanders with the angle, as in any wide lens, and more where pieces of glass are decentred.
-The camera's origin is the point nearest to all lines. At infinity only their directions matter.
+one point: the entrance pupil wanders with the angle, as in any wide lens, and more where pieces of glass are
+decentered. The camera's origin is the point nearest to all lines. At infinity only their directions matter.
 
 The lines are kept as Chebyshev sums over the image and a margin, from which `unproject` reads and `project` solves by
 Newton's method; how far the sums are from direct tracing is measured when the lens is made (`table_error`).
@@ -34,7 +34,7 @@ _CHUNK = 1 << 14
 class TruthLens:
     """A camera whose lens is traced ray by ray.
 
-    Convention: as `kcal.lens.camera.Camera`: x right, y down, z forward, metres; pixel (0, 0) is the centre of the
+    Convention: as `kcal.lens.camera.Camera`: x right, y down, z forward, meters; pixel (0, 0) is the center of the
     first pixel. All tensors are float64; nothing here is differentiable.
 
     Args:
@@ -42,10 +42,10 @@ class TruthLens:
         focal: paraxial focal length in pixels; that of the prescription if left out. It scales the image, whatever
             the lens's own size.
         size: (width, height) in pixels.
-        center: pixel in which the barrel's axis meets the sensor; the image's centre if left out.
-        misalignment: how the glass is decentred and tilted; shares of the focal length, and radians.
+        center: pixel in which the barrel's axis meets the sensor; the image's center if left out.
+        misalignment: how the glass is decentered and tilted; shares of the focal length, and radians.
         sensor_tilt: turn of the sensor about x and y, radians.
-        focal_mm: focal length in millimetres. It says how large the lens is beside what it looks at, and with it how
+        focal_mm: focal length in millimeters. It says how large the lens is beside what it looks at, and with it how
             much the wandering pupil matters at close range.
         wander: share of the pupil's wander that is kept: 0 lets all lines meet, 1 is the whole of it. The default
             stands for a board ten times as large and as far away; no model of kcal knows of a wandering pupil, and
@@ -122,12 +122,12 @@ class TruthLens:
 
     @property
     def pupil_wander(self) -> float:
-        """Largest distance of a line of sight from the origin, metres."""
+        """Largest distance of a line of sight from the origin, meters."""
         at, heading = self.lines(self._probe(33)).spatial()
         return float(torch.linalg.vector_norm(torch.linalg.cross(at, heading), dim=-1).max())
 
     def inside(self, pixels: Tensor) -> Tensor:
-        """Whether pixels (..., N, 2) lie on the image, whose edges are half a pixel beyond the outer centres."""
+        """Whether pixels (..., N, 2) lie on the image, whose edges are half a pixel beyond the outer centers."""
         pixels = as_points("pixels", pixels, 2)
         return ((pixels >= -0.5) & (pixels <= torch.tensor(self.size, dtype=torch.float64) - 0.5)).all(-1)
 
@@ -199,7 +199,7 @@ class TruthLens:
     def _measure(self) -> float:
         share = torch.quasirandom.SobolEngine(2).draw(256, dtype=torch.float64)
         pixels = self.low + share * (self.high - self.low)
-        # Slopes and, as at a distance of one metre, places.
+        # Slopes and, as at a distance of one meter, places.
         off = self._table.values(pixels) - torch.cat(self.trace(pixels), -1)
         return float(off.abs().max() * self._focal)
 

@@ -28,7 +28,7 @@ def invert_window(lens: AnyLens, window: Window) -> tuple[Tensor, Tensor]:
 
     Returns:
         slopes x / z and y / z (height, width, 2), followed for a `TruthLens` by where the line of sight crosses the
-        plane z = 0 in metres (height, width, 4); and valid (height, width).
+        plane z = 0 in meters (height, width, 4); and valid (height, width).
 
     Example:
         >>> camera = Camera.build(focal=(400, 400), center=(159.5, 119.5), size=(320, 240))

@@ -12,7 +12,7 @@ from kcal.errors import InputError
 from kcal.solve.result import State, blend
 
 
-class DenseLinearisation:
+class DenseLinearization:
     """Normal equations of one dense Jacobian (..., R, P), columns scaled to length one."""
 
     def __init__(self, residuals: Tensor, jacobian: Tensor) -> None:
@@ -24,7 +24,7 @@ class DenseLinearisation:
         self._parts = 0.5 * (residuals * residuals).sum(-1), scale, normal, gradient
 
     @classmethod
-    def of_rows(cls, rows: Tensor) -> DenseLinearisation:
+    def of_rows(cls, rows: Tensor) -> DenseLinearization:
         """From (..., P + 1, R): the derivatives by each parameter, and last the residuals, by one product."""
         self = cls.__new__(cls)
         gram = rows @ rows.transpose(-1, -2)
@@ -37,17 +37,17 @@ class DenseLinearisation:
 
     @property
     def cost(self) -> Tensor:
-        """See `Linearisation`."""
+        """See `Linearization`."""
         return self._parts[0]
 
-    def blend(self, mask: Tensor, other: DenseLinearisation) -> DenseLinearisation:
-        """See `Linearisation.blend`."""
+    def blend(self, mask: Tensor, other: DenseLinearization) -> DenseLinearization:
+        """See `Linearization.blend`."""
         out = copy.copy(self)
         out._parts = blend(mask, self._parts, other._parts)
         return out
 
     def step(self, damping: Tensor) -> tuple[State, Tensor]:
-        """See `Linearisation.step`."""
+        """See `Linearization.step`."""
         _, scale, normal, gradient = self._parts
         identity = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
         factor, info = torch.linalg.cholesky_ex(normal + damping[..., None, None] * identity)
@@ -75,9 +75,9 @@ class DenseProblem:
         residuals = self._residuals(state)
         return 0.5 * (residuals * residuals).sum(-1)
 
-    def linearise(self, state: State) -> DenseLinearisation:
-        """See `Problem.linearise`."""
-        return DenseLinearisation(self._residuals(state), self._jacobian(state[0], *self._data))
+    def linearize(self, state: State) -> DenseLinearization:
+        """See `Problem.linearize`."""
+        return DenseLinearization(self._residuals(state), self._jacobian(state[0], *self._data))
 
     def _residuals(self, state: State) -> Tensor:
         residuals = self._value(state[0], *self._data)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.solve.result import State
-from kcal.solve.schur import SchurLinearisation
+from kcal.solve.schur import SchurLinearization
 
 # A cost (scalar) of a shared step (S,), a local step (V, L) and data.
 SteppedCost = Callable[..., Tensor]
@@ -61,7 +61,7 @@ class Curvature(NamedTuple):
     coupling: Tensor
     local: Tensor
 
-    def beside(self, shared: Tensor, local: Tensor) -> SchurLinearisation:
+    def beside(self, shared: Tensor, local: Tensor) -> SchurLinearization:
         """The system with this matrix and a right-hand side ((S,), (V, L)), whose undamped step is minus H⁻¹ times it.
 
         The same elimination as that of Gauss and Newton's normal equations: only the blocks are others.
@@ -70,7 +70,7 @@ class Curvature(NamedTuple):
         gram = self.local.new_zeros(len(self.local), L + S + 1, L + S + 1)
         gram[:, :L, :L], gram[:, :L, L:-1], gram[:, :L, -1] = self.local, self.coupling, local
         gram[0, L:-1, L:-1], gram[0, L:-1, -1] = self.shared, shared
-        return SchurLinearisation(gram, L)
+        return SchurLinearization(gram, L)
 
 
 def curvature(cost: SteppedCost, shared: Tensor, local: Tensor) -> tuple[State, Curvature]:

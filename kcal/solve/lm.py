@@ -30,7 +30,7 @@ _FEW = 4
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LMOptions:
-    """Options of `minimise`.
+    """Options of `minimize`.
 
     Args:
         max_iterations: trial steps at the most, rejected ones counted.
@@ -56,7 +56,7 @@ class LMOptions:
             raise InputError("LMOptions: initial_damping must be positive, residual_floor not negative")
 
 
-def minimise(
+def minimize(
     problem: Problem,
     start: State,
     options: LMOptions | None = None,
@@ -64,7 +64,7 @@ def minimise(
     *,
     unroll: bool = False,
 ) -> Result:
-    """Minimise half the sum of squares by Levenberg and Marquardt's method.
+    """Minimize half the sum of squares by Levenberg and Marquardt's method.
 
     θ_new = θ - (JᵀJ + λ D)⁻¹ Jᵀr, the paper's Eq. 6 with r = f(θ) - y and with D = diag(JᵀJ) in place of the
     identity, so that the units of the parameters do not matter. A step that raises the cost, or makes it NaN, is
@@ -83,12 +83,12 @@ def minimise(
         The best state with its status. Nothing is raised for a failure to converge: read `status`.
     """
     with torch.set_grad_enabled(unroll and torch.is_grad_enabled()):
-        return _minimise(problem, start, options or LMOptions(), callback)
+        return _minimize(problem, start, options or LMOptions(), callback)
 
 
-def _minimise(problem: Problem, start: State, options: LMOptions, callback: Callback | None) -> Result:
+def _minimize(problem: Problem, start: State, options: LMOptions, callback: Callback | None) -> Result:
     state = start
-    linear = problem.linearise(state)
+    linear = problem.linearize(state)
     device = linear.cost.device
 
     def on_host(values: Tensor) -> np.ndarray:
@@ -123,10 +123,10 @@ def _minimise(problem: Problem, start: State, options: LMOptions, callback: Call
                     values[kept] for values in (cost, damping, growth, status, iterations)
                 )
                 running = running[kept]
-                linear = problem.linearise(state)
+                linear = problem.linearize(state)
         step, decrease = linear.step(on_device(damping))
         candidate = problem.retract(state, step)
-        joint = problem.linearise(candidate) if problem.joint else None
+        joint = problem.linearize(candidate) if problem.joint else None
         new_cost = on_host(problem.cost(candidate) if joint is None else joint.cost)
         predicted = on_host(decrease)
         solved = np.isfinite(predicted)
@@ -167,7 +167,7 @@ def _minimise(problem: Problem, start: State, options: LMOptions, callback: Call
             status = np.where(status == 0, int(Status.INTERRUPTED), status)
         if (accept & (status == 0)).any():
             if joint is None:
-                linear = problem.linearise(state)
+                linear = problem.linearize(state)
             else:
                 linear = joint if accept.all() else linear.blend(on_device(accept), joint)
 
@@ -249,7 +249,7 @@ class LevenbergMarquardt(nn.Module):
         self.backward = backward
 
     def forward(self, start: Tensor, *data: Tensor, callback: Callback | None = None) -> Result:
-        """Minimise from `start` (..., P); each data tensor has the same leading shape (...).
+        """Minimize from `start` (..., P); each data tensor has the same leading shape (...).
 
         Returns:
             A `Result` with `x` (..., P) and a status for each element.
@@ -271,12 +271,12 @@ class LevenbergMarquardt(nn.Module):
                     f"{tuple(start.shape[:-1])}"
                 )
         if self.backward == "unroll":
-            return minimise(
+            return minimize(
                 DenseProblem(self.residual, start.shape[:-1], data), (start,), self.options, callback, unroll=True
             )
         constant = tuple(tensor.detach() for tensor in data)
         problem = DenseProblem(self.residual, start.shape[:-1], constant)
-        result = minimise(problem, (start.detach(),), self.options, callback)
+        result = minimize(problem, (start.detach(),), self.options, callback)
         if self.backward == "implicit" and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in data):
             x = attach_implicit_gradient(self.residual, result.x, result.converged, data)
             result = dataclasses.replace(result, state=(x,))

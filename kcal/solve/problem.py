@@ -9,7 +9,7 @@ from torch import Tensor
 from kcal.solve.result import State
 
 
-class Linearisation(Protocol):
+class Linearization(Protocol):
     """A problem near one state: cost, and the damped Gauss-Newton step.
 
     Every column of the Jacobian is scaled to length one first (Marquardt's scaling), so that the damping has no
@@ -49,7 +49,7 @@ class Problem(Protocol):
 
     @property
     def joint(self) -> bool:
-        """Whether a linearisation costs little more than the cost alone, so that trial states are linearised."""
+        """Whether a linearization costs little more than the cost alone, so that trial states are linearized."""
         ...
 
     @property
@@ -61,8 +61,8 @@ class Problem(Protocol):
         """Half the sum of squared residuals, (...)."""
         ...
 
-    def linearise(self, state: State) -> Any:
-        """The problem's linearisation at `state`."""
+    def linearize(self, state: State) -> Any:
+        """The problem's linearization at `state`."""
         ...
 
     def retract(self, state: State, step: State) -> State:

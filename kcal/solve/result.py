@@ -73,7 +73,7 @@ _MESSAGES = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Result:
-    """The outcome of `minimise`.
+    """The outcome of `minimize`.
 
     Args:
         state: the best state found, in the problem's own form.

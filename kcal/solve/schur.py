@@ -15,7 +15,7 @@ from torch import Tensor
 from kcal.solve.result import State, blend
 
 
-class SchurLinearisation:
+class SchurLinearization:
     """Normal equations built from what each view contributes.
 
     Args:
@@ -47,8 +47,8 @@ class SchurLinearisation:
         self._shared_gradient = gradient * self._shared_scale
         self.cost = 0.5 * total[..., -1, -1]
 
-    def blend(self, mask: Tensor, other: SchurLinearisation) -> SchurLinearisation:
-        """See `Linearisation.blend`."""
+    def blend(self, mask: Tensor, other: SchurLinearization) -> SchurLinearization:
+        """See `Linearization.blend`."""
         out = copy.copy(self)
         names = tuple(vars(self))
         old, new = (tuple(vars(one)[name] for name in names) for one in (self, other))
@@ -65,7 +65,7 @@ class SchurLinearisation:
         return matrix, self._shared_gradient - folded[..., -1], solved, (info != 0).any(-1)
 
     def step(self, damping: Tensor) -> tuple[State, Tensor]:
-        """See `Linearisation.step`; the step is (shared (..., S), local (..., V, L))."""
+        """See `Linearization.step`; the step is (shared (..., S), local (..., V, L))."""
         matrix, gradient, solved, failed = self._reduce(damping)
         factor, info = torch.linalg.cholesky_ex(matrix)
         shared = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
@@ -146,7 +146,7 @@ class SchurProblem(ABC):
         return None
 
     def shared_rows(self, state: State) -> Tensor | None:
-        """(..., S + 1, Q), see `SchurLinearisation`: priors and bounds; None where there are none."""
+        """(..., S + 1, Q), see `SchurLinearization`: priors and bounds; None where there are none."""
         return None
 
     def view_cost(self, state: State) -> Tensor:
@@ -165,6 +165,6 @@ class SchurProblem(ABC):
         rows = self.rows(state)
         return rows @ rows.transpose(-1, -2)
 
-    def linearise(self, state: State) -> SchurLinearisation:
-        """See `Problem.linearise`."""
-        return SchurLinearisation(self.gram(state), self.local_size, self.shared_rows(state))
+    def linearize(self, state: State) -> SchurLinearization:
+        """See `Problem.linearize`."""
+        return SchurLinearization(self.gram(state), self.local_size, self.shared_rows(state))

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import time
 from concurrent.futures import Future
-from pathlib import Path
 
 import cv2
 import pytest
@@ -191,7 +190,7 @@ class TestJobs:
         ("text", "message"),
         [
             ("name,images\na,east\n", "must name the columns"),
-            ("camera,images,colour\na,east,red\n", "must name the columns"),
+            ("camera,images,color\na,east,red\n", "must name the columns"),
             ("camera,images\n", "no camera"),
             ("camera,images\na,east,\n", "line 2: 2 fields"),
             ("camera,images\na,east\na,west\n", "two cameras"),
@@ -234,8 +233,7 @@ def test_every_piece_comes_back_when_workers_die(folder):
 
 def test_a_killed_run_continues_and_gives_the_same_table(folder, tmp_path):
     out, whole = tmp_path / "out", tmp_path / "whole"
-    script = Path(__file__).parents[2] / "scripts" / "calibrate_batch.py"
-    command = [sys.executable, str(script), str(folder), *WHAT, "--workers", "1", "-o"]
+    command = [sys.executable, "-m", "kcal", "batch", str(folder), *WHAT, "--workers", "1", "-o"]
     # A session of its own, so that the workers die with it: one that lived on could still finish a piece.
     running = subprocess.Popen(
         [*command, str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True

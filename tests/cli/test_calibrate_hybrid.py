@@ -9,7 +9,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-import kcal.calibrate.hybrid
+import kcal.calibrate.lensfit.hybrid
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
@@ -35,8 +35,8 @@ def observations(field: float) -> Observations:
         draw = torch.rand(6, dtype=torch.float64, generator=generator) - 0.5
         depth = 0.6 + 0.3 * draw[3]
         turn = rotation_from_vector(1.2 * draw[:3])
-        centre = torch.stack([0.9 * depth * draw[4], 0.6 * depth * draw[5], depth])
-        pixels, valid = camera.project((BOARD.points - BOARD.points.mean(0)) @ turn.T + centre)
+        center = torch.stack([0.9 * depth * draw[4], 0.6 * depth * draw[5], depth])
+        pixels, valid = camera.project((BOARD.points - BOARD.points.mean(0)) @ turn.T + center)
         if bool((valid & camera.inside(pixels)).all()):
             pixels = pixels + 0.05 * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
             views.append(View(name=f"{len(views):02d}.png", pixels=tuple((u, v) for u, v in pixels.tolist())))
@@ -47,8 +47,10 @@ def observations(field: float) -> Observations:
 def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder, and fewer models and units than the command's own."""
     models = ("opencv5", "opencv8")
-    few = functools.partial(kcal.calibrate.hybrid.HybridOptions, models=models, rivals=models, widths=(1.2, 0.6, 0.3))
-    monkeypatch.setattr(kcal.calibrate.hybrid, "HybridOptions", few)
+    few = functools.partial(
+        kcal.calibrate.lensfit.hybrid.HybridOptions, models=models, rivals=models, widths=(1.2, 0.6, 0.3)
+    )
+    monkeypatch.setattr(kcal.calibrate.lensfit.hybrid, "HybridOptions", few)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     return tmp_path

@@ -39,8 +39,8 @@ def observations(side: int, count: int, noise: float = 0.1) -> Observations:
         angle = 2.0 * math.pi * i / max(count, 5)
         tilt = torch.tensor([0.5 * math.cos(angle), 0.5 * math.sin(angle), 0.1 * i], dtype=torch.float64)
         rotation = rotation_from_vector(tilt)
-        centre = torch.tensor([0.05 * math.cos(2 * angle), 0.06 * math.sin(3 * angle), 0.75], dtype=torch.float64)
-        points = (BOARD.points - middle) @ rotation.T + centre
+        center = torch.tensor([0.05 * math.cos(2 * angle), 0.06 * math.sin(3 * angle), 0.75], dtype=torch.float64)
+        points = (BOARD.points - middle) @ rotation.T + center
         pixels: Tensor = RIG(points)[side]
         pixels = pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
         views.append(View(name=f"{('left', 'right')[side]}{i:02}.png", pixels=tuple(map(tuple, pixels.tolist()))))

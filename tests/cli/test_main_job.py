@@ -169,8 +169,8 @@ class TestBadInput:
         assert not Path("a.obs.json").exists()
 
     def test_no_board_in_any_image(self, run: Run) -> None:
-        grey = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
-        write_png("a.png", grey)
+        gray = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
+        write_png("a.png", gray)
         refused(run("detect", "a.png", "--board", "9x6", "--square", "25mm", "-o", "a.obs.json"), "a.png", "no board")
         assert not Path("a.obs.json").exists()
 

@@ -24,7 +24,7 @@ CAMERAS = [
     Camera.build(focal=(1611, 1610), center=(951, 546), size=(1920, 1080), coefficients=[-0.19, 0.05, -2e-4, 3e-4]),
 ]
 ROTATION = [enu_from_cam(16.0, -0.5, 0.4).T, enu_from_cam(16.2, -0.3, -0.2).T]
-CENTRE = torch.tensor([[2.0, -1.0, 3.0], [11.6, -3.7, 3.1]], dtype=torch.float64)
+CENTER = torch.tensor([[2.0, -1.0, 3.0], [11.6, -3.7, 3.1]], dtype=torch.float64)
 HEADER = "name,left_u,left_v,right_u,right_v"
 
 
@@ -33,13 +33,13 @@ def points(count: int, near: float, far: float, seed: int) -> Tensor:
     distance = near * (far / near) ** draw[:, :1]
     across, up = 0.7 * (draw[:, 1:2] - 0.5), 0.4 * (draw[:, 2:] - 0.5)
     right, down, ahead = ROTATION[0]
-    return CENTRE[0] + distance * (ahead + across * right - up * down)
+    return CENTER[0] + distance * (ahead + across * right - up * down)
 
 
 def marked(where: Tensor, seed: int, yaw: float = 0.0) -> Tensor:
     """(N, 2, 2) marks with 0.1 px of noise; the right camera turned by `yaw` radians."""
     turns = rotation_from_vector(torch.tensor([[0.0, 0, 0], [0, yaw, 0]], dtype=torch.float64))
-    sides = [CAMERAS[c].project((where - CENTRE[c]) @ (turns[c] @ ROTATION[c]).T)[0] for c in (0, 1)]
+    sides = [CAMERAS[c].project((where - CENTER[c]) @ (turns[c] @ ROTATION[c]).T)[0] for c in (0, 1)]
     exact = torch.stack(sides, 1)
     return exact + 0.1 * torch.randn(exact.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
@@ -68,7 +68,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     rows = [
         (f"peak{i}", *a, *b, distance, 0.1 * distance)
         for i, ((a, b), distance) in enumerate(
-            zip(marked(far, 3).tolist(), (far - CENTRE.mean(0)).norm(dim=-1).tolist(), strict=True)
+            zip(marked(far, 3).tolist(), (far - CENTER.mean(0)).norm(dim=-1).tolist(), strict=True)
         )
     ]
     table(tmp_path / "far.csv", f"{HEADER},range,range_sigma", rows)
@@ -77,7 +77,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     now = marked(static, 5, math.radians(0.01))
     now[3] += 9.0
     marks_table(tmp_path / "now.csv", "s", now)
-    positions = enu_to_geodetic(CENTRE, ORIGIN).tolist()
+    positions = enu_to_geodetic(CENTER, ORIGIN).tolist()
     table(tmp_path / "gnss.csv", "name,lat,lon,height,sigma,sigma_up", [
         (name, *place, 0.02, 0.04) for name, place in zip(("left", "right"), positions, strict=True)
     ])  # fmt: skip
@@ -117,7 +117,7 @@ def test_from_survey_to_positions(
     stands = file.mounting
     assert stands is not None
     assert stands.covariance is not None
-    true = enu_to_geodetic(CENTRE[0], ORIGIN).tolist()
+    true = enu_to_geodetic(CENTER[0], ORIGIN).tolist()
     assert [stands.lat, stands.lon] == pytest.approx(true[:2], abs=1e-6)
     assert stands.height == pytest.approx(true[2], abs=4.5 * stands.covariance[2][2] ** 0.5)
     assert stands.heading_deg == pytest.approx(16.0, abs=4.5 * math.degrees(stands.covariance[5][5] ** 0.5))
@@ -191,7 +191,7 @@ def test_check_by_landmarks(site: Path, monkeypatch: pytest.MonkeyPatch, capsys:
     ("arguments", "message"),
     [
         (["--landmarks", "survey.csv"], "--landmarks and --marks belong together"),
-        (["--features", "far.csv", "--baseline", "10"], "write LENGTH±SIGMA in metres"),
+        (["--features", "far.csv", "--baseline", "10"], "write LENGTH±SIGMA in meters"),
         (["--features", "far.csv"], "nothing tells where right stands"),
         (["--landmarks", "survey.csv", "--marks", "then.csv"], "names must be the same in both files"),
         (["--landmarks", "survey.csv", "--marks", "marks.csv", "--refine-cameras"], "are for boards only"),

@@ -44,7 +44,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 
 @pytest.mark.parametrize(("kind", "channels"), [(np.uint8, 1), (np.uint8, 3), (np.uint16, 1), (np.uint16, 3)])
-def test_depth_and_colours_are_kept(
+def test_depth_and_colors_are_kept(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kind: type, channels: int
 ) -> None:
     image = picture(kind, channels)
@@ -54,7 +54,7 @@ def test_depth_and_colours_are_kept(
     assert "1 of 1 images undistorted, 64x48 px" in printed
 
     camera = load_camera(folder / "new/out/left_undistorted.json")
-    assert torch.equal(camera.parameters_vector, new_pinhole(CAMERA, 1).parameters_vector)
+    assert torch.equal(camera.params, new_pinhole(CAMERA, 1).params)
     stored = decode_image((folder / "new/out/a[1].png").read_bytes(), "a")
     assert stored.dtype == kind
     expected, mask = Undistort(CAMERA, camera)(torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1))

@@ -4,7 +4,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from kcal.calibrate.mono import calibrate_camera
+from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.charuco import free_side, marker_cells
@@ -16,12 +16,12 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 
 BOARD = Board.parse("charuco:9x6", "25mm")
-FINE = 8  # printed pixels a millimetre
+FINE = 8  # printed pixels a millimeter
 
 
 @pytest.fixture(scope="module")
 def paper():
-    """The printed page, FINE pixels a millimetre, 1 white; and where corner 0 is, in millimetres."""
+    """The printed page, FINE pixels a millimeter, 1 white; and where corner 0 is, in millimeters."""
     drawing = board_sheet(BOARD, "A4").drawing
     page = np.ones((round(drawing.height * FINE), round(drawing.width * FINE)), np.float32)
     for r in drawing.rectangles:
@@ -41,8 +41,8 @@ def shoot(paper, camera, rotation, translation, seed=0):
         for dx in (-0.25, 0.25):
             pixels = camera.grid(width, height) + torch.tensor([dx, dy], dtype=torch.float64)
             rays = camera.unproject(pixels)[0] @ rotation  # into the board's frame
-            centre = -rotation.T @ translation
-            hit = centre + rays * (-centre[2] / rays[..., 2])[..., None]
+            center = -rotation.T @ translation
+            hit = center + rays * (-center[2] / rays[..., 2])[..., None]
             where = (1000 * hit[..., :2] + origin) * scale - 0.5
             size = torch.tensor([page.shape[-1] - 1.0, page.shape[-2] - 1.0], dtype=torch.float64)
             sample = torch.nn.functional.grid_sample(
@@ -110,7 +110,7 @@ class TestDetection:
         found = detect_board(image, BOARD)
         error = found.pixels - truth
         assert bool(torch.isfinite(error).all())
-        # 0.03: a window of 6 px, and the page is drawn on a grid of half a millimetre.
+        # 0.03: a window of 6 px, and the page is drawn on a grid of half a millimeter.
         assert float(error.square().mean().sqrt()) < 0.03
         assert found.covariance is not None
 

@@ -9,7 +9,7 @@ from board_render import homography, render
 
 from kcal.corners.board import Board
 from kcal.corners.detect import _find_sector, detect_board, detect_images
-from kcal.corners.images import read_grey
+from kcal.corners.images import read_gray
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 
@@ -95,7 +95,7 @@ def test_a_part_of_the_board_is_not_the_board():
 @pytest.mark.parametrize(("columns", "rows"), [(8, 6), (7, 6), (5, 5)])
 def test_a_part_of_a_real_board_is_not_the_board(stereo, columns, rows):
     part = Board(columns=columns, rows=rows, square=0.025)
-    found = [detect_board(read_grey(path), part) for path in stereo[::6]]
+    found = [detect_board(read_gray(path), part) for path in stereo[::6]]
     assert all(one.pixels is None for one in found)
     assert sum("go on beyond" in one.reason or "uneven" in one.reason for one in found) >= 2
 
@@ -229,7 +229,7 @@ def test_real_calibration_reaches_the_known_residual(stereo):
 def test_detection_does_not_depend_on_what_was_called_before(stereo):
     # With 3x3 the second detector finds some part of the board, and which one depends on OpenCV's random numbers.
     part = Board(columns=3, rows=3, square=0.025)
-    images = [read_grey(path) for path in stereo[::5]]
+    images = [read_gray(path) for path in stereo[::5]]
 
     def corners(seed):
         cv2.setRNGSeed(seed)

@@ -10,12 +10,12 @@ from board_render import homography, render
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kcal.calibrate.mono import CalibrationOptions, calibrate_camera
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.board import Board
 from kcal.corners.crossing import NAMES, Beside, crossing
 from kcal.corners.detect import detect_images
 from kcal.corners.erf import ErfRefine, erf_saddle
-from kcal.corners.grid import line_bend, local_side, neighbours
+from kcal.corners.grid import line_bend, local_side, neighbors
 from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import Status
 from kcal.errors import InputError
@@ -143,8 +143,8 @@ class TestFit:
         ratio = predicted.diagonal(dim1=-2, dim2=-1).mean().sqrt() / errors.square().mean().sqrt()
         # 240 numbers know their own spread to 5 %; the aim is 20 %.
         assert 0.8 < float(ratio) < 1.2
-        normalised = torch.linalg.solve_triangular(torch.linalg.cholesky(predicted), errors[..., None], upper=False)
-        assert 0.8 < float(normalised.square().mean().sqrt()) < 1.2
+        normalized = torch.linalg.solve_triangular(torch.linalg.cholesky(predicted), errors[..., None], upper=False)
+        assert 0.8 < float(normalized.square().mean().sqrt()) < 1.2
 
     def test_blur_is_that_of_the_image(self):
         for blur in (0.7, 1.0, 1.5):
@@ -201,7 +201,7 @@ class TestFit:
         # 0.001 without the curve: the renderer's sampling.
         assert float((found.pixels - truth).square().mean().sqrt()) < 0.002
 
-    def test_grey_scale_does_not_matter(self):
+    def test_gray_scale_does_not_matter(self):
         # An offset does, a little: light multiplies what is there, and black would not be black.
         image, _, start, side = scene(20)
         image = torch.from_numpy(image).double()
@@ -240,7 +240,7 @@ class TestGradient:
             return erf_saddle(image + torch.nn.functional.pad(middle, (14, 14, 14, 14)), start, 16.0).pixels
 
         middle = torch.zeros(5, 5, dtype=torch.float64, requires_grad=True)
-        # The minimum is found to about 1e-7 px, over a difference of 0.1 grey levels.
+        # The minimum is found to about 1e-7 px, over a difference of 0.1 gray levels.
         assert torch.autograd.gradcheck(corner, (middle,), eps=0.1, atol=2e-6)
 
     def test_is_finite_with_bad_corners_about(self):
@@ -307,7 +307,7 @@ class TestRejection:
         with pytest.raises(InputError, match="positive"):
             erf_saddle(image, pixels, -1.0)
         with pytest.raises(InputError, match="around"):
-            erf_saddle(image, pixels, 10.0, around=neighbours(torch.zeros(4, 2), 2, 2))
+            erf_saddle(image, pixels, 10.0, around=neighbors(torch.zeros(4, 2), 2, 2))
         assert erf_saddle(image, torch.zeros(0, 2), torch.zeros(0)).pixels.shape == (0, 2)
 
 
@@ -355,10 +355,10 @@ class TestNoise:
         assert 0.75 < float(ratio) < 1.25  # 240 numbers know their own spread to 5 %; the aim is 20 %
 
 
-class TestNeighbours:
+class TestNeighbors:
     def test_perspective_is_foreseen_at_the_border(self):
         _, truth, _, _ = scene(20, tilt=(0.2, 0.15))
-        around = neighbours(truth, 5, 4)
+        around = neighbors(truth, 5, 4)
         size = int(20 * 7.5) + 24, int(20 * 6.5) + 24
         # The board with one more square on each side has the outer squares' ends among its corners.
         bigger = Board(columns=7, rows=6, square=0.02)
@@ -384,9 +384,9 @@ class TestNeighbours:
         _, truth, _, _ = scene(20)
         seen = truth.clone()
         truth[6] = math.nan
-        around = neighbours(truth, 5, 4)
+        around = neighbors(truth, 5, 4)
         # Corner 7's step follows from the corners on its other side; corner 6 has nothing.
-        torch.testing.assert_close(around.step[7, 0], neighbours(seen, 5, 4).step[7, 0], rtol=0, atol=1e-9)
+        torch.testing.assert_close(around.step[7, 0], neighbors(seen, 5, 4).step[7, 0], rtol=0, atol=1e-9)
         assert bool(torch.isnan(around.step[6]).all())
         assert bool(torch.isfinite(around.change).all())
 

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kcal.corners.images import decode_grey, expand_images, read_grey, to_8bit, unique_names
+from kcal.corners.images import decode_gray, expand_images, read_gray, to_8bit, unique_names
 from kcal.errors import FileError, InputError
 
 
@@ -13,8 +13,8 @@ from kcal.errors import FileError, InputError
 def picture():
     y, x = np.mgrid[:120, :160]
     rng = np.random.default_rng(0)
-    grey = np.where((x // 20 + y // 20) % 2 == 0, 60, 200) + rng.normal(0, 8, x.shape)
-    return np.clip(grey, 0, 255).astype(np.uint8)
+    gray = np.where((x // 20 + y // 20) % 2 == 0, 60, 200) + rng.normal(0, 8, x.shape)
+    return np.clip(gray, 0, 255).astype(np.uint8)
 
 
 def encoded(picture, suffix, *options):
@@ -23,14 +23,14 @@ def encoded(picture, suffix, *options):
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff", ".bmp", ".pgm"])
 def test_lossless_formats_are_exact(picture, suffix):
-    assert (decode_grey(encoded(picture, suffix), "x") == picture).all()
+    assert (decode_gray(encoded(picture, suffix), "x") == picture).all()
 
 
 def test_sixteen_bits_stay_sixteen(picture, tmp_path):
     deep = picture.astype(np.uint16) * 200 + 7
     for suffix in (".png", ".tiff"):
         (tmp_path / f"deep{suffix}").write_bytes(encoded(deep, suffix))
-        image = read_grey(tmp_path / f"deep{suffix}")
+        image = read_gray(tmp_path / f"deep{suffix}")
         assert image.dtype == np.uint16
         assert (image == deep).all()
 
@@ -42,7 +42,7 @@ def test_exif_orientation_is_ignored(picture):
     plain = encoded(picture, ".jpg")
     turned = plain[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + plain[2:]
     assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (160, 120)  # the tag works
-    assert (decode_grey(turned, "x") == decode_grey(plain, "x")).all()
+    assert (decode_gray(turned, "x") == decode_gray(plain, "x")).all()
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
@@ -50,31 +50,31 @@ def test_exif_orientation_is_ignored(picture):
 def test_truncated_files_are_refused(picture, suffix, share, capfd):
     data = encoded(picture, suffix)
     with pytest.raises(FileError, match=r"cut\.img: .*(truncated|not an image)"):
-        decode_grey(data[: int(len(data) * share)], "cut.img")
+        decode_gray(data[: int(len(data) * share)], "cut.img")
     assert capfd.readouterr().err == ""  # no decoder talks to the user
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="libjpeg's messages cannot be caught there")
-def test_jpeg_that_the_decoder_would_fill_with_grey_is_refused(picture, capfd):
+def test_jpeg_that_the_decoder_would_fill_with_gray_is_refused(picture, capfd):
     data = encoded(picture, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 95)
     patched = data[: len(data) // 2] + b"\xff\xd9"
     assert cv2.imdecode(np.frombuffer(patched, np.uint8), cv2.IMREAD_GRAYSCALE) is not None  # OpenCV says nothing
     capfd.readouterr()
     with pytest.raises(FileError, match="Corrupt JPEG data"):
-        decode_grey(patched, "patched.jpg")
+        decode_gray(patched, "patched.jpg")
     assert capfd.readouterr().err == ""
 
 
 def test_spare_bytes_before_the_end_of_a_jpeg_are_harmless(picture):
     data = encoded(picture, ".jpg")
-    assert (decode_grey(data[:-2] + bytes(17) + data[-2:], "x") == decode_grey(data, "x")).all()
+    assert (decode_gray(data[:-2] + bytes(17) + data[-2:], "x") == decode_gray(data, "x")).all()
 
 
 def test_decoding_without_an_error_stream(picture):
     saved = os.dup(2)
     os.close(2)
     try:
-        image = decode_grey(encoded(picture, ".png"), "x")
+        image = decode_gray(encoded(picture, ".png"), "x")
     finally:
         os.dup2(saved, 2)
         os.close(saved)
@@ -87,7 +87,7 @@ def test_decoding_without_an_error_stream(picture):
         (b"", "the file is empty"),
         (b"these are words, no image", "not an image"),
         (encoded(np.arange(64, dtype=np.uint8).reshape(8, 8), ".png"), "8x8 pixels are too few"),
-        (encoded(np.full((50, 50), 128, np.uint8), ".png"), "same grey level"),
+        (encoded(np.full((50, 50), 128, np.uint8), ".png"), "same gray level"),
         (encoded(np.random.default_rng(0).random((50, 50), np.float32), ".tiff"), "float32"),
     ],
 )
@@ -95,16 +95,16 @@ def test_useless_files_say_why(tmp_path, content, message):
     path = tmp_path / "x.png"
     path.write_bytes(content)
     with pytest.raises(FileError, match=message) as caught:
-        read_grey(path)
+        read_gray(path)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
 
 
 def test_missing_file_and_folder(tmp_path):
     with pytest.raises(FileError, match="No such file"):
-        read_grey(tmp_path / "none.png")
+        read_gray(tmp_path / "none.png")
     with pytest.raises(FileError, match=r"directory|Permission"):
-        read_grey(tmp_path)
+        read_gray(tmp_path)
 
 
 def test_to_8bit_ignores_hot_pixels_and_keeps_order():

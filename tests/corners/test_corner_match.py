@@ -25,7 +25,7 @@ class TestEnlarge:
         view = enlarge(torch.rand(50, 70), torch.tensor([30.4, 20.0]))
         pixels = torch.tensor([[30.37, 19.81], [18.0, 8.0]], dtype=torch.float64)
         torch.testing.assert_close(view.to_image(view.from_image(pixels)), pixels, rtol=0, atol=1e-12)
-        # The crop's first pixel covers ten of the patch, its centre lies between the fifth and the sixth.
+        # The crop's first pixel covers ten of the patch, its center lies between the fifth and the sixth.
         assert view.from_image(pixels[1]).tolist() == [4.5, 4.5]
 
     def test_a_ramp_keeps_its_place(self):
@@ -100,8 +100,8 @@ def stereo(distance=60.0, noise=0.0, seed=0):
     ):
         rays, _ = camera.unproject(camera.grid(320, 240))
         rays = rays @ R  # into the left frame
-        centre = -R.T @ t
-        wall = centre + rays * ((distance - centre[2]) / rays[..., 2])[..., None]
+        center = -R.T @ t
+        wall = center + rays * ((distance - center[2]) / rays[..., 2])[..., None]
         image = texture(3, wall[..., :2] / distance)
         images.append(image + noise * torch.randn(image.shape, generator=generator, dtype=torch.float64))
     return rig, *images
@@ -149,7 +149,7 @@ class TestMatch:
     def test_a_shifted_camera_shows_beside_the_line(self):
         # Half a pixel of vertical misalignment: the match follows the image, and says how far off the line it is.
         rig, left, right = stereo()
-        parameters = rig.right.parameters_vector.clone()
+        parameters = rig.right.params.clone()
         parameters[3] += 0.5
         crooked = StereoRig(
             rig.left,

@@ -103,7 +103,7 @@ def test_cell_levels_and_first_square():
     image, truth = flat(board, 10)
     levels = cell_levels(image, truth, 5, 4)
     assert levels.shape == (3, 4)
-    assert float(levels[0, 0]) == pytest.approx(40, abs=3)  # dark grey of the renderer, noise 1
+    assert float(levels[0, 0]) == pytest.approx(40, abs=3)  # dark gray of the renderer, noise 1
     assert float(levels[0, 1]) == pytest.approx(215, abs=3)
     assert first_square_dark(image, truth, 5, 4) == (True, 1.0)
     light_first, _ = flat(board, 10, dark_first=False)

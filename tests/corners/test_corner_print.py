@@ -29,7 +29,7 @@ def svg_rectangles(text):
 
 
 def pdf_rectangles(data, height):
-    """Rectangles in millimetres from the top left, read back from the page's content."""
+    """Rectangles in millimeters from the top left, read back from the page's content."""
     found = np.array(re.findall(rb"([-\d.]+) ([-\d.]+) ([-\d.]+) ([-\d.]+) re", data), dtype=float) * 25.4 / 72
     found[:, 1] = height - found[:, 1] - found[:, 3]
     return found
@@ -55,7 +55,7 @@ def test_what_is_printed_is_what_is_detected():
     drawing = board_sheet(A4).drawing
     found = detect_board(raster(drawing), A4)
     corner = drawing.rectangles[0]
-    # Corner 0 is the inner corner of the black square at the top left; a pixel's centre lies half a pixel in.
+    # Corner 0 is the inner corner of the black square at the top left; a pixel's center lies half a pixel in.
     expected = np.array([corner.x + 25, corner.y + 25]) * 4 - 0.5
     np.testing.assert_allclose(found.pixels[0].numpy(), expected, rtol=0, atol=1e-3)
     np.testing.assert_allclose(found.pixels[9].numpy(), expected + np.array([0, 100]), rtol=0, atol=1e-3)

@@ -75,7 +75,7 @@ def test_methods_agree():
         assert float((other.pixels - ours).abs().nan_to_num().max()) < 0.08
 
 
-def test_grey_scale_and_offset_do_not_matter():
+def test_gray_scale_and_offset_do_not_matter():
     image, _, start, side = scene(20)
     image = torch.from_numpy(image).double()
     one = saddle(image, start, side).pixels
@@ -134,8 +134,8 @@ def test_gradient_with_respect_to_the_image():
     image = image + 0.05 * torch.sin(0.9 * x)[None] * torch.cos(0.7 * x)[:, None]
     start = torch.tensor([[16.0, 16.0]], dtype=torch.float64)
 
-    def corner(centre):
-        canvas = torch.nn.functional.pad(centre, (14, 14, 14, 14)) + image
+    def corner(center):
+        canvas = torch.nn.functional.pad(center, (14, 14, 14, 14)) + image
         return saddle(canvas, start, 20.0).pixels
 
     # Bilinear sampling has kinks, none of them within the finite difference here.

@@ -50,7 +50,7 @@ class TestVideo:
         assert seen.names == ("shots.avi#000002", "shots.avi#000009", "shots.avi#000016")
         assert seen.image_size == SIZE
         for pixels, place in zip(seen.pixels(), places[:3], strict=True):
-            # JPEG frames of a codec with colour at half resolution.
+            # JPEG frames of a codec with color at half resolution.
             assert float((pixels - still(place)[1]).abs().max()) < 0.1
 
     def test_frames_and_a_limit(self, video):

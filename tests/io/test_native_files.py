@@ -88,7 +88,7 @@ class TestCamera:
     def test_round_trip_is_exact(self, tmp_path: Path, model: str | LensModel) -> None:
         before = awkward_camera(model)
         after = load_camera(save_camera(before, tmp_path / "camera.json"))
-        assert torch.equal(after.parameters_vector, before.parameters_vector)
+        assert torch.equal(after.params, before.params)
         assert (after.model, after.size, after.fingerprint) == (before.model, before.size, before.fingerprint)
 
     def test_record_round_trip(self, tmp_path: Path, camera: Camera) -> None:
@@ -203,7 +203,7 @@ class TestCamera:
         content["coefficients"] = dict(reversed(content["coefficients"].items()))
         path = tmp_path / "reordered.json"
         path.write_text(json.dumps(content))
-        assert torch.equal(load_camera(path).parameters_vector, camera.parameters_vector)
+        assert torch.equal(load_camera(path).params, camera.params)
 
     @pytest.mark.parametrize(
         ("path_in_file", "value", "message"),
@@ -224,7 +224,7 @@ class TestCamera:
             (["calibration", "views"], 3, "per_view_rms has 2"),
             (["calibration", "created"], "2026-01-01T00:00:00", "timezone"),
             (["version"], 2, "version 2"),
-            (["colour"], "red", "Extra"),
+            (["color"], "red", "Extra"),
         ],
     )
     def test_wrong_field(
@@ -256,10 +256,10 @@ class TestCamera:
         with pytest.raises(InputError, match="finite"):
             camera_to_file(camera, standard_deviations={"fx": math.nan})
         with pytest.raises(InputError, match="batch"):
-            camera_to_file(Camera(camera.parameters_vector.expand(3, -1), size=camera.size, model=camera.model))
+            camera_to_file(Camera(camera.params.expand(3, -1), size=camera.size, model=camera.model))
         broken = copy.deepcopy(camera)
         with torch.no_grad():
-            broken.parameters_vector[7] = math.nan
+            broken.params[7] = math.nan
         with pytest.raises(InputError, match="finite"):
             camera_to_file(broken)
 

@@ -33,7 +33,7 @@ def of_parameters(camera: Camera, name: str) -> Callable[[Tensor, Tensor], Tenso
     module = Method(camera, name)
 
     def function(value: Tensor, vector: Tensor) -> Tensor:
-        result, valid = functional_call(module, {"camera.parameters_vector": vector}, (value,))
+        result, valid = functional_call(module, {"camera.params": vector}, (value,))
         assert bool(valid.all())
         return result
 
@@ -98,8 +98,8 @@ def test_invalid_pixels_leave_no_nan_in_gradients() -> None:
     assert valid.tolist() == [True, False, False]
     rays[..., 0].sum().backward()
     assert pixels.grad is not None
-    assert camera.parameters_vector.grad is not None
-    assert bool(torch.isfinite(camera.parameters_vector.grad).all())
+    assert camera.params.grad is not None
+    assert bool(torch.isfinite(camera.params.grad).all())
     assert pixels.grad[1].tolist() == [0.0, 0.0]
     assert float(pixels.grad[0, 0]) > 0.009
 
@@ -113,8 +113,8 @@ def test_invalid_points_leave_no_nan_in_gradients() -> None:
     assert bool(torch.isfinite(pixels).all())
     pixels.sum().backward()
     assert points.grad is not None
-    assert camera.parameters_vector.grad is not None
-    assert bool(torch.isfinite(camera.parameters_vector.grad).all())
+    assert camera.params.grad is not None
+    assert bool(torch.isfinite(camera.params.grad).all())
     assert torch.equal(points.grad[1:], torch.zeros(3, 3, dtype=torch.float64))
 
 

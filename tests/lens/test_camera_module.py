@@ -55,7 +55,7 @@ class TestPrecision:
     def test_a_network_around_it_is_still_cast(self) -> None:
         network = nn.Sequential(nn.Linear(2, 2), make_camera()).half()
         assert network[0].weight.dtype == torch.float16
-        assert network[1].parameters_vector.dtype == torch.float64
+        assert network[1].params.dtype == torch.float64
 
     @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
     def test_inputs_are_promoted(self, dtype: torch.dtype) -> None:
@@ -88,7 +88,7 @@ class TestState:
     def test_parameters_are_frozen_until_asked(self) -> None:
         camera = make_camera()
         assert [p.requires_grad for p in camera.parameters()] == [False]
-        assert camera.requires_grad_(True).parameters_vector.requires_grad
+        assert camera.requires_grad_(True).params.requires_grad
 
     def test_camera_keeps_its_own_copy(self) -> None:
         vector = parameters("opencv5", strong("opencv5"))
@@ -111,7 +111,7 @@ class TestState:
         point = torch.tensor([[3.0, 0.0, 1.0]])
         assert camera.project(point)[1].tolist() == [True]
         with torch.no_grad():
-            camera.parameters_vector[5] = -1 / 12
+            camera.params[5] = -1 / 12
         camera.update_valid_region()
         assert float(camera.valid_radius) == pytest.approx(2.0, abs=1e-12)
         assert camera.project(point)[1].tolist() == [False]
@@ -120,11 +120,11 @@ class TestState:
         base = make_camera("opencv5")
         seen = {base.fingerprint}
         for i in range(10):
-            vector = base.parameters_vector.clone()
+            vector = base.params.clone()
             vector[i] = torch.nextafter(vector[i], torch.tensor(9.0).double())
             seen.add(Camera(vector, size=base.size).fingerprint)
-        seen.add(Camera(base.parameters_vector, size=(1920, 1081)).fingerprint)
-        padded = torch.cat([base.parameters_vector, torch.zeros(3, dtype=torch.float64)])
+        seen.add(Camera(base.params, size=(1920, 1081)).fingerprint)
+        padded = torch.cat([base.params, torch.zeros(3, dtype=torch.float64)])
         seen.add(Camera(padded, size=base.size, model="opencv8").fingerprint)
         assert len(seen) == 13
         assert make_camera("opencv5").fingerprint == base.fingerprint
@@ -150,7 +150,7 @@ class TestBatches:
         for i, vector in enumerate(vectors):
             alone = Camera(vector, size=(4, 3), model="ext20")
             own, _ = alone.project(POINTS)
-            # Vectorised kernels may round otherwise: one unit in the last place of numbers near one.
+            # Vectorized kernels may round otherwise: one unit in the last place of numbers near one.
             torch.testing.assert_close(pixels[i // 2, i % 2], own, rtol=0, atol=1e-14)
             # Newton stops within 1e-13, and batches stop together: some iterate once more than alone.
             torch.testing.assert_close(rays[i // 2, i % 2], alone.unproject(own)[0], rtol=0, atol=1e-12)

@@ -108,7 +108,7 @@ class TestAngles:
         torch.testing.assert_close(pixels, expected, rtol=0, atol=1e-12)
 
     def test_what_has_no_place(self) -> None:
-        # Straight behind, at the centre of projection, and not finite.
+        # Straight behind, at the center of projection, and not finite.
         points = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [torch.nan, 0.0, 1.0]], dtype=torch.float64)
         pixels, valid = self.ideal.project(points)
         assert valid.tolist() == [False] * 3

@@ -103,20 +103,20 @@ class TestAgainstOthers:
         image = torch.rand(1, 3, 480, 640)
         x, y = (torch.from_numpy(m)[None] for m in maps[:2])
         ours, _ = Undistort(BARREL)(image)
-        # Positions in float32 differ by some 1e-4 px, neighbours by up to 1.
+        # Positions in float32 differ by some 1e-4 px, neighbors by up to 1.
         assert (ours - remap(image, x, y, align_corners=True)).abs().max() < 5e-4
 
     @pytest.mark.parametrize("alpha", [0.0, 1.0])
     def test_cv2_remap_on_a_real_image(self, kcal_data: Path, alpha: float) -> None:
-        grey = cv2.imread(str(kcal_data / "opencv_stereo" / "left01.jpg"), cv2.IMREAD_GRAYSCALE)
-        assert grey is not None
-        image = grey.astype(np.float32)
+        gray = cv2.imread(str(kcal_data / "opencv_stereo" / "left01.jpg"), cv2.IMREAD_GRAYSCALE)
+        assert gray is not None
+        image = gray.astype(np.float32)
         new = new_pinhole(BARREL, alpha)
         maps = undistort_maps(BARREL, new)
         theirs = cv2.remap(image, maps.map_x, maps.map_y, cv2.INTER_LINEAR)
         ours, mask = Undistort(BARREL, new)(torch.from_numpy(image)[None])
         exact, _ = Undistort(BARREL, new)(torch.from_numpy(image)[None].double())
-        # OpenCV's maps are float32: 3e-5 px at 640, times edges of up to 200 grey levels a pixel.
+        # OpenCV's maps are float32: 3e-5 px at 640, times edges of up to 200 gray levels a pixel.
         assert np.abs(exact[0].numpy() - theirs).max() < 0.01
         # In float32 our positions pass through [-1, 1] and err by up to 640 * 1.2e-7 px as well.
         assert np.abs(ours[0].numpy() - theirs).max() < 0.02
@@ -136,7 +136,7 @@ class TestAgainstOthers:
 
 
 class TestMask:
-    def test_needs_all_four_neighbours(self) -> None:
+    def test_needs_all_four_neighbors(self) -> None:
         camera = build(100, (11, 9), [], "pinhole")
         pixels = torch.tensor([[0.0, 0.0], [10.0, 8.0], [-1e-3, 4.0], [5.0, 8.001], [10.0 + 1e-8, 4.0]], dtype=F64)
         found, seen = source_pixels(camera, camera.unproject(pixels)[0])
@@ -166,7 +166,7 @@ class TestModule:
         assert undistort(images[:0])[0].shape == (0, 3, 1, 50, 60)
 
     def test_batch_of_cameras(self) -> None:
-        batch = Camera(torch.stack([LITTLE.parameters_vector, OTHER.parameters_vector]), size=(160, 120))
+        batch = Camera(torch.stack([LITTLE.params, OTHER.params]), size=(160, 120))
         image = torch.rand(1, 120, 160, dtype=F64)
         out, mask = Undistort(batch)(image)
         assert out.shape == (2, 1, 120, 160)
@@ -199,7 +199,7 @@ class TestModule:
             # The ramp itself is rounded on the way in and out. Positions rounded to 11 bits would err by up to 0.15 px.
             assert (out.double() - full).abs().max() < 2 * torch.finfo(kind).eps
         assert undistort.grid_x.dtype == torch.float32
-        assert undistort.camera.parameters_vector.dtype == F64
+        assert undistort.camera.params.dtype == F64
 
     def test_maps_follow_the_parameters(self) -> None:
         image = ramp((160, 120))
@@ -250,7 +250,7 @@ class TestGradients:
         new = Camera.build(focal=(6.13, 6.37), center=(2.913, 2.471), size=(6, 5), model="pinhole")
         image = torch.rand(1, 6, 7, dtype=F64, generator=torch.Generator().manual_seed(1))
         undistort = Undistort(copy.deepcopy(SMALL), new).requires_grad_(True)
-        names = ["camera.parameters_vector", "new_camera.parameters_vector"]
+        names = ["camera.params", "new_camera.params"]
         values = [undistort.get_parameter(name).detach().clone().requires_grad_(True) for name in names]
         mask = undistort(image)[1]
         assert mask.double().mean() > 0.6
@@ -273,6 +273,6 @@ class TestGradients:
         assert image.grad is not None
         undistort.requires_grad_(True)
         undistort(image)[0].sum().backward()
-        gradient = undistort.camera.parameters_vector.grad
+        gradient = undistort.camera.params.grad
         assert gradient is not None
         assert gradient.abs().max() > 0

@@ -162,7 +162,7 @@ class TestFold:
     def test_rational_lens_with_a_pole_in_the_image(self) -> None:
         valid = check_round_trip(self.opencv, image_grid(self.opencv))
         assert 0 < int(valid.sum()) < len(valid)
-        # The axis and its neighbourhood are a sane lens all the same.
+        # The axis and its neighborhood are a sane lens all the same.
         assert bool(self.opencv.unproject(self.opencv.center[None] + 500.0)[1].all())
 
     def test_beyond_the_fold(self) -> None:

@@ -1,4 +1,4 @@
-"""What the numbers mean: axes, pixel centres, skew, names and their order. One worked value for each."""
+"""What the numbers mean: axes, pixel centers, skew, names and their order. One worked value for each."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class TestFrames:
         torch.testing.assert_close(rays, expected, rtol=0, atol=1e-15)
         assert valid.tolist() == [True, True]
 
-    def test_integer_pixel_is_a_centre(self) -> None:
+    def test_integer_pixel_is_a_center(self) -> None:
         # An image of 1280 columns reaches from -0.5 (left edge) to 1279.5 (right edge); its middle is 639.5.
         edges = torch.tensor(
             [[-0.5, 0.0], [-0.51, 0.0], [1279.5, 0.0], [1279.51, 0.0], [0.0, -0.51], [0.0, 719.5], [0.0, 719.51]]

@@ -258,7 +258,7 @@ class TestFile:
 def test_bad_input_is_refused() -> None:
     camera = _opencv14()
     with pytest.raises(InputError, match="batch"):
-        bake(Camera(camera.parameters_vector.expand(2, -1), size=camera.size, model=camera.model))
+        bake(Camera(camera.params.expand(2, -1), size=camera.size, model=camera.model))
     for tolerance in (0.0, -1.0, 1e-9, float("nan"), float("inf")):
         with pytest.raises(InputError, match="tolerance"):
             bake(camera, tolerance)

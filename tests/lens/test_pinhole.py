@@ -38,12 +38,12 @@ class TestNewPinhole:
         new = new_pinhole(camera, alpha, size)
         assert new.size == size
         assert new.model.names == ()
-        assert np.abs(new.parameters_vector[:4].numpy() - expected).max() < 0.02
+        assert np.abs(new.params[:4].numpy() - expected).max() < 0.02
 
     def test_identity(self) -> None:
         camera = build(500, (640, 480), [0.0])
         for alpha in (0.0, 0.4, 1.0):
-            assert (new_pinhole(camera, alpha).parameters_vector - camera.parameters_vector[:5]).abs().max() < 1e-10
+            assert (new_pinhole(camera, alpha).params - camera.params[:5]).abs().max() < 1e-10
 
     @settings(max_examples=50)
     @given(
@@ -85,13 +85,13 @@ class TestNewPinhole:
         assert (shown.amax(0) > last - 2).all()
 
     def test_batch_is_one_by_one(self) -> None:
-        values = torch.stack([BARREL.parameters_vector, PINCUSHION.parameters_vector])
+        values = torch.stack([BARREL.params, PINCUSHION.params])
         values = torch.stack([values, values * torch.tensor([1.1, 1.1, *[1.0] * 8], dtype=F64)])
         for alpha in (0.0, 0.6, 1.0):
-            batch = new_pinhole(Camera(values, size=(640, 480)), alpha).parameters_vector
+            batch = new_pinhole(Camera(values, size=(640, 480)), alpha).params
             assert batch.shape == (2, 2, 5)
             for i, j in np.ndindex(2, 2):
-                single = new_pinhole(Camera(values[i, j], size=(640, 480)), alpha).parameters_vector
+                single = new_pinhole(Camera(values[i, j], size=(640, 480)), alpha).params
                 assert (batch[i, j] - single).abs().max() < 1e-10
 
     @pytest.mark.parametrize("alpha", [-0.1, 1.1, math.nan])

@@ -159,7 +159,7 @@ class TestCamera:
 
     def test_closed_form_derivatives(self) -> None:
         camera = make_hybrid()
-        field, vector = camera.residual.field, camera.parameters_vector.detach()
+        field, vector = camera.residual.field, camera.params.detach()
         wanted = range(len(vector))
 
         def project(points: Tensor, values: Tensor) -> Tensor:
@@ -192,10 +192,10 @@ class TestCamera:
         state = {k: v.detach() for k, v in camera.state_dict().items()}
 
         def unproject(pixels: Tensor, values: Tensor, weights: Tensor) -> Tensor:
-            now = state | {"parameters_vector": values, "residual.weights": weights}
+            now = state | {"params": values, "residual.weights": weights}
             return torch.func.functional_call(Unproject(camera), {f"camera.{k}": v for k, v in now.items()}, pixels)[0]
 
-        inputs = (pixels, state["parameters_vector"], state["residual.weights"])
+        inputs = (pixels, state["params"], state["residual.weights"])
         automatic = torch.autograd.functional.jacobian(unproject, inputs)
         for i, steps in enumerate((1e-3, 1e-6, 1e-6)):
             found = numeric(lambda v: unproject(*inputs[:i], v, *inputs[i + 1 :]), inputs[i], steps)  # noqa: B023
@@ -239,7 +239,7 @@ class TestCamera:
             camera.free("nonsense")
 
     def test_no_batch(self) -> None:
-        vector = make_hybrid().parameters_vector.detach()
+        vector = make_hybrid().params.detach()
         with pytest.raises(InputError, match="not a batch"):
             HybridCamera(torch.stack([vector, vector]), size=(4, 4), model="opencv8")
 
@@ -249,7 +249,7 @@ class TestCamera:
         copied = copy.deepcopy(rig)
         copied.load_state_dict(rig.state_dict())
         assert copied.left.fingerprint == camera.fingerprint
-        vector = camera.parameters_vector.detach().clone()
+        vector = camera.params.detach().clone()
         vector[:5] /= 15.0
         small = HybridCamera(vector, size=(128, 72), model="opencv8", residual=camera.residual)
         # A ramp shows in each new pixel the column where the hybrid, not its lens alone, puts that pixel's ray.

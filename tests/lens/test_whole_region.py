@@ -1,35 +1,24 @@
-"""The inverse over whole valid regions and images of many random lenses: a small run of `scripts/check_inverse.py`."""
+"""The inverse over whole valid regions and images of many random lenses: a small run of `scripts/check/inverse.py`."""
 
 from __future__ import annotations
-
-import importlib.util
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 
 from kcal.lens.distortion import distort
 from kcal.lens.inverse import undistort
-
-SCRIPT = Path(__file__).parents[2] / "scripts" / "check_inverse.py"
+from scripts.check import inverse
 
 
 def test_random_lenses() -> None:
-    spec = importlib.util.spec_from_file_location("check_inverse", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    sys.modules["check_inverse"] = script
-    spec.loader.exec_module(script)
-    tally = script.sweep(lenses=320, seed=1, points=100)
+    tally = inverse.sweep(lenses=320, seed=1, points=100)
     assert tally.points > 20_000
     assert tally.valid > 15_000
     assert (tally.lost, tally.elsewhere, tally.wrong) == (0, 0, 0)
     assert tally.worst < 1e-9
 
 
-# A tilted, decentred lens found by the sweep.
+# A tilted, decentered lens found by the sweep.
 BENT = [
     0.008283487628948559, -0.1761725765383967, 0.22356479586426953, 0.07462202349038814, -0.06215175012836545,
     0.005180133590947832, 0.020311540980875634, 0.1005421132347756, -0.15451424842339886, -0.14166261245059308,
@@ -38,7 +27,7 @@ BENT = [
 
 
 @pytest.mark.parametrize("mirror", [1.0, -1.0])
-def test_a_fold_between_a_point_and_its_neighbours(mirror: float) -> None:
+def test_a_fold_between_a_point_and_its_neighbors(mirror: float) -> None:
     """Where the valid region is not convex, a solver that only goes downhill stops at the fold."""
     lens = torch.tensor(BENT, dtype=torch.float64)
     lens[[3, 8, 9, 13]] *= mirror  # p2, s1, s2, tau_y

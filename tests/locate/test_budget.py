@@ -29,7 +29,7 @@ def test_table_2_and_the_exact_values_beside_it(disparity: float, at_1_km: float
         assert found.nearer[i].abs() < found.first_order[i] < found.farther[i]
 
 
-def test_two_pixels_at_5_km_are_eight_kilometres_and_four_are_beyond_infinity() -> None:
+def test_two_pixels_at_5_km_are_eight_kilometers_and_four_are_beyond_infinity() -> None:
     found = range_errors(planned_rig(), [5000.0], BudgetErrors(disparity_px=2.0))["disparity"]
     assert (found.nearer.item(), found.farther.item()) == pytest.approx((-1923.1, 8333.3), abs=0.1)
     found = range_errors(planned_rig(), [5000.0], BudgetErrors(disparity_px=4.0))["disparity"]

@@ -122,7 +122,7 @@ def test_gradients_of_the_closed_form_also_at_a_pole() -> None:
     enu = tensor([300.0, -2000.0, 50.0], [0.0, 0.0, 0.0]).requires_grad_()
     scale = tensor(1e5, 1e5, 1.0)
     home = origin.geodetic
-    # Degrees hold 1e-14: with steps of 1 m that is 1e-9 of a slope in metres.
+    # Degrees hold 1e-14: with steps of 1 m that is 1e-9 of a slope in meters.
     assert torch.autograd.gradcheck(
         lambda p: (enu_to_geodetic(p, origin) - home) * scale, enu, eps=1.0, rtol=1e-3, atol=1e-4
     )
@@ -167,7 +167,7 @@ def test_up_is_not_height() -> None:
     assert heights.tolist() == pytest.approx([1.96] * len(heights), abs=0.02)
 
 
-def test_longitude_is_normalised_across_the_antimeridian() -> None:
+def test_longitude_is_normalized_across_the_antimeridian() -> None:
     east = enu_to_geodetic(tensor([5000.0, 0.0, 0.0]), Origin(lat=10.0, lon=179.99, height=0.0))[0, 1].item()
     west = enu_to_geodetic(tensor([-5000.0, 0.0, 0.0]), Origin(lat=10.0, lon=-179.99, height=0.0))[0, 1].item()
     # 5 km is 0.0456 degrees of longitude at 10 degrees north.
@@ -202,7 +202,7 @@ def test_shapes_and_bad_points() -> None:
         ("10,400,0", "longitude 400 is outside"),
         ("nan,0,0", "finite"),
         ("10,20,inf", "finite"),
-        ("10,20,200000", "metres are needed"),
+        ("10,20,200000", "meters are needed"),
     ],
 )
 def test_bad_origins_say_what_to_write(text: str, message: str) -> None:

@@ -12,7 +12,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
 from kcal.lens.rig import StereoRig
-from kcal.locate.errors import RigCovariance, mounting_covariance
+from kcal.locate.covariances import RigCovariance, mounting_covariance
 from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic
 from kcal.locate.localizer import Localization, StereoLocalizer
 from kcal.locate.stereo import Status, Triangulate
@@ -62,7 +62,7 @@ def test_the_point_has_the_least_weighted_reprojection_error() -> None:
     misses = again - torch.cat([left, right], -1)
     cost = (misses[:, None] @ torch.linalg.inv(cov) @ misses[..., None]).sum()
     (gradient,) = torch.autograd.grad(cost, points)
-    # Per metre; the cost changes by one over some metres here.
+    # Per meter; the cost changes by one over some meters here.
     assert gradient.abs().max() < 1e-6
 
 
@@ -101,7 +101,7 @@ def test_errors_of_the_calibration_are_in_the_interval(z: float) -> None:
     turn = rotation_from_vector(draws[:, 18:21]) @ rig.right_from_left_rotation
     in_right = (turn @ point[0])[:, None] + (rig.right_from_left_translation + draws[:, 21:])[:, None]
     seen = [
-        project_components(points.mT, left.parameters_vector + part, left.model).pixels[..., 0]
+        project_components(points.mT, left.params + part, left.model).pixels[..., 0]
         for points, part in ((point.expand(count, 1, 3), draws[:, :9]), (in_right, draws[:, 9:18]))
     ]
     marks = torch.cat(seen, -1) + noise(0.1, count, 4, seed=9)
@@ -139,7 +139,7 @@ def test_refraction_lowers_the_point() -> None:
 
 
 BAD = [
-    # left, right, status; f = 1600 px, b = 10 m, centre (959.5, 539.5), sigma 0.3 px
+    # left, right, status; f = 1600 px, b = 10 m, center (959.5, 539.5), sigma 0.3 px
     ((980.0, 540.0), (970.0, 540.0), Status.OK),
     ((980.0, 540.0), (979.5, 540.0), Status.BEARING_ONLY),
     ((970.0, 540.0), (970.0, 540.0), Status.PARALLEL),
@@ -192,7 +192,7 @@ def test_gradients_of_everything() -> None:
 
     def outputs(left: torch.Tensor, right: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor, ...]:
         found = module(left, right, 0.5 * (half + half.mT))
-        # 1e5 m a degree: all in metres.
+        # 1e5 m a degree: all in meters.
         place = (found.geodetic - home) * tensor(1e5, 1e5, 1.0)
         return (
             found.enu,
@@ -215,9 +215,7 @@ def test_gradients_reach_freed_parameters_of_a_camera() -> None:
     rig.right.free("cx")
     module(left, right).enu.norm().backward()
     moved = {
-        sign: Camera(
-            rig.right.parameters_vector.detach() + sign * 1e-3 * tensor(0, 0, 1.0, *[0] * 7), size=SIZE, model="opencv5"
-        )
+        sign: Camera(rig.right.params.detach() + sign * 1e-3 * tensor(0, 0, 1.0, *[0] * 7), size=SIZE, model="opencv5")
         for sign in (1, -1)
     }
     ranges = {}
@@ -225,7 +223,7 @@ def test_gradients_reach_freed_parameters_of_a_camera() -> None:
         other = StereoRig(rig.left, camera, rig.right_from_left_rotation, rig.right_from_left_translation)
         ranges[sign] = localizer(other)(left, right).enu.norm().item()
     slope = (ranges[1] - ranges[-1]) / 2e-3
-    assert rig.right.parameters_vector.grad[2].item() == pytest.approx(slope, rel=1e-6)
+    assert rig.right.params.grad[2].item() == pytest.approx(slope, rel=1e-6)
 
 
 def test_batches_pieces_and_precision() -> None:
@@ -260,8 +258,8 @@ def test_sensitivities() -> None:
     left, right, _ = rig(tensor([0.0, 0.0, 5000.0], [0.0, 0.0, 1000.0]))
     slopes = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0).sensitivity(left, right)
     # Z² / (f b) m/px, and Z² / b m/rad: 436 m for 0.01° at 5 km.
-    assert slopes.metres_per_pixel.tolist() == pytest.approx([1562.5, 62.5], rel=1e-3)
-    assert slopes.metres_per_degree.tolist() == pytest.approx([43_633, 1745.3], rel=1e-3)
+    assert slopes.meters_per_pixel.tolist() == pytest.approx([1562.5, 62.5], rel=1e-3)
+    assert slopes.meters_per_degree.tolist() == pytest.approx([43_633, 1745.3], rel=1e-3)
     # By turning the rig and locating again.
     turned_rig = StereoRig(rig.left, rig.right, turned(1e-4), rig.right_from_left_translation)
     module = StereoLocalizer(turned_rig, origin=ORIGIN, heading_deg=0.0)
@@ -285,7 +283,7 @@ def test_compiles_as_one_graph_with_its_gradients() -> None:
 
 
 def test_a_detector_is_trained_through_it() -> None:
-    """Heat maps, kornia's soft-argmax, a crop's offset, metres: the loss is the position, no pixel is given."""
+    """Heat maps, kornia's soft-argmax, a crop's offset, meters: the loss is the position, no pixel is given."""
     torch.manual_seed(0)
     rig = pinhole_rig(1600.0, 10.0)
     truth = torch.stack(

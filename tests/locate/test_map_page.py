@@ -43,13 +43,13 @@ def test_everything_is_where_it_should_be() -> None:
     content = data(map_page(located, truth))
     assert [point["name"] for point in content["points"]] == ["gate", "</script><b>mast", "ship"]
     assert [arc["name"] for arc in content["arcs"]] == ["250 m", "1 km", "5 km"]
-    for arc, metres in zip(content["arcs"], (250, 1000, 5000), strict=True):
+    for arc, meters in zip(content["arcs"], (250, 1000, 5000), strict=True):
         places = torch.tensor([[*place, ORIGIN.height] for place in arc["line"]], dtype=torch.float64)
         horizontal = geodetic_to_enu(places, ORIGIN)[:, :2].norm(dim=-1)
         # Drawn at the origin's height, not in its tangent plane.
-        assert (horizontal - metres).abs().max() < 0.02
+        assert (horizontal - meters).abs().max() < 0.02
     for spot, row in zip(content["truth"], truth, strict=True):
-        # The drop of the ellipsoid at 60 km moves a horizontal place by less than a metre per metre of height.
+        # The drop of the ellipsoid at 60 km moves a horizontal place by less than a meter per meter of height.
         enu = geodetic_to_enu(tensor(*spot, ORIGIN.height), ORIGIN)
         assert (enu - row)[:2].norm() < 1e-5 * row.norm() * max(1.0, float(row.norm()) / 1000)
     assert len(content["regions"]) == 3
@@ -114,7 +114,7 @@ def test_a_geotiff_lies_where_it_belongs(tmp_path: Path) -> None:
     lon = west + (column + 0.5) / pixels.shape[1] * (east - west)
     lat = north - (row + 0.5) / pixels.shape[0] * (north - south)
     x, y = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32643", always_xy=True).transform(lon, lat)
-    # Half a pixel of 20 m, and the colours of WEBP spread over more.
+    # Half a pixel of 20 m, and the colors of WEBP spread over more.
     assert (x, y) == pytest.approx((273_000 + 70.5 * 20, 2_111_000 - 40.5 * 20), abs=30)
     page = map_page(scene()[0], image=tmp_path / "ortho.tif")
     assert data(page)["image"]["name"] == "ortho.tif"

@@ -17,8 +17,8 @@ from locate_rigs import pinhole_rig, real_rig, spread_points, tensor
 
 from kcal.errors import FileError, InputError
 from kcal.locate.cot import to_cot
+from kcal.locate.covariances import RigCovariance
 from kcal.locate.datum import find_geoid
-from kcal.locate.errors import RigCovariance
 from kcal.locate.export import to_csv, to_geojson, write_positions
 from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.kml import to_kml
@@ -26,7 +26,7 @@ from kcal.locate.positions import Located, Position, locate
 from kcal.locate.stereo import Status
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
-RIG = pinhole_rig()  # f b = 16 000 px m, centre (959.5, 539.5)
+RIG = pinhole_rig()  # f b = 16 000 px m, center (959.5, 539.5)
 
 
 def one(left: tuple[float, float], right: tuple[float, float], **options: float) -> Position:
@@ -50,7 +50,7 @@ def test_end_to_end_with_real_lenses() -> None:
     assert (located.enu - enu).norm(dim=-1).max() < 1e-6
     geodetic = enu_to_geodetic(enu, ORIGIN)
     for position, true_enu, (lat, lon, height) in zip(located.positions, enu, geodetic.tolist(), strict=True):
-        # 1e-11 degrees is a micrometre.
+        # 1e-11 degrees is a micrometer.
         assert (position.lat, position.lon) == pytest.approx((lat, lon), abs=1e-11)
         assert position.height == pytest.approx(height, abs=1e-6)
         assert position.range_m == pytest.approx(float(true_enu.norm()), rel=1e-9)
@@ -64,7 +64,7 @@ def test_end_to_end_with_real_lenses() -> None:
 def test_a_point_ahead_of_a_rig_that_looks_east_is_east() -> None:
     position = mixed().positions[0]
     east, north, up = position.enu
-    # 16 px: 1000 m. The mark of the left camera is 16 px right of its centre: 10 m, and right of east is south.
+    # 16 px: 1000 m. The mark of the left camera is 16 px right of its center: 10 m, and right of east is south.
     assert (east, north, up) == pytest.approx((1000.0, -10.0, 0.0), abs=1e-6)
     assert position.lon > ORIGIN.lon
     assert position.lat < ORIGIN.lat
@@ -203,8 +203,8 @@ def test_csv_keeps_every_digit(tmp_path: Path) -> None:
 def test_covariances_circles_and_slopes_of_a_position() -> None:
     position = one((975.5, 539.5), (959.5, 539.5), pixel_sigma=0.1)
     # Z² / (f b) = 62.5 m/px at 1 km, and 17.45 m for 0.01 degrees.
-    assert position.metres_per_pixel == pytest.approx(62.5, rel=1e-3)
-    assert position.metres_per_degree == pytest.approx(1745, rel=1e-3)
+    assert position.meters_per_pixel == pytest.approx(62.5, rel=1e-3)
+    assert position.meters_per_degree == pytest.approx(1745, rel=1e-3)
     along = math.sqrt(position.covariance[1][1])
     assert along == pytest.approx(62.5 * 0.1 * math.sqrt(2), rel=1e-3)
     assert position.cep50_m == pytest.approx(0.6745 * along, rel=0.01)

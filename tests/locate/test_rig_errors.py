@@ -9,7 +9,7 @@ from locate_rigs import real_rig, tensor
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.locate.errors import RigCovariance
+from kcal.locate.covariances import RigCovariance
 from kcal.locate.geodesy import Origin, enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 

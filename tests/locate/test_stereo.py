@@ -130,7 +130,7 @@ def test_low_precision_around_the_module_changes_nothing() -> None:
 
 
 BAD_MARKS = [
-    # left, right, status; the pinhole rig has f = 1600 px, b = 10 m and its centre at (959.5, 539.5)
+    # left, right, status; the pinhole rig has f = 1600 px, b = 10 m and its center at (959.5, 539.5)
     ((980.0, 540.0), (970.0, 540.0), Status.OK),
     ((970.0, 540.0), (970.0, 540.0), Status.PARALLEL),
     ((960.0, 540.0), (970.0, 540.0), Status.PARALLEL),
@@ -161,7 +161,7 @@ def test_statuses_and_no_nan_in_values_or_gradients() -> None:
 
 
 def test_outside_the_lens() -> None:
-    # x - x³/12 turns back at r = 2: distorted 4/3, that is 1333 px from the centre of a wide sensor.
+    # x - x³/12 turns back at r = 2: distorted 4/3, that is 1333 px from the center of a wide sensor.
     camera = Camera.build(
         focal=(1000, 1000), center=(2000, 500), size=(4001, 1001), coefficients=[-1 / 12], model="opencv4"
     )

@@ -37,7 +37,7 @@ class TestSurvey:
             lat, lon, height = place
             assert found == pytest.approx(pipeline.transform(lon, lat, height), abs=1e-6)
 
-    def test_local_metres_and_unequal_sigmas(self, tmp_path: Path) -> None:
+    def test_local_meters_and_unequal_sigmas(self, tmp_path: Path) -> None:
         survey = read_survey(write(tmp_path, "name,east,north,up,sigma,sigma_up\na,1,2,3,0.02,0.05\nb,4,5,6,0.1,\n"))
         assert survey.origin is None
         assert survey.points.tolist() == [[1, 2, 3], [4, 5, 6]]
@@ -128,8 +128,8 @@ class TestMounting:
     def test_north_and_up_are_those_at_the_camera(self) -> None:
         """20 km east of the origin at 60 degrees: meridians converge by 0.31°, the vertical tilts by 0.18°."""
         origin = Origin(lat=60.0, lon=11.0, height=0.0)
-        centre = torch.tensor([20_000.0, 0.0, 0.0], dtype=torch.float64)
-        there = mounting_of(enu_from_cam(90.0).T, centre, torch.zeros(6, 6).double(), origin)
-        lon = float(enu_to_geodetic(centre, origin)[1])
+        center = torch.tensor([20_000.0, 0.0, 0.0], dtype=torch.float64)
+        there = mounting_of(enu_from_cam(90.0).T, center, torch.zeros(6, 6).double(), origin)
+        lon = float(enu_to_geodetic(center, origin)[1])
         assert there.heading_deg == pytest.approx(90.0 + (lon - 11.0) * math.sin(math.radians(60.0)), abs=1e-3)
         assert there.pitch_deg == pytest.approx(math.degrees(20_000 / 6_394_000), abs=1e-3)

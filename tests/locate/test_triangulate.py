@@ -73,7 +73,7 @@ def test_far_origins_cost_no_digits() -> None:
     moved[:, :, 3] -= cameras[:, :, :3] @ shift
     found, valid = triangulate_linear(moved, rays_to(points, cameras))
     assert valid.all()
-    # The matrices hold the centres to 1e-9 m only: 1e-10 of the baseline, hence of the range.
+    # The matrices hold the centers to 1e-9 m only: 1e-10 of the baseline, hence of the range.
     assert (found - shift - points).norm(dim=-1).max() < 5e-6
 
 

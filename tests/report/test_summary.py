@@ -16,7 +16,7 @@ from kcal.report.summary import Part, save_summary, summary_page
 
 def test_pictures_are_inside_and_nothing_is_fetched(tmp_path: Path) -> None:
     picture = write_png(tmp_path / "a.png", np.full((4, 6), 128, np.uint8))
-    part = Part(heading="P", pictures=((picture, "grey"),))
+    part = Part(heading="P", pictures=((picture, "gray"),))
     page = save_summary(tmp_path / "s.html", "T", "Lead", [part]).read_text()
     (inside,) = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
     assert base64.b64decode(inside) == picture.read_bytes()

@@ -48,10 +48,10 @@ def test_a_turned_camera_has_no_error() -> None:
 
 def test_another_focal_length_is_a_zoom() -> None:
     found = error_at_infinity(camera(focal=(501, 501)), camera())
-    centred = found.pixels - torch.tensor([319.5, 239.5])
-    torch.testing.assert_close(found.errors, 0.002 * centred, atol=2e-6, rtol=0)
-    assert found.rms == pytest.approx(float((0.002 * centred).pow(2).sum(-1).mean().sqrt()), rel=1e-6)
-    assert found.maximum == pytest.approx(0.002 * float(centred.norm(dim=-1).max()), rel=1e-5)
+    centered = found.pixels - torch.tensor([319.5, 239.5])
+    torch.testing.assert_close(found.errors, 0.002 * centered, atol=2e-6, rtol=0)
+    assert found.rms == pytest.approx(float((0.002 * centered).pow(2).sum(-1).mean().sqrt()), rel=1e-6)
+    assert found.maximum == pytest.approx(0.002 * float(centered.norm(dim=-1).max()), rel=1e-5)
 
 
 def test_no_rotation_does_better() -> None:

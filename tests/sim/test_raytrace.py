@@ -145,7 +145,7 @@ def test_pieces_of_glass_are_counted_and_checked() -> None:
     lens = PRESCRIPTIONS["surveillance"]
     assert lens.elements[1] == (2, 4)  # cemented
     with pytest.raises(InputError, match="1 entries for 7"):
-        place(lens, 1.0, 1.0, Misalignment(decentre=((0.0, 0.0),)))
+        place(lens, 1.0, 1.0, Misalignment(decenter=((0.0, 0.0),)))
     with pytest.raises(InputError, match="not negative"):
         Misalignment.draw(lens, -1.0, torch.Generator())
     with pytest.raises(InputError, match="equal media"):

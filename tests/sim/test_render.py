@@ -100,7 +100,7 @@ def test_corners_are_where_the_true_lens_sees_them(gamma):
     assert float(error.square().mean().sqrt()) < 0.0015
 
 
-def test_gamma_is_a_curve_of_grey_levels():
+def test_gamma_is_a_curve_of_gray_levels():
     camera, pose = camera_of(), POSES["tilted"]
     plain, curved = (
         render_light(camera, pose, BOARD, replace(CLEAN, black=0, white=255, background=20, gamma=gamma))
@@ -115,7 +115,7 @@ def test_gamma_is_a_curve_of_grey_levels():
     assert float(curved[edge].mean()) == pytest.approx(255 * math.sqrt(0.5), abs=4)
 
 
-def test_grey_levels_are_the_blurred_scene_averaged_over_the_pixels():
+def test_gray_levels_are_the_blurred_scene_averaged_over_the_pixels():
     """Against 12 x 12 rays a pixel, each inverted through the lens on its own, with hard edges, blurred, averaged."""
     camera = camera_of(LENS, size=(64, 48), focal=55.0)
     pose = pose_of((0.5, -0.4, 0.3), (0.02, 0.01, 0.75))
@@ -156,7 +156,7 @@ def test_inverse_is_interpolated_below_a_thousandth_of_a_pixel():
 
 
 def test_nothing_is_painted_beyond_the_fold():
-    # r - 0.5 r³ folds at r = 0.816, which is 0.544 after distortion: 272 px from the centre of a 640 x 480 image.
+    # r - 0.5 r³ folds at r = 0.816, which is 0.544 after distortion: 272 px from the center of a 640 x 480 image.
     camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.5])
     window = Window(0, 0, 640, 480)
     normalized, valid = invert_window(camera, window)
@@ -189,7 +189,7 @@ def test_a_cut_board_is_drawn_as_far_as_it_is_seen():
     pose = pose_of((0.2, 0.3, 0.1), (0.02, 0.01, 0.6))
     part = render_board(small, pose, BOARD, options)
     whole = render_board(large, pose, BOARD, options)[120:320, 200:450]
-    # The grid of the inverse lies elsewhere: grey levels may round differently.
+    # The grid of the inverse lies elsewhere: gray levels may round differently.
     assert int((part.int() - whole.int()).abs().max()) <= 1
     assert not project_board(small, pose, BOARD)[1].all()
     outside = pose_of((0, 0, 0), (5.0, 0.0, 1.0))
@@ -237,7 +237,7 @@ def test_refusals():
         render_board(camera, pose_of((0, math.pi, 0), (0, 0, 1.0)), BOARD, CLEAN)
     with pytest.raises(InputError, match="Generator"):
         render_board(camera, POSES["tilted"], BOARD, RenderOptions(noise=1))
-    batch = Camera(camera.parameters_vector[None].expand(2, -1), size=camera.size, model=camera.model)
+    batch = Camera(camera.params[None].expand(2, -1), size=camera.size, model=camera.model)
     with pytest.raises(InputError, match="single camera"):
         render_board(batch, POSES["tilted"], BOARD, CLEAN)
 

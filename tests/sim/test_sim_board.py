@@ -4,7 +4,7 @@ import torch
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.sim.board import BoardPose, BoardSize, area_colours, board_points, check_pose, project_board
+from kcal.sim.board import BoardPose, BoardSize, area_colors, board_points, check_pose, project_board
 
 
 def test_points_are_those_of_the_library_board():
@@ -36,27 +36,27 @@ def test_border_goes_on_outside():
         (3.0, 6.0 + 1.5, 0, 0),
     ],
 )
-def test_colours_of_squares(a, b, paper, black):
+def test_colors_of_squares(a, b, paper, black):
     a, b, width = (torch.tensor([value], dtype=torch.float64) for value in (a, b, 0.01))
-    colours = area_colours(a, b, width, width, BoardSize(9, 6, 1.0), 1)
-    assert float(colours.paper) == pytest.approx(paper, abs=1e-12)
-    assert float(colours.black) == pytest.approx(black, abs=1e-12)
+    colors = area_colors(a, b, width, width, BoardSize(9, 6, 1.0), 1)
+    assert float(colors.paper) == pytest.approx(paper, abs=1e-12)
+    assert float(colors.black) == pytest.approx(black, abs=1e-12)
 
 
 def test_area_averages_are_integrals():
     # Midpoint sums over boxes of any size, also many squares wide; n midpoints err by less than edges * width / n.
     generator = torch.Generator().manual_seed(3)
     board, n = BoardSize(5, 4, 1.0), 400
-    centre = 9 * torch.rand((40, 2), dtype=torch.float64, generator=generator) - 2.5
+    center = 9 * torch.rand((40, 2), dtype=torch.float64, generator=generator) - 2.5
     width = 2.5 * torch.rand((40, 2), dtype=torch.float64, generator=generator) + 1e-3
-    colours = area_colours(centre[:, 0], centre[:, 1], width[:, 0], width[:, 1], board, 1)
+    colors = area_colors(center[:, 0], center[:, 1], width[:, 0], width[:, 1], board, 1)
     step = (torch.arange(n, dtype=torch.float64) + 0.5) / n - 0.5
-    a = (centre[:, 0, None] + width[:, 0, None] * step)[:, :, None]
-    b = (centre[:, 1, None] + width[:, 1, None] * step)[:, None, :]
+    a = (center[:, 0, None] + width[:, 0, None] * step)[:, :, None]
+    b = (center[:, 1, None] + width[:, 1, None] * step)[:, None, :]
     paper = (a > -2) & (a < 6) & (b > -2) & (b < 5)
     black = (a > -1) & (a < 5) & (b > -1) & (b < 4) & ((a.floor() + b.floor()) % 2 == 0)
-    torch.testing.assert_close(colours.paper, paper.double().mean((1, 2)), rtol=0, atol=6 / n)
-    torch.testing.assert_close(colours.black, black.double().mean((1, 2)), rtol=0, atol=6 / n)
+    torch.testing.assert_close(colors.paper, paper.double().mean((1, 2)), rtol=0, atol=6 / n)
+    torch.testing.assert_close(colors.black, black.double().mean((1, 2)), rtol=0, atol=6 / n)
 
 
 def test_visible_is_valid_and_inside():

@@ -76,7 +76,7 @@ def test_a_perfect_lens_is_round() -> None:
 def test_turning_the_misplaced_glass_turns_the_picture() -> None:
     drawn = Misalignment.draw(PRESCRIPTIONS["surveillance"], 2.0, torch.Generator().manual_seed(2))
     turned = Misalignment(
-        decentre=tuple((-y, x) for x, y in drawn.decentre), tilt=tuple((-y, x) for x, y in drawn.tilt)
+        decenter=tuple((-y, x) for x, y in drawn.decenter), tilt=tuple((-y, x) for x, y in drawn.tilt)
     )
     straight, quarter = (
         TruthLens("surveillance", size=(600, 600), focal=500.0, misalignment=each, sensor_tilt=tilt)

@@ -1,4 +1,4 @@
-"""The Levenberg-Marquardt loop: known minima through every solver, and honest behaviour where there is none."""
+"""The Levenberg-Marquardt loop: known minima through every solver, and honest behavior where there is none."""
 
 from __future__ import annotations
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.solve.dense import DenseLinearisation
-from kcal.solve.lm import LevenbergMarquardt, minimise
+from kcal.solve.dense import DenseLinearization
+from kcal.solve.lm import LevenbergMarquardt, minimize
 from kcal.solve.result import State, Status
-from kcal.solve.schur import SchurLinearisation, SchurProblem
+from kcal.solve.schur import SchurLinearization, SchurProblem
 
 # (batch, views, local, shared, residuals a view)
 SIZES = [
@@ -68,7 +68,7 @@ class TestStep:
         lam = torch.full(size[0], damping, dtype=torch.float64)
         # Elements of a batch differ in damping, too.
         lam = lam * (1.0 + torch.arange(lam.numel(), dtype=torch.float64).reshape(size[0]))
-        schur, dense = SchurLinearisation(rows @ rows.mT, local), DenseLinearisation(residuals, jacobian)
+        schur, dense = SchurLinearization(rows @ rows.mT, local), DenseLinearization(residuals, jacobian)
         torch.testing.assert_close(schur.cost, dense.cost, rtol=1e-13, atol=0)
         step, predicted = schur.step(lam)
         (expected,), decrease = dense.step(lam)
@@ -80,7 +80,7 @@ class TestStep:
         """(JᵀJ + λ diag JᵀJ) δ = -Jᵀr, and the predicted decrease is that of the linear model."""
         rows, local = random_rows(*size), size[2]
         residuals, jacobian = dense_form(rows, local)
-        step, predicted = SchurLinearisation(rows @ rows.mT, local).step(
+        step, predicted = SchurLinearization(rows @ rows.mT, local).step(
             torch.full(size[0], damping, dtype=torch.float64)
         )
         delta = joined(step)
@@ -103,7 +103,7 @@ def test_information_is_the_inverse_covariance(size: tuple) -> None:
     scaled = jacobian / norm[..., None, :]
     shared = size[3]
     covariance = torch.linalg.inv(scaled.transpose(-1, -2) @ scaled)[..., :shared, :shared]
-    matrix, scale = SchurLinearisation(rows @ rows.mT, local).information()
+    matrix, scale = SchurLinearization(rows @ rows.mT, local).information()
     torch.testing.assert_close(scale, 1.0 / norm[..., :shared], rtol=1e-13, atol=0)
     # Two inverses of matrices with condition numbers up to 1e4.
     torch.testing.assert_close(torch.linalg.inv(matrix), covariance, rtol=1e-9, atol=1e-9)
@@ -122,8 +122,8 @@ def test_columns_of_zeros_stay_and_disturb_nothing(where: str) -> None:
         rows[..., :3, :] = 0.0
     residuals, jacobian = dense_form(rows, 3)
     lam = torch.full((2,), 1e-3, dtype=torch.float64)
-    step, predicted = SchurLinearisation(rows @ rows.mT, 3).step(lam)
-    (expected,), decrease = DenseLinearisation(residuals, jacobian).step(lam)
+    step, predicted = SchurLinearization(rows @ rows.mT, 3).step(lam)
+    (expected,), decrease = DenseLinearization(residuals, jacobian).step(lam)
     delta = joined(step)
     dead = torch.linalg.vector_norm(jacobian, dim=-2) == 0
     assert bool(dead.any())
@@ -136,12 +136,12 @@ def test_what_cannot_be_solved_is_not_predicted() -> None:
     """NaN rows, and a damping too small for twin columns, give no finite prediction, in their element alone."""
     rows = random_rows((3,), 4, 2, 3, 9, spread=0.0)
     rows[1, 2, 0, 3] = torch.nan
-    _, predicted = SchurLinearisation(rows @ rows.mT, 2).step(torch.full((3,), 1e-3, dtype=torch.float64))
+    _, predicted = SchurLinearization(rows @ rows.mT, 2).step(torch.full((3,), 1e-3, dtype=torch.float64))
     assert torch.isfinite(predicted).tolist() == [True, False, True]
     # A shared column that is minus another's, and of a smooth size, so that rounding cannot hide it.
     rows = random_rows((), 4, 2, 3, 9, spread=0.0).sign()
     rows[..., 3, :] = -rows[..., 2, :]
-    _, predicted = SchurLinearisation(rows @ rows.mT, 2).step(torch.tensor(-1e-3, dtype=torch.float64))
+    _, predicted = SchurLinearization(rows @ rows.mT, 2).step(torch.tensor(-1e-3, dtype=torch.float64))
     assert not bool(torch.isfinite(predicted))
 
 
@@ -188,7 +188,7 @@ def test_same_minimum_as_one_dense_solve() -> None:
     dense = LevenbergMarquardt(residual)(start)
     state = (start[:2].clone(), start[2:].reshape(6, 2).clone())
     kept = tuple(tensor.clone() for tensor in state)
-    schur = minimise(problem, state)
+    schur = minimize(problem, state)
     assert int(schur.status) == int(dense.status) == Status.CONVERGED
     torch.testing.assert_close(schur.cost, dense.cost, rtol=1e-11, atol=0)
     # Same steps, so that even the path is the same.
@@ -201,9 +201,9 @@ def test_batch_of_starts_is_one_by_one() -> None:
     x, y = curves()
     shared = torch.tensor([[0.5, 0.0], [3.0, 1.0], [2.0, -0.3]], dtype=torch.float64)
     local = torch.zeros(3, 6, 2, dtype=torch.float64)
-    together = minimise(Planes(y, x, (3,)), (shared, local))
+    together = minimize(Planes(y, x, (3,)), (shared, local))
     for i in range(3):
-        alone = minimise(Planes(y, x), (shared[i], local[i]))
+        alone = minimize(Planes(y, x), (shared[i], local[i]))
         assert int(together.status[i]) == int(alone.status)
         torch.testing.assert_close(together.cost[i], alone.cost, rtol=1e-12, atol=0)
         # Both stop where the cost is flat to 1e-12 of itself.

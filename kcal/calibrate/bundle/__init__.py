@@ -1,0 +1,1 @@
+"""What is minimized: board problems, priors, poses, closed-form starts, covariance."""

@@ -1,0 +1,157 @@
+"""Which parameters of a camera are free, fixed, tied or known beforehand, by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior
+from kcal.calibrate.bundle.priors import Prior, Term
+from kcal.errors import InputError
+from kcal.lens.model import PRESETS, LensModel
+from kcal.lens.projection import INTRINSICS, parameter_names
+
+
+@dataclasses.dataclass(frozen=True)
+class Free:
+    """Free parameters of a camera, some of which move together.
+
+    Args:
+        indices: of the parameters that move, ascending.
+        slots: for each of them the number of the unknown that it follows.
+    """
+
+    indices: tuple[int, ...]
+    slots: tuple[int, ...]
+
+    @classmethod
+    def of(cls, free: Free | Sequence[int]) -> Free:
+        """Indices, each an unknown of its own."""
+        return free if isinstance(free, Free) else cls(tuple(free), tuple(range(len(free))))
+
+    def __len__(self) -> int:
+        """How many unknowns there are."""
+        return max(self.slots) + 1 if self.slots else 0
+
+    def __iter__(self) -> Iterator[int]:
+        """The parameters' indices."""
+        return iter(self.indices)
+
+    def collapse(self, columns: Tensor, dim: int) -> Tensor:
+        """Derivatives by each parameter (along `dim`) to derivatives by each unknown: those tied are added."""
+        if len(self) == len(self.indices):
+            return columns
+        shape = list(columns.shape)
+        shape[dim] = len(self)
+        return columns.new_zeros(shape).index_add_(dim, torch.tensor(self.slots, device=columns.device), columns)
+
+    def expand(self, step: Tensor) -> Tensor:
+        """A step of the unknowns (..., len) as a step of each parameter."""
+        return step if len(self) == len(self.indices) else step[..., list(self.slots)]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Rules:
+    """What the user says of a camera's parameters; skew is held at 0 unless it is named.
+
+    Args:
+        fixed: name -> value.
+        tied: groups of names that are equal.
+        free: names that are estimated although they are held by default.
+        priors: name -> (mean, standard deviation), both in the parameter's units.
+        mild: a prior on all coefficients that have none of their own, or None.
+    """
+
+    fixed: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    tied: tuple[tuple[str, ...], ...] = ()
+    free: tuple[str, ...] = ()
+    priors: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    mild: CoefficientPrior | None = None
+
+    @property
+    def informed(self) -> bool:
+        """Whether anything is known beside the corners."""
+        return bool(self.priors) or self.mild is not None
+
+    def check(self, model: LensModel) -> None:
+        """Raise `InputError` for names that do not exist, for contradictions and for values that are none."""
+        tied = [name for group in self.tied for name in group]
+        for name in (*self.fixed, *tied, *self.free, *self.priors):
+            if name not in parameter_names(model):
+                known = any(name in parameter_names(preset) for preset in PRESETS.values())
+                raise InputError(
+                    f"lens model {model} has no parameter {name!r}"
+                    if known
+                    else f"unknown parameter {name!r}" + f"; it has {', '.join(parameter_names(model))}"
+                )
+        held = {"skew"} - set(self.free)
+        for name, value in self.fixed.items():
+            if not math.isfinite(value) or (name in ("fx", "fy") and value <= 0):
+                raise InputError(f"parameter {name} cannot be fixed at {value}")
+            for other, names in (("tied", tied), ("freed", self.free), ("given a prior", self.priors)):
+                if name in names:
+                    raise InputError(f"parameter {name} is fixed and {other}: choose one")
+        for name in (*tied, *self.priors):
+            if name in held:
+                raise InputError(f"parameter {name} is held at 0: free it before it is tied or given a prior")
+        for group in self.tied:
+            if len(group) < 2:
+                raise InputError(f"a tie needs two parameters at least, got {', '.join(group) or 'none'}")
+        twice = {name for name in tied if tied.count(name) > 1}
+        if twice:
+            raise InputError(f"parameter {min(twice)} is tied twice: write one tie of all that are equal")
+        for name, (mean, sigma) in self.priors.items():
+            if not (math.isfinite(mean) and math.isfinite(sigma) and sigma > 0):
+                raise InputError(f"prior of {name}: a value and a positive standard deviation, got {mean} ± {sigma}")
+
+    def allows(self, model: LensModel) -> bool:
+        """Whether a smaller model keeps the rules with the coefficients it lacks at zero."""
+        names = parameter_names(model)
+        if any(name not in names and value != 0 for name, value in self.fixed.items()):
+            return False
+        return all(len({name in names for name in group}) == 1 for group in self.tied)
+
+    def parameters(self, model: LensModel) -> Free:
+        """The free parameters of a model."""
+        names = parameter_names(model)
+        held = ({"skew"} - set(self.free)) | set(self.fixed)
+        leader = {name: group[0] for group in self.tied for name in group}
+        indices = [i for i, name in enumerate(names) if name not in held]
+        order: dict[str, int] = {}
+        slots = [order.setdefault(leader.get(names[i], names[i]), len(order)) for i in indices]
+        return Free(tuple(indices), tuple(slots))
+
+    def impose(self, parameters: Tensor, model: LensModel) -> Tensor:
+        """Parameters (..., 5 + P) that keep the rules: fixed ones at their values, tied ones at their mean."""
+        names, out = parameter_names(model), parameters.clone()
+        for name, value in self.fixed.items():
+            if name in names:
+                out[..., names.index(name)] = value
+        for group in self.tied:
+            members = [names.index(name) for name in group if name in names]
+            if members:
+                out[..., members] = out[..., members].mean(-1, keepdim=True)
+        return out
+
+    def terms(self, model: LensModel, noise: float) -> tuple[Term, ...]:
+        """The priors as residuals beside corners of `noise` pixels."""
+        names = parameter_names(model)
+        known = {name: prior for name, prior in self.priors.items() if name in names}
+        found: list[Term] = []
+        if known:
+            mean, sigma = torch.tensor(list(known.values()), dtype=torch.float64).unbind(-1)
+            found.append(Prior(torch.tensor([names.index(name) for name in known]), mean, noise / sigma))
+        if self.mild is not None:
+            found.append(self.mild.prior(model, noise, {*self.fixed, *self.priors}))
+        return tuple(found)
+
+
+def natural_value(name: str, size: tuple[int, int]) -> float:
+    """Where a parameter is fixed that is given no value: the image's center, and 0 for skew and coefficients."""
+    if name in INTRINSICS[:2]:
+        raise InputError(f"parameter {name} has no natural value: say at which it is fixed")
+    return {"cx": (size[0] - 1) / 2, "cy": (size[1] - 1) / 2}.get(name, 0.0)

@@ -1,0 +1,1 @@
+"""One camera, from observations to a camera with error bars."""

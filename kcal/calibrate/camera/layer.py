@@ -1,0 +1,324 @@
+"""Calibration as a layer of a network: corners in, a camera out, and gradients through the solution."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from kcal.calibrate.bundle.batching import alone
+from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior, is_overparameterized
+from kcal.calibrate.bundle.priors import Prior, Term
+from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.camera.exact_minimum import RecordedProblem, settle
+from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.solve import solve
+from kcal.checks import as_points, require_finite
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
+from kcal.lens.projection import parameter_names, project_components
+from kcal.solve.implicit import implicit_step
+from kcal.solve.result import State
+
+Backward = Literal["implicit", "unroll", "none"]
+
+# Steps that are recorded by backward="unroll"; each multiplies the error of the derivative by the share of the
+# curvature that Gauss and Newton leave out.
+_UNROLLED = 8
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CalibratedViews:
+    """A camera and the poses of its boards, as tensors of autograd's graph.
+
+    Args:
+        parameters: (5 + P,) fx, fy, cx, cy, skew, coefficients.
+        board_warp: (2,) meters; zeros unless it is estimated.
+        cam_from_board_rotation: (V, 3, 3).
+        cam_from_board_translation: (V, 3) meters.
+        residuals: (V, N, 2) projected minus observed, pixels; 0 where a corner was not seen.
+        model: the lens model.
+        size: (width, height) of the image.
+        reach: radius on the plane z = 1 of the outermost corner, to which a weak prior refers.
+    """
+
+    parameters: Tensor
+    board_warp: Tensor
+    cam_from_board_rotation: Tensor
+    cam_from_board_translation: Tensor
+    residuals: Tensor
+    model: LensModel
+    size: tuple[int, int]
+    reach: float
+
+    def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (..., N, 2) of points (..., N, 3) of the camera's frame, and whether the lens is regular there.
+
+        Differentiable by the parameters and the points; 0 where it is not regular.
+        """
+        points = as_points("points_cam", points_cam, 3).transpose(-1, -2)
+        seen = project_components(points, self.parameters, self.model)
+        pixels = torch.where(seen.regular[..., None, :], seen.pixels, 0.0)
+        return pixels.transpose(-1, -2), seen.regular
+
+    def camera(self) -> Camera:
+        """The camera, out of the graph."""
+        return Camera(self.parameters.detach(), size=self.size, model=self.model)
+
+    def state(self) -> State:
+        """As the solver's tuple, out of the graph."""
+        none = self.parameters.new_zeros(0, 3, 3), self.parameters.new_zeros(0, 3)
+        pose = self.cam_from_board_rotation, self.cam_from_board_translation
+        return tuple(tensor.detach() for tensor in (self.parameters, self.board_warp, *none, *pose))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Board:
+    points: Tensor
+
+
+@dataclasses.dataclass(frozen=True)
+class _Corners:
+    """What `kcal.calibrate.camera.solve.solve` asks of observations."""
+
+    board: _Board
+    image_size: tuple[int, int]
+    corners: Tensor
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"view {i}" for i in range(len(self.corners)))
+
+    def pixels(self) -> Tensor:
+        return self.corners
+
+    def covariances(self) -> Tensor | None:
+        return None
+
+
+def calibrate_views(
+    pixels: Tensor,
+    board_points: Tensor,
+    size: tuple[int, int],
+    options: CalibrationOptions | None = None,
+    *,
+    mask: Tensor | None = None,
+    prior_means: Tensor | None = None,
+    corner_sigma: float = 0.2,
+    start: CalibratedViews | None = None,
+    backward: Backward = "implicit",
+) -> CalibratedViews:
+    """Calibrate one camera, with gradients by the corners, the board's points and the means of the priors.
+
+    The solution x minimizes c(x) = ½ Σ ρ(‖projected - observed‖²) + ½ Σ (corner_sigma / σ_k)² (x_k - mean_k)², where
+    all corners count alike; a weak prior adds such terms for the coefficients, for the outermost corner that the search
+    found. "implicit" differentiates the condition ∂c/∂x = 0: dx/dd = -H⁻¹ ∂²c/∂x∂d with the exact Hessian H of c,
+    residuals' curvature and robust loss counted, in the blocks of the Schur complement (work and memory grow linearly
+    with the views; nothing is computed before a gradient is asked for). "unroll" records eight steps of Gauss and
+    Newton at the solution: the same derivatives but for what such steps leave, and of any order. "none" carries no
+    gradient.
+
+    Args:
+        pixels: (V, N, 2) corners; NaN where not seen.
+        board_points: (N, 3) meters, in the order of the corners, near the plane z = 0. A board's warp is as wide as
+            its outermost corners; where several tie, they share the derivative of that width.
+        size: (width, height) of the image in pixels.
+        options: as for `calibrate_camera`; `reject` is refused, because what is left out is no continuous choice.
+        mask: (V, N) bool, which corners count; None: those that are finite.
+        prior_means: (Q,) in the order of `options.priors`, in place of their means.
+        corner_sigma: pixels of a corner's noise along an axis, against which priors count. Given, not measured, so
+            that the cost is a function of the data alone.
+        start: an earlier solution of nearly the same data, in place of the search: for training loops. It stays in that
+            solution's minimum.
+        backward: see above.
+
+    Returns:
+        The camera and the poses. Values do not depend on `backward`, but for rounding.
+
+    Raises:
+        InputError: wrong shapes or values.
+        DegenerateError: too few views, or data that do not determine a parameter, for which no derivative exists: a
+            flat valley, a saddle, a bound. Fix parameters, choose a smaller model, or add priors.
+
+    Example:
+        >>> from kcal.corners.board import Board
+        >>> from kcal.lens.pose import rotation_from_vector
+        >>> board = Board(columns=7, rows=6, square=0.05).points
+        >>> truth = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)
+        >>> shift = torch.tensor([-0.15, -0.12, 0.6], dtype=torch.float64)
+        >>> pixels, _ = truth.project(board @ rotation_from_vector(tilts).transpose(-1, -2) + shift)
+        >>> pixels = pixels.requires_grad_(True)
+        >>> found = calibrate_views(pixels, board, (640, 480), CalibrationOptions(model="pinhole"))
+        >>> (by_pixels,) = torch.autograd.grad(found.parameters[2], pixels)  # of cx
+        >>> [round(float(value), 9) + 0.0 for value in by_pixels.sum((0, 1))]  # all corners one pixel to the right
+        [1.0, 0.0]
+    """
+    options = options or CalibrationOptions()
+    pixels, board_points, means = _checked(pixels, board_points, options, mask, prior_means, corner_sigma, backward)
+    rules = options.rules(size)
+    known = [parameter_names(options.lens).index(name) for name in options.priors]
+    weights = torch.tensor([corner_sigma / sigma for _, sigma in options.priors.values()], dtype=torch.float64)
+
+    def problem_of(values: Sequence[Tensor], kind: type[BoardProblem] = BoardProblem) -> BoardProblem:
+        corners, board, mean = values
+        terms: list[Term] = [Prior(torch.tensor(known), mean, weights)] if known else []
+        if options.weak_prior is not None and options.camera is None and is_overparameterized(options.lens):
+            mild = CoefficientPrior(options.weak_prior, reach)
+            terms.append(mild.prior(options.lens, corner_sigma, {*options.fixed, *options.priors}))
+        return kind(
+            board,
+            corners[:, None],
+            [options.lens],
+            [rules.parameters(options.lens)],
+            free_warp=options.board_warp,
+            loss=options.loss,
+            terms=terms,
+        )
+
+    data = (pixels, board_points, means)
+    fixed = tuple(tensor.detach() for tensor in data)
+    if start is None:
+        corners = _Corners(_Board(fixed[1]), size, fixed[0])
+        priors = {n: (float(m), s) for (n, (_, s)), m in zip(options.priors.items(), fixed[2], strict=True)}
+        begin = alone(solve(corners, dataclasses.replace(options, priors=priors), lambda _: None)).result.state
+        reach = _reach(begin, fixed[1], fixed[0])
+    else:
+        begin, reach = start.state(), start.reach
+        if start.model != options.lens or len(begin[-1]) != len(pixels):
+            raise InputError("calibrate_views: the start is of another lens model or another number of views")
+    problem = problem_of(fixed)
+    state, found = settle(problem, problem.tidy(begin))
+
+    if backward == "unroll":
+        recorded = problem_of(data, RecordedProblem)
+        for _ in range(_UNROLLED):
+            step, _ = recorded.linearize(state).step(state[0].new_zeros(()))
+            state = recorded.retract(state, step)
+    elif backward == "implicit" and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in data):
+        here = state
+
+        def cost(shared: Tensor, local: Tensor, *values: Tensor) -> Tensor:
+            return problem_of(values).cost(problem.retract(here, (shared, local)))
+
+        state = problem.retract(state, implicit_step(cost, found, data))
+    at = problem if backward == "none" else problem_of(data)
+    return CalibratedViews(
+        parameters=state[0],
+        board_warp=state[1],
+        cam_from_board_rotation=state[-2],
+        cam_from_board_translation=state[-1],
+        residuals=at.pixel_errors(state)[:, 0].transpose(-1, -2),
+        model=options.lens,
+        size=size,
+        reach=reach,
+    )
+
+
+class CalibrationLayer(nn.Module):
+    """`calibrate_views` as a module: calibrates in its forward pass, carries gradients in its backward pass.
+
+    Args:
+        size: (width, height) of the image in pixels.
+        options: as for `calibrate_camera`.
+        backward: "implicit" (exact first derivatives), "unroll" (derivatives of any order, more memory) or "none".
+        corner_sigma: pixels of a corner's noise along an axis, against which priors count.
+
+    Convention: float64 whatever comes in; half precision of the network around it stays outside.
+
+    Example:
+        >>> layer = CalibrationLayer((640, 480), CalibrationOptions(model="pinhole"), backward="none")
+        >>> layer
+        CalibrationLayer(size=(640, 480), model=pinhole, backward=none)
+    """
+
+    def __init__(
+        self,
+        size: tuple[int, int],
+        options: CalibrationOptions | None = None,
+        *,
+        backward: Backward = "implicit",
+        corner_sigma: float = 0.2,
+    ) -> None:
+        super().__init__()
+        self.size, self.options = size, options or CalibrationOptions()
+        self.backward, self.corner_sigma = backward, corner_sigma
+
+    def forward(
+        self,
+        pixels: Tensor,
+        board_points: Tensor,
+        mask: Tensor | None = None,
+        prior_means: Tensor | None = None,
+        start: CalibratedViews | None = None,
+    ) -> CalibratedViews:
+        """See `calibrate_views`."""
+        return calibrate_views(
+            pixels,
+            board_points,
+            self.size,
+            self.options,
+            mask=mask,
+            prior_means=prior_means,
+            corner_sigma=self.corner_sigma,
+            start=start,
+            backward=self.backward,
+        )
+
+    def __call__(self, *args: Any, **kwargs: Any) -> CalibratedViews:
+        """See `forward`."""
+        result: CalibratedViews = super().__call__(*args, **kwargs)
+        return result
+
+    def extra_repr(self) -> str:
+        """One line for people."""
+        return f"size={self.size}, model={self.options.lens}, backward={self.backward}"
+
+
+def _reach(state: State, board_points: Tensor, pixels: Tensor) -> float:
+    """Largest undistorted radius at which a corner was seen."""
+    no_rules = Views(board_points=board_points, pixels=pixels[:, None], size=(1, 1), free_warp=False)
+    return float(no_rules.observed_radius(state))
+
+
+def _checked(
+    pixels: Tensor,
+    board_points: Tensor,
+    options: CalibrationOptions,
+    mask: Tensor | None,
+    prior_means: Tensor | None,
+    corner_sigma: float,
+    backward: str,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Corners (NaN where they do not count), board points and means of priors as float64."""
+    if backward not in ("implicit", "unroll", "none"):
+        raise InputError(f"calibrate_views: backward must be implicit, unroll or none, got {backward!r}")
+    if options.reject is not None:
+        raise InputError("calibrate_views: leaving corners out is no continuous choice; use a robust loss, or a mask")
+    if not 0 < corner_sigma < float("inf"):
+        raise InputError(f"calibrate_views: corner_sigma must be positive pixels, got {corner_sigma}")
+    pixels, board_points = as_points("pixels", pixels, 2), as_points("board_points", board_points, 3)
+    if pixels.ndim != 3 or board_points.ndim != 2 or pixels.shape[1] != len(board_points):
+        raise InputError(
+            f"calibrate_views: pixels (V, N, 2) and board points (N, 3) are needed, got {tuple(pixels.shape)} and "
+            f"{tuple(board_points.shape)}"
+        )
+    require_finite("board_points", board_points)
+    if mask is not None:
+        if mask.shape != pixels.shape[:-1] or mask.dtype != torch.bool:
+            raise InputError(f"calibrate_views: the mask must be bool {tuple(pixels.shape[:-1])}")
+        if not bool(torch.isfinite(pixels[mask]).all()):
+            raise InputError("calibrate_views: the mask lets corners count that are not finite")
+        pixels = torch.where(mask[..., None], pixels, torch.nan)
+    if prior_means is None:
+        prior_means = torch.tensor([mean for mean, _ in options.priors.values()], dtype=torch.float64)
+    elif prior_means.shape != (len(options.priors),):
+        raise InputError(
+            f"calibrate_views: {len(options.priors)} prior means are needed, got shape {tuple(prior_means.shape)}"
+        )
+    return pixels, board_points, prior_means.to(torch.float64)

@@ -1,0 +1,206 @@
+"""Has a rig turned since it was solved? The monitor behind `kcal rig check`: attitudes from what does not move.
+
+Masts bend in the sun and mounts settle: the cameras stay where they are and turn by thousandths of a degree, which at
+long range is all that matters (0.01° of relative yaw is 436 m at 5 km with 10 m of baseline). Only rotations are
+unknown here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.rig.adjustment import Adjustment, chi2_quantile
+from kcal.calibrate.rig.initial_poses import Start
+from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, reject_wrong
+from kcal.calibrate.rig.records import item_records
+from kcal.calibrate.rig.result import ItemResidual
+from kcal.calibrate.rig.sources import Features, Landmarks, RigData
+from kcal.calibrate.rig.uncertainty import SharedSpread, relative_rows
+from kcal.checks import as_points
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.pose import vector_from_rotation
+from kcal.lens.rig import StereoRig
+from kcal.solve.lm import LMOptions
+
+_NAMES = ("left then", "right then", "left", "right")
+_SOLVER = LMOptions(residual_floor=1e-8)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Drift:
+    """How the cameras have turned, in radians about their own axes: pitch (x), yaw (y), roll (z).
+
+    Args:
+        left: (3,) turn of the left camera; None where only the relative attitude can be told.
+        right: (3,) of the right camera; likewise.
+        relative: (3,) of right_from_left about the right camera's axes, as in
+            `kcal.calibrate.bundle.twist.apply_twist`.
+        left_covariance: (3, 3), None as above.
+        right_covariance: (3, 3), None as above.
+        relative_covariance: (3, 3).
+        chi2: of the relative turn: with three degrees of freedom, if there was none.
+        rig: the rig as it stands now: the same cameras in the same places, turned.
+        pose_covariance: (6, 6) what the measurement adds to the covariance of the rig's relative pose.
+        cam_from_local: (3, 3) of the left camera now, where a pose was given.
+        items: residuals by item, those left out included: what moved, or is not the same thing.
+        variance: by which covariances were multiplied, because residuals were larger than stated.
+    """
+
+    left: Tensor | None
+    right: Tensor | None
+    relative: Tensor
+    left_covariance: Tensor | None
+    right_covariance: Tensor | None
+    relative_covariance: Tensor
+    chi2: float
+    rig: StereoRig
+    pose_covariance: Tensor
+    cam_from_local: Tensor | None
+    items: tuple[ItemResidual, ...]
+    variance: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance alone would show so much in less than one of a thousand checks."""
+        return self.chi2 > float(chi2_quantile(torch.tensor(3.0), 0.999))
+
+    @property
+    def left_out(self) -> tuple[ItemResidual, ...]:
+        """What is not part of the answer."""
+        return tuple(item for item in self.items if not item.used)
+
+
+def measure_drift(
+    rig: StereoRig,
+    *,
+    features: Features | None = None,
+    landmarks: Landmarks | None = None,
+    pose: tuple[Tensor, Tensor] | None = None,
+    before: tuple[Tensor, Tensor] | None = None,
+) -> Drift:
+    """Find how the cameras of a rig have turned.
+
+    From static features that were matched when the rig was good and are matched again (what they are and how far away
+    does not matter), from surveyed landmarks, or from far features of known range; the last tell only how the right
+    camera has turned if the left one has not. Features that moved are left out.
+
+    Args:
+        rig: as it was solved.
+        features: pixels (F, 4, 2): left and right then, left and right now; NaN then where they have no history.
+        landmarks: pixels (L, 2, 2), left and right now.
+        pose: rotation cam_from_local (3, 3) and center (3,) of the left camera when the rig was solved, in the frame of
+            the landmarks; needed with these.
+        before: (3, 3) covariances of the relative turn and of the left camera's attitude (about its own axes) when the
+            rig was solved. Without a history they are part of what a turn is compared with; with one they cancel.
+
+    Raises:
+        InputError: nothing to measure with, or landmarks without a pose.
+        DegenerateError: too little to tell the turn.
+
+    Example:
+        >>> from kcal.lens.camera import Camera
+        >>> from kcal.lens.pose import rotation_from_vector
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> turn = rotation_from_vector(torch.tensor([0.0, 2e-4, 0.0], dtype=torch.float64))
+        >>> later = StereoRig(camera, camera, turn, turn @ rig.right_from_left_translation)
+        >>> points = torch.tensor([[-900.0, 200, 3000], [800, -90, 2500], [40, 60, 4000], [300, 200, 2000]]).double()
+        >>> pixels = torch.stack([*rig(points)[:2], *later(points)[:2]], 1)
+        >>> known = torch.zeros(4).double(), torch.full((4,), torch.inf).double()
+        >>> static = Features(names=tuple("abcd"), pixels=pixels, inverse_range=known[0], inverse_range_sigma=known[1])
+        >>> round(float(measure_drift(rig, features=static).relative[1]), 9)
+        0.0002
+    """
+    if features is None and landmarks is None:
+        raise InputError("drift: features or landmarks are needed")
+    if landmarks is not None and pose is None:
+        raise InputError("drift: landmarks need the left camera's pose in their frame")
+    history = features is not None and bool(torch.isfinite(features.pixels[:, :2]).all(-1).any())
+    # Without anything that ties it to then, the left camera holds the frame.
+    loose = history or landmarks is not None
+    rotation, center = pose or (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    rotation, center = as_points("pose rotation", rotation, 3), as_points("pose center", center, 3)
+    right = rig.right_from_left_rotation @ rotation
+    right_center = center - rotation.T @ rig.right_from_left_rotation.T @ rig.right_from_left_translation
+    nothing = torch.empty(0, 3, 3, dtype=torch.float64), torch.empty(0, 3, dtype=torch.float64)
+    start = Start(
+        rotation=torch.stack([rotation, right, rotation, right]),
+        center=torch.stack([center, right_center, center, right_center]),
+        board_rotation=nothing[0],
+        board_translation=nothing[1],
+    )
+    if landmarks is not None:
+        unseen = torch.full_like(landmarks.pixels, math.nan)
+        landmarks = dataclasses.replace(landmarks, pixels=torch.cat([unseen, landmarks.pixels], 1))
+    cameras = (rig.left, rig.right, rig.left, rig.right)
+    data = RigData(cameras=cameras, names=_NAMES, features=features, landmarks=landmarks)
+    work = Adjustment(data, start, "fixed", 1.0, turning=[False, False, loose, True], moving=[False] * 4)
+    masks = _masks(data)
+    reasons: list[dict[int, str]] = [
+        dict.fromkeys((~mask).nonzero()[:, 0].tolist(), "too few of the images have a mark of it") for mask in masks
+    ]
+    if sum(int(mask.sum()) for mask in masks) < 2:
+        raise DegenerateError("drift: two features or landmarks at least are needed; more let wrong ones be found")
+    work.solve(masks, ROUGHLY, LOSS)
+    reject_wrong(work, masks, reasons, _SOLVER)
+    problem, _ = work.solve(masks, _SOLVER)
+    state = work.part(masks)
+    cost = 2.0 * float(problem.cost(state))
+    freedom = int(sum(int(f.sum()) for f in work.freedom(masks))) - problem.shared_size
+    large = freedom > 0 and cost > float(chi2_quantile(torch.tensor(float(freedom)), 0.999))
+    variance = cost / freedom if large else 1.0
+    spread = SharedSpread(problem, state, variance)
+    rows = relative_rows(problem, state, 2, 3)
+    covariance, determined = spread.of(rows)
+    if not bool(determined[:3].all()):
+        left_open = "; ".join(spread.open_directions(_NAMES, absolute=True))
+        raise DegenerateError(f"drift: what was seen does not determine how the cameras have turned ({left_open})")
+    turned, places = state[1], state[2]
+    relative = turned[3] @ turned[2].T
+    drift = vector_from_rotation(relative @ rig.right_from_left_rotation.T)
+    own = [vector_from_rotation(turned[c + 2] @ turned[c].T) for c in (0, 1)]
+    alone = []
+    for c in (2, 3):
+        slot = problem.turn[c]
+        unit = torch.zeros(3, problem.shared_size, dtype=torch.float64)
+        if slot is not None:
+            unit[:, slot] = torch.eye(3, dtype=torch.float64)
+        alone.append(spread.of(unit)[0])
+    compared = covariance[:3, :3]
+    if before is not None and not history:
+        turn = relative
+        compared = compared + before[0]
+        alone = [alone[0] + before[1], alone[1] + before[0] + turn @ before[1] @ turn.T]
+    return Drift(
+        left=own[0] if loose else None,
+        right=own[1] if loose else None,
+        relative=drift,
+        left_covariance=alone[0] if loose else None,
+        right_covariance=alone[1] if loose else None,
+        relative_covariance=compared,
+        chi2=float(drift @ torch.linalg.solve(compared, drift)),
+        rig=StereoRig(rig.left, rig.right, relative, turned[3] @ (places[2] - places[3])),
+        pose_covariance=covariance,
+        cam_from_local=turned[2] if pose is not None else None,
+        items=item_records(work, masks, reasons),
+        variance=variance,
+    )
+
+
+def _masks(data: RigData) -> list[Tensor]:
+    """What says anything: landmarks with a mark now, features seen by both cameras now or by one then and now."""
+    none = torch.zeros(0, dtype=torch.bool)
+    marked = none
+    if data.landmarks is not None:
+        marked = torch.isfinite(data.landmarks.pixels).all(-1).any(-1)
+    matched = none
+    if data.features is not None:
+        seen = torch.isfinite(data.features.pixels).all(-1)
+        known = torch.isfinite(data.features.inverse_range_sigma)
+        past = seen[:, :2].any(-1)
+        matched = seen[:, 2:].any(-1) & (past | (known & seen[:, 2:].all(-1)))
+    return [none, marked, matched]

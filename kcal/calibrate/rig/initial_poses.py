@@ -1,0 +1,325 @@
+"""Where the cameras of a rig stand, roughly, before everything is adjusted together."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.bundle.closed_form import spread_out
+from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, Poses, consensus, pose_alone
+from kcal.calibrate.rig.resection import consensus_pose, consensus_rotation, rotation_between
+from kcal.calibrate.rig.sources import Boards, RigData
+from kcal.errors import DegenerateError
+from kcal.solve.lm import LMOptions
+
+# A board farther from where the other boards put it (pixels, and times the median) does not belong.
+_ROUGH = (10.0, 10.0)
+# Weight of "cameras are held upright" where measured positions leave a turn open.
+_LEVEL = 1e-3
+
+
+@dataclasses.dataclass(kw_only=True, eq=False)
+class Start:
+    """Poses to begin with.
+
+    Args:
+        rotation: (C, 3, 3) cam_from_world.
+        center: (C, 3) meters.
+        board_rotation: (V, 3, 3) world_from_board.
+        board_translation: (V, 3) meters.
+    """
+
+    rotation: Tensor
+    center: Tensor
+    board_rotation: Tensor
+    board_translation: Tensor
+
+
+@dataclasses.dataclass(kw_only=True, eq=False)
+class InitialPoses:
+    """What a solve begins with.
+
+    Args:
+        data: with boards turned where they had been read from the other end.
+        starts: rivals; the best solution decides.
+        flipped: boards that were turned.
+        foreign: boards that do not belong, with the reason.
+        usable: (V,) boards that two cameras at least see well.
+    """
+
+    data: RigData
+    starts: list[Start]
+    flipped: list[str]
+    foreign: dict[int, str]
+    usable: Tensor
+
+
+class _Known:
+    """Poses found so far; None where a camera still has none."""
+
+    def __init__(self, count: int) -> None:
+        self.rotation: list[Tensor | None] = [None] * count
+        self.center: list[Tensor | None] = [None] * count
+
+    def poses(self, camera: int) -> Poses:
+        rotation, center = self.rotation[camera], self.center[camera]
+        assert rotation is not None
+        assert center is not None
+        return Poses(rotation, -(rotation @ center))
+
+    def put(self, camera: int, rotation: Tensor, center: Tensor) -> None:
+        self.rotation[camera], self.center[camera] = rotation, center
+
+    @property
+    def ready(self) -> list[int]:
+        return [c for c, rotation in enumerate(self.rotation) if rotation is not None]
+
+
+def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
+    """Find a pose for every camera and board, from landmarks, then boards, then features and measured positions.
+
+    Raises:
+        DegenerateError: nothing ties a camera to the others; it is named.
+    """
+    count = len(data.cameras)
+    known, views = _Known(count), _BoardViews(data, solver)
+    if data.landmarks is not None:
+        for c in range(count):
+            _from_landmarks(data, c, known)
+    placed = bool(known.ready)
+    if not placed:
+        known.put(0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    open_ends: list[int] = []
+    headings = None if placed else _measured_starts(data)
+    while headings is None and len(known.ready) < count:
+        waiting = [c for c in range(count) if c not in known.ready]
+        if views.link(known, waiting):
+            continue
+        if not any(_from_features(data, c, known, open_ends, placed) for c in waiting):
+            names = ", ".join(data.names[c] for c in waiting)
+            raise DegenerateError(
+                f"nothing tells where {names} stands: it needs boards seen together with another camera, three or "
+                "better four landmarks, or features together with its position or the baseline"
+            )
+    views.settle(known)
+    starts = headings or _starts(data, known, open_ends)
+    if data.absolute and not placed and headings is None:
+        for start in starts:
+            _into_frame(data, start)
+    for start in starts:
+        start.board_rotation, start.board_translation = views.world(start)
+    return InitialPoses(
+        data=views.data, starts=starts, flipped=views.flipped, foreign=views.foreign, usable=views.usable
+    )
+
+
+def _measured_starts(data: RigData) -> list[Start] | None:
+    """Starts for cameras whose positions are all measured and that only features tie: level, in eight headings."""
+    if (
+        data.features is None
+        or data.boards is not None
+        or {p.camera for p in data.positions} != {*range(len(data.cameras))}
+    ):
+        return None
+    known = _Known(len(data.cameras))
+    known.put(0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    for _ in data.cameras:
+        for camera in range(len(data.cameras)):
+            if camera not in known.ready:
+                _from_features(data, camera, known, [], False)
+    if len(known.ready) < len(data.cameras):
+        return None
+    relative = torch.stack([known.poses(c).rotation for c in range(len(data.cameras))])
+    center = torch.stack([place for c in range(len(data.cameras)) if (place := _position(data, c)) is not None])
+    nothing, starts = torch.empty(0, dtype=torch.float64), []
+    for eighth in range(8):
+        sine, cosine = math.sin(math.pi * eighth / 4), math.cos(math.pi * eighth / 4)
+        level = torch.tensor([[cosine, -sine, 0.0], [0.0, 0.0, -1.0], [sine, cosine, 0.0]], dtype=torch.float64)
+        starts.append(
+            Start(rotation=relative @ level, center=center, board_rotation=nothing, board_translation=nothing)
+        )
+    return starts
+
+
+def _position(data: RigData, camera: int) -> Tensor | None:
+    return next((p.point for p in data.positions if p.camera == camera), None)
+
+
+def _from_landmarks(data: RigData, camera: int, known: _Known) -> None:
+    landmarks = data.landmarks
+    assert landmarks is not None
+    rays, valid = data.cameras[camera].unproject(landmarks.pixels[:, camera])
+    found = consensus_pose(rays[valid], landmarks.points[valid], _position(data, camera))
+    if found is not None:
+        known.put(camera, found[0], found[1])
+
+
+def _from_features(data: RigData, camera: int, known: _Known, open_ends: list[int], placed: bool) -> bool:
+    """Rotation from features shared with a camera that is known; the center from its position or a baseline."""
+    if data.features is None:
+        return False
+    features, center = data.features, _position(data, camera) if placed else None
+    for other in known.ready:
+        both = torch.isfinite(features.pixels[:, [camera, other]]).all(-1).all(-1)
+        rays, valid = data.cameras[camera].unproject(features.pixels[:, camera])
+        far, seen = data.cameras[other].unproject(features.pixels[:, other])
+        use = both & valid & seen
+        if int(use.sum()) < 2:
+            continue
+        pose = known.poses(other)
+        back = known.center[other]
+        assert back is not None
+        directions = far[use] @ pose.rotation
+        rotation, _ = consensus_rotation(rays[use], directions)
+        if center is None:
+            length = _baseline(data, camera, other)
+            if length is None:
+                continue
+            # Along which axis the camera stands is tried below.
+            center = back + length * pose.rotation[0]
+            open_ends.append(camera)
+        known.put(camera, rotation, center)
+        return True
+    return False
+
+
+def _baseline(data: RigData, one: int, other: int) -> float | None:
+    for baseline in data.baselines:
+        if {baseline.first, baseline.second} == {one, other}:
+            return baseline.length
+    places = _position(data, one), _position(data, other)
+    if places[0] is None or places[1] is None:
+        return None
+    return float(torch.linalg.vector_norm(places[0] - places[1]))
+
+
+def _starts(data: RigData, known: _Known, open_ends: list[int]) -> list[Start]:
+    rotation = torch.stack([known.poses(c).rotation for c in range(len(data.cameras))])
+    center = torch.stack([place for place in known.center if place is not None])
+    nothing = torch.empty(0, dtype=torch.float64)
+    starts = [Start(rotation=rotation, center=center, board_rotation=nothing, board_translation=nothing)]
+    for camera in open_ends:
+        other = 0 if camera != 0 else 1
+        length = float(torch.linalg.vector_norm(center[camera] - center[other]))
+        axes = torch.cat([rotation[other], -rotation[other]])
+        starts = [
+            dataclasses.replace(start, center=start.center.index_copy(0, torch.tensor([camera]), place[None]))
+            for start in starts
+            for place in start.center[other] + length * axes
+        ]
+    return starts
+
+
+def _into_frame(data: RigData, start: Start) -> None:
+    """Turn and shift a rig that stands in its first camera's frame to where its cameras were measured."""
+    index = [p.camera for p in data.positions]
+    there = torch.stack([p.point for p in data.positions])
+    here = start.center[index]
+    level = -start.rotation.transpose(-1, -2)[..., 1].mean(0, keepdim=True)
+    up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    moved = there - there.mean(0), here - here.mean(0)
+    scale = max(float(torch.linalg.vector_norm(moved[1])), 1.0)
+    turn = rotation_between(torch.cat([moved[0] / scale, _LEVEL * up]), torch.cat([moved[1] / scale, _LEVEL * level]))
+    start.center = (start.center - here.mean(0)) @ turn.T + there.mean(0)
+    start.rotation = start.rotation @ turn.T
+
+
+class _BoardViews:
+    """Each camera's boards, found by it alone, and what they say of two cameras that saw the same ones."""
+
+    def __init__(self, data: RigData, solver: LMOptions) -> None:
+        self.data = data
+        self.flipped: list[str] = []
+        self.foreign: dict[int, str] = {}
+        self._alone: list[Poses] = []
+        self._good = torch.zeros(0, len(data.cameras), dtype=torch.bool)
+        boards = data.boards
+        if boards is None:
+            return
+        points, good = boards.board.points, []
+        for c, camera in enumerate(data.cameras):
+            _, valid = camera.normalize(boards.pixels[:, c])
+            enough = valid.sum(-1) >= MINIMUM_CORNERS
+            enough[enough.clone()] &= spread_out(points, boards.pixels[enough, c])
+            rotation = torch.full((len(enough), 3, 3), math.nan, dtype=torch.float64)
+            translation = torch.full((len(enough), 3), math.nan, dtype=torch.float64)
+            if bool(enough.any()):
+                found, _ = pose_alone(points, boards.pixels[enough, c], camera, solver)
+                rotation[enough], translation[enough] = found.rotation, found.translation
+            self._alone.append(Poses(rotation, translation))
+            good.append(enough)
+        self._good = torch.stack(good, -1)
+
+    def link(self, known: _Known, waiting: list[int]) -> bool:
+        """Place the waiting camera that shares most boards with one that is placed."""
+        shared = [(int((self._good[:, c] & self._good[:, o]).sum()), c, o) for c in waiting for o in known.ready]
+        number, camera, other = max(shared)
+        if number == 0:
+            return False
+        relative = self._relative(other, camera)
+        pose = relative.after(known.poses(other))
+        known.put(camera, pose.rotation, -(pose.rotation.T @ pose.translation))
+        return True
+
+    def settle(self, known: _Known) -> None:
+        """Turn boards that were read from the other end also for cameras that landmarks have placed."""
+        boards = self.data.boards
+        if boards is None:
+            return
+        for camera in range(1, len(self.data.cameras)):
+            if bool((self._good[:, 0] & self._good[:, camera]).any()):
+                self._relative(0, camera)
+
+    def _relative(self, first: int, second: int) -> Poses:
+        boards = self.data.boards
+        assert boards is not None
+        both = (self._good[:, first] & self._good[:, second]).nonzero()[:, 0]
+        cameras = self.data.cameras[first], self.data.cameras[second]
+        one, two = (Poses(self._alone[c].rotation[both], self._alone[c].translation[both]) for c in (first, second))
+        pixels = boards.pixels[both][:, [first, second]]
+        relative, turned, error = consensus(boards.board.points, pixels, cameras, one, two)
+        if bool(turned.any()):
+            self._turn(boards, both[turned], second)
+        limit = max(_ROUGH[0] * float(error.median()), _ROUGH[1])
+        for i in (error > limit).nonzero()[:, 0].tolist():
+            self.foreign[int(both[i])] = f"its board is {float(error[i]):.0f} px away from where the others put it"
+        return relative
+
+    def _turn(self, boards: Boards, views: Tensor, camera: int) -> None:
+        pixels = boards.pixels.clone()
+        pixels[views, camera] = pixels[views, camera].flip(-2)
+        covariance = boards.covariance
+        if covariance is not None:
+            covariance = covariance.clone()
+            covariance[views, camera] = covariance[views, camera].flip(-3)
+        self.data = dataclasses.replace(
+            self.data, boards=dataclasses.replace(boards, pixels=pixels, covariance=covariance)
+        )
+        # The pose of a board that is read from its other end: half a turn about its middle.
+        half = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+        turn = Poses(half, boards.board.points.amin(0) + boards.board.points.amax(0))
+        alone = self._alone[camera]
+        new = Poses(alone.rotation[views], alone.translation[views]).after(turn)
+        alone.rotation[views], alone.translation[views] = new.rotation, new.translation
+        self.flipped += [f"{boards.names[i]} ({self.data.names[camera]})" for i in views.tolist()]
+
+    def world(self, start: Start) -> tuple[Tensor, Tensor]:
+        """world_from_board by the first camera that sees each board well; where none does, any pose."""
+        count = len(self._good)
+        rotation = torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
+        translation = torch.zeros(count, 3, dtype=torch.float64)
+        for c in reversed(range(len(self.data.cameras))):
+            seen = self._good[:, c] if count else self._good.new_zeros(0)
+            if bool(seen.any()):
+                back = start.rotation[c].T
+                rotation[seen] = back @ self._alone[c].rotation[seen]
+                translation[seen] = self._alone[c].translation[seen] @ start.rotation[c] + start.center[c]
+        return rotation, translation
+
+    @property
+    def usable(self) -> Tensor:
+        """(V,) whether at least two cameras see a board well."""
+        return self._good.sum(-1) >= 2

@@ -1,0 +1,242 @@
+"""What a rig can be solved from: boards, surveyed landmarks, far features, measured baselines, measured positions.
+
+All of it is in one local frame in meters: east, north, up of an origin where anything is known on the Earth
+(`kcal.locate.survey` reads latitudes and longitudes), the first camera's frame where nothing is. `C` is the number of
+cameras throughout; pixels are NaN where a camera did not see something.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.bundle.weights import whitening
+from kcal.checks import as_points, require_finite
+from kcal.corners.board import Board
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+
+
+def _positive(name: str, value: float) -> None:
+    if not 0 < value < math.inf:
+        raise InputError(f"{name}: a positive number is needed, got {value}")
+
+
+def _marked(kind: str, names: tuple[str, ...], pixels: Tensor) -> None:
+    """Refuse marks that are not one in each camera for each name."""
+    count = len(names)
+    if pixels.ndim != 3 or pixels.shape[::2] != (count, 2):
+        raise InputError(f"{kind}: pixels ({count}, C, 2) are needed, got {tuple(pixels.shape)}")
+    _names(kind, names, count)
+
+
+def _names(kind: str, names: tuple[str, ...], count: int) -> None:
+    if len(names) != count:
+        raise InputError(f"{kind}: {len(names)} names for {count}; one each is needed")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"{kind}: the name {twice[0]!r} is there twice")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Boards:
+    """Boards shown to several cameras at the same moment.
+
+    Args:
+        board: the board.
+        pixels: (V, C, N, 2) its corners.
+        names: one a moment.
+        covariance: (V, C, N, 2, 2) px² of corners, by which they weigh; all alike if left out.
+        sigma: of a corner along an axis, px; estimated from the residuals if left out.
+    """
+
+    board: Board
+    pixels: Tensor
+    names: tuple[str, ...]
+    covariance: Tensor | None = None
+    sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.pixels.ndim != 4 or self.pixels.shape[2:] != (self.board.corners, 2):
+            raise InputError(
+                f"boards: pixels (V, C, {self.board.corners}, 2) are needed, got {tuple(self.pixels.shape)}"
+            )
+        _names("boards", self.names, len(self.pixels))
+        if self.covariance is not None and self.covariance.shape != (*self.pixels.shape, 2):
+            raise InputError(
+                f"boards: a covariance {(*self.pixels.shape, 2)} is needed, got {tuple(self.covariance.shape)}"
+            )
+        if self.sigma is not None:
+            _positive("boards: sigma", self.sigma)
+
+    def whitening(self, sigma: float) -> Tensor:
+        """(V, C, N, 2, 2) by which residuals are multiplied; corners have `sigma` on average."""
+        if self.covariance is None:
+            return (torch.eye(2, dtype=torch.float64) / sigma).expand(*self.pixels.shape, 2)
+        flat = self.covariance.flatten(0, 2)
+        return (whitening(flat, sigma**2) / sigma).unflatten(0, self.pixels.shape[:3])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Landmarks:
+    """Surveyed points, marked in the images.
+
+    Args:
+        names: one each.
+        points: (L, 3) meters in the local frame.
+        sigma: (L, 3) meters along the frame's axes, of the survey; independent from point to point.
+        pixels: (L, C, 2) marks.
+        pixel_sigma: of a mark along an axis, px.
+    """
+
+    names: tuple[str, ...]
+    points: Tensor
+    sigma: Tensor
+    pixels: Tensor
+    pixel_sigma: float = 0.3
+
+    def __post_init__(self) -> None:
+        count = len(self.names)
+        if self.points.shape != (count, 3) or self.sigma.shape != (count, 3):
+            raise InputError(
+                f"landmarks: points and sigma ({count}, 3) are needed, got {tuple(self.points.shape)} and "
+                f"{tuple(self.sigma.shape)}"
+            )
+        _marked("landmarks", self.names, self.pixels)
+        require_finite("landmarks: points", as_points("landmarks: points", self.points, 3))
+        if not bool((torch.isfinite(self.sigma) & (self.sigma > 0)).all()):
+            raise InputError("landmarks: every sigma must be a positive number of meters; nothing is surveyed exactly")
+        _positive("landmarks: pixel_sigma", self.pixel_sigma)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Features:
+    """Things matched between the images whose position nobody surveyed.
+
+    A feature alone ties the epipolar geometry: relative pitch and roll. It locks relative yaw if something is known of
+    its range, and the farther it is, the less need be known: a summit 20 km ± 2 km away is 0.8 ± 0.08 px of disparity
+    with 10 m of baseline and f 1600 px; a star has none.
+
+    Args:
+        names: one each.
+        pixels: (F, C, 2) marks.
+        inverse_range: (F,) one over meters from the middle of the rig; 0 at infinity.
+        inverse_range_sigma: (F,) its standard deviation; infinite where the range is not known.
+        pixel_sigma: of a mark along an axis, px.
+    """
+
+    names: tuple[str, ...]
+    pixels: Tensor
+    inverse_range: Tensor
+    inverse_range_sigma: Tensor
+    pixel_sigma: float = 0.3
+
+    def __post_init__(self) -> None:
+        count = len(self.names)
+        _marked("features", self.names, self.pixels)
+        if self.inverse_range.shape != (count,) or self.inverse_range_sigma.shape != (count,):
+            raise InputError(f"features: inverse_range and its sigma ({count},) are needed")
+        if not bool((torch.isfinite(self.inverse_range) & (self.inverse_range_sigma > 0)).all()):
+            raise InputError("features: inverse ranges must be finite and their sigmas positive")
+        _positive("features: pixel_sigma", self.pixel_sigma)
+
+
+def inverse_range_beyond(meters: float) -> tuple[float, float]:
+    """Inverse range and its standard deviation of what is known to be farther than `meters`.
+
+    Any inverse range from 0 to 1 / meters is taken as equally likely: the mean and the spread of that.
+
+    Example:
+        >>> inverse_range_beyond(1000.0)[0]
+        0.0005
+    """
+    _positive("range", meters)
+    return 0.5 / meters, 1.0 / (meters * math.sqrt(12.0))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Baseline:
+    """A measured distance between the centers of two cameras, meters."""
+
+    first: int
+    second: int
+    length: float
+    sigma: float
+
+    def __post_init__(self) -> None:
+        _positive("baseline", self.length)
+        _positive("baseline: sigma", self.sigma)
+        if self.first == self.second:
+            raise InputError("baseline: two different cameras are needed")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class MeasuredPosition:
+    """A camera's projection center, measured (by GNSS, say): (3,) meters in the local frame and its (3,) sigmas."""
+
+    camera: int
+    point: Tensor
+    sigma: Tensor
+
+    def __post_init__(self) -> None:
+        if self.point.shape != (3,) or self.sigma.shape != (3,) or not bool(torch.isfinite(self.point).all()):
+            raise InputError("position: three meters and three sigmas are needed")
+        if not bool((torch.isfinite(self.sigma) & (self.sigma > 0)).all()):
+            raise InputError("position: every sigma must be a positive number of meters")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class RigData:
+    """All that a rig is solved from; any of it may be missing.
+
+    Args:
+        cameras: two or more, calibrated; unlike sizes and models are welcome.
+        names: of the cameras.
+        covariances: (5 + P, 5 + P) of each camera's parameters, where intrinsics are solved with priors.
+        boards: see `Boards`.
+        landmarks: see `Landmarks`.
+        features: see `Features`.
+        baselines: see `Baseline`.
+        positions: see `MeasuredPosition`.
+
+    Raises:
+        InputError: names or shapes that do not fit each other, fewer than two cameras.
+
+    Example:
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080))
+        >>> RigData(cameras=(camera, camera), names=("left", "right")).absolute
+        False
+    """
+
+    cameras: tuple[Camera, ...]
+    names: tuple[str, ...]
+    covariances: tuple[Tensor | None, ...] | None = None
+    boards: Boards | None = None
+    landmarks: Landmarks | None = None
+    features: Features | None = None
+    baselines: tuple[Baseline, ...] = ()
+    positions: tuple[MeasuredPosition, ...] = ()
+
+    def __post_init__(self) -> None:
+        count = len(self.cameras)
+        if count < 2:
+            raise InputError("a rig has two cameras or more")
+        _names("cameras", self.names, count)
+        if not all(isinstance(camera, Camera) and camera.params.ndim == 1 for camera in self.cameras):
+            raise InputError("a rig is made of single cameras of the kinds Camera and HybridCamera")
+        if self.covariances is not None and len(self.covariances) != count:
+            raise InputError(f"covariances: one a camera is needed, got {len(self.covariances)} for {count}")
+        for kind, source in (("boards", self.boards), ("landmarks", self.landmarks), ("features", self.features)):
+            if source is not None and source.pixels.shape[1] != count:
+                raise InputError(f"{kind}: pixels of {source.pixels.shape[1]} cameras, the rig has {count}")
+        numbers = [n for b in self.baselines for n in (b.first, b.second)] + [p.camera for p in self.positions]
+        if any(not 0 <= number < count for number in numbers):
+            raise InputError(f"baselines and positions name cameras 0 to {count - 1}")
+
+    @property
+    def absolute(self) -> bool:
+        """Whether anything places the rig in the local frame; otherwise that is the first camera's."""
+        return self.landmarks is not None or bool(self.positions)

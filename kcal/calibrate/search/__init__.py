@@ -1,0 +1,1 @@
+"""How a minimum is found where there are several."""

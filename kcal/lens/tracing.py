@@ -1,0 +1,95 @@
+"""What only an ordinary, eager call may do: look at values, and work through points a cache-sized piece at a time.
+
+Under `torch.compile`, `torch.export` and `vmap` no branch may depend on values, and the compiler does its own blocking.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+# Points a piece: large enough to outweigh the cost of a call, small enough for the caches of one core.
+CHUNK = 16384
+
+
+def is_traced() -> bool:
+    """Whether this call is being compiled or exported."""
+    return torch.compiler.is_compiling() or torch.jit.is_tracing()
+
+
+def known_true(mask: Tensor) -> bool:
+    """Whether a mask is true everywhere; False also where that may not be asked (compile, export, vmap)."""
+    if is_traced():
+        return False
+    try:
+        return bool(mask.all())
+    except RuntimeError:  # vmap refuses to turn tensors into branches
+        return False
+
+
+def may_branch(*tensors: Tensor) -> bool:
+    """Whether Python may branch on values computed from these tensors."""
+    return all(known_true(tensor.reshape(-1)[:0] == 0) for tensor in tensors)
+
+
+def separate(points: Tensor) -> tuple[Tensor, ...]:
+    """Points (..., K) as K tensors (...).
+
+    Compiled kernels get each coordinate in memory of its own, because loops over interleaved ones are not vectorized:
+    that is worth a factor of two to three. `as_strided` is what the compiler does not fuse away.
+    """
+    if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+        planes = points.movedim(-1, 0).contiguous()
+        points = torch.as_strided(planes, planes.shape, planes.stride()).movedim(0, -1)
+    return points.unbind(-1)
+
+
+def finite_or(x: Tensor, y: Tensor, other_x: Tensor, other_y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Coordinates (..., N) with others in place of what is not finite, and the mask of what was.
+
+    To be called before any arithmetic: 0 * NaN in the backward pass would spoil the gradients of parameters.
+    """
+    finite = torch.isfinite(x + y)
+    if known_true(finite):
+        return x, y, finite
+    return torch.where(finite, x, other_x), torch.where(finite, y, other_y), finite
+
+
+def is_differentiated(*tensors: Tensor) -> bool:
+    """Whether derivatives by any of the tensors are being recorded, in reverse or in forward mode."""
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        return True
+    return not is_traced() and any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
+
+
+def plain_on_host(*tensors: Tensor) -> bool:
+    """Whether NumPy may do the work: on the CPU, where nothing is differentiated, traced or mapped."""
+    if torch.is_grad_enabled() or is_traced() or any(tensor.device.type != "cpu" for tensor in tensors):
+        return False
+    try:
+        # What `torch.func` wraps has no memory of its own.
+        return not is_differentiated(*tensors) and all(tensor.data_ptr() >= 0 for tensor in tensors)
+    except RuntimeError:
+        return False
+
+
+def in_chunks(
+    function: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor, batch: int, *, differentiated: bool
+) -> tuple[Tensor, Tensor]:
+    """Call `function`, which maps points (..., N, K) to values (..., N, L) and a mask (..., N), piece by piece.
+
+    Args:
+        function: what to call; each point must stand for itself.
+        points: (..., N, K).
+        batch: how many cameras each point is computed for.
+        differentiated: then everything is done in one piece, because the graph would keep all pieces anyway.
+    """
+    count = points.shape[-2]
+    size = max(1, CHUNK // max(1, batch * points[..., 0, 0].numel() if count else 1))
+    if is_traced() or differentiated or count <= size:
+        return function(points)
+    values, masks = zip(*(function(piece) for piece in points.split(size, -2)), strict=True)
+    return torch.cat(values, -2), torch.cat(masks, -1)

@@ -1,0 +1,242 @@
+"""Maximum-likelihood positions: Gauss-Newton on the reprojection errors of two or more cameras.
+
+A point is sought as a direction and an inverse distance from the first camera,
+
+    X = (r + a e1 + b e2) / ρ,   camera c sees   R_c (r + a e1 + b e2) + ρ t_c
+
+with r the first guess of the direction and e1, e2 across it. Pixels are nearly linear in (a, b, ρ) at any range, also
+at infinity (ρ = 0) and beyond (ρ < 0, rays that diverge), so that two steps reach rounding, the normal equations are
+well conditioned, and the errors of (a, b, ρ) are Gaussian where those of a distance are not. ρ is in units of one over
+`scale`, the rig's own size.
+
+Source: the parametrization is that of Civera, Davison and Montiel (2008), "Inverse Depth Parametrization for Monocular
+SLAM"; the optimum is the one of Hartley and Sturm (1997).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.lens.camera import Camera
+from kcal.lens.pose import side_axes, step_rows
+from kcal.lens.projection import Projection, project_components
+from kcal.lens.tracing import known_true
+
+_STEPS = 5
+# The derivative of the optimum comes from this many steps with a fixed matrix; each leaves a share of about the
+# residual over the focal length, 1e-4, of the error.
+_CHORDS = 2
+# A step that moves no pixel by more than this, in units of the noise, is the last.
+_SETTLED = 1e-7
+
+Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+class Sight(NamedTuple):
+    """A camera and where it stands: points_cam = rotation @ points + translation, in the first camera's frame."""
+
+    camera: Camera
+    rotation: Tensor
+    translation: Tensor
+
+
+class Fit(NamedTuple):
+    """Points at the optimum, in the first camera's frame; K = 3 unknowns a, b, ρ; M = 2 C pixel coordinates.
+
+    Attributes:
+        direction: (..., 3, N), not of length one; the point is scale * direction / inverse.
+        inverse: (..., N) ρ.
+        sides: (..., 2, 3, N) the vectors e1 and e2.
+        covariance: the six of the (..., N) symmetric 3x3 covariance of (a, b, ρ) from the noise of the pixels.
+        gain: (..., 3, M, N) change of (a, b, ρ) by each pixel coordinate.
+        residual: (..., M, N) predicted minus measured pixels.
+        projections: one for each camera, at the optimum.
+        turned: one for each camera, (..., 3, N): the direction in the camera's axes, before its translation.
+    """
+
+    direction: Tensor
+    inverse: Tensor
+    sides: Tensor
+    covariance: Six
+    gain: Tensor
+    residual: Tensor
+    projections: tuple[Projection, ...]
+    turned: tuple[Tensor, ...]
+
+
+class _At(NamedTuple):
+    cost: Tensor
+    jacobian: Tensor
+    weighted: Tensor
+    residual: Tensor
+    direction: Tensor
+    projections: tuple[Projection, ...]
+    turned: tuple[Tensor, ...]
+
+
+class _Setting(NamedTuple):
+    """What stays fixed while (a, b, ρ) moves."""
+
+    sights: Sequence[Sight]
+    base: Tensor
+    sides: Tensor
+    shifts: list[Tensor]
+    pixels: Tensor
+    usable: Tensor
+    weight: Tensor | None
+    wanted: tuple[tuple[int, ...], ...]
+
+
+def refine(
+    sights: Sequence[Sight],
+    scale: Tensor,
+    start: tuple[Tensor, Tensor],
+    pixels: Tensor,
+    usable: Tensor,
+    weight: Tensor | None = None,
+    *,
+    by_camera: bool = False,
+    differentiated: bool = False,
+) -> Fit:
+    """Minimize the weighted squares of the reprojection errors, each point on its own.
+
+    Args:
+        sights: C cameras; the first has the identity as its pose.
+        scale: meters, the size of the rig; sets the unit of ρ.
+        start: unit directions (..., N, 3) in the first camera's frame, and ρ (..., N).
+        pixels: (..., 2 C, N): u, v of the first camera, u, v of the second, ...
+        usable: (..., N); what is not gets a harmless answer.
+        weight: (..., 2 C, 2 C, N) inverse covariance of the pixels; None: independent with a variance of one.
+        by_camera: also form derivatives by the cameras' own parameters (`projections[c].by_camera`).
+        differentiated: let gradients flow to pixels, weights, cameras and poses.
+    """
+    base = start[0].detach().mT
+    sides = torch.stack([side.mT for side in side_axes(start[0].detach())], -3)
+    wanted = tuple(tuple(range(s.camera.values.shape[-1])) if by_camera else () for s in sights)
+    setting = _Setting(
+        sights, base, sides, [s.translation / scale for s in sights], pixels, usable, weight, tuple(() for _ in sights)
+    )
+    zero = torch.zeros_like(start[1])
+    with torch.no_grad():
+        theta = torch.stack([zero, zero, torch.where(usable, start[1], 0.0)], -2)
+        best, step, cost, at = theta, torch.zeros_like(theta), torch.full_like(zero, torch.inf), None
+        for _ in range(_STEPS):
+            at = _evaluate(setting, theta)
+            better = at.cost <= cost
+            every = known_true(better)
+            newton = _newton(at, usable)
+            moved = (at.jacobian * newton[..., None, :]).sum(-3).abs().amax(-2)
+            if every:
+                best, step, cost = theta, newton, at.cost
+            else:
+                best = torch.where(better[..., None, :], theta, best)
+                step = torch.where(better[..., None, :], newton, 0.25 * step)
+                cost = torch.where(better, at.cost, cost)
+            if every and known_true(moved <= _SETTLED * _noise(weight)):
+                break
+            theta = best + step
+        theta = best
+    if not differentiated and not by_camera and every and at is not None:
+        return _finish(at, theta, setting, usable)
+    if differentiated:
+        inverse = _inverse(_matrix(_evaluate(setting, theta), usable))
+        inverse = tuple(value.detach() for value in inverse)  # type: ignore[assignment]
+        for _ in range(_CHORDS):
+            at = _evaluate(setting, theta)
+            theta = theta - torch.where(usable[..., None, :], _times(inverse, _gradient(at)), 0.0)
+    return _finish(_evaluate(setting._replace(wanted=wanted), theta), theta, setting, usable)
+
+
+def _noise(weight: Tensor | None) -> Tensor | float:
+    """A lower bound of the pixels' noise."""
+    return 1.0 if weight is None else weight.diagonal(dim1=-3, dim2=-2).amax(-1).clamp_min(1e-30).rsqrt()
+
+
+def _evaluate(setting: _Setting, theta: Tensor) -> _At:
+    a, b, inverse = (value[..., None, :] for value in theta.unbind(-2))
+    e1, e2 = setting.sides[..., 0, :, :], setting.sides[..., 1, :, :]
+    direction = setting.base + a * e1 + b * e2
+    rows, predicted, projections, turned = [], [], [], []
+    for number, (sight, shift) in enumerate(zip(setting.sights, setting.shifts, strict=True)):
+        ahead, along, across = direction, e1, e2
+        if number:
+            ahead, along, across = sight.rotation @ direction, sight.rotation @ e1, sight.rotation @ e2
+        seen = ahead + inverse * shift[:, None]
+        with torch.no_grad():
+            good = setting.usable if sight.camera.model.fisheye else setting.usable & (seen[..., 2, :] > 1e-6)
+        if not known_true(good):
+            # The axis is a harmless stand-in: no NaN in values or gradients.
+            seen = torch.where(good[..., None, :], seen, seen.new_tensor([[0.0], [0.0], [1.0]]))
+        projection = project_components(
+            seen, sight.camera.values, sight.camera.model, setting.wanted[number], sight.camera.field
+        )
+        columns = torch.stack([along, across, shift[:, None].expand_as(along)], -3)
+        # (..., 3 unknowns, 3 of the point, 2, N) summed over the point.
+        rows.append((columns[..., None, :] * projection.by_point[..., None, :, :, :]).sum(-3))
+        predicted.append(projection.pixels)
+        projections.append(projection)
+        turned.append(ahead)
+    jacobian = torch.cat(rows, -2)
+    residual = torch.where(setting.usable[..., None, :], torch.cat(predicted, -2) - setting.pixels, 0.0)
+    weighted = jacobian
+    if setting.weight is None:
+        cost = (residual * residual).sum(-2)
+    else:
+        weighted = (setting.weight[..., None, :, :, :] * jacobian[..., None, :, :]).sum(-2)
+        cost = (setting.weight * residual[..., None, :, :] * residual[..., None, :]).sum((-3, -2))
+    return _At(cost, jacobian, weighted, residual, direction, tuple(projections), tuple(turned))
+
+
+def _matrix(at: _At, usable: Tensor) -> Six:
+    """Jᵀ W J by its six entries 11, 12, 13, 22, 23, 33; the identity where a point is not usable."""
+    j, w = at.jacobian.unbind(-3), at.weighted.unbind(-3)
+    entries = []
+    for row, column in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+        entries.append(torch.where(usable, (j[row] * w[column]).sum(-2), 1.0 if row == column else 0.0))
+    return tuple(entries)  # type: ignore[return-value]
+
+
+def _gradient(at: _At) -> Tensor:
+    return (at.weighted * at.residual[..., None, :, :]).sum(-2)
+
+
+def _newton(at: _At, usable: Tensor) -> Tensor:
+    return -_times(_inverse(_matrix(at, usable)), _gradient(at))
+
+
+def _inverse(m: Six) -> Six:
+    """Of symmetric positive 3x3 matrices, by their adjugate; zero where the determinant vanishes."""
+    a, b, c, d, e, f = m
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * A + b * B + c * C
+    regular = determinant > 0
+    scale = torch.where(regular, 1.0 / torch.where(regular, determinant, 1.0), 0.0)
+    return A * scale, B * scale, C * scale, (a * f - c * c) * scale, (b * c - a * e) * scale, (a * d - b * b) * scale
+
+
+def _times(m: Six, v: Tensor) -> Tensor:
+    a, b, c, d, e, f = m
+    x, y, z = v.unbind(-2)
+    return torch.stack([a * x + b * y + c * z, b * x + d * y + e * z, c * x + e * y + f * z], -2)
+
+
+def _finish(at: _At, theta: Tensor, setting: _Setting, usable: Tensor) -> Fit:
+    covariance = _inverse(_matrix(at, usable))
+    weighted = at.weighted.movedim(-3, -2)  # (..., M, 3, N)
+    gain = torch.stack([_times(covariance, row) for row in weighted.unbind(-3)], -2)
+    return Fit(at.direction, theta[..., 2, :], setting.sides, covariance, gain, at.residual, at.projections, at.turned)
+
+
+def by_pose(fit: Fit, number: int) -> Tensor:
+    """Derivatives (..., 6, 2, N) of the predicted pixels of a camera by a step of its pose: rotation, translation.
+
+    The step is that of `kcal.lens.pose`: a rotation vector (radians) from the left and an added translation
+    (in units of `scale`, as the inverse distance is).
+    """
+    rows = step_rows(fit.projections[number].by_point, fit.turned[number])
+    turn, shift = rows[..., :3, :, :], rows[..., 3:, :, :]
+    return torch.cat([turn, shift * fit.inverse[..., None, None, :]], -3)

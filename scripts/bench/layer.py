@@ -1,0 +1,111 @@
+"""Gradients through a calibration: time, and what Gauss and Newton's matrix would get wrong; docs/measured/solver.md.
+
+python -m scripts.bench.layer          prints and writes the section
+python -m scripts.bench.layer --dry    prints only
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.camera.layer import CalibratedViews, calibrate_views
+from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.lens.model import LensModel
+from scripts.bench.solver import MODELS, NOISE, SIZE, simulate
+from scripts.shared.page import write_section
+from scripts.shared.timing import row, show
+
+VIEWS, REPEATS, STEP = (30, 200, 800), 3, 1e-3
+WEAK = {5: None, 14: 0.3}
+
+
+def timed(call: Callable[[], object]) -> float:
+    """Median of the CPU seconds of some calls."""
+    seconds = []
+    for _ in range(REPEATS):
+        start = time.process_time()
+        call()
+        seconds.append(time.process_time() - start)
+    return statistics.median(seconds)
+
+
+def linear_gradient(found: CalibratedViews, pixels: Tensor, board: Tensor, options: CalibrationOptions) -> Tensor:
+    """What Gauss and Newton's matrix in place of the Hessian makes of the derivative of fx by the corners."""
+    free: Free = options.rules(found.size).parameters(found.model)
+    problem = BoardProblem(board, pixels[:, None], [found.model], [free])
+    rows, size = problem.rows(found.state()), len(free)
+    whole = rows.new_zeros(size + 6 * len(rows), len(rows), rows.shape[-1])
+    whole[:size] = rows[:, 6:-1].transpose(0, 1)
+    for view in range(len(rows)):
+        whole[size + 6 * view : size + 6 * view + 6, view] = rows[view, :6]
+    flat = whole.flatten(1)
+    scale = flat.norm(dim=1, keepdim=True)
+    gradient = torch.linalg.lstsq((flat / scale).T, torch.eye(flat.shape[1], dtype=flat.dtype)).solution[0]
+    return (gradient / scale[0]).unflatten(0, (len(rows), 2, -1)).transpose(-1, -2)
+
+
+def study(views: int, coefficients: int) -> str:
+    """A row of the table."""
+    drawn = simulate(views)
+    board, pixels = torch.from_numpy(drawn["board"]), torch.from_numpy(drawn["pixels"])
+    options = CalibrationOptions(model=LensModel.named(MODELS[coefficients]), weak_prior=WEAK[coefficients])
+    first = calibrate_views(pixels, board, SIZE, options, backward="none")
+    again = pixels.clone().requires_grad_(True)
+    found = calibrate_views(again, board, SIZE, options, start=first)
+    (exact,) = torch.autograd.grad(found.parameters[0], again, retain_graph=True)
+
+    generator = torch.Generator().manual_seed(views)
+    along = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+    ends = [
+        calibrate_views(pixels + sign * STEP * along, board, SIZE, options, start=first, backward="none").parameters[0]
+        for sign in (1.0, -1.0)
+    ]
+    resolved = float(ends[0] - ends[1]) / (2.0 * STEP)
+    error = abs(float((exact * along).sum()) - resolved) / abs(resolved)
+    linear = "-"
+    if coefficients == 5 and views == VIEWS[0]:
+        off = linear_gradient(first, pixels, board, options) - exact
+        linear = f"{100.0 * float(off.norm() / exact.norm()):.2f} %"
+    cells = (
+        timed(lambda: calibrate_views(pixels, board, SIZE, options, backward="none")),
+        timed(lambda: calibrate_views(again, board, SIZE, options, start=first)),
+        timed(lambda: torch.autograd.grad(found.parameters[0], again, retain_graph=True)),
+    )
+    return row(views, coefficients, *(f"{value:.3f}" for value in cells), f"{error:.1e}", linear)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--dry", action="store_true", help="print only")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    lines = [
+        "## Gradients through a calibration",
+        "",
+        f"Made by `scripts/bench/layer.py`: simulated views of a 6x7 board, noise {NOISE} px an axis; 14 coefficients "
+        "with a weak prior. CPU seconds on one thread, medians of three: calibrating from nothing, again from an "
+        "earlier solution as in a training loop, and the gradient of fx by all corners. *Error*: of that gradient "
+        "along a random direction against the central difference of two calibrations. *Gauss-Newton*: how far off it "
+        "would be without the curvature of the residuals.",
+        "",
+        row("views", "coefficients", "from nothing, s", "again, s", "gradient, s", "error", "Gauss-Newton"),
+        "|---|---|---|---|---|---|---|",
+    ]
+    show(lines[-2:])
+    for views in VIEWS:
+        for coefficients in WEAK:
+            lines += show([study(views, coefficients)])
+    if not arguments.dry:
+        write_section("solver.md", "gradients", "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

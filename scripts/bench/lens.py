@@ -1,0 +1,213 @@
+"""Points through the lens and back: kcal beside OpenCV and kornia, in speed, accuracy and honesty.
+
+    python -m scripts.bench.lens [--quick] [--markdown docs/measured/lens.md]
+
+Tables: throughput of project and unproject (100, 10 000 and 1 000 000 points, float64, one thread and two, eager and
+compiled), what the three answer where a pixel has no ray, and undistortion of 1080p images. Within a round every side
+runs once, in turn; ratios are taken within a round: median (smallest to largest), above 1 kcal is faster.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import platform
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import kornia
+import numpy as np
+import torch
+from kornia.geometry.calibration import distort_points, undistort_points
+from torch import Tensor
+
+import kcal
+from kcal.lens.camera import Camera
+from kcal.lens.distortion import distort
+from kcal.lens.modules import Unproject
+from scripts.bench import undistort
+from scripts.shared.timing import ratios, row, show, spread, times
+
+SIZE = (1920, 1080)
+# A barrel lens of 62 degrees across, every term of OpenCV's at work, and no fold in the image.
+LENS = [-0.28, 0.1, 5e-4, -3e-4, 0.02, 0.05, 0.02, 0.01, 4e-4, -2e-4, -3e-4, 1e-4, 0.004, -0.006]
+MORE = [0.004, -0.002, 0.003, 0.001, 1e-4, -1e-4]
+MODELS = {"opencv14": LENS, "ext20": LENS + MORE}
+COUNTS = (100, 10_000, 1_000_000)
+CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-10)
+# kornia issue 3273: a camera whose corners lie beyond the fold of its lens.
+NO_CORNERS = {
+    "focal": (1917.36, 1917.36),
+    "center": (1920, 1080),
+    "size": (3840, 2160),
+    "coefficients": [-0.2535, 0.0924, -0.0006, 0.0007, -0.0191],
+}
+
+Call = Callable[[], object]
+
+
+def build(model: str) -> Camera:
+    """The camera of the tables."""
+    return Camera.build(focal=(1600, 1605), center=(957, 541), size=SIZE, coefficients=MODELS[model], model=model)
+
+
+def peers_project(camera: Camera, points: Tensor) -> list[Call]:
+    """OpenCV and kornia with the first 14 coefficients: neither has more."""
+    matrix, lens = camera.matrix, camera.coefficients[:14]
+    array, K, d, zero = points.numpy(), matrix.numpy(), lens.numpy().copy(), np.zeros(3)
+    # kornia takes the pixels of an undistorted camera, so that the division by depth is done beforehand.
+    flat = points[:, :2] / points[:, 2:] * camera.focal + camera.center
+    return [
+        lambda: cv2.projectPoints(array, zero, zero, K, d)[0],
+        lambda: distort_points(flat, matrix, lens),
+    ]
+
+
+def peers_unproject(camera: Camera, pixels: Tensor) -> list[Call]:
+    """OpenCV until 1e-10 in at most 20 iterations; kornia with 20 iterations."""
+    matrix, lens = camera.matrix, camera.coefficients[:14]
+    array, K, d = pixels.numpy()[:, None].copy(), matrix.numpy(), lens.numpy().copy()
+    return [
+        lambda: cv2.undistortPoints(array, K, d, criteria=CRITERIA)[:, 0],
+        lambda: undistort_points(pixels, matrix, lens, num_iters=20),
+    ]
+
+
+@torch.no_grad()
+def throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
+    """Rows of both directions."""
+    lines = show(
+        [
+            "| direction | coefficients | points | threads | kcal eager | kcal compiled | OpenCV | kornia "
+            "| OpenCV / eager | kornia / eager | OpenCV / compiled | kornia / compiled |",
+            "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        ]
+    )
+    for threads, direction, model in itertools.product((1, 2), ("project", "unproject"), MODELS):
+        torch.set_num_threads(threads)
+        cv2.setNumThreads(threads)
+        torch.compiler.reset()
+        camera = build(model)
+        # The compiler may take the parameters for what they are, constants of this camera.
+        module = camera if direction == "project" else Unproject(camera)
+        compiled = torch.compile(module, fullgraph=True, dynamic=True)
+        for count in counts:
+            points = _points(camera, count)
+            data = points if direction == "project" else camera.project(points)[0]
+            peers = (peers_project if direction == "project" else peers_unproject)(camera, data)
+            calls: list[Call] = [lambda: module(data), lambda: compiled(data), *peers]  # noqa: B023
+            found = times(calls, rounds)
+            rate = [spread([1e-6 * count / s for s in side]) for side in found]
+            faster = [ratios(found[own], found[other]) for own, other in itertools.product((0, 1), (2, 3))]
+            lines += show([row(direction, len(MODELS[model]), f"{count:.0e}", threads, *rate, *faster)])
+    return lines
+
+
+@torch.no_grad()
+def accuracy(count: int = 100_000) -> list[str]:
+    """Largest error of each direction over the image, in pixels."""
+    lines = show(["| | kcal | OpenCV | kornia |", "|---|---|---|---|"])
+    camera = build("opencv14")
+    points = _points(camera, count)
+    pixels, _ = camera.project(points)
+    forward = [torch.as_tensor(np.asarray(call())).reshape(-1, 2) for call in peers_project(camera, points)]
+    differences = [f"{float((other - pixels).abs().max()):.1e}" for other in forward]
+    lines += show([row("project, largest difference to kcal, px", "", *differences)])
+    rays, valid = camera.unproject(pixels)
+    found = [rays / rays[:, 2:]]
+    for normalized in normalized_by_peers(camera, pixels):
+        found.append(torch.cat([normalized, torch.ones(count, 1)], -1))
+    errors = [float((camera.project(ray)[0] - pixels).norm(dim=-1).max()) for ray in found]
+    assert bool(valid.all())
+    return lines + show([row("unproject, largest round trip, px", *(f"{e:.1e}" for e in errors))])
+
+
+def normalized_by_peers(camera: Camera, pixels: Tensor) -> list[Tensor]:
+    """Answers of OpenCV and kornia on the plane z = 1; kornia's own are pixels of an undistorted camera."""
+    opencv, kornias = (torch.as_tensor(np.asarray(call())) for call in peers_unproject(camera, pixels))
+    return [opencv, (kornias - camera.center) / camera.focal]
+
+
+@torch.no_grad()
+def honesty() -> list[str]:
+    """What each answers where iterations diverge, or no ray exists."""
+    lines = show(
+        [
+            "| pixel | kcal: ray's x / z, y / z | round trip, px | OpenCV (20, 1e-10) | round trip, px "
+            "| kornia, 20 iterations | round trip, px |",
+            "|---|---|---|---|---|---|---|",
+        ]
+    )
+    strong = {"focal": (500, 500), "center": (1600, 1200), "size": (3201, 2401)}
+    pincushion = Camera.build(**strong, coefficients=[0.5])  # type: ignore[arg-type]
+    barrel = Camera.build(**strong, coefficients=[-0.5])  # type: ignore[arg-type]
+    corners = Camera.build(**NO_CORNERS)  # type: ignore[arg-type]
+    cases = [
+        ("k1 = 0.5, three focal lengths off axis: a ray exists", pincushion, [3100.0, 1200.0]),
+        ("k1 = -0.5, three focal lengths off axis: none exists", barrel, [3100.0, 1200.0]),
+        ("3840x2160, corner without a preimage", corners, [0.0, 0.0]),
+        ("3840x2160, the opposite corner", corners, [3839.0, 2159.0]),
+    ]
+    for name, camera, pixel in cases:
+        pixels = torch.tensor([pixel], dtype=torch.float64)
+        rays, valid = camera.unproject(pixels)
+        cells = [_answer(rays[0, :2] / rays[0, 2], camera, pixels)] if bool(valid) else [("**invalid**", "–")]
+        cells += [_answer(normalized[0], camera, pixels) for normalized in normalized_by_peers(camera, pixels)]
+        lines += show([row(name, *itertools.chain(*cells))])
+    return lines
+
+
+def _answer(normalized: Tensor, camera: Camera, pixels: Tensor) -> tuple[str, str]:
+    """The answer, and how far from the pixel the formulas of the lens put it (no fold asked after)."""
+    again = distort(normalized[None], camera.coefficients, camera.model) * camera.focal + camera.center
+    x, y = normalized.tolist()
+    return f"{x:.4g}, {y:.4g}", f"{float((again - pixels).norm()):.2g}"
+
+
+def _points(camera: Camera, count: int) -> Tensor:
+    """Points 1 to 50 m deep that are seen in pixels spread over the image."""
+    generator = torch.Generator().manual_seed(1)
+    pixels = torch.rand(count, 2, generator=generator, dtype=torch.float64) * torch.tensor(SIZE)
+    depth = 1 + 49 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    rays, _ = camera.unproject(pixels)
+    return rays / rays[:, 2:] * depth
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few rounds, no more than 10 000 points")
+    parser.add_argument("--markdown", type=Path, help="also write the page to this file")
+    arguments = parser.parse_args()
+    rounds, counts = (3, COUNTS[:2]) if arguments.quick else (15, COUNTS)
+
+    lines = show(
+        [
+            "# The lens, measured",
+            "",
+            f"Made by `scripts/bench/lens.py` with kcal {kcal.__version__}, torch {torch.__version__}, kornia "
+            f"{kornia.__version__}, OpenCV {cv2.__version__} on {platform.processor() or platform.machine()}; "
+            f"{rounds} rounds. Median (smallest to largest); a ratio is the other's time over kcal's: above 1, kcal is "
+            "faster. How the inverse works is written in `kcal/lens/inverse.py`, conventions in "
+            "[conventions.md](../reference/conventions.md).",
+            "",
+            "## Speed",
+            "",
+            "Million points a second, float64. The peers have 14 coefficients at most; beside kcal's 20 they run with "
+            "14. kcal's answers carry a mask: whether the point lies before the fold, whether the pixel has a ray.",
+            "",
+        ]
+    )
+    lines += throughput(rounds, counts)
+    lines += show(["", "## Accuracy", "", "The same camera with 14 coefficients, over the whole image.", ""])
+    lines += accuracy()
+    lines += show(["", "## Where iterations diverge, or no ray exists", ""])
+    lines += honesty()
+    lines += show(["", "## Images of 1080p", ""])
+    lines += undistort.tables(3 if arguments.quick else 30)
+    if arguments.markdown:
+        arguments.markdown.write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,266 @@
+"""Inverse nets and lookup tables, measured; two sections of docs/measured/hybrid.md.
+
+    python -m scripts.bench.nets [--rounds 15] [--write]
+
+Inverse nets: how good they are alone, how many Newton steps they save as a start, and what that is worth in time.
+Lookup tables: size, stated bound, the largest error found at random points, and time beside the camera itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import kcal.lens.inverse
+from kcal.lens.bake import bake
+from kcal.lens.camera import Camera
+from kcal.lens.distortion import distort_components
+from kcal.lens.hybrid import HybridCamera
+from kcal.lens.inverse import InverseStart
+from kcal.lens.inverse_start import start_from, without_tilt
+from kcal.lens.projection import from_pixels
+from kcal.lens.residual import FieldGrid, FieldResidual, undo_components
+from kcal.nets.inverse_fit import InverseNetOptions, train_inverse
+from scripts.bench.lens import LENS, SIZE
+from scripts.bench.lens import build as build_hd
+from scripts.shared.page import write_section
+from scripts.shared.timing import ratios, row, show, spread, times
+
+PAGE = "hybrid.md"
+POINTS = 10_000
+# A lens of some 150 degrees, as fitted to a real one.
+WIDE = [0.4749, 0.02579, 3e-5, -9e-6, 8.2e-5, 0.7623, 0.09433, 1.329e-3, 3.1e-5, -2e-7, -2.6e-5, 3e-8, 1.1e-3, 1e-3]
+# Corners beyond the fold: kornia issue 3273.
+FOLDING = [-0.2535, 0.0924, -0.0006, 0.0007, -0.0191]
+
+
+def hybrid() -> HybridCamera:
+    """The camera of 14 coefficients with a field of about a tenth of a pixel."""
+    grid = FieldGrid.covering((-0.6, -0.34), (0.6, 0.34), widths=[0.2, 0.1])
+    generator = torch.Generator().manual_seed(0)
+    weights = 1e-4 * torch.randn(2, grid.count, generator=generator, dtype=torch.float64)
+    return HybridCamera.of(build_hd("opencv14"), FieldResidual(grid, weights))
+
+
+CAMERAS: dict[str, Callable[[], Camera]] = {
+    "opencv5": lambda: Camera.build(focal=(1600, 1605), center=(957, 541), size=SIZE, coefficients=LENS[:5]),
+    "opencv14": lambda: build_hd("opencv14"),
+    "ext20": lambda: build_hd("ext20"),
+    "opencv14, 150°": lambda: Camera.build(
+        focal=(2073.8, 2077.7), center=(3003.5, 2001.4), size=(6016, 4016), coefficients=WIDE, model="opencv14"
+    ),
+    "opencv5, corners beyond the fold": lambda: Camera.build(
+        focal=(1917.36, 1917.36), center=(1920, 1080), size=(3840, 2160), coefficients=FOLDING
+    ),
+    "fisheye4": lambda: Camera.build(
+        focal=(400, 402), center=(637, 481), size=(1280, 960), coefficients=[0.02, -0.01, 0.003], model="fisheye4"
+    ),
+    "hybrid: opencv14 and a field": hybrid,
+}
+
+
+def random_pixels(camera: Camera, count: int) -> Tensor:
+    """Pixels of the image that have a ray."""
+    generator = torch.Generator().manual_seed(5)
+    pixels = torch.rand(2 * count, 2, generator=generator, dtype=torch.float64) * torch.tensor(camera.size) - 0.5
+    return pixels[camera.unproject(pixels)[1]][:count]
+
+
+def steps_from(camera: Camera, pixels: Tensor, start: InverseStart | None) -> Tensor:
+    """How many full Newton steps each pixel takes to the tolerance of `kcal.lens.inverse`, at the most 12."""
+    goal_x, goal_y = from_pixels(pixels[:, 0], pixels[:, 1], camera.params)
+    if camera.field is not None:
+        goal_x, goal_y, _ = undo_components(goal_x, goal_y, camera.field)
+    if start is None:
+        x, y, _, rest = without_tilt(goal_x, goal_y, camera.coefficients, camera.model)
+        x, y = start_from(x, y, rest, camera.inverse_start)
+    else:
+        x, y = start(goal_x, goal_y)
+    enough = (1 + goal_x**2 + goal_y**2) * kcal.lens.inverse.TOLERANCE**2
+    steps = torch.zeros(len(pixels))
+    for _ in range(12):
+        lens = distort_components(x, y, camera.coefficients, camera.model)
+        a, b, d, e = lens.point
+        error_x, error_y = lens.x - goal_x, lens.y - goal_y
+        far = ~(error_x**2 + error_y**2 <= enough)
+        steps += far
+        inverse = torch.where(far, lens.determinant.reciprocal(), 0.0)
+        x, y = x - (e * error_x - b * error_y) * inverse, y - (a * error_y - d * error_x) * inverse
+    return steps
+
+
+def evaluations(camera: Camera, pixels: Tensor, start: InverseStart | None) -> int:
+    """How often one call of `unproject` evaluates the lens for all its pixels."""
+    with mock.patch.object(kcal.lens.inverse, "distort_components", wraps=distort_components) as counted:
+        camera.unproject(pixels, start=start)
+    return counted.call_count
+
+
+def alone(seeds: int) -> list[str]:
+    """Accuracy of the nets themselves."""
+    lines = show(
+        [
+            "| camera | corrects | weights | fit, s | guess, RMS px | guess, max px | net, RMS px | net, max px |",
+            "|---|---|---|---|---|---|---|---|",
+        ]
+    )
+    for name, build in CAMERAS.items():
+        camera = build()
+        for radial in (True, False):
+            fits, seconds = [], []
+            for seed in range(seeds):
+                clock = time.process_time()
+                fits.append(train_inverse(camera, InverseNetOptions(radial=radial, seed=seed)))
+                seconds.append(time.process_time() - clock)
+            middle = [
+                statistics.median(values)
+                for values in zip(*((f.start_rms, f.start_largest, f.rms, f.largest) for f in fits), strict=True)
+            ]
+            lines += show(
+                [
+                    row(
+                        name,
+                        "the radial start" if radial else "the distorted position",
+                        fits[0].net.weights.numel(),
+                        spread(seconds),
+                        *(f"{value:.2g}" for value in middle),
+                    )
+                ]
+            )
+    return lines
+
+
+@torch.no_grad()
+def as_start(rounds: int) -> list[str]:
+    """Steps, evaluations and time of `unproject` with and without a net."""
+    lines = show(
+        [
+            "| camera | Newton steps, mean (most): closed form | with the net | evaluations of the lens a call "
+            "| with the net | µs per 1000 pixels | with the net | time without / with |",
+            "|---|---|---|---|---|---|---|---|",
+        ]
+    )
+    for name, build in CAMERAS.items():
+        camera = build()
+        guess = train_inverse(camera).net.guess
+        pixels = random_pixels(camera, POINTS)
+        plain, helped = camera.unproject(pixels), camera.unproject(pixels, start=guess)
+        assert torch.equal(plain[1], helped[1])
+        assert float((plain[0] - helped[0]).abs().max()) < 1e-6
+        steps = [steps_from(camera, pixels, start) for start in (None, guess)]
+        found = times([lambda: camera.unproject(pixels), lambda: camera.unproject(pixels, start=guess)], rounds)  # noqa: B023
+        lines += show(
+            [
+                row(
+                    name,
+                    *(f"{float(s.mean()):.2f} ({int(s.max())})" for s in steps),
+                    *(evaluations(camera, pixels, start) for start in (None, guess)),
+                    *(spread([1e9 * s / POINTS for s in side], 0) for side in found),
+                    ratios(found[1], found[0]),
+                )
+            ]
+        )
+    return lines
+
+
+@torch.no_grad()
+def tables(rounds: int) -> list[str]:
+    """Lookup tables of each camera."""
+    lines = show(
+        [
+            "| camera | tolerance, px | baking, s | cells: project | unproject | file, kB | bound, px | largest error "
+            "found, px | answers for | project: camera / table | unproject: camera / table |",
+            "|---|---|---|---|---|---|---|---|---|---|---|",
+        ]
+    )
+    for name, build in CAMERAS.items():
+        camera = build()
+        pixels = random_pixels(camera, 10 * POINTS)
+        rays, _ = camera.unproject(pixels)
+        few, few_rays = pixels[:POINTS], rays[:POINTS]
+        for tolerance in (1e-2, 1e-3):
+            clock = time.process_time()
+            lookup = bake(camera, tolerance)
+            seconds = time.process_time() - clock
+            again, valid = lookup.unproject(pixels)
+            largest = float((camera.project(again)[0] - pixels).norm(dim=-1)[valid].max())
+            there, seen = lookup.project(rays)
+            largest = max(largest, float((there - pixels).norm(dim=-1)[seen].max()))
+            calls: list[Callable[[], Any]] = [
+                lambda: camera.project(few_rays),  # noqa: B023
+                lambda: lookup.project(few_rays),  # noqa: B023
+                lambda: camera.unproject(few),  # noqa: B023
+                lambda: lookup.unproject(few),  # noqa: B023
+            ]
+            found = times(calls, rounds)
+            cells = [t.cells.shape for t in (lookup.pixels_from_chart, lookup.chart_from_pixels)]
+            buffer = io.BytesIO()
+            np.savez(buffer, **{key: value.numpy() for key, value in lookup.state_dict().items()})
+            lines += show(
+                [
+                    row(
+                        name,
+                        f"{tolerance:.0e}",
+                        f"{seconds:.1f}",
+                        *(f"{c[1]} x {c[0]}" for c in cells),
+                        round(len(buffer.getvalue()) / 1000),
+                        f"{max(lookup.bound):.1e}",
+                        f"{largest:.1e}",
+                        f"{100 * min(lookup.coverage):.1f} %",
+                        ratios(found[1], found[0]),
+                        ratios(found[3], found[2]),
+                    )
+                ]
+            )
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--write", action="store_true", help=f"also write the sections of docs/{PAGE}")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    nets = [
+        "## Inverse nets",
+        "",
+        "Made by `scripts/bench/nets.py`. The net of `train_inverse` (three layers, Inv_NN of the paper's Fig. 8), "
+        "fitted by Levenberg-Marquardt to exact rays of pixels all over the image, and judged on others. *Guess*: "
+        f"what it corrects, in closed form. Medians over {arguments.seeds} seeds. Infinite: somewhere the answer lies "
+        "beyond the fold. A hybrid camera's field is undone before, by Newton steps of its own.",
+        "",
+        *alone(arguments.seeds),
+        "",
+        f"As a start of `unproject`, {POINTS} pixels, one thread, eager. Newton steps are counted for each pixel until "
+        "its residual is rounding; a call works on all pixels together and stops with the slowest. Rays and masks are "
+        "the same either way. Compiled and exported graphs take the same number of steps with any start.",
+        "",
+        *as_start(arguments.rounds),
+    ]
+    lookup = [
+        "## Lookup tables",
+        "",
+        "Made by `scripts/bench/nets.py`: `bake(camera, tolerance)`, the coarsest bicubic tables that keep it. "
+        f"*Bound*: stated by the tables, both directions; *found*: at {10 * POINTS} random pixels. *Answers for*: the "
+        "share of the image's pixels with a ray, the worse direction. Ratios of time for "
+        f"{POINTS} points, one thread, eager: above 1, the table is faster.",
+        "",
+        *tables(arguments.rounds),
+    ]
+    if arguments.write:
+        write_section(PAGE, "inverse nets", "\n".join(nets))
+        write_section(PAGE, "lookup tables", "\n".join(lookup))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,239 @@
+"""kcal beside OpenCV on OpenCV's own 13 stereo pairs: projection, calibration, rig, time.
+
+    KCAL_DATA=folder python -m scripts.bench.opencv [--repeats 5] [--markdown docs/measured/opencv.md]
+
+The folder holds `opencv_stereo/left01.jpg` ... `right14.jpg` (OpenCV's samples; Debian ships them in opencv-doc). Both
+sides get the same corners, found by kcal and rounded to float32, as OpenCV wants them. RMS is sqrt(mean ‖r‖²) over
+points, of OpenCV as it returns it. Times are of whole calls in one process on one thread, the two sides in turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+import kcal
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.rig.from_boards import RigOptions, calibrate_rig
+from kcal.calibrate.rig.pairs import pair_by_name
+from kcal.corners.board import Board
+from kcal.corners.detect import detect_images
+from kcal.corners.observations import Observations
+from kcal.lens.camera import Camera
+from kcal.locate.check import triangulated_sides
+
+BOARD = Board(columns=9, rows=6, square=0.025)
+CRITERIA = (3, 300, 1e-12)
+FLAGS = {
+    "opencv5": 0,
+    "opencv8": cv2.CALIB_RATIONAL_MODEL,
+    "opencv12": cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL,
+    "opencv14": cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=5, help="timed runs of each side")
+    parser.add_argument("--markdown", type=Path, help="also write the tables to this file")
+    arguments = parser.parse_args()
+    folder = os.environ.get("KCAL_DATA")
+    if not folder or not Path(folder, "opencv_stereo").is_dir():
+        sys.exit("set KCAL_DATA to the folder that holds opencv_stereo/")
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+
+    seen = {side: _observe(Path(folder, "opencv_stereo"), side) for side in ("left", "right")}
+    text = [
+        "# kcal beside OpenCV",
+        "",
+        f"Made by `scripts/bench/opencv.py` with kcal {kcal.__version__}, torch {torch.__version__}, OpenCV "
+        f"{cv2.__version__}, one thread. 13 pairs of OpenCV's sample images, 640x480, 9x6 corners, squares of 25 mm; "
+        "the same corners for both.",
+        "",
+        *_detection(seen),
+        *_projection(),
+        *_calibration(seen, arguments.repeats),
+        *_rig(seen, arguments.repeats),
+    ]
+    if arguments.markdown:
+        arguments.markdown.write_text("\n".join(text) + "\n")
+
+
+def _show(lines: list[str]) -> list[str]:
+    print("\n".join(lines), flush=True)
+    return lines
+
+
+def _observe(folder: Path, side: str) -> Observations:
+    found = detect_images(sorted(folder.glob(f"{side}*.jpg")), BOARD)
+    views = []
+    for view in found.views:
+        rounded = tuple(p if p is None else (float(np.float32(p[0])), float(np.float32(p[1]))) for p in view.pixels)
+        views.append(view.model_copy(update={"pixels": rounded}))
+    return found.model_copy(update={"views": tuple(views)})
+
+
+def _detection(seen: dict[str, Observations]) -> list[str]:
+    found = sum(len(o.views) for o in seen.values())
+    total = found + sum(len(o.failures) for o in seen.values())
+    unseen = sum(view.pixels.count(None) for o in seen.values() for view in o.views)
+    return _show(["## Detection", "", f"Boards found: {found} of {total} images; corners left out: {unseen}.", ""])
+
+
+def _projection() -> list[str]:
+    lines = ["## Projection against `cv2.projectPoints`", "", "| coefficients | largest difference, px |", "|---|---|"]
+    generator = np.random.default_rng(0)
+    lens = generator.normal(size=14) * [0.2, 0.05, 1e-3, 1e-3, 0.02, 0.05, 0.02, 0.01, *[1e-3] * 4, 0.02, 0.02]
+    points = generator.uniform(-1, 1, (2000, 3)) * [1.2, 0.7, 0.5] + [0, 0, 2]
+    matrix = np.array([[1600, 0, 957.0], [0, 1590, 541], [0, 0, 1]])
+    for count in (4, 5, 8, 12, 14):
+        theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, lens[:count])[0][:, 0]
+        camera = Camera.build(
+            focal=(1600, 1590),
+            center=(957, 541),
+            size=(1920, 1080),
+            coefficients=lens[:count].tolist(),
+            model=f"opencv{count}",
+        )
+        ours, valid = camera.project(torch.from_numpy(points))
+        difference = np.abs(ours.numpy() - theirs)[valid.numpy()].max()
+        lines.append(f"| {count} | {difference:.1e} ({int(valid.sum())} points) |")
+    return _show([*lines, ""])
+
+
+def _calibration(seen: dict[str, Observations], repeats: int) -> list[str]:
+    lines = _show(
+        [
+            "## Calibration of one camera",
+            "",
+            f"OpenCV's criteria: {CRITERIA[1]} iterations, {CRITERIA[2]:g}. Time: median (smallest to largest) of "
+            f"{repeats} whole calls; kcal's passes through every smaller model and several starts.",
+            "",
+            "| camera | model | RMS kcal, px | RMS OpenCV | difference | kcal, ms | OpenCV, ms | ratio |",
+            "|---|---|---|---|---|---|---|---|",
+        ]
+    )
+    for side, observations in seen.items():
+        for model in FLAGS:
+            ours, theirs, times = _in_turn(
+                partial(calibrate_camera, observations, CalibrationOptions(model=model, weighted=False)),
+                partial(_opencv, observations, model),
+                repeats,
+            )
+            ratios = [a / b for a, b in zip(*times, strict=True)]
+            lines += _show(
+                [
+                    f"| {side} | {model} | {ours.rms:.7f} | {theirs[0]:.7f} | {ours.rms - theirs[0]:+.1e} "
+                    f"| {_spread(times[0], 1e3)} | {_spread(times[1], 1e3)} | {_spread(ratios)} |"
+                ]
+            )
+    return [*lines, *_show([""])]
+
+
+def _spread(values: list[float], factor: float = 1.0) -> str:
+    median, low, high = (factor * f(values) for f in (statistics.median, min, max))
+    digits = 1 if median < 10 else 0
+    return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def _in_turn(first: Callable[[], Any], second: Callable[[], Any], repeats: int) -> tuple[Any, Any, list[list[float]]]:
+    """Results of both, and their seconds; one run of each first, not counted."""
+    results = [first(), second()]
+    times: list[list[float]] = [[], []]
+    for _ in range(repeats):
+        for which, call in enumerate((first, second)):
+            start = time.perf_counter()
+            results[which] = call()
+            times[which].append(time.perf_counter() - start)
+    return results[0], results[1], times
+
+
+def _points(observations: Observations, also: Observations | None = None) -> tuple[list[Any], list[Any]]:
+    """Board points and pixels of each view as OpenCV wants them: only the corners seen (in both views, for pairs)."""
+    pixels = observations.pixels()
+    seen = torch.isfinite(pixels).all(-1)
+    if also is not None:
+        seen = seen & torch.isfinite(also.pixels()).all(-1)
+    board = observations.board.points.float()
+    return [board[s].numpy() for s in seen], [p[s].float().numpy() for p, s in zip(pixels, seen, strict=True)]
+
+
+def _opencv(observations: Observations, model: str) -> Any:
+    boards, pixels = _points(observations)
+    size = observations.image_size
+    return cv2.calibrateCamera(boards, pixels, size, None, None, flags=FLAGS[model], criteria=CRITERIA)
+
+
+def _rig(seen: dict[str, Observations], repeats: int) -> list[str]:
+    lines = _show(
+        [
+            "## Rig from the 13 pairs",
+            "",
+            "Both sides start from the same cameras (kcal's, 5 coefficients). Squares: mean and standard deviation of "
+            "all triangulated sides, `cv2.undistortPoints` and `cv2.triangulatePoints` for OpenCV; true 25 mm.",
+            "",
+            "| intrinsics | side | baseline, mm | RMS, px | squares, mm | ms |",
+            "|---|---|---|---|---|---|",
+        ]
+    )
+    left, right = seen["left"], seen["right"]
+    cameras = (calibrate_camera(left).camera, calibrate_camera(right).camera)
+    pairs = pair_by_name(left.names, right.names)
+    for word, refine in (("fixed", False), ("refined jointly", True)):
+        ours, theirs, times = _in_turn(
+            partial(calibrate_rig, *cameras, left, right, pairs, RigOptions(refine_cameras=refine)),
+            partial(_opencv_stereo, left, right, cameras, refine),
+            repeats,
+        )
+        side = triangulated_sides(ours.rig, BOARD.columns, BOARD.rows, ours.pixels)
+        rms, baseline, mean, spread = theirs
+        lines += _show(
+            [
+                f"| {word} | kcal | {1e3 * float(ours.rig.baseline):.5f} | {ours.rms:.7f} "
+                f"| {1e3 * side.mean:.4f} ± {1e3 * side.spread:.4f} | {_spread(times[0], 1e3)} |",
+                f"| {word} | OpenCV | {1e3 * baseline:.5f} | {rms:.7f} | {1e3 * mean:.4f} ± {1e3 * spread:.4f} "
+                f"| {_spread(times[1], 1e3)} |",
+            ]
+        )
+    return [*lines, *_show([""])]
+
+
+def _opencv_stereo(
+    left: Observations, right: Observations, cameras: tuple[Camera, Camera], refine: bool
+) -> tuple[float, ...]:
+    boards, a = _points(left, right)
+    b = _points(right, left)[1]
+    start = [array.numpy().copy() for camera in cameras for array in (camera.matrix, camera.coefficients)]
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS if refine else cv2.CALIB_FIX_INTRINSIC
+    solved = cv2.stereoCalibrate(boards, a, b, *start, left.image_size, flags=flags, criteria=CRITERIA)  # type: ignore[call-overload]
+    rms, K1, D1, K2, D2, R, T = solved[:7]
+    P1, P2 = np.eye(3, 4), np.hstack([R, T])
+    sides = []
+    place = left.board.points.float().numpy()
+    for points, p, q in zip(boards, a, b, strict=True):
+        u, v = cv2.undistortPoints(p, K1, D1)[:, 0], cv2.undistortPoints(q, K2, D2)[:, 0]
+        homogeneous = cv2.triangulatePoints(P1, P2, u.T.astype(float), v.T.astype(float))
+        every_corner = np.full((BOARD.corners, 3), np.nan)
+        every_corner[(place[:, None] == points).all(-1).any(1)] = (homogeneous[:3] / homogeneous[3]).T
+        grid = every_corner.reshape(BOARD.rows, BOARD.columns, 3)
+        for step in (np.diff(grid, axis=0), np.diff(grid, axis=1)):
+            side = np.linalg.norm(step, axis=-1).ravel()
+            sides.append(side[np.isfinite(side)])
+    every = np.concatenate(sides)
+    return rms, float(np.linalg.norm(T)), float(every.mean()), float(every.std(ddof=1))
+
+
+if __name__ == "__main__":
+    main()

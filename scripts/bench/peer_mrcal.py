@@ -1,0 +1,88 @@
+"""mrcal's splined lens on one training set, for `bench_hybrid.py`; runs in an interpreter that has mrcal, without kcal.
+
+    /usr/bin/python3 scripts/bench/peer_mrcal.py problem.npz SPLINED13x9
+
+The stages are those of mrcal-calibrate-cameras: a stereographic seed from a rough focal length, its refinement, the
+lens with mrcal's regularization, and with the board's warp. Prints one line of JSON: seconds of all that (process CPU
+and wall) and sum(w² |r|²) with its count over held-out views, whose poses alone are solved again.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import Any
+
+import mrcal  # type: ignore[import-not-found, unused-ignore]
+import numpy as np
+
+
+def arrays(corners: Any, weight: Any, shape: tuple[int, int]) -> tuple[Any, Any]:
+    """Mrcal's observations (V, H, W, 3) and indices of frame and camera."""
+    seen = np.zeros((len(corners), *shape, 3))
+    seen[..., :2] = np.nan_to_num(corners).reshape(len(corners), *shape, 2)
+    seen[..., 2] = np.where(weight > 0, weight, -1.0).reshape(len(corners), *shape)
+    index = np.zeros((len(corners), 3), np.int32)
+    index[:, 0], index[:, 2] = np.arange(len(corners)), -1
+    return seen, index
+
+
+def main() -> None:
+    with np.load(sys.argv[1]) as data:
+        corners, weight, train, held = data["corners"], data["weight"], data["train"], data["held"]
+        size, (columns, rows) = data["image_size"].astype(np.int32)[None], data["board_size"].tolist()
+        square, focal = float(data["square_m"]), float(data["focal"])
+    nx, ny = sys.argv[2].removeprefix("SPLINED").split("x")
+    lens = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={nx}_Ny={ny}_fov_x_deg=170"
+    common = {"imagersizes": size, "calibration_object_spacing": square, "do_apply_outlier_rejection": False}
+    seen, index = arrays(corners[train], weight[train], (rows, columns))
+
+    cpu, wall = time.process_time(), time.perf_counter()
+    intrinsics, extrinsics, frames = mrcal.seed_stereographic(
+        imagersizes=size,
+        focal_estimate=focal,
+        indices_frame_camera=index[:, :2].copy(),
+        observations=seen,
+        object_spacing=square,
+    )
+    for free in (False, True):
+        mrcal.optimize(
+            intrinsics, extrinsics, frames, None, seen, index, None, None, "LENSMODEL_STEREOGRAPHIC",
+            do_optimize_intrinsics_core=free, do_optimize_intrinsics_distortions=False,
+            do_optimize_calobject_warp=False, do_apply_regularization=False, **common,
+        )  # fmt: skip
+    small = (np.random.default_rng(0).random(mrcal.lensmodel_num_params(lens) - 4) - 0.5) * 2e-6
+    intrinsics, warp = np.concatenate([intrinsics, small[None]], 1), np.zeros(2)
+
+    def optimize(frames: Any, seen: Any, index: Any, what: dict[str, bool]) -> None:
+        mrcal.optimize(
+            intrinsics=intrinsics, extrinsics_rt_fromref=None, frames_rt_toref=frames, points=None,
+            observations_board=seen, indices_frame_camintrinsics_camextrinsics=index, observations_point=None,
+            indices_point_camintrinsics_camextrinsics=None, lensmodel=lens, do_optimize_intrinsics_core=False,
+            **what, **common,
+        )  # fmt: skip
+
+    optimize(frames, seen, index, {"do_optimize_calobject_warp": False, "do_apply_regularization": True})
+    common["calobject_warp"] = warp
+    optimize(frames, seen, index, {"do_optimize_calobject_warp": True, "do_apply_regularization": True})
+    out = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
+
+    if len(held):
+        seen, index = arrays(corners[held], weight[held], (rows, columns))
+        poses = mrcal.estimate_monocular_calobject_poses_Rt_tocam(
+            index[:, :2].copy(), seen, square, [(lens, intrinsics[0])]
+        )
+        frames = mrcal.rt_from_Rt(poses)
+        fixed = {"do_optimize_intrinsics_distortions": False, "do_optimize_calobject_warp": False}
+        optimize(frames, seen, index, {**fixed, "do_apply_regularization": False})
+        board = mrcal.ref_calibration_object(columns, rows, square, calobject_warp=warp)
+        errors = mrcal.project(mrcal.transform_point_rt(frames[:, None, None], board), lens, intrinsics[0])
+        errors = errors - seen[..., :2]
+        used = seen[..., 2] > 0
+        out |= {"sum": float(((errors**2).sum(-1) * seen[..., 2] ** 2)[used].sum()), "count": int(used.sum())}
+    print(json.dumps(out))
+
+
+if __name__ == "__main__":
+    main()

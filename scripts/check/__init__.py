@@ -1,0 +1,1 @@
+"""Coverage of error bars, many seeds, conformance."""

@@ -1,0 +1,207 @@
+"""What the experiment's cameras are worth on its site: rigs oriented by landmarks, points located, errors split up.
+
+The range error that cameras and rig make (*calibration*) is not one number: each survey and each set of the landmarks'
+marks gives another, and a single one may be near zero at 5 km by luck. So every pair of cameras is oriented `DRAWS`
+times with fresh noise, the same for all models, and once without any, which leaves the *lenses* alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.calibrate.rig.solve import JointOptions, solve_rig
+from kcal.calibrate.rig.sources import Landmarks, RigData
+from kcal.errors import KcalError
+from kcal.lens.camera import Camera
+from kcal.locate.stereo import Triangulate
+from kcal.sim.scene import DemoScene
+from scripts.paper.site import MARK_SIGMA, SURVEY_SIGMA
+
+SIDES = ("left", "right")
+DRAWS, MARKINGS = 10, 10  # of the landmarks' noise, and of the seven points' marks for each of them
+FAR, MARGIN = 5000.0, 70.0  # meters; pixels from the edge, about where the outermost targets are
+NAN = math.nan
+# Pixels to places, and places (ENU) to pixels; NaN where there is none.
+Rig = tuple[Callable[[Tensor, Tensor], Tensor], Callable[[Tensor], tuple[Tensor, Tensor]]]
+# From places of landmarks and their pixels, left and right.
+Orient = Callable[[Tensor, Tensor, Tensor], Rig]
+
+
+def judge(scene: DemoScene, orient: Orient) -> dict[str, Any]:
+    """Errors of the seven points, of far points all over the image, and of the check points; meters and pixels."""
+    targets, marks, far = scene.targets.enu, scene.target_marks, far_points(scene)
+    true = marks.true_left, marks.true_right
+    truth, seen = scene.landmarks.enu, scene.landmark_marks
+    generator = scene.generator(-60)
+    survey = SURVEY_SIGMA * torch.randn((DRAWS, *truth.shape), dtype=torch.float64, generator=generator)
+    noise = MARK_SIGMA * torch.randn((DRAWS, 2, len(truth), 2), dtype=torch.float64, generator=generator)
+    marking = MARK_SIGMA * torch.randn(
+        (2, DRAWS, MARKINGS, *targets[:, :2].shape), dtype=torch.float64, generator=generator
+    )
+
+    place, _ = orient(truth, seen.true_left, seen.true_right)
+    found: dict[str, Any] = {
+        "lens": ranges(place(*true), targets).tolist(),
+        "lens_far": rms_or_inf(ranges(place(*far.pixels), far.enu)),
+        "range_error": [],
+        "position_error": [],
+        "reprojection": [],
+        "far": [],
+    }
+    total = torch.zeros(len(targets), dtype=torch.float64)
+    for draw in range(DRAWS):
+        place, project = orient(truth + survey[draw], seen.true_left + noise[draw, 0], seen.true_right + noise[draw, 1])
+        exact = place(*true)
+        found["range_error"].append(ranges(exact, targets).tolist())
+        found["position_error"].append((exact - targets).norm(dim=-1).tolist())
+        found["reprojection"].append(pixel_errors(project(targets), true))
+        found["far"].append(rms_or_inf(ranges(place(*far.pixels), far.enu)))
+        total += ranges(place(true[0] + marking[0, draw], true[1] + marking[1, draw]), targets).square().sum(0)
+        if draw == 0:
+            check = scene.check_marks
+            found["check_reprojection"] = pixel_errors(
+                project(scene.surveyed(scene.checks).enu), (check.left, check.right)
+            )
+            found["marked"] = place(marks.left, marks.right).tolist()
+            found["integer"] = place(marks.left.round(), marks.right.round()).tolist()
+    return found | {"total": (total / (DRAWS * MARKINGS)).sqrt().tolist()}
+
+
+def nowhere(scene: DemoScene) -> dict[str, Any]:
+    """What is recorded where there is no camera, or no rig."""
+    none, places = [NAN] * len(scene.targets.names), [[NAN] * 3] * len(scene.targets.names)
+    each = {name: [none] * DRAWS for name in ("range_error", "position_error", "reprojection")}
+    checks = [NAN] * len(scene.checks.names)
+    return each | {
+        "lens": none, "lens_far": math.inf, "far": [math.inf] * DRAWS, "total": none, "marked": places,
+        "integer": places, "check_reprojection": checks,
+    }  # fmt: skip
+
+
+class Far(NamedTuple):
+    """Points 5 km away all over what both cameras see, and their true pixels, left and right."""
+
+    enu: Tensor
+    pixels: tuple[Tensor, Tensor]
+
+
+def far_points(scene: DemoScene) -> Far:
+    width, height = scene.rig.left.size
+    u = torch.linspace(MARGIN, width - 1 - MARGIN, 13, dtype=torch.float64)
+    v = torch.linspace(MARGIN, height - 1 - MARGIN, 7, dtype=torch.float64)
+    rays, known = scene.rig.left.unproject(torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(-1, 2))
+    points = FAR * torch.nn.functional.normalize(rays, dim=-1)
+    left, right, valid = scene.rig(points)
+    size = torch.tensor([width, height], dtype=torch.float64) - 1.0 - MARGIN
+    both = known & valid & ((right >= MARGIN) & (right <= size)).all(-1)
+    return Far(points[both] @ scene.enu_from_rig.T, (left[both], right[both]))
+
+
+def ranges(found: Tensor, true: Tensor) -> Tensor:
+    """Errors of the distance from the left camera's true place, meters."""
+    return found.norm(dim=-1) - true.norm(dim=-1)
+
+
+def rms_or_inf(errors: Tensor) -> float:
+    """RMS; infinite if a point has no place."""
+    return float(torch.nan_to_num(errors.square(), nan=math.inf).mean().sqrt())
+
+
+def pixel_errors(seen: tuple[Tensor, Tensor], true: tuple[Tensor, Tensor]) -> list[float]:
+    """The larger of the two cameras' errors for each point, pixels; NaN where a model has no pixel."""
+    return torch.stack([(a - b).norm(dim=-1) for a, b in zip(seen, true, strict=True)]).amax(0).tolist()
+
+
+def bound(scene: DemoScene) -> list[float]:
+    """Standard deviation of each range that the marks' noise alone leaves, with the rig known exactly, meters."""
+    points = scene.points_rig(scene.targets)
+    columns = []
+    for axis in torch.eye(3, dtype=torch.float64):
+        step = 1e-5 * points.norm(dim=-1, keepdim=True) * axis
+        ahead, behind = (torch.cat(scene.rig(points + sign * step)[:2], -1) for sign in (1, -1))
+        columns.append((ahead - behind) / (2e-5 * points.norm(dim=-1, keepdim=True)))
+    jacobian = torch.stack(columns, -1)
+    covariance = torch.linalg.inv(jacobian.transpose(-1, -2) @ jacobian) * MARK_SIGMA**2
+    sight = torch.nn.functional.normalize(points, dim=-1)
+    return torch.einsum("ni,nij,nj->n", sight, covariance, sight).sqrt().tolist()
+
+
+def by_kcal(scene: DemoScene, cameras: tuple[Camera, Camera]) -> Orient:
+    """`solve_rig` on the landmarks, and `Triangulate`."""
+
+    def orient(points: Tensor, left: Tensor, right: Tensor) -> Rig:
+        landmarks = Landmarks(
+            names=scene.landmarks.names,
+            points=points,
+            sigma=torch.full_like(points, SURVEY_SIGMA),
+            pixels=torch.stack([left, right], 1),
+            pixel_sigma=MARK_SIGMA,
+        )
+        try:
+            # Nothing is left out: a lens model that contradicts the landmarks is to show it.
+            solved = solve_rig(RigData(cameras=cameras, names=SIDES, landmarks=landmarks), JointOptions(reject=False))
+        except (KcalError, RuntimeError):
+            return lost
+        rig = solved.stereo()
+        locate = Triangulate(rig, pixel_sigma=MARK_SIGMA)
+
+        def place(left: Tensor, right: Tensor) -> Tensor:
+            found = locate(left, right)
+            enu = found.points @ solved.rotation[0] + solved.center[0]
+            return torch.where((found.status == 0)[..., None], enu, torch.nan)
+
+        def project(enu: Tensor) -> tuple[Tensor, Tensor]:
+            left, right, valid = rig((enu - solved.center[0]) @ solved.rotation[0].T)
+            return torch.where(valid[:, None], left, torch.nan), torch.where(valid[:, None], right, torch.nan)
+
+        return place, project
+
+    return orient
+
+
+# A rig that could not be solved locates nothing.
+lost: Rig = (
+    lambda left, right: left.new_full((*left.shape[:-1], 3), NAN),
+    lambda enu: (enu.new_full((len(enu), 2), NAN), enu.new_full((len(enu), 2), NAN)),
+)
+
+
+def by_opencv(cameras: dict[str, tuple[Any, Any]]) -> Orient:
+    """`solvePnP` on the landmarks, `undistortPoints` and `triangulatePoints`, as a user of OpenCV would.
+
+    Args:
+        cameras: matrix and distortion of both sides.
+    """
+
+    def orient(points: Tensor, left: Tensor, right: Tensor) -> Rig:
+        surveyed, poses = points.numpy(), {}
+        for side, pixels in zip(SIDES, (left, right), strict=True):
+            matrix, lens = cameras[side]
+            _, turn, shift = cv2.solvePnP(surveyed, pixels.numpy(), matrix, lens, flags=cv2.SOLVEPNP_SQPNP)
+            poses[side] = cv2.solvePnPRefineLM(surveyed, pixels.numpy(), matrix, lens, turn, shift)
+        projections = [np.hstack([cv2.Rodrigues(turn)[0], shift]) for turn, shift in poses.values()]
+
+        def place(left: Tensor, right: Tensor) -> Tensor:
+            plane = [
+                cv2.undistortPoints(pixels.reshape(-1, 1, 2).numpy(), *cameras[side])[:, 0].T
+                for side, pixels in zip(SIDES, (left, right), strict=True)
+            ]
+            homogeneous = cv2.triangulatePoints(projections[0], projections[1], plane[0], plane[1])
+            enu = (homogeneous[:3] / homogeneous[3]).T
+            ahead = enu @ projections[0][2, :3] + projections[0][2, 3] > 0
+            return torch.from_numpy(np.where(ahead[:, None], enu, NAN)).reshape(*left.shape[:-1], 3)
+
+        def project(enu: Tensor) -> tuple[Tensor, Tensor]:
+            pixels = [cv2.projectPoints(enu.numpy(), *poses[side], *cameras[side])[0][:, 0] for side in SIDES]
+            return torch.from_numpy(pixels[0]), torch.from_numpy(pixels[1])
+
+        return place, project
+
+    return orient

@@ -1,0 +1,125 @@
+"""The paper's rig for `reproduce_paper.py`: its three kinds of lenses, its images, and the corners found in them.
+
+Images are rendered through a ray-traced lens, get noise, a gamma and JPEG's losses, and go through kcal's detector and
+through OpenCV's; nothing that is calibrated ever sees the truth.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from kcal.corners.board import Board
+from kcal.corners.detect import detect_board, view_of
+from kcal.corners.observations import Failure, Observations, View
+from kcal.sim.captures import PAPER_BOARD
+from kcal.sim.poses import sample_board_poses
+from kcal.sim.render import RenderOptions, render_board
+from kcal.sim.scene import DemoScene, Places
+from kcal.sim.true_rig import drawn_rig
+from kcal.sim.truth import TruthLens
+
+BOARD = Board(columns=PAPER_BOARD.columns, rows=PAPER_BOARD.rows, square=PAPER_BOARD.square)
+QUALITY = 90  # of JPEG
+MARK_SIGMA, SURVEY_SIGMA = 0.05, 0.02  # pixels, meters
+# What a small noisy camera and what a good one makes of the same scene.
+LOOKS = {
+    "cctv": RenderOptions(blur=1.0, noise=4.0, vignetting=0.3, gamma=2.2),
+    "vision": RenderOptions(blur=0.7, noise=1.5, vignetting=0.1),
+}
+CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+
+
+class Kind(NamedTuple):
+    """A kind of camera: lens, how badly it is put together, its look, and how much of the site's field it sees."""
+
+    title: str
+    lens: str
+    strength: float
+    look: str = "cctv"
+    field: float = 1.0
+
+
+KINDS = {
+    "glass": Kind("wide glass lens, poorly centered", "surveillance", 3.0),
+    "plastic": Kind("plastic aspheres", "webcam", 1.0, field=0.7),
+    "vision": Kind("machine vision lens", "machine-vision", 1.0, look="vision", field=0.88),
+}
+
+
+def paper_scene(kind: Kind, seed: int) -> DemoScene:
+    """The site of one draw: its own lenses, survey and marks."""
+    plain = DemoScene()
+
+    def seen(places: Places) -> Places:
+        return tuple((label, meters, kind.field * bearing, up) for label, meters, bearing, up in places)
+
+    return dataclasses.replace(
+        plain,
+        seed=seed,
+        rig=drawn_rig(kind.lens, kind.strength, 100 + seed),
+        near_board=PAPER_BOARD,
+        render=LOOKS[kind.look],
+        mark_sigma=MARK_SIGMA,
+        survey_sigma=SURVEY_SIGMA,
+        targets_at=seen(plain.targets_at),
+        landmarks_at=seen(plain.landmarks_at),
+        checks_at=seen(plain.checks_at),
+    )
+
+
+def lenses(name: str, seed: int) -> dict[str, TruthLens]:
+    """The two cameras of a kind's rig."""
+    rig: Any = paper_scene(KINDS[name], seed).rig
+    return {"left": rig.left, "right": rig.right}
+
+
+def observe(folder: Path, name: str, seed: int, side: str, lens: TruthLens, views: int) -> dict[str, float]:
+    """Render, spoil and search the images of one camera; the corners go to files, the times come back."""
+    kind = KINDS[name]
+    # Streams of their own for poses and noise, whatever else was drawn.
+    generator = torch.Generator().manual_seed(1_000_003 * (seed + 1) + 17 * len(name) + (side == "right"))
+    poses = sample_board_poses(lens, PAPER_BOARD, views, generator, fill=(0.25, 0.8))
+    spent = {"render": 0.0, "detect": 0.0, "detect, OpenCV": 0.0}
+    found: dict[str, list[View]] = {"kcal": [], "opencv": []}
+    failures: dict[str, list[Failure]] = {"kcal": [], "opencv": []}
+    for number, pose in enumerate(poses):
+        start = time.process_time()
+        light = render_board(lens, pose, PAPER_BOARD, LOOKS[kind.look], generator)
+        packed = cv2.imencode(".jpg", light.numpy(), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+        image = np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+        spent["render"] += time.process_time() - start
+
+        label = f"view-{number:02d}"
+        start = time.process_time()
+        detection = detect_board(image, BOARD)
+        spent["detect"] += time.process_time() - start
+        if detection.pixels is None:
+            failures["kcal"].append(Failure(name=label, reason=detection.reason))
+        else:
+            found["kcal"].append(view_of(detection, label))
+
+        start = time.process_time()
+        seen, corners = cv2.findChessboardCorners(image, (BOARD.columns, BOARD.rows), flags=CLASSIC)
+        if seen:
+            corners = cv2.cornerSubPix(image, corners, (11, 11), (-1, -1), (3, 30, 1e-3))
+            pixels = tuple(map(tuple, corners.reshape(-1, 2).astype(float).tolist()))
+            found["opencv"].append(View(name=label, pixels=pixels))
+        else:
+            failures["opencv"].append(Failure(name=label, reason="not found"))
+        spent["detect, OpenCV"] += time.process_time() - start
+    for who in found:
+        Observations(
+            board=BOARD,
+            image_size=lens.size,
+            refinement="erf" if who == "kcal" else "opencv",
+            views=tuple(found[who]),
+            failures=tuple(failures[who]),
+        ).save(folder / f"{side}.{who}.json")
+    return spent

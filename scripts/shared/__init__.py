@@ -1,0 +1,1 @@
+"""What scripts share: pages, timing, memory, simulated views."""

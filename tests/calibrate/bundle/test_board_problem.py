@@ -1,0 +1,285 @@
+"""The bundle problem: its rows are the derivatives of its residuals, and its residuals are those of the cameras."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState, warp_shape
+from kcal.corners.board import Board
+from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.projection import parameter_names
+from kcal.solve.lm import LevenbergMarquardt, LMOptions, minimize
+from kcal.solve.result import State, Status
+
+BOARD = Board(columns=4, rows=3, square=0.1)
+VIEWS = 3
+MODELS = ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "ext20", "ext24")
+_LENS = {
+    "k1": -0.2, "k2": 0.06, "p1": 0.004, "p2": -0.006, "k3": -0.02, "k4": 0.08, "k5": -0.03, "k6": 0.01,
+    "s1": 0.006, "s2": -0.004, "s3": -0.005, "s4": 0.003, "tau_x": 0.03, "tau_y": -0.05, "k7": 0.01, "k8": -0.006,
+    "k9": -0.007, "k10": 0.005, "s5": 0.002, "s6": -0.003, "k11": 0.004, "k12": 0.003, "k13": -0.002, "k14": 0.001,
+}  # fmt: skip
+
+
+def scene(
+    models: tuple[str, ...], *, kind: str = "strong", missing: bool = False, batch: tuple[int, ...] = ()
+) -> tuple[Tensor, list[LensModel], State]:
+    """Pixels (V, C, N, 2), models and a state near them. Focal lengths of order one, so that tolerances bite.
+
+    `kind` "zero": all coefficients, the warp and all rotations are exactly zero.
+    """
+    generator = torch.Generator().manual_seed(11)
+    strong = kind == "strong"
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*batch, *shape, generator=generator, dtype=torch.float64)
+
+    lenses = [LensModel.named(model) for model in models]
+    parameters = []
+    for c, lens in enumerate(lenses):
+        head = torch.tensor([2.0 + 0.2 * c, 1.8, 0.3, -0.2 * c, 0.05], dtype=torch.float64)
+        body = torch.tensor([_LENS[name] if strong else 0.0 for name in lens.names], dtype=torch.float64)
+        parameters.append(torch.cat([head, body]).expand(*batch, -1) + (1e-3 * normal(5 + lens.size) if batch else 0))
+    others = len(models) - 1
+    state = BoardState(
+        parameters=tuple(parameters),
+        warp=strong * torch.tensor([0.02, -0.03], dtype=torch.float64).expand(*batch, -1),
+        cam_from_first_rotation=rotation_from_vector(strong * 0.1 * normal(others, 3)),
+        cam_from_first_translation=0.1 * normal(others, 3),
+        first_from_board_rotation=rotation_from_vector(strong * 0.3 * normal(VIEWS, 3)),
+        first_from_board_translation=torch.tensor([-0.15, -0.1, 1.0]).double() + 0.05 * normal(VIEWS, 3),
+    ).pack()
+    shape = (VIEWS, len(models), BOARD.corners, 2)
+    pixels = torch.rand(shape, generator=generator, dtype=torch.float64)
+    if missing:
+        hidden = torch.rand(shape[:-1], generator=generator) < 0.3
+        pixels[hidden] = torch.nan
+    return pixels, lenses, state
+
+
+def zero_step(problem: BoardProblem) -> tuple[Tensor, Tensor]:
+    shared = torch.zeros(*problem.batch, problem.shared_size, dtype=torch.float64)
+    return shared, torch.zeros(*problem.batch, VIEWS, 6, dtype=torch.float64)
+
+
+def by_autograd(problem: BoardProblem, state: State) -> Tensor:
+    """(V, 6 + S, R) derivatives of residuals(retract(state, step)) at step 0, one shared and one own block a view."""
+    shared, local = zero_step(problem)
+    by_shared, by_local = torch.func.jacfwd(lambda *step: problem.residuals(problem.retract(state, step)), (0, 1))(
+        shared, local
+    )
+    # by_local is (V, R, V, 6): a view's residuals depend on its own pose alone.
+    for v, w in itertools.permutations(range(VIEWS), 2):
+        assert bool((by_local[v, :, w] == 0).all())
+    own = torch.stack([by_local[v, :, v].T for v in range(VIEWS)])
+    return torch.cat([own, by_shared.transpose(-1, -2)], -2)
+
+
+def by_differences(problem: BoardProblem, state: State, size: float = 1e-3) -> Tensor:
+    """As `by_autograd`, by fourth-order central differences; all views' poses are moved at once."""
+    shared, local = zero_step(problem)
+
+    def moved(i: int, by: float) -> Tensor:
+        step = (shared.clone(), local.clone())
+        if i < 6:
+            step[1][:, i] = by
+        else:
+            step[0][i - 6] = by
+        return problem.residuals(problem.retract(state, step))
+
+    columns = []
+    for i in range(6 + problem.shared_size):
+        near, far = moved(i, size) - moved(i, -size), moved(i, 2 * size) - moved(i, -2 * size)
+        columns.append((8.0 * near - far) / (12.0 * size))
+    return torch.stack(columns, -2)
+
+
+def check_rows(problem: BoardProblem, state: State, *, differences: bool = True) -> None:
+    rows = problem.rows(state)
+    assert rows.shape[-2] == 6 + problem.shared_size + 1
+    assert bool(torch.isfinite(rows).all())
+    assert torch.equal(rows[..., -1, :], problem.residuals(state))
+    torch.testing.assert_close(rows[..., :-1, :], by_autograd(problem, state), rtol=1e-11, atol=1e-12)
+    if differences:
+        # Rounding 1e-16 / 1e-3 and a truncation of h⁴ times a fifth derivative.
+        torch.testing.assert_close(rows[..., :-1, :], by_differences(problem, state), rtol=1e-7, atol=1e-8)
+
+
+def free_all(models: list[LensModel]) -> list[list[int]]:
+    return [list(range(5 + model.size)) for model in models]
+
+
+@pytest.mark.parametrize("kind", ["strong", "zero"])
+class TestRows:
+    @pytest.mark.parametrize("model", MODELS)
+    def test_one_camera(self, model: str, kind: str) -> None:
+        pixels, models, state = scene((model,), kind=kind)
+        check_rows(BoardProblem(BOARD.points, pixels, models, free_all(models), free_warp=True), state)
+
+    @pytest.mark.parametrize("models", [("opencv5", "opencv14"), ("opencv8", "pinhole", "opencv4")])
+    def test_more_cameras(self, models: tuple[str, ...], kind: str) -> None:
+        pixels, lenses, state = scene(models, kind=kind, missing=True)
+        check_rows(BoardProblem(BOARD.points, pixels, lenses, free_all(lenses), free_warp=True), state)
+
+    def test_every_subset_of_blocks(self, kind: str) -> None:
+        """Blocks: focal lengths, center, skew and lens of camera 0; the same of camera 1; the warp."""
+        pixels, models, state = scene(("opencv5", "opencv4"), kind=kind, missing=True)
+        whole = BoardProblem(BOARD.points, pixels, models, free_all(models), free_warp=True).rows(state)
+        sizes = [5 + model.size for model in models]
+        columns = [range(6, 6 + sizes[0]), range(6 + sizes[0], 6 + sum(sizes))]
+        pose = [6 + sum(sizes) + i for i in range(6)]
+        bend = [12 + sum(sizes), 13 + sum(sizes)]
+        parts = [[[0, 1], [2, 3], [4], list(range(5, size))] for size in sizes]
+        for chosen in itertools.product([False, True], repeat=9):
+            free = [
+                [i for part, on in zip(parts[c], chosen[4 * c : 4 * c + 4], strict=True) if on for i in part]
+                for c in (0, 1)
+            ]
+            problem = BoardProblem(BOARD.points, pixels, models, free, free_warp=chosen[8])
+            rows = problem.rows(state)
+            wanted = [*range(6), *(columns[0][i] for i in free[0]), *(columns[1][i] for i in free[1]), *pose]
+            wanted += [*(bend if chosen[8] else []), whole.shape[-2] - 1]
+            # The warp is applied alike whether it is free or not.
+            torch.testing.assert_close(rows, whole[..., wanted, :], rtol=0, atol=0)
+            # What is not free does not move.
+            step = tuple(torch.ones_like(part) for part in zero_step(problem))
+            before, after = problem.unpack(state), problem.unpack(problem.retract(state, step))
+            for c in (0, 1):
+                held = [i for i in range(sizes[c]) if i not in free[c]]
+                assert torch.equal(after.parameters[c][held], before.parameters[c][held])
+                assert torch.equal(after.parameters[c][free[c]], before.parameters[c][free[c]] + 1.0)
+            assert torch.equal(after.warp, before.warp + (1.0 if chosen[8] else 0.0))
+
+    @pytest.mark.parametrize("order", [[7, 0, 3], [1, 0]])
+    def test_order_of_free_parameters_is_kept(self, order: list[int], kind: str) -> None:
+        pixels, models, state = scene(("opencv5",), kind=kind)
+        check_rows(BoardProblem(BOARD.points, pixels, models, [order]), state)
+
+    def test_no_shared_parameter_at_all(self, kind: str) -> None:
+        pixels, models, state = scene(("opencv5",), kind=kind, missing=True)
+        check_rows(BoardProblem(BOARD.points, pixels, models, [()]), state)
+
+    def test_batch(self, kind: str) -> None:
+        pixels, models, state = scene(("opencv5", "opencv4"), kind=kind, missing=True, batch=(2, 2))
+        options = {"free_warp": True}
+        together = BoardProblem(BOARD.points, pixels, models, free_all(models), batch=(2, 2), **options)
+        alone = BoardProblem(BOARD.points, pixels, models, free_all(models), **options)
+        for i, j in itertools.product(range(2), range(2)):
+            element = tuple(tensor[i, j] for tensor in state)
+            torch.testing.assert_close(together.rows(state)[i, j], alone.rows(element), rtol=1e-13, atol=1e-14)
+            torch.testing.assert_close(together.cost(state)[i, j], alone.cost(element), rtol=1e-13, atol=0)
+
+
+class TestResiduals:
+    @pytest.mark.parametrize("missing", [False, True])
+    def test_are_those_of_the_cameras(self, missing: bool) -> None:
+        """Through `Camera.project`, corner by corner; u of all corners, then v; camera after camera."""
+        pixels, models, state = scene(("opencv8", "opencv5"), missing=missing)
+        problem = BoardProblem(BOARD.points, pixels, models, [(), ()])
+        s = problem.unpack(state)
+        bent = BOARD.points.clone()
+        bent[:, 2] = s.warp @ warp_shape(BOARD.points)
+        residuals = problem.residuals(state).unflatten(-1, (2, 2, -1))
+        cameras = [Camera(p, size=(4, 3), model=m) for p, m in zip(s.parameters, models, strict=True)]
+        for v in range(VIEWS):
+            first = bent @ s.first_from_board_rotation[v].T + s.first_from_board_translation[v]
+            second = first @ s.cam_from_first_rotation[0].T + s.cam_from_first_translation[0]
+            for c, points in enumerate((first, second)):
+                projected, valid = cameras[c].project(points)
+                assert bool(valid.all())
+                expected = torch.nan_to_num(projected - pixels[v, c]).T
+                torch.testing.assert_close(residuals[v, c], expected, rtol=1e-12, atol=1e-13)
+        assert problem.residual_count == 2 * int(torch.isfinite(pixels[..., 0]).sum())
+
+    @pytest.mark.parametrize("where", ["behind", "on the image plane", "beyond the fold"])
+    def test_a_seen_corner_without_projection_is_nan_an_unseen_one_is_not(self, where: str) -> None:
+        pixels, models, state = scene(("opencv5",), kind="zero")
+        turned = rotation_from_vector(torch.tensor([0.0, 1.2, 0.0], dtype=torch.float64))
+        if where == "beyond the fold":
+            # k1 alone: r (1 + k1 r²) folds at r² = 1 / 0.9, and the board's last column lies at x / z = 1.2.
+            state[0][5] = -0.3
+            state[-1][1] = torch.tensor([0.9, -0.1, 1.0])
+        else:
+            # The board leans towards the camera, its last column behind or in the plane of the camera.
+            state[-2][1] = turned
+            depth = 0.3 * float(torch.sin(torch.tensor(1.2).double()))
+            state[-1][1] = torch.tensor([0.0, 0.0, depth - (0.02 if where == "behind" else 0.0)]).double()
+            if where == "on the image plane":
+                state[-1][1, 2] = -float(turned[2, 0]) * float(BOARD.points[3, 0])
+        points = BOARD.points @ state[-2][1].T + state[-1][1]
+        radius = points[:, :2].norm(dim=-1) / points[:, 2]
+        lost = radius**2 * 0.9 > 1.0 if where == "beyond the fold" else points[:, 2] <= 0
+        assert lost.any()
+        assert not lost.all()
+        problem = BoardProblem(BOARD.points, pixels, models, [()])
+        residuals = problem.residuals(state).unflatten(-1, (1, 2, -1))
+        assert torch.equal(torch.isnan(residuals[1, 0]), lost.expand(2, -1))
+        assert bool(torch.isfinite(residuals[[0, 2]]).all())
+        assert bool(torch.isnan(problem.cost(state)))
+        # A start there is told as such.
+        assert bool(torch.isnan(problem.linearize(state).cost))
+        assert int(minimize(problem, state).status) == Status.BAD_START
+        hidden = pixels.clone()
+        hidden[1, 0, lost] = torch.nan
+        problem = BoardProblem(BOARD.points, hidden, models, [()])
+        assert bool(torch.isfinite(problem.residuals(state)).all())
+        assert bool(torch.isfinite(problem.rows(state)).all())
+
+    def test_warp_is_the_deflection_at_the_middle(self) -> None:
+        board = Board(columns=5, rows=3, square=0.1)
+        shape = warp_shape(board.points)
+        middle = 1 * 5 + 2
+        assert shape[:, middle].tolist() == [1.0, 1.0]
+        for corner in (0, 4, 10, 14):
+            assert shape[:, corner].abs().max() < 1e-15
+        # On the middle row the bend along y is whole, along x a parabola.
+        torch.testing.assert_close(shape[1, 5:10], torch.ones(5).double(), rtol=0, atol=1e-15)
+        torch.testing.assert_close(shape[0, 5:10], torch.tensor([0, 0.75, 1, 0.75, 0]).double(), rtol=0, atol=1e-15)
+
+
+def test_tidy_only_rounds() -> None:
+    pixels, models, state = scene(("opencv5", "opencv5"))
+    problem = BoardProblem(BOARD.points, pixels, models, [(), ()])
+    skewed = list(state)
+    skewed[2], skewed[4] = state[2] * (1 + 1e-9), state[4] * (1 - 1e-9)
+    tidied = problem.tidy(tuple(skewed))
+    for before, after in zip(state, tidied, strict=True):
+        torch.testing.assert_close(after, before, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("models", [("opencv5",), ("opencv4", "pinhole")])
+def test_same_optimum_as_dense(models: tuple[str, ...]) -> None:
+    """All parameters and poses in one vector through the dense solver: the same minimum from the same start."""
+    _, lenses, truth = scene(models)
+    board = BOARD.points
+    free = [[i for i, name in enumerate(parameter_names(lens)) if name in ("fx", "cx", "k1")] for lens in lenses]
+    blank = BoardProblem(board, torch.zeros(VIEWS, len(models), BOARD.corners, 2).double(), lenses, free)
+    exact = blank.residuals(truth).unflatten(-1, (len(models), 2, -1)).transpose(-1, -2)
+    noise = torch.randn(exact.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    pixels = exact + 1e-3 * noise
+    pixels[1, 0, :2] = torch.nan
+    problem = BoardProblem(board, pixels, lenses, free)
+    shared, local = zero_step(problem)
+    start = problem.retract(truth, (shared + 0.01, local + 0.01))
+
+    def residual(step: Tensor) -> Tensor:
+        own = step[problem.shared_size :].reshape(VIEWS, 6)
+        return problem.residuals(problem.retract(start, (step[: problem.shared_size], own))).flatten()
+
+    options = LMOptions(tolerance=1e-14)
+    dense = LevenbergMarquardt(residual, options)(torch.zeros(problem.shared_size + 6 * VIEWS).double())
+    schur = minimize(problem, start, options)
+    assert bool(dense.converged)
+    assert bool(schur.converged)
+    torch.testing.assert_close(schur.cost, dense.cost, rtol=1e-12, atol=0)
+    parameters = start[0].clone()
+    offsets = [0, 5 + lenses[0].size]
+    slots = [offset + i for offset, indices in zip(offsets, free, strict=False) for i in indices]
+    parameters[slots] += dense.x[: len(slots)]
+    torch.testing.assert_close(schur.state[0], parameters, rtol=0, atol=1e-7)

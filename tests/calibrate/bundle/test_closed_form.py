@@ -1,0 +1,229 @@
+"""Closed-form starts are exact where the theory says so, without any iteration."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, pixels_of
+from torch import Tensor
+
+from kcal.calibrate.bundle.closed_form import (
+    flipped_poses,
+    homographies,
+    intrinsics_candidates,
+    poses_from_homographies,
+    radial_start,
+    spread_out,
+)
+from kcal.calibrate.bundle.poses import refine_poses, unflip
+from kcal.corners.board import Board
+from kcal.lens.camera import Camera
+from kcal.solve.lm import LMOptions
+from kcal.solve.result import State
+
+CENTERED = Camera.build(focal=(500, 505), center=(319.5, 239.5), size=SIZE, model="pinhole")
+OFF_CENTER = Camera.build(focal=(500, 505), center=(341.5, 221.0), size=SIZE, model="pinhole")
+
+
+def true_homographies(truth: Camera, poses: Motions) -> Tensor:
+    rotation, translation = poses
+    h = truth.matrix @ torch.cat([rotation[..., :2], translation[..., None]], -1)
+    return h / h[:, 2:, 2:]
+
+
+def state_of(truth: Camera, poses: Motions) -> State:
+    empty = torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
+    return (truth.params.detach().clone(), torch.zeros(2).double(), *empty, *poses)
+
+
+class TestHomographies:
+    def test_exact(self) -> None:
+        poses = motions(OFF_CENTER, 5, 1)
+        expected = true_homographies(OFF_CENTER, poses)
+        found = homographies(BOARD.points, pixels_of(OFF_CENTER, poses))
+        # Entries reach 1e3; the smallest eigenvector of a 9 x 9 system loses some digits.
+        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-9)
+
+    def test_corners_that_were_not_seen_have_no_say(self) -> None:
+        poses = motions(OFF_CENTER, 3, 1)
+        pixels = pixels_of(OFF_CENTER, poses)
+        pixels[0, 12:] = torch.nan
+        pixels[1, ::2] = torch.nan
+        # Four corners of a quadrilateral are the fewest.
+        four = [0, 6, 35, 41]
+        pixels[2, [i for i in range(BOARD.corners) if i not in four]] = torch.nan
+        found = homographies(BOARD.points, pixels)
+        # Two rows of corners alone leave the last digits to rounding.
+        torch.testing.assert_close(found, true_homographies(OFF_CENTER, poses), rtol=1e-7, atol=1e-6)
+
+
+class TestSpreadOut:
+    @pytest.mark.parametrize(
+        ("seen", "enough"),
+        [
+            (range(42), True),
+            (range(7), False),
+            (range(8), False),
+            (range(9), True),
+            (range(0, 42, 7), False),
+            (range(0, 41, 8), False),
+            ([0, 6, 35, 41], True),
+            ([0, 3, 6, 20], False),
+            ([0, 6, 35], False),
+            ([], False),
+        ],
+    )
+    def test_lines(self, seen: list[int], enough: bool) -> None:
+        pixels = pixels_of(CENTERED, motions(CENTERED, 2, 1))
+        pixels[1, [i for i in range(42) if i not in seen]] = torch.nan
+        assert spread_out(BOARD.points, pixels).tolist() == [True, enough]
+
+    @pytest.mark.parametrize("square", [1e-6, 1e3])
+    def test_size_of_the_board_does_not_matter(self, square: float) -> None:
+        board = Board(columns=40, rows=3, square=square)
+        pixels = torch.zeros(3, 120, 2, dtype=torch.float64)
+        pixels[1, 41:] = torch.nan
+        pixels[2, 42:] = torch.nan
+        assert spread_out(board.points, pixels).tolist() == [True, False, True]
+
+
+class TestIntrinsics:
+    @pytest.mark.parametrize("views", [2, 6])
+    def test_exact_with_the_principal_point_in_the_middle(self, views: int) -> None:
+        found = intrinsics_candidates(true_homographies(CENTERED, motions(CENTERED, views, 4)), SIZE)[0]
+        expected = CENTERED.params[:4]
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=0)
+
+    @pytest.mark.parametrize("views", [3, 6])
+    def test_second_is_exact_with_it_elsewhere(self, views: int) -> None:
+        homography = true_homographies(OFF_CENTER, motions(OFF_CENTER, views, 4))
+        found = intrinsics_candidates(homography, SIZE)
+        torch.testing.assert_close(found[1], OFF_CENTER.params[:4], rtol=1e-8, atol=0)
+        # The first is a compromise, near enough to start from.
+        assert 0.5 < float(found[0][0]) / 500 < 2.0
+
+    def test_scale_and_sign_of_homographies_do_not_matter(self) -> None:
+        homography = true_homographies(OFF_CENTER, motions(OFF_CENTER, 5, 4))
+        scaled = homography * torch.tensor([-1e4, 1e-4, 1.0, 7.0, -2.0], dtype=torch.float64)[:, None, None]
+        plain, other = intrinsics_candidates(homography, SIZE), intrinsics_candidates(scaled, SIZE)
+        for a, b in zip(plain, other, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-9, atol=0)
+
+    def test_boards_parallel_to_the_image_leave_only_guesses(self) -> None:
+        rotation = torch.eye(3).double().expand(4, 3, 3)
+        translation = torch.tensor([[-0.1, -0.1, 0.6], [0, 0, 0.8], [-0.2, 0.0, 1.0], [-0.1, -0.2, 1.2]]).double()
+        candidates = intrinsics_candidates(true_homographies(CENTERED, (rotation, translation)), SIZE)
+        guesses = torch.stack(candidates[-4:])
+        assert (guesses[:, 0] / SIZE[0]).tolist() == [1.0, 0.5, 2.0, 4.0]
+        assert bool((guesses[:, 2:] == torch.tensor([319.5, 239.5]).double()).all())
+        assert all(bool(torch.isfinite(candidate).all()) for candidate in candidates)
+
+
+class TestPoses:
+    @pytest.mark.parametrize("truth", [CENTERED, OFF_CENTER], ids=["centered", "off center"])
+    def test_exact(self, truth: Camera) -> None:
+        poses = motions(truth, 6, 2)
+        rotation, translation = poses_from_homographies(true_homographies(truth, poses), truth.params[:4])
+        torch.testing.assert_close(rotation, poses[0], rtol=0, atol=1e-12)
+        torch.testing.assert_close(translation, poses[1], rtol=0, atol=1e-12)
+
+    def test_board_is_in_front_whatever_the_sign(self) -> None:
+        poses = motions(CENTERED, 4, 2)
+        homography = -3.0 * true_homographies(CENTERED, poses)
+        rotation, translation = poses_from_homographies(homography, CENTERED.params[:4])
+        torch.testing.assert_close(rotation, poses[0], rtol=0, atol=1e-12)
+        torch.testing.assert_close(translation, poses[1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_radial_terms_are_exact_under_known_poses(missing: bool) -> None:
+    truth = Camera.build(
+        focal=(500, 505), center=(325.8, 235.3), size=SIZE, coefficients=[-0.08, 0.03], model="opencv4"
+    )
+    poses = motions(truth, 4, 3)
+    pixels = pixels_of(truth, poses)
+    if missing:
+        pixels[1, 5:] = torch.nan
+    found = radial_start(BOARD.points, pixels, truth.params[:4], *poses)
+    torch.testing.assert_close(found, torch.tensor([-0.08, 0.03], dtype=torch.float64), rtol=0, atol=1e-11)
+
+
+class TestFlippedPoses:
+    def test_is_an_involution(self) -> None:
+        state = state_of(CENTERED, motions(CENTERED, 6, 5))
+        twice = flipped_poses(BOARD.points, flipped_poses(BOARD.points, state))
+        for before, after in zip(state, twice, strict=True):
+            torch.testing.assert_close(after, before, rtol=0, atol=1e-14)
+
+    def test_keeps_the_center_and_mirrors_the_tilt(self) -> None:
+        state = state_of(CENTERED, motions(CENTERED, 6, 5))
+        twin = flipped_poses(BOARD.points, state)
+        middle = BOARD.points.mean(0)
+        center = state[-2] @ middle + state[-1]
+        torch.testing.assert_close(twin[-2] @ middle + twin[-1], center, rtol=0, atol=1e-14)
+        identity = torch.eye(3).double().expand(6, 3, 3)
+        torch.testing.assert_close(twin[-2] @ twin[-2].transpose(-1, -2), identity, rtol=0, atol=1e-14)
+        torch.testing.assert_close(torch.linalg.det(twin[-2]), torch.ones(6).double(), rtol=0, atol=1e-14)
+        # The normals make the same angle with the line of sight, on opposite sides of it.
+        d = center / torch.linalg.vector_norm(center, dim=-1, keepdim=True)
+        before, after = state[-2][..., 2], twin[-2][..., 2]
+        along = (before * d).sum(-1, keepdim=True)
+        torch.testing.assert_close((after * d).sum(-1, keepdim=True), along, rtol=0, atol=1e-14)
+        torch.testing.assert_close(after - along * d, -(before - along * d), rtol=0, atol=1e-14)
+
+    def test_twins_look_alike_from_afar_and_ever_more_so(self) -> None:
+        """Pixels of the twins differ by second order in (board / distance): a hundredth at ten times the distance."""
+        board = Board(columns=7, rows=6, square=0.01)
+        gaps = []
+        for far in (3.0, 30.0):
+            truth = Camera.build(focal=(500 * far, 505 * far), center=(319.5, 239.5), size=SIZE, model="pinhole")
+            rotation = motions(CENTERED, 5, 5)[0]
+            translation = torch.tensor([0.0, 0.0, far]).double() - rotation @ board.points.mean(0)
+            state = state_of(truth, (rotation, translation))
+            pixels = pixels_of(truth, (rotation, translation), board=board)
+            twin = flipped_poses(board.points, state)
+            gaps.append(float((pixels_of(truth, (twin[-2], twin[-1]), board=board) - pixels).abs().max()))
+        # The size of the image is the same, 30 px or so.
+        assert gaps[0] < 0.5
+        assert gaps[1] == pytest.approx(gaps[0] / 10, rel=0.1)
+
+
+class TestUnflip:
+    def test_repairs_planted_flips_and_leaves_good_poses_alone(self) -> None:
+        truth = camera()
+        poses = motions(truth, 12, 6, fill=0.12)
+        pixels = pixels_of(truth, poses, noise=0.1)[:, None]
+        best, cost = refine_poses(BOARD.points, pixels, [truth.model], state_of(truth, poses), LMOptions())
+        twin, worse = refine_poses(
+            BOARD.points, pixels, [truth.model], flipped_poses(BOARD.points, best), LMOptions(max_iterations=1000)
+        )
+        # Where the twin leads to a minimum of its own, every second of them.
+        planted = worse > 1.2 * cost
+        planted[planted.nonzero()[::2, 0]] = False
+        assert int(planted.sum()) >= 3
+        mixed = (
+            *best[:-2],
+            torch.where(planted[:, None, None], twin[-2], best[-2]),
+            torch.where(planted[:, None], twin[-1], best[-1]),
+        )
+        repaired, changed = unflip(BOARD.points, pixels, [truth.model], mixed)
+        assert changed == planted.nonzero()[:, 0].tolist()
+        # The search stops early, within 1e-3 of the cost.
+        final, _ = refine_poses(BOARD.points, pixels, [truth.model], repaired, LMOptions())
+        torch.testing.assert_close(final[-2], best[-2], rtol=0, atol=1e-6)
+        torch.testing.assert_close(final[-1], best[-1], rtol=0, atol=1e-6)
+        _, changed = unflip(BOARD.points, pixels, [truth.model], repaired)
+        assert changed == []
+
+    def test_refining_poses_moves_nothing_else_and_returns_the_cost_of_each_view(self) -> None:
+        truth = camera()
+        poses = motions(truth, 4, 6)
+        pixels = pixels_of(truth, poses)[:, None]
+        pixels[2] += 0.5
+        state = state_of(truth, poses)
+        refined, cost = refine_poses(BOARD.points, pixels, [truth.model], state, LMOptions())
+        for before, after in zip(state[:-2], refined[:-2], strict=True):
+            assert torch.equal(before, after)
+        assert cost.shape == (4,)
+        assert bool((cost[[0, 1, 3]] < 1e-18).all())
+        assert float(cost[2]) > 1e-4

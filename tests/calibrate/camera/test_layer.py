@@ -1,0 +1,254 @@
+"""Gradients through a calibration: against solving anew, against recorded steps, and where there are none."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from calibrate_scenes import BOARD, SIZE, camera, motions, pixels_of
+from torch import Tensor, nn
+
+from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.camera.layer import CalibratedViews, CalibrationLayer, calibrate_views
+from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.outliers import OutlierRejection
+from kcal.calibrate.search.model_ladder import embed
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
+from kcal.solve.robust import RobustLoss
+
+# Of the rays (0.3, 0.2), (-0.4, 0.1), (0.1, -0.3).
+POINTS = torch.tensor([[0.3, 0.2, 1.0], [-0.4, 0.1, 1.0], [0.1, -0.3, 1.0]], dtype=torch.float64)
+POSES = motions(camera(), 5, 3)
+# Noise that leaves residuals of half a pixel: their curvature is part of the derivative.
+CORNERS = pixels_of(camera("opencv4"), POSES, noise=0.4)
+PRIORS = {"fx": (498.0, 1.5), "cy": (236.0, 0.7)}
+
+
+def summary(found: CalibratedViews) -> Tensor:
+    """A function of all that is found, in pixels and of about equal size."""
+    seen = found.project(POINTS)[0].flatten()
+    return torch.cat([seen, 500.0 * found.cam_from_board_translation[0], 1e3 * found.board_warp, found.residuals[2, 3]])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        CalibrationOptions(model="opencv4"),
+        CalibrationOptions(model="opencv4", board_warp=True, tied=(("fx", "fy"),), fixed={"p1": 0.0}, priors=PRIORS),
+        CalibrationOptions(model="opencv4", loss=RobustLoss(kind="cauchy", scale=0.5), priors=PRIORS),
+        CalibrationOptions(model="opencv14", weak_prior=0.3),
+    ],
+    ids=["plain", "warp, tie, fixed, priors", "robust, priors", "14 coefficients, weak prior"],
+)
+def test_derivatives_are_those_of_solving_anew(options: CalibrationOptions) -> None:
+    """Along random directions, by corners, board points (off their plane too) and prior means."""
+    corners = CORNERS.clone()
+    corners[1, :4] = torch.nan
+    means = torch.tensor([mean for mean, _ in options.priors.values()], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(2)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(3, *shape, generator=generator, dtype=torch.float64)
+
+    directions = (draw(*corners.shape), 1e-3 * draw(*BOARD.points.shape), draw(len(means)))
+    if options.board_warp:
+        # The width of the warp's parabolas is that of the outermost corners, a minimum with a kink where several tie.
+        x, y = BOARD.points[:, :2].T
+        outside = (x == x.min()) | (x == x.max()) | (y == y.min()) | (y == y.max())
+        directions[1][:, outside, :2] = 0.0
+    base = calibrate_views(corners, BOARD.points, SIZE, options, backward="none")
+
+    def solve(amount: Tensor) -> Tensor:
+        data = [
+            value + torch.tensordot(amount, along, 1)
+            for value, along in zip((corners, BOARD.points, means), directions, strict=True)
+        ]
+        found = calibrate_views(data[0], data[1], SIZE, options, prior_means=data[2], start=base)
+        return summary(found)
+
+    # Central differences over 1e-4 px of solutions that are exact to some 1e-11 px.
+    zero = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(solve, (zero,), eps=1e-4, atol=5e-6, rtol=5e-6)
+
+
+# What Gauss and Newton leave out of the Hessian is a percent of it, and more of that of a robust loss, where the
+# weights' own change is left out too.
+@pytest.mark.parametrize(("loss", "left"), [(None, 1e-9), (RobustLoss(kind="huber", scale=0.8), 1e-4)])
+def test_recorded_steps_have_the_same_derivatives_and_second_ones(loss: RobustLoss | None, left: float) -> None:
+    options = CalibrationOptions(model="opencv4", loss=loss, priors=PRIORS)
+    base = calibrate_views(CORNERS, BOARD.points, SIZE, options, backward="none")
+    gradients = []
+    for backward in ("implicit", "unroll"):
+        corners = CORNERS.clone().requires_grad_(True)
+        found = calibrate_views(corners, BOARD.points, SIZE, options, start=base, backward=backward)
+        gradients.append(torch.autograd.grad(summary(found).sum(), corners, create_graph=backward == "unroll")[0])
+    torch.testing.assert_close(gradients[1].detach(), gradients[0], rtol=0, atol=left * float(gradients[0].abs().max()))
+    assert bool(torch.autograd.grad(gradients[1].square().sum(), corners)[0].isfinite().all())
+
+
+def test_the_curvature_of_residuals_counts() -> None:
+    """With Gauss and Newton's matrix in place of the Hessian the derivative would be off by three percent here."""
+    corners = CORNERS.clone().requires_grad_(True)
+    found = calibrate_views(corners, BOARD.points, SIZE, CalibrationOptions(model="opencv4"))
+    (exact,) = torch.autograd.grad(found.parameters[0], corners)
+    problem = BoardProblem(BOARD.points, CORNERS[:, None], [found.model], [[0, 1, 2, 3, 5, 6, 7, 8]])
+    rows = problem.rows(found.state())  # dx/dd = (JᵀJ)⁻¹ Jᵀ, of fx
+    whole = torch.zeros(38, 5, rows.shape[-1], dtype=torch.float64)
+    whole[:8] = rows[:, 6:-1].transpose(0, 1)
+    for v in range(5):
+        whole[8 + 6 * v : 14 + 6 * v, v] = rows[v, :6]
+    flat = whole.flatten(1)
+    linear = torch.linalg.solve(flat @ flat.T, flat)[0].unflatten(0, (5, 2, -1)).transpose(-1, -2)
+    error = float((linear - exact).norm() / exact.norm())
+    assert 1e-4 < error < 0.1
+
+
+def test_values_do_not_depend_on_backward_and_none_carries_nothing() -> None:
+    corners = CORNERS.clone().requires_grad_(True)
+    found = [
+        CalibrationLayer(SIZE, CalibrationOptions(model="opencv4"), backward=how)(corners, BOARD.points)
+        for how in ("implicit", "unroll", "none")
+    ]
+    for other in found[1:]:
+        torch.testing.assert_close(summary(other), summary(found[0]), rtol=0, atol=1e-6)
+    assert [one.parameters.requires_grad for one in found] == [True, True, False]
+
+
+def test_it_is_calibrate_cameras_solution() -> None:
+    from calibrate_scenes import observe
+
+    from kcal.calibrate.camera.calibrate import calibrate_camera
+
+    options = CalibrationOptions(model="opencv5")
+    found = calibrate_views(CORNERS, BOARD.points, SIZE, options)
+    result = calibrate_camera(observe(CORNERS), options)
+    for name, ours, theirs in zip(
+        result.camera.names, found.parameters.tolist(), result.camera.params.tolist(), strict=True
+    ):
+        assert abs(ours - theirs) <= 1e-4 * (result.sigma.get(name) or 0.0)
+    assert float(found.residuals.square().sum(-1).mean().sqrt()) == pytest.approx(result.rms, rel=1e-9)
+    assert torch.equal(found.camera().params, found.parameters)
+
+
+def test_a_known_camera_leaves_poses() -> None:
+    corners = CORNERS[:1].clone().requires_grad_(True)
+    found = calibrate_views(corners, BOARD.points, SIZE, CalibrationOptions(camera=camera("opencv4")))
+    (gradient,) = torch.autograd.grad(found.cam_from_board_translation[0, 2], corners)
+    # Corners that move apart by a share bring the board nearer by that share.
+    middle = corners.detach().mean((0, 1))
+    nearer = float((gradient * (corners.detach() - middle)).sum())
+    assert nearer == pytest.approx(-float(POSES[1][0, 2]), rel=0.2)
+
+
+def test_unseen_corners_have_no_influence() -> None:
+    mask = torch.ones(CORNERS.shape[:-1], dtype=torch.bool)
+    mask[2, 5:9] = False
+    for fill in (torch.nan, 1e4):
+        corners = torch.where(mask[..., None], CORNERS, fill).requires_grad_(True)
+        found = CalibrationLayer(SIZE, CalibrationOptions(model="opencv4"))(corners, BOARD.points, mask)
+        (gradient,) = torch.autograd.grad(summary(found).sum(), corners)
+        assert bool(gradient.isfinite().all())
+        assert bool((gradient[~mask] == 0).all())
+        assert bool((gradient[mask] != 0).all())
+
+
+def test_training_through_calibrations_finds_the_corners_bias() -> None:
+    """A detector is off by an unknown matrix times a feature of each corner; cameras calibrated from it tell which.
+
+    The reference is a calibration from clean corners with the same noise. The loss sees only where the cameras image
+    three rays: six numbers for four unknowns.
+    """
+    generator = torch.Generator().manual_seed(8)
+    features = torch.randn(*CORNERS.shape, generator=generator, dtype=torch.float64)
+    features = features + 0.01 * (CORNERS - CORNERS.mean((0, 1)))  # a bias that grows outward bends the lens
+    bias = torch.tensor([[0.6, -0.3], [0.2, 0.5]], dtype=torch.float64)
+    options = CalibrationOptions(model="opencv4")
+    reference = calibrate_views(CORNERS, BOARD.points, SIZE, options, backward="none")
+    wanted = reference.project(POINTS)[0]
+    measured = CORNERS + features @ bias
+
+    net = nn.Linear(2, 2, bias=False, dtype=torch.float64)
+    nn.init.zeros_(net.weight)
+    layer = CalibrationLayer(SIZE, options)
+    optimizer = torch.optim.LBFGS(net.parameters(), max_iter=20, line_search_fn="strong_wolfe", tolerance_grad=1e-12)
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        found = layer(measured - net(features), BOARD.points, start=reference)
+        loss = (found.project(POINTS)[0] - wanted).square().sum()
+        loss.backward()
+        return loss.detach()
+
+    before = float(closure())
+    optimizer.step(closure)
+    assert float(closure()) < 1e-4 * before
+    torch.testing.assert_close(net.weight.detach().T, bias, rtol=0, atol=0.01)
+
+
+class TestRefusals:
+    def test_what_the_views_do_not_determine(self) -> None:
+        """Boards parallel to the image leave the focal length open."""
+        flat = torch.eye(3).double().expand(4, 3, 3)
+        shift = torch.tensor([[-0.15, -0.1, 1.0], [-0.3, -0.1, 1.0], [-0.1, -0.2, 1.0], [0.0, 0.0, 1.0]]).double()
+        corners = pixels_of(camera("pinhole"), (flat, shift), noise=0.1)
+        options = CalibrationOptions(model="pinhole")
+        with pytest.raises(DegenerateError, match="focal length"):
+            calibrate_views(corners, BOARD.points, SIZE, options)
+        tied = CalibrationOptions(model="pinhole", fixed={"fx": 500.0, "fy": 505.0})
+        assert calibrate_views(corners, BOARD.points, SIZE, tied).parameters[0] == 500.0
+
+    def test_a_valley(self) -> None:
+        """Without distortion any numerator does that its denominator cancels."""
+        corners = pixels_of(camera("pinhole"), POSES)
+        start = calibrate_views(corners, BOARD.points, SIZE, CalibrationOptions(model="opencv5"), backward="none")
+        rich = LensModel.named("opencv8")
+        begin = dataclasses.replace(start, model=rich, parameters=embed(start.parameters, start.model, rich))
+        with pytest.raises(DegenerateError, match="no derivatives"):
+            calibrate_views(corners, BOARD.points, SIZE, CalibrationOptions(model=rich), start=begin)
+
+    def test_exact_corners_are_no_flat_valley(self) -> None:
+        corners = pixels_of(camera("opencv4"), POSES).requires_grad_(True)
+        found = calibrate_views(corners, BOARD.points, SIZE, CalibrationOptions(model="opencv4"))
+        torch.testing.assert_close(found.parameters.detach(), camera("opencv4").params.detach(), rtol=1e-8, atol=1e-8)
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"pixels": CORNERS[0]}, "V, N, 2"),
+            ({"pixels": CORNERS.int()}, "floating point"),
+            ({"board_points": BOARD.points[:5]}, "V, N, 2"),
+            ({"mask": torch.ones(2, 2, dtype=torch.bool)}, "mask"),
+            ({"prior_means": torch.ones(1)}, "prior means"),
+            ({"corner_sigma": 0.0}, "corner_sigma"),
+            ({"backward": "explicit"}, "implicit, unroll or none"),
+            ({"options": CalibrationOptions(reject=OutlierRejection())}, "continuous"),
+        ],
+    )
+    def test_input(self, change: dict[str, object], message: str) -> None:
+        arguments: dict[str, object] = {"pixels": CORNERS, "board_points": BOARD.points, "size": SIZE, **change}
+        with pytest.raises(InputError, match=message):
+            calibrate_views(**arguments)  # type: ignore[arg-type]
+
+    def test_a_start_of_another_model(self) -> None:
+        start = calibrate_views(CORNERS, BOARD.points, SIZE, CalibrationOptions(model="opencv4"), backward="none")
+        with pytest.raises(InputError, match="start"):
+            calibrate_views(CORNERS, BOARD.points, SIZE, CalibrationOptions(model="opencv5"), start=start)
+
+
+def test_float32_corners_are_promoted() -> None:
+    corners = CORNERS.float().requires_grad_(True)
+    found = CalibrationLayer(SIZE, CalibrationOptions(model="opencv4")).half()(corners, BOARD.points.float())
+    assert found.parameters.dtype == torch.float64
+    found.parameters[0].backward()
+    assert corners.grad is not None
+    assert corners.grad.dtype == torch.float32
+
+
+def test_camera_is_a_camera() -> None:
+    found = calibrate_views(CORNERS, BOARD.points, SIZE, CalibrationOptions(model="opencv4"))
+    made = found.camera()
+    assert isinstance(made, Camera)
+    torch.testing.assert_close(made.project(POINTS)[0], found.project(POINTS)[0].detach(), rtol=0, atol=1e-9)

@@ -1,0 +1,171 @@
+"""The 26 real images of OpenCV's stereo sample (environment variable KCAL_DATA), against OpenCV on the same corners."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
+from kcal.calibrate.rig.from_boards import RigCalibrationResult, RigOptions, calibrate_rig
+from kcal.calibrate.rig.pairs import pair_by_name
+from kcal.corners.board import Board
+from kcal.corners.detect import detect_images
+from kcal.corners.observations import Observations
+from kcal.lens.camera import Camera
+from kcal.locate.check import triangulated_sides
+
+cv2 = pytest.importorskip("cv2")
+
+BOARD = Board(columns=9, rows=6, square=0.025)
+SIZE = (640, 480)
+STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 300, 1e-12)
+RATIONAL = cv2.CALIB_RATIONAL_MODEL
+PRISM = RATIONAL | cv2.CALIB_THIN_PRISM_MODEL
+FLAGS = {"opencv5": 0, "opencv8": RATIONAL, "opencv12": PRISM, "opencv14": PRISM | cv2.CALIB_TILTED_MODEL}
+SIDES = ("left", "right")
+Solve = Callable[[str, str], CameraCalibrationResult]
+
+
+@pytest.fixture(scope="module")
+def seen(kcal_data: Path) -> dict[str, Observations]:
+    """Corners of both cameras, rounded to float32 as OpenCV takes them.
+
+    By the saddle fit, which leaves out no corner here and gives no covariances: both sides minimize the plain RMS.
+    """
+    found = {}
+    for side in SIDES:
+        views = detect_images(sorted((kcal_data / "opencv_stereo").glob(f"{side}*.jpg")), BOARD, "saddle")
+        assert len(views.views) == 13
+        pixels = views.pixels()
+        assert bool(torch.isfinite(pixels).all())
+        rounded = pixels.float().double().tolist()
+        kept = [
+            view.model_copy(update={"pixels": tuple(map(tuple, corners))})
+            for view, corners in zip(views.views, rounded, strict=True)
+        ]
+        found[side] = views.model_copy(update={"views": tuple(kept)})
+    return found
+
+
+@pytest.fixture(scope="module")
+def solved(seen: dict[str, Observations]) -> Solve:
+    """kcal's calibrations, each solved once."""
+    known: dict[tuple[str, str], CameraCalibrationResult] = {}
+
+    def solve(side: str, model: str) -> CameraCalibrationResult:
+        if (side, model) not in known:
+            known[side, model] = calibrate_camera(seen[side], CalibrationOptions(model=model))
+        return known[side, model]
+
+    return solve
+
+
+def opencv(seen: Observations, model: str) -> tuple:
+    pixels = seen.pixels().float()
+    board = BOARD.points.float().numpy()
+    return cv2.calibrateCamera(
+        [board] * len(pixels), list(pixels.numpy()), SIZE, None, None, flags=FLAGS[model], criteria=STEPS
+    )
+
+
+@pytest.mark.parametrize("side", SIDES)
+class TestCamera:
+    def test_five_coefficients_are_opencvs(self, side: str, seen: dict[str, Observations], solved: Solve) -> None:
+        rms, matrix, lens, *_ = opencv(seen[side], "opencv5")
+        result = solved(side, "opencv5")
+        assert result.rms == pytest.approx(rms, abs=1e-6)
+        assert result.warnings == ()
+        # The same camera to the digits at which OpenCV stops, which is far below σ (0.3 px).
+        found = result.camera.matrix
+        assert float(found[0, 0]) == pytest.approx(matrix[0, 0], abs=1e-2)
+        assert float(found[1, 2]) == pytest.approx(matrix[1, 2], abs=1e-2)
+        other = Camera.build(
+            focal=(matrix[0, 0], matrix[1, 1]), center=(matrix[0, 2], matrix[1, 2]), size=SIZE, coefficients=lens[0, :5]
+        )
+        rays, valid = other.unproject(other.grid(17, 13).reshape(-1, 2))
+        assert bool(valid.all())
+        assert float((result.camera.project(rays)[0] - other.project(rays)[0]).abs().max()) < 1e-2
+
+    def test_corners_as_good_as_the_design_promises(self, side: str, solved: Solve) -> None:
+        assert solved(side, "opencv5").rms < 0.17
+
+    @pytest.mark.parametrize("model", ["opencv8", "opencv12", "opencv14"])
+    def test_richer_models_never_end_above_opencv(
+        self, side: str, model: str, seen: dict[str, Observations], solved: Solve
+    ) -> None:
+        # OpenCV rounds the board's corners to float32: 1e-6 px.
+        assert solved(side, model).rms <= opencv(seen[side], model)[0] + 1e-6
+
+    def test_richer_models_never_end_above_smaller_ones(self, side: str, solved: Solve) -> None:
+        rms = [solved(side, model).rms for model in ("opencv4", *FLAGS)]
+        assert rms == sorted(rms, reverse=True)
+
+    def test_a_model_that_is_too_rich_says_so(self, side: str, solved: Solve) -> None:
+        """13 views do not determine 14 coefficients: σ of the principal point grows tenfold, or a warning comes."""
+        rich, plain = solved(side, "opencv14"), solved(side, "opencv5")
+        grown = [(rich.sigma[name] or torch.inf) / (plain.sigma[name] or 0.0) for name in ("cx", "cy")]
+        assert rich.warnings or min(grown) > 3.0
+
+
+@pytest.fixture(scope="module")
+def rigs(seen: dict[str, Observations], solved: Solve) -> dict[bool, RigCalibrationResult]:
+    """Solved with the cameras held (False) and refined (True)."""
+    cameras = [solved(side, "opencv5").camera for side in SIDES]
+    pairs = pair_by_name(seen["left"].names, seen["right"].names)
+    return {
+        refine: calibrate_rig(*cameras, seen["left"], seen["right"], pairs, RigOptions(refine_cameras=refine))
+        for refine in (False, True)
+    }
+
+
+class TestRig:
+    def test_is_opencvs(self, seen: dict[str, Observations], rigs: dict[bool, RigCalibrationResult]) -> None:
+        result = rigs[False]
+        assert len(result.pairs) == 13
+        assert result.flipped == ()
+        assert result.excluded == ()
+        # One of these pairs costs ten times as much to join as the typical one: nothing is left out, but it is named.
+        assert [text.split(": its two views disagree")[0] for text in result.warnings] == [
+            "pair left08.jpg, right08.jpg"
+        ]
+        board = BOARD.points.float().numpy()
+        corners = [list(seen[side].pixels().float().numpy()) for side in SIDES]
+        lenses = [
+            part for camera in (result.rig.left, result.rig.right)
+            for part in (camera.matrix.numpy().copy(), camera.coefficients.numpy().copy())
+        ]  # fmt: skip
+        rms, _, _, _, _, rotation, translation, *_ = cv2.stereoCalibrate(
+            [board] * 13, *corners, *lenses, SIZE, flags=cv2.CALIB_FIX_INTRINSIC, criteria=STEPS
+        )
+        assert result.rms == pytest.approx(rms, rel=1e-6)
+        baseline = float((translation**2).sum() ** 0.5)
+        assert float(result.rig.baseline) == pytest.approx(baseline, rel=1e-6)
+        found = result.rig.right_from_left_rotation
+        torch.testing.assert_close(found, torch.from_numpy(rotation).double(), rtol=0, atol=1e-6)
+
+    def test_refined_cameras_never_end_above(self, rigs: dict[bool, RigCalibrationResult]) -> None:
+        assert rigs[True].rms <= rigs[False].rms
+        assert rigs[True].excluded == ()
+
+    @pytest.mark.parametrize("refined", [False, True])
+    def test_squares_are_as_large_as_they_are(self, rigs: dict[bool, RigCalibrationResult], refined: bool) -> None:
+        result = rigs[refined]
+        mean, _ = triangulated_sides(result.rig, BOARD.columns, BOARD.rows, result.pixels)
+        assert mean == pytest.approx(BOARD.square, rel=1e-3)
+
+    def test_a_turned_board_changes_nothing(
+        self, seen: dict[str, Observations], solved: Solve, rigs: dict[bool, RigCalibrationResult]
+    ) -> None:
+        turned = [
+            view.model_copy(update={"pixels": view.pixels[::-1]}) if i in (2, 6, 9) else view
+            for i, view in enumerate(seen["right"].views)
+        ]
+        right = seen["right"].model_copy(update={"views": tuple(turned)})
+        pairs = pair_by_name(seen["left"].names, right.names)
+        cameras = [solved(side, "opencv5").camera for side in SIDES]
+        result = calibrate_rig(*cameras, seen["left"], right, pairs)
+        assert [pairs.index(pair) for pair in result.flipped] == [2, 6, 9]
+        assert float(result.rig.baseline) == pytest.approx(float(rigs[False].rig.baseline), rel=1e-7)

@@ -1,0 +1,129 @@
+"""The monitor of a rig's attitude: turns found to their sigmas, moving things named, statistics as stated."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from rig_scenes import CAMERAS, CENTER, ROTATION, landmarks, normal, see, spread_points, tensor
+from torch import Tensor
+
+from kcal.calibrate.rig.drift import measure_drift
+from kcal.calibrate.rig.sources import Features
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.lens.rig import StereoRig
+
+RELATIVE = ROTATION[1] @ ROTATION[0].T
+RIG = StereoRig(CAMERAS[0], CAMERAS[1], RELATIVE, ROTATION[1] @ (CENTER[0] - CENTER[1]))
+TURN = tensor([4e-5, -6e-5, 9e-5], [-2e-5, math.radians(0.01), 5e-5])
+
+
+def seen(points: Tensor, turns: Tensor) -> Tensor:
+    """(N, 2, 2) pixels in cameras that have turned."""
+    sides = []
+    for c, turn in enumerate(turns):
+        pixels, valid = CAMERAS[c].project((points - CENTER[c]) @ (rotation_from_vector(turn) @ ROTATION[c]).T)
+        assert bool(valid.all())
+        sides.append(pixels)
+    return torch.stack(sides, 1)
+
+
+def static(count: int, noise: float = 0.0, seed: int = 0, turns: Tensor = TURN) -> Features:
+    points = spread_points(count, 300.0, 8000.0, 11)
+    pixels = torch.cat([seen(points, torch.zeros(2, 3).double()), seen(points, turns)], 1)
+    return Features(
+        names=tuple(f"s{i}" for i in range(count)),
+        pixels=pixels + noise * normal(pixels.shape, 600 + seed),
+        inverse_range=torch.zeros(count, dtype=torch.float64),
+        inverse_range_sigma=torch.full((count,), math.inf, dtype=torch.float64),
+        pixel_sigma=max(noise, 0.1),
+    )
+
+
+def relative_turn(turns: Tensor = TURN) -> Tensor:
+    left, right = rotation_from_vector(turns)
+    return vector_from_rotation(right @ RELATIVE @ left.T @ RELATIVE.T)
+
+
+class TestFeatures:
+    def test_exact_marks_give_the_turn(self) -> None:
+        found = measure_drift(RIG, features=static(12))
+        assert found.left is not None
+        assert found.right is not None
+        torch.testing.assert_close(torch.stack([found.left, found.right]), TURN, rtol=0, atol=1e-10)
+        torch.testing.assert_close(found.relative, relative_turn(), rtol=0, atol=1e-10)
+        turned = rotation_from_vector(TURN[1]) @ ROTATION[1]
+        torch.testing.assert_close(
+            found.rig.right_from_left_translation, turned @ (CENTER[0] - CENTER[1]), rtol=0, atol=1e-8
+        )
+        assert found.significant
+
+    def test_sigmas_are_the_spread(self) -> None:
+        """16 checks of 15 features: χ² with 48 degrees of freedom, ± 4 of its deviations."""
+        total = 0.0
+        for seed in range(0, 16_000, 1000):
+            found = measure_drift(RIG, features=static(15, 0.1, seed))
+            error = vector_from_rotation(rotation_from_vector(found.relative) @ rotation_from_vector(-relative_turn()))
+            total += float(error @ torch.linalg.solve(found.relative_covariance, error))
+        assert abs(total - 48) < 4 * (2 * 48) ** 0.5
+
+    def test_no_drift_is_not_significant_and_a_tenth_of_a_pixel_is(self) -> None:
+        still = measure_drift(RIG, features=static(40, 0.1, turns=torch.zeros(2, 3).double()))
+        assert not still.significant
+        assert measure_drift(RIG, features=static(40, 0.1)).significant
+
+    def test_what_moved_is_named(self) -> None:
+        features = static(20, 0.1)
+        features.pixels[3, 2:] += tensor([6.0, 1.0], [5.0, 1.0])
+        features.pixels[8, 3] += tensor(0.0, 4.0)
+        found = measure_drift(RIG, features=features)
+        assert {item.name for item in found.left_out} == {"s3", "s8"}
+        error = found.relative - relative_turn()
+        assert bool((error.abs() < 4.5 * found.relative_covariance.diagonal().sqrt()).all())
+
+    def test_features_of_known_range_tell_the_relative_turn_without_a_history(self) -> None:
+        turns = TURN * tensor([0.0], [1.0])
+        features = static(15, turns=turns)
+        points = spread_points(15, 300.0, 8000.0, 11)
+        inverse = 1.0 / torch.linalg.vector_norm(points - CENTER[:2].mean(0), dim=-1)
+        pixels = features.pixels.clone()
+        pixels[:, :2] = math.nan
+        known = dataclasses.replace(features, pixels=pixels, inverse_range=inverse, inverse_range_sigma=1e-3 * inverse)
+        found = measure_drift(RIG, features=known)
+        assert found.left is None
+        torch.testing.assert_close(found.relative, relative_turn(turns), rtol=0, atol=1e-9)
+
+
+class TestLandmarks:
+    def test_attitudes_in_the_local_frame(self) -> None:
+        marks = landmarks()
+        marks = dataclasses.replace(marks, pixels=seen(marks.points, TURN))
+        found = measure_drift(RIG, landmarks=marks, pose=(ROTATION[0], CENTER[0]))
+        assert found.cam_from_local is not None
+        torch.testing.assert_close(found.cam_from_local, rotation_from_vector(TURN[0]) @ ROTATION[0])
+        torch.testing.assert_close(found.relative, relative_turn(), rtol=0, atol=1e-10)
+
+    def test_how_well_the_rig_was_known_counts(self) -> None:
+        marks = landmarks()
+        marks = dataclasses.replace(marks, pixels=seen(marks.points, TURN))
+        pose = (ROTATION[0], CENTER[0])
+        rough = 1e-6 * torch.eye(3, dtype=torch.float64)
+        assert measure_drift(RIG, landmarks=marks, pose=pose).significant
+        assert not measure_drift(RIG, landmarks=marks, pose=pose, before=(rough, rough)).significant
+
+
+class TestRefusals:
+    def test_too_little(self) -> None:
+        with pytest.raises(InputError, match="features or landmarks are needed"):
+            measure_drift(RIG)
+        with pytest.raises(InputError, match="need the left camera's pose"):
+            measure_drift(RIG, landmarks=landmarks())
+        with pytest.raises(DegenerateError, match="two features or landmarks"):
+            measure_drift(RIG, features=static(1))
+
+
+def test_scene_sees_its_features() -> None:
+    assert bool(torch.isfinite(see(spread_points(20, 300.0, 8000.0, 11), 0)).all())

@@ -1,0 +1,427 @@
+"""Rigs, simulated: the pose comes back, turned and wrong pairs are found, and mixed-up input is refused."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import pytest
+import torch
+from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, observe, pixels_of
+from torch import Tensor
+
+from kcal.calibrate.rig.from_boards import RigCalibrationResult, RigOptions, calibrate_rig
+from kcal.calibrate.rig.pairs import pair_by_name, read_pairs
+from kcal.corners.board import Board
+from kcal.errors import FileError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.solve.result import Status
+
+# 8 x 6 corners: the colors are the same after half a turn, so that a detector cannot know the first corner.
+AMBIGUOUS = Board(columns=8, rows=6, square=0.04)
+LEFT = camera()
+RIGHT = Camera.build(focal=(560, 555), center=(310.0, 250.0), size=SIZE, coefficients=[-0.15, 0.03, 0, 0.001, 0])
+ROTATION = rotation_from_vector(torch.tensor([0.02, 0.1, 0.01], dtype=torch.float64))
+TRANSLATION = torch.tensor([-0.12, 0.005, 0.01], dtype=torch.float64)
+
+
+@functools.cache
+def poses(count: int, seed: int, board: Board) -> Motions:
+    """Boards seen completely by both cameras."""
+    rotation, translation = motions(LEFT, 5 * count + 5, seed, board=board, fill=0.4)
+    points = board.points @ rotation.transpose(-1, -2) + translation[:, None]
+    pixels, valid = RIGHT.project(points @ ROTATION.T + TRANSLATION)
+    both = (valid & RIGHT.inside(pixels)).all(-1).nonzero()[:count, 0]
+    assert len(both) == count
+    return rotation[both], translation[both]
+
+
+def views(count: int, seed: int, *, board: Board = BOARD, noise: float = 0.0, noise_seed: int = 0) -> Tensor:
+    """Corners (P, 2, N, 2)."""
+    rotation, translation = poses(count, seed, board)
+    left = pixels_of(LEFT, (rotation, translation), board=board, noise=noise, seed=noise_seed)
+    turned = (ROTATION @ rotation, translation @ ROTATION.T + TRANSLATION)
+    right = pixels_of(RIGHT, turned, board=board, noise=noise, seed=noise_seed + 500)
+    return torch.stack([left, right], 1)
+
+
+def names(count: int) -> list[tuple[str, str]]:
+    return [(f"l{i}", f"r{i}") for i in range(count)]
+
+
+def solve(
+    pixels: Tensor, *, left: Camera = LEFT, right: Camera = RIGHT, board: Board = BOARD, **options: bool
+) -> RigCalibrationResult:
+    pairs = names(len(pixels))
+    seen = [observe(pixels[:, c], board=board, names=[pair[c] for pair in pairs]) for c in (0, 1)]
+    return calibrate_rig(left, right, seen[0], seen[1], pairs, RigOptions(**options))
+
+
+def off(result: RigCalibrationResult) -> tuple[float, float]:
+    """Angle (radians) and distance (meters) from the true pose."""
+    turn = vector_from_rotation(result.rig.right_from_left_rotation @ ROTATION.T)
+    return float(turn.norm()), float((result.rig.right_from_left_translation - TRANSLATION).norm())
+
+
+class TestTruth:
+    @pytest.mark.parametrize("count", [1, 2, 5])
+    def test_comes_back(self, count: int) -> None:
+        result = solve(views(count, 1))
+        assert result.status == Status.EXACT
+        assert result.rms < 1e-11
+        assert max(off(result)) < 1e-11
+        assert result.pairs == tuple(names(count))
+        assert result.flipped == ()
+        assert result.excluded == ()
+        assert float(result.rig.baseline) == pytest.approx(float(TRANSLATION.norm()), rel=1e-10)
+
+    def test_few_pairs_are_warned_of(self) -> None:
+        assert solve(views(3, 1)).warnings == ()
+        for count in (1, 2):
+            assert [text[:15] for text in solve(views(count, 1)).warnings] == [f"{count} pair(s) only:"]
+
+    def test_corners_that_one_camera_did_not_see(self) -> None:
+        pixels = views(5, 1)
+        hidden = torch.rand(pixels.shape[:-1], generator=torch.Generator().manual_seed(1)) < 0.4
+        pixels[hidden] = torch.nan
+        result = solve(pixels)
+        assert result.status == Status.EXACT
+        assert max(off(result)) < 1e-10
+        assert torch.equal(torch.isnan(result.pixels[..., 0]), hidden)
+
+    def test_numbers_follow_from_the_residuals(self) -> None:
+        pixels = views(6, 2, noise=0.2)
+        pixels[2, 1, :9] = torch.nan
+        result = solve(pixels)
+        seen = torch.isfinite(pixels[..., 0]).sum(-1).double()
+        both = ((result.rms_left**2 * seen[:, 0].sum() + result.rms_right**2 * seen[:, 1].sum()) / seen.sum()) ** 0.5
+        assert result.rms == pytest.approx(float(both), rel=1e-12)
+        squared = (result.per_pair_rms**2 * seen.sum(-1)).sum() / seen.sum()
+        assert result.rms == pytest.approx(float(squared**0.5), rel=1e-9)
+        # 0.2 px an axis, with 6 parameters and 36 of poses from 990 numbers; 4 standard errors.
+        assert result.rms == pytest.approx(0.2 * (2 * (1 - 42 / 990)) ** 0.5, rel=4 / (2 * 990) ** 0.5)
+
+    def test_refined_cameras_fit_no_worse_and_start_may_be_off(self) -> None:
+        pixels = views(8, 3, noise=0.1)
+        rough = [Camera(c.params * torch.tensor([1.01, 1.01] + [1.0] * 8).double(), size=SIZE) for c in (LEFT, RIGHT)]
+        fixed = solve(pixels, left=rough[0], right=rough[1])
+        refined = solve(pixels, left=rough[0], right=rough[1], refine_cameras=True)
+        assert refined.rms < fixed.rms
+        assert refined.rms == pytest.approx(0.1 * 2**0.5, rel=0.1)
+        assert abs(float(refined.rig.left.focal[0]) - 500) < 4
+        assert torch.equal(fixed.rig.left.params, rough[0].params)
+        # The error of the focal length shows in the σ of the pose.
+        assert bool((refined.sigma_translation > solve(pixels).sigma_translation).all())
+
+    def test_sigma_is_the_spread(self) -> None:
+        """40 repetitions: 39 s² / σ² is χ²; s² / σ² lies in 0.332 to 2.17 but for 6e-5 (4 standard deviations)."""
+        results = [solve(views(4, 5, noise=0.2, noise_seed=seed)) for seed in range(40)]
+        turns = torch.stack(
+            [vector_from_rotation(result.rig.right_from_left_rotation @ ROTATION.T) for result in results]
+        )
+        shifts = torch.stack([result.rig.right_from_left_translation - TRANSLATION for result in results])
+        for found, sigma in ((turns, "sigma_rotation"), (shifts, "sigma_translation")):
+            predicted = torch.stack([getattr(result, sigma) for result in results]).pow(2).mean(0)
+            ratio = found.var(0) / predicted
+            assert bool(((ratio > 0.332) & (ratio < 2.17)).all()), (sigma, ratio)
+            assert bool((found.mean(0).abs() < 4.5 * (predicted / 40).sqrt()).all()), sigma
+
+
+class TestWeights:
+    def test_corners_count_by_their_covariances(self) -> None:
+        """Half the corners five times worse, and known to be: the scatter of the yaw falls."""
+        noise = torch.where(torch.arange(BOARD.corners) % 2 == 0, 0.05, 0.4)[:, None]
+        error: dict[bool, list[float]] = {True: [], False: []}
+        for seed in range(6):
+            pixels = views(4, 5) + noise * torch.randn(
+                4, 2, BOARD.corners, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+            )
+            pairs = names(4)
+            seen = []
+            for c in (0, 1):
+                plain = observe(pixels[:, c], names=[pair[c] for pair in pairs])
+                spread = tuple((float(s) ** 2, 0.0, float(s) ** 2) for s in noise[:, 0])
+                known = tuple(view.model_copy(update={"covariance": spread}) for view in plain.views)
+                seen.append(plain.model_copy(update={"views": known}))
+            for weighted in error:
+                result = calibrate_rig(LEFT, RIGHT, seen[0], seen[1], pairs, RigOptions(weighted=weighted))
+                error[weighted].append(off(result)[0] ** 2)
+                # The RMS that is reported stays the plain one.
+                assert result.rms == pytest.approx(float(noise.square().mean().sqrt()) * 2**0.5, rel=0.2)
+        assert sum(error[True]) < 0.25 * sum(error[False])
+
+    def test_covariance_is_that_of_the_sigmas(self) -> None:
+        for refine in (False, True):
+            result = solve(views(5, 3, noise=0.1), refine_cameras=refine)
+            assert result.covariance.shape == (26, 26)
+            sigma = result.covariance.diagonal().sqrt()
+            torch.testing.assert_close(sigma[20:23], result.sigma_rotation, rtol=1e-6, atol=0)
+            torch.testing.assert_close(sigma[23:], result.sigma_translation, rtol=1e-6, atol=0)
+            # Parameters that were held have none: all, or the skew of each camera.
+            assert bool((sigma[:20] > 0).any()) == refine
+            assert sigma[4] == sigma[14] == 0
+
+
+class TestTurned:
+    """Trap 8: a board read from its other end in some pairs."""
+
+    @pytest.mark.parametrize("board", [BOARD, AMBIGUOUS], ids=["7x6", "8x6"])
+    @pytest.mark.parametrize("side", [0, 1])
+    @pytest.mark.parametrize("count", [1, 2])
+    def test_in_20_and_40_percent_of_pairs(self, count: int, side: int, board: Board) -> None:
+        pixels = views(5, 7, board=board, noise=0.1)
+        plain = solve(pixels, board=board)
+        turned = pixels.clone()
+        which = [3, 1][:count]
+        turned[which, side] = turned[which, side].flip(-2)
+        result = solve(turned, board=board)
+        assert result.flipped == tuple(names(5)[i] for i in sorted(which))
+        assert result.excluded == ()
+        assert result.rms == pytest.approx(plain.rms, rel=1e-9)
+        # Both stop where the cost is flat to 1e-12 of itself.
+        assert float(result.rig.baseline) == pytest.approx(float(plain.rig.baseline), rel=1e-6)
+        # The corners come back as used.
+        expected = pixels.clone()
+        if side == 0:
+            expected[which] = expected[which].flip(-2)
+        assert torch.equal(result.pixels, expected)
+
+    def test_in_all_pairs(self) -> None:
+        pixels = views(5, 7, noise=0.1)
+        plain = solve(pixels)
+        pixels[:, 1] = pixels[:, 1].flip(-2)
+        result = solve(pixels)
+        assert result.flipped == tuple(names(5))
+        assert float(result.rig.baseline) == pytest.approx(float(plain.rig.baseline), rel=1e-6)
+
+    @pytest.mark.parametrize("count", [1, 2])
+    def test_one_or_two_pairs_are_taken_as_read(self, count: int) -> None:
+        """A single pair fits both ways; chance must not decide."""
+        for seed in range(8):
+            result = solve(views(count, seed, noise=0.1))
+            assert result.flipped == ()
+            assert result.excluded == ()
+            assert off(result)[1] < 0.01
+
+    def test_of_two_pairs_with_unseen_corners(self) -> None:
+        pixels = views(5, 7, noise=0.1)
+        pixels[2, 1, :10] = torch.nan
+        pixels[4, 0, -12:] = torch.nan
+        plain = solve(pixels)
+        pixels[[2, 4], 1] = pixels[[2, 4], 1].flip(-2)
+        result = solve(pixels)
+        assert result.flipped == (("l2", "r2"), ("l4", "r4"))
+        assert float(result.rig.baseline) == pytest.approx(float(plain.rig.baseline), rel=1e-6)
+
+
+class TestWrongPairs:
+    def test_are_left_out_and_named(self) -> None:
+        pixels = views(8, 2, noise=0.1)
+        wrong = pixels.clone()
+        wrong[2, 1], wrong[5, 1] = pixels[5, 1], pixels[2, 1]
+        result = solve(wrong)
+        assert {pair for pair, _ in result.excluded} == {("l2", "r2"), ("l5", "r5")}
+        assert all("px away from where the other pairs put it" in reason for _, reason in result.excluded)
+        assert [pair for pair in names(8) if pair not in result.pairs] == [("l2", "r2"), ("l5", "r5")]
+        assert len(result.per_pair_rms) == len(result.pixels) == 6
+        kept = torch.tensor([0, 1, 3, 4, 6, 7])
+        assert float(result.rig.baseline) == pytest.approx(float(solve(pixels[kept]).rig.baseline), rel=1e-6)
+
+    @pytest.mark.parametrize("shift", [(0.0, 4.0), (4.0, 0.0), (0.0, 8.0), (15.0, 0.0)])
+    def test_a_board_that_moved_between_the_exposures(self, shift: tuple[float, float]) -> None:
+        """Left in, 4 px in one pair of eight turn the rig by 0.4 degrees."""
+        pixels = views(8, 2, noise=0.1)
+        pixels[3, 1] += torch.tensor(shift, dtype=torch.float64)
+        result = solve(pixels)
+        assert [pair for pair, _ in result.excluded] == [("l3", "r3")]
+        assert off(result)[0] < 5 * float(result.sigma_rotation.norm())
+        assert off(result)[1] < 5 * float(result.sigma_translation.norm())
+
+    @pytest.mark.parametrize("shift", [(1.0, 0.0), (0.0, 1.0), (0.5, 0.5)])
+    def test_a_pixel_is_noticed_and_can_be_left_out(self, shift: tuple[float, float]) -> None:
+        """Each camera alone fits such a pair well, and the joint RMS hardly rises: what joining it costs tells."""
+        pixels = views(8, 2, noise=0.1)
+        pixels[3, 1] += torch.tensor(shift, dtype=torch.float64)
+        warned = solve(pixels)
+        assert warned.excluded == ()
+        assert [text.split(":")[0] for text in warned.warnings] == ["pair l3, r3"]
+        assert warned.disagreement.argmax() == 3
+        result = solve(pixels, reject=True)
+        assert [pair for pair, _ in result.excluded] == [("l3", "r3")]
+        assert "disagree about the rig" in result.excluded[0][1]
+        assert result.warnings == ()
+        assert off(result)[0] < 5 * float(result.sigma_rotation.norm())
+        assert off(result)[0] < 0.5 * off(warned)[0]
+
+    def test_good_pairs_are_neither_named_nor_left_out(self) -> None:
+        for seed in range(3):
+            result = solve(views(6, 2, noise=0.1, noise_seed=seed), reject=True)
+            assert result.excluded == ()
+            assert result.warnings == ()
+
+    def test_an_exact_capture_loses_no_pair_to_rounding(self) -> None:
+        assert solve(views(6, 2)).excluded == ()
+
+
+class TestRefusals:
+    def test_swapped_cameras(self) -> None:
+        with pytest.raises(InputError, match="swapped"):
+            solve(views(5, 1, noise=0.1), left=RIGHT, right=LEFT)
+
+    def test_swapped_observations(self) -> None:
+        with pytest.raises(InputError, match="swapped"):
+            solve(views(5, 1, noise=0.1).flip(1))
+
+    def test_nearly_equal_cameras_are_not_called_swapped_for_noise(self) -> None:
+        pixels = views(5, 1, noise=0.3)
+        twin = Camera(RIGHT.params * (1 + 1e-5), size=SIZE)
+        assert solve(pixels, right=twin).excluded == ()
+
+    def test_another_camera(self) -> None:
+        other = Camera.build(focal=(1200, 600), center=(320, 240), size=SIZE)
+        with pytest.raises(InputError, match=r"right observations do not fit the right camera \(RMS \d+\.\d px\)"):
+            solve(views(5, 1), right=other)
+
+    def test_a_camera_that_is_merely_wrong_is_warned_of(self) -> None:
+        other = Camera.build(focal=(800, 800), center=(320, 240), size=SIZE)
+        assert any("px is high" in text for text in solve(views(5, 1), right=other).warnings)
+
+    def test_boards(self) -> None:
+        pixels = views(3, 1)
+        one = observe(pixels[:, 0], names=["l0", "l1", "l2"])
+        other = observe(
+            pixels[:, 1], names=["r0", "r1", "r2"], board=Board(columns=7, rows=6, square=0.051)
+        )  # another square
+        with pytest.raises(InputError, match=r"the cameras saw different boards: .*50 mm.*51 mm"):
+            calibrate_rig(LEFT, RIGHT, one, other, names(3))
+
+    def test_image_sizes(self) -> None:
+        pixels = views(3, 1)
+        seen = [observe(pixels[:, c], names=[pair[c] for pair in names(3)]) for c in (0, 1)]
+        half = Camera(RIGHT.params, size=(320, 240))
+        with pytest.raises(InputError, match="the right camera has images of 320x240, its observations of 640x480"):
+            calibrate_rig(LEFT, half, seen[0], seen[1], names(3))
+
+    def test_pairs(self) -> None:
+        pixels = views(3, 1)
+        seen = [observe(pixels[:, c], names=[pair[c] for pair in names(3)]) for c in (0, 1)]
+        with pytest.raises(InputError, match="no pair of views"):
+            calibrate_rig(LEFT, RIGHT, seen[0], seen[1], [])
+        with pytest.raises(InputError, match="no view named 'r7'"):
+            calibrate_rig(LEFT, RIGHT, seen[0], seen[1], [("l0", "r7")])
+
+    def test_too_few_corners(self) -> None:
+        pixels = views(3, 1)
+        pixels[1, 1, 5:] = torch.nan
+        with pytest.raises(InputError, match="pair l1, r1: at least 6 corners are needed in each view"):
+            solve(pixels)
+
+    def test_corners_on_one_line(self) -> None:
+        pixels = views(3, 1, noise=0.1)
+        pixels[1, 1, 7:] = torch.nan
+        with pytest.raises(InputError, match=r"r1: .* lie on one line"):
+            solve(pixels)
+
+
+class TestPairByName:
+    @pytest.mark.parametrize(
+        ("left", "right", "expected"),
+        [
+            (["left01.jpg", "left02.jpg"], ["right01.jpg", "right02.jpg"], [(0, 0), (1, 1)]),
+            (["left02.jpg", "left01.jpg"], ["right01.jpg", "right03.jpg"], [(1, 0)]),
+            (["l_1.png", "l_10.png"], ["r_10.png", "r_1.png"], [(0, 1), (1, 0)]),
+            (["01_L.tif", "02_L.tif"], ["02_R.tif", "01_R.tif"], [(0, 1), (1, 0)]),
+            (["cam0/0001.png", "cam0/0002.png"], ["cam1/0001.png", "cam1/0002.png"], [(0, 0), (1, 1)]),
+            (["cam0_7.png"], ["cam1_7.png"], [(0, 0)]),
+            (["Camera 2 - 0007.png"], ["Camera 3 - 0007.png"], [(0, 0)]),
+            (["a.jpg", "b.jpg"], ["b.jpg", "a.jpg"], [(0, 1), (1, 0)]),
+            (["IMG_0012.JPG"], ["DSC_00012.JPG"], [(0, 0)]),
+            # "l" and "r" within words are no sides.
+            (["world_1.png"], ["world_2.png", "world_1.png"], [(0, 1)]),
+            # Equal names win over equal numbers.
+            (["1_5.png", "2_5.png"], ["2_5.png", "1_5.png"], [(0, 1), (1, 0)]),
+        ],
+    )
+    def test_pairs(self, left: list[str], right: list[str], expected: list[tuple[int, int]]) -> None:
+        assert pair_by_name(left, right) == [(left[i], right[j]) for i, j in expected]
+
+    @pytest.mark.parametrize(
+        ("left", "right"),
+        [
+            (["a/left01.png", "b/left01.png"], ["right01.png"]),
+            (["left01.png"], ["a/right01.png", "b/right01.png"]),
+            (["x_1.png", "y_1.png"], ["z_1.png"]),
+        ],
+    )
+    def test_doubt_is_an_error(self, left: list[str], right: list[str]) -> None:
+        with pytest.raises(InputError, match=r"look alike; give a CSV of pairs"):
+            pair_by_name(left, right)
+
+    @pytest.mark.parametrize(("left", "right"), [(["left01.png"], ["right02.png"]), ([], ["a"]), (["a"], []), ([], [])])
+    def test_no_partner_is_an_error(self, left: list[str], right: list[str]) -> None:
+        with pytest.raises(InputError, match=r"has a partner by name .* give a CSV of pairs"):
+            pair_by_name(left, right)
+
+
+class TestPairsFile:
+    LEFT, RIGHT = ("a.png", "b.png", "c, d.png"), ("1.png", "2.png", "3.png")
+
+    def read(self, folder: Path, content: str | bytes) -> list[tuple[str, str]]:
+        path = folder / "pairs.csv"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return read_pairs(path, self.LEFT, self.RIGHT)
+
+    @pytest.mark.parametrize(
+        "content",
+        [
+            "left,right\na.png,2.png\nb.png,1.png\n",
+            "left,right\r\na.png,2.png\r\nb.png,1.png",
+            "\ufeffleft,right\na.png,2.png\nb.png,1.png\n",
+            "left , right\n\n a.png , 2.png\n\nb.png,1.png\n\n",
+        ],
+        ids=["plain", "Windows", "byte order mark", "blanks"],
+    )
+    def test_reads(self, tmp_path: Path, content: str) -> None:
+        assert self.read(tmp_path, content) == [("a.png", "2.png"), ("b.png", "1.png")]
+
+    def test_quoted_names(self, tmp_path: Path) -> None:
+        assert self.read(tmp_path, 'left,right\n"c, d.png",3.png\n') == [("c, d.png", "3.png")]
+
+    @pytest.mark.parametrize(
+        ("content", "error", "message"),
+        [
+            ("", FileError, "the header must be left,right; it is nothing"),
+            ("right,left\n1.png,a.png\n", FileError, "the header must be left,right; it is right,left"),
+            ("a.png,1.png\n", FileError, "it is a.png,1.png"),
+            ("left;right\na.png;1.png\n", FileError, "it is left;right"),
+            ("left,right\n", FileError, "no pair below the header"),
+            ("left,right\n\n\n", FileError, "no pair below the header"),
+            ("left,right\na.png\n", FileError, "line 2 has 1 fields, two are needed"),
+            ("left,right\na.png,1.png,x\n", FileError, "line 2 has 3 fields"),
+            (
+                "left,right\na.png,1.png\nz.png,2.png\n",
+                InputError,
+                "line 3: no view of the left camera is named 'z.png'",
+            ),
+            ("left,right\na.png,b.png\n", InputError, "line 2: no view of the right camera is named 'b.png'"),
+            ("left,right\na.png,1.png\na.png,2.png\n", InputError, "line 3: 'a.png' is paired twice"),
+            ("left,right\na.png,1.png\nb.png,1.png\n", InputError, "line 3: '1.png' is paired twice"),
+            (b"left,right\na\xff.png,1.png\n", FileError, "cannot read"),
+        ],
+    )
+    def test_refuses(self, tmp_path: Path, content: str | bytes, error: type[Exception], message: str) -> None:
+        with pytest.raises(error) as caught:
+            self.read(tmp_path, content)
+        assert str(caught.value).startswith(str(tmp_path / "pairs.csv"))
+        assert message in str(caught.value)
+
+    def test_no_file(self, tmp_path: Path) -> None:
+        with pytest.raises(FileError, match="cannot read"):
+            read_pairs(tmp_path / "none.csv", self.LEFT, self.RIGHT)
+        with pytest.raises(FileError, match="cannot read"):
+            read_pairs(tmp_path, self.LEFT, self.RIGHT)
+
+    def test_a_field_beyond_all_measure(self, tmp_path: Path) -> None:
+        with pytest.raises(FileError, match="cannot read: field larger"):
+            self.read(tmp_path, "left,right\n" + 200_000 * "a" + ",1.png\n")

@@ -1,0 +1,525 @@
+"""Joint rigs, simulated: derivatives, recovery, covariances, wrong items named, what is not determined named."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rig_scenes import (
+    BOARD,
+    CAMERAS,
+    CENTER,
+    NAMES,
+    ROTATION,
+    boards,
+    features,
+    landmarks,
+    normal,
+    see,
+    spread_points,
+    tensor,
+)
+from torch import Tensor
+
+from kcal.calibrate import rig_limits
+from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.rig.blocks import BoardGroup, FeatureGroup, Group, LandmarkGroup
+from kcal.calibrate.rig.problem import DistanceTerm, ParameterTerm, PlaceTerm, RigProblem
+from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
+from kcal.calibrate.rig.result import RigSolution
+from kcal.calibrate.rig.solve import JointOptions, solve_rig
+from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData, inverse_range_beyond
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.hybrid import HybridCamera
+from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.lens.residual import FieldGrid, FieldResidual
+from kcal.solve.result import State, Status
+
+APART = float((CENTER[0] - CENTER[1]).norm())
+BASELINE = (Baseline(first=0, second=1, length=APART, sigma=0.005),)
+
+
+def data(count: int = 2, **sources: object) -> RigData:
+    return RigData(cameras=CAMERAS[:count], names=NAMES[:count], **sources)  # type: ignore[arg-type]
+
+
+def positions(count: int, sigma: float = 0.02) -> tuple[MeasuredPosition, ...]:
+    return tuple(
+        MeasuredPosition(camera=c, point=CENTER[c], sigma=torch.full((3,), sigma).double()) for c in range(count)
+    )
+
+
+def off(found: RigSolution) -> float:
+    """Largest error: radians of any camera, meters of any center; relative ones where nothing is absolute."""
+    rotation, center = ROTATION[: len(found.names)], CENTER[: len(found.names)]
+    if not found.absolute:
+        rotation, center = rotation @ ROTATION[0].T, (center - CENTER[0]) @ ROTATION[0].T
+    turn = vector_from_rotation(found.rotation @ rotation.transpose(-1, -2))
+    return max(float(turn.abs().max()), float((found.center - center).abs().max()))
+
+
+def pose_error(found: RigSolution) -> Tensor:
+    """(6,) of the relative pose, as `kcal.calibrate.bundle.twist.apply_twist` counts it."""
+    rotation = ROTATION[1] @ ROTATION[0].T
+    rig = found.stereo()
+    shift = rig.right_from_left_translation - ROTATION[1] @ (CENTER[0] - CENTER[1])
+    return torch.cat([vector_from_rotation(rig.right_from_left_rotation @ rotation.T), shift])
+
+
+def mixed_problem() -> tuple[RigProblem, State]:
+    """Every kind of residual, away from the solution; cameras partly free, one corner unseen."""
+    marks = landmarks(count=4, cameras=3, noise=0.3)
+    far = features(count=4, cameras=3, noise=0.3, known=0.2)
+    shown = boards(count=2, cameras=3, noise=0.2)
+    shown.pixels[1, 1, 3] = torch.nan
+    identity = torch.eye(2, dtype=torch.float64)
+
+    def white(pixels: Tensor) -> Tensor:
+        skewed = identity / 0.3 + tensor([0.0, 0.7], [0.2, 0.0])
+        return skewed.expand(*pixels.shape, 2)
+
+    sigma = far.inverse_range_sigma.clone()
+    sigma[1] = math.inf
+    anchor = CENTER.mean(0)
+    groups: list[tuple[Group, int]] = [
+        (BoardGroup(shown.pixels, white(shown.pixels), BOARD.points), 2),
+        (LandmarkGroup(marks.pixels, white(marks.pixels), marks.points, marks.sigma), 1),
+        (FeatureGroup(far.pixels, white(far.pixels), far.inverse_range, sigma, anchor), 2),
+    ]
+    index = [0, 2, 4, 6]
+    terms = [
+        DistanceTerm(0, 1, 10.0, 0.01),
+        PlaceTerm(1, CENTER[1] + 0.1, tensor(0.1, 0.2, 0.3)),
+        ParameterTerm(1, CAMERAS[1].params + 0.1, normal((4, 4), 7)),
+    ]
+    problem = RigProblem(
+        [camera.model for camera in CAMERAS],
+        [None] * 3,
+        groups,
+        terms,
+        [Free((0, 1, 7), (0, 0, 1)), Free.of(index), Free((), ())],
+        [True, True, False],
+        [False, True, True],
+    )
+    towards = spread_points(4, 8000.0, 40_000.0, 9) - anchor
+    length = towards.norm(dim=-1)
+    state = (
+        torch.cat([camera.params for camera in CAMERAS]),
+        ROTATION,
+        CENTER,
+        ROTATION[0].T @ rotation_from_vector(tensor([0.3, 0.1, 0.0], [0.1, -0.3, 0.1])),
+        CENTER[0] + tensor([3.0, 1.0, 20.0], [5.0, -1.0, 25.0]) @ ROTATION[0],
+        marks.points + 0.01,
+        towards / length[:, None],
+        1.0 / length,
+    )
+    return problem, state
+
+
+def residuals(problem: RigProblem, state: State, shared: Tensor, local: Tensor) -> Tensor:
+    """All residuals after a step."""
+    moved = problem.retract(state, (shared, local))
+    sights = problem.sights(moved)
+    each = zip(problem.groups, problem.locals(moved), strict=True)
+    return torch.cat([*(g.residuals(sights, part).flatten() for g, part in each), problem.term_rows(moved)[-1]])
+
+
+class TestDerivatives:
+    def test_analytic_equal_autograd_and_numeric(self) -> None:
+        problem, state = mixed_problem()
+        shared = torch.zeros(problem.shared_size, dtype=torch.float64)
+        local = torch.zeros(sum(map(len, problem.groups)), 6, dtype=torch.float64)
+        by_shared, by_local = torch.func.jacfwd(lambda s, v: residuals(problem, state, s, v), (0, 1))(shared, local)
+        sights = problem.sights(state)
+        rows, block, start = [], 0, 0
+        for group, part in zip(problem.groups, problem.locals(state), strict=True):
+            found = group.rows(sights, part, problem.shared_size)
+            rows.append(found[:, group.size : -1].movedim(1, -1).flatten(0, -2))
+            for own in found[:, : group.size]:
+                stop = start + own.shape[-1]
+                torch.testing.assert_close(own.T, by_local[start:stop, block, 6 - group.size :], rtol=1e-9, atol=1e-7)
+                start, block = stop, block + 1
+        analytic = torch.cat([*rows, problem.term_rows(state)[:-1].T])
+        torch.testing.assert_close(analytic, by_shared, rtol=1e-9, atol=1e-7)
+        for k in range(problem.shared_size):
+            step = 1e-6 * torch.eye(problem.shared_size, dtype=torch.float64)[k]
+            ends = [residuals(problem, state, sign * step, local) for sign in (1.0, -1.0)]
+            numeric = (ends[0] - ends[1]) / 2e-6
+            scale = float(numeric.abs().max()) + 1.0
+            torch.testing.assert_close(analytic[:, k], numeric, rtol=1e-5, atol=1e-5 * scale)
+
+    def test_unseen_things_count_nothing(self) -> None:
+        problem, state = mixed_problem()
+        assert problem.groups[0].counts.tolist() == [252, 250]
+        assert problem.groups[2].counts.tolist() == [7, 6, 7, 7]
+        rows = problem.groups[0].rows(problem.sights(state), problem.locals(state)[0], problem.shared_size)
+        assert bool((rows[1, :, 84 + 3] == 0).all())
+        assert bool((rows[1, :, 84 + 42 + 3] == 0).all())
+
+
+class TestResection:
+    def test_three_points_give_the_pose_among_four(self) -> None:
+        points = spread_points(3, 100.0, 900.0, 1)
+        rays = (points - CENTER[0]) @ ROTATION[0].T
+        rotation, center = poses_from_three(rays / rays.norm(dim=-1, keepdim=True), points)
+        error = (center - CENTER[0]).norm(dim=-1).nan_to_num(math.inf)
+        best = int(error.argmin())
+        assert float(error[best]) < 1e-7
+        torch.testing.assert_close(rotation[best], ROTATION[0], rtol=0, atol=1e-9)
+
+    def test_a_minority_of_wrong_points_does_no_harm(self) -> None:
+        points = spread_points(9, 60.0, 900.0, 2)
+        rays = (points - CENTER[0]) @ ROTATION[0].T
+        rays = rays / rays.norm(dim=-1, keepdim=True)
+        points[[1, 4, 6]] += tensor([30.0, 0, 9], [0, -50, 20], [9, 9, -40])
+        found = consensus_pose(rays, points)
+        assert found is not None
+        assert float((found[1] - CENTER[0]).norm()) < 1e-6
+
+
+SOURCES = {
+    "landmarks": lambda n: {"landmarks": landmarks(cameras=n)},
+    "boards": lambda n: {"boards": boards(cameras=n)},
+    "features and positions": lambda n: {"features": features(cameras=n, known=0.01), "positions": positions(n)},
+    # With a stated sigma: beside corners that seem exact to 0.001 px a position of 2 cm is rounding.
+    "boards and positions": lambda n: {
+        "boards": dataclasses.replace(boards(cameras=n), sigma=0.1),
+        "positions": positions(n),
+    },
+    "all": lambda n: {
+        "landmarks": landmarks(cameras=n), "features": features(cameras=n), "boards": boards(cameras=n),
+        "baselines": BASELINE, "positions": positions(n)[:1],
+    },
+}  # fmt: skip
+
+
+class TestRecovery:
+    @pytest.mark.parametrize("count", [2, 3])
+    @pytest.mark.parametrize("kind", list(SOURCES))
+    def test_exact_data_give_the_truth(self, kind: str, count: int) -> None:
+        found = solve_rig(data(count, **SOURCES[kind](count)))
+        assert found.status in (Status.EXACT, Status.CONVERGED)
+        assert found.left_out == ()
+        if kind in ("features and positions", "boards and positions") and count == 2:
+            # Two measured positions leave a turn about their line open; what the cameras are to each other is known.
+            assert found.undetermined == ("a turn of the rig about its baseline",)
+            assert float(pose_error(found).abs().max()) < 1e-6
+            assert math.isinf(float(found.mounting_covariance().diagonal().max()))
+        else:
+            assert found.undetermined == ()
+            # Positions of three cameras in a row hold the tilt weakly: 1e-6 there, else rounding.
+            assert off(found) < (1e-9 if "positions" not in kind else 1e-5)
+        assert bool(torch.isfinite(found.relative_covariance()).all())
+
+    def test_each_source_has_its_residuals(self) -> None:
+        found = solve_rig(data(**SOURCES["all"](2)))
+        assert [source.source for source in found.sources] == [
+            "boards", "landmarks", "features", "baselines", "positions",
+        ]  # fmt: skip
+        assert [source.used for source in found.sources] == [6, 12, 20, 1, 1]
+
+    def test_noise_shows_as_it_is(self) -> None:
+        sources = {"landmarks": landmarks(noise=0.1, error=0.02), "boards": boards(noise=0.08)}
+        found = solve_rig(data(**sources, features=features(noise=0.1, known=0.1)))
+        assert found.sigma_corner == pytest.approx(0.08, rel=0.1)
+        assert [source.sigmas for source in found.sources] == pytest.approx([1.0, 1.0, 1.0], abs=0.25)
+        assert found.variance == 1.0
+        assert found.warnings == ()
+
+    def test_boards_read_from_the_other_end(self) -> None:
+        shown = boards(noise=0.05)
+        plain = solve_rig(data(boards=shown))
+        shown.pixels[2, 1] = shown.pixels[2, 1].flip(-2)
+        turned = solve_rig(data(boards=shown))
+        assert turned.flipped == ("pair 2 (right)",)
+        sigma = plain.relative_covariance().diagonal().sqrt()
+        assert bool(((pose_error(turned) - pose_error(plain)).abs() < 1e-4 * sigma).all())
+
+    def test_a_baseline_sets_the_scale_of_far_features(self) -> None:
+        found = solve_rig(data(features=features(count=40, noise=0.1, known=0.1), baselines=BASELINE))
+        error, sigma = pose_error(found), found.relative_covariance().diagonal().sqrt()
+        assert bool((error.abs() < 4.5 * sigma).all())
+        # Yaw is locked to a thousandth of a degree, while where the baseline points is hardly seen from afar.
+        assert math.degrees(float(sigma[1])) < 0.002
+        assert float(sigma[4:].max()) > 0.1
+
+
+class TestFrame:
+    @settings(max_examples=6)
+    @given(
+        turn=st.tuples(*[st.floats(-3.0, 3.0)] * 3),
+        shift=st.tuples(*[st.floats(-5e4, 5e4)] * 3),
+    )
+    def test_the_solution_moves_with_the_frame(self, turn: tuple, shift: tuple) -> None:
+        """Landmarks turned and shifted as a whole, up to 50 km: cameras follow, relative pose and sigmas stay."""
+        marks = landmarks(noise=0.1, error=0.02)
+        rotation, offset = rotation_from_vector(tensor(*turn)), tensor(*shift)
+        moved = dataclasses.replace(marks, points=marks.points @ rotation.T + offset)
+        here, there = solve_rig(data(landmarks=marks)), solve_rig(data(landmarks=moved))
+        sigma = here.relative_covariance().diagonal().sqrt()
+        assert bool(((pose_error(there) - pose_error(here)).abs() < 1e-4 * sigma).all())
+        torch.testing.assert_close(there.relative_covariance().diagonal().sqrt(), sigma, rtol=1e-5, atol=0)
+        spread = float(here.mounting_covariance().diagonal()[:3].sqrt().min())
+        assert float((there.center - (here.center @ rotation.T + offset)).abs().max()) < 1e-4 * spread + 1e-9
+
+    def test_a_free_lens_that_landmarks_cannot_tell_is_refused_by_name(self) -> None:
+        with pytest.raises(DegenerateError, match=r"how right stands from left: a mixture of .* and more could"):
+            solve_rig(data(landmarks=landmarks(count=4, noise=0.1)), JointOptions(intrinsics="free"))
+
+    def test_three_landmarks_leave_nothing_to_check_with(self) -> None:
+        found = solve_rig(data(landmarks=landmarks(count=3, noise=0.1)))
+        assert any("nothing is left over to check" in text for text in found.warnings)
+
+
+class TestHybrid:
+    def test_corrections_of_the_lens_are_in_it(self) -> None:
+        """Half a pixel of learned correction: the rig is the true one, also with the parameters free."""
+        camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), coefficients=[-0.1])
+        grid = FieldGrid.covering((-0.7, -0.4), (0.7, 0.4), widths=[0.25])
+        cameras = tuple(
+            HybridCamera.of(camera, FieldResidual(grid, 3e-4 * normal((2, grid.count), 70 + c))) for c in (0, 1)
+        )
+        marks = landmarks(count=30)
+        sides = [cameras[c].project((marks.points - CENTER[c]) @ ROTATION[c].T) for c in (0, 1)]
+        plain = camera.project((marks.points - CENTER[0]) @ ROTATION[0].T)[0]
+        assert float((sides[0][0] - plain).abs().max()) > 0.2
+        assert bool((sides[0][1] & sides[1][1]).all())
+        sources = RigData(
+            cameras=cameras,
+            names=NAMES[:2],
+            landmarks=dataclasses.replace(marks, pixels=torch.stack([side[0] for side in sides], 1)),
+        )
+        found = solve_rig(sources)
+        assert off(found) < 1e-9
+        assert found.left_out == ()
+        free = solve_rig(sources, JointOptions(intrinsics="free"))
+        assert off(free) < 1e-6
+        assert all(isinstance(solved, HybridCamera) for solved in free.cameras)
+
+
+class TestIntrinsics:
+    def test_priors_and_free_parameters(self) -> None:
+        # What 30 close views would leave: a few tenths of a pixel of fx, fy, cx, cy.
+        spread = torch.zeros(10, dtype=torch.float64)
+        spread[:4] = tensor(0.5, 0.5, 0.3, 0.3)
+        rough = [camera.params + spread * normal((10,), 40 + c) for c, camera in enumerate(CAMERAS[:2])]
+        cameras = tuple(
+            type(camera)(values, size=camera.size, model=camera.model)
+            for camera, values in zip(CAMERAS, rough, strict=False)
+        )
+        sources = data(
+            landmarks=landmarks(count=30, noise=0.1, error=0.02), boards=boards(noise=0.1)
+        )  # fmt: skip
+        sources = dataclasses.replace(sources, cameras=cameras, covariances=(torch.diag(spread**2),) * 2)
+        held = solve_rig(sources)
+        prior = solve_rig(sources, JointOptions(intrinsics="prior"))
+        free = solve_rig(sources, JointOptions(intrinsics="free"))
+        assert held.cameras == cameras
+        assert prior.chi2 < held.chi2
+        for c in (0, 1):
+            joint = prior.joint_covariance()[10 * c : 10 * c + 10, 10 * c : 10 * c + 10].diagonal().sqrt()
+            error = (prior.cameras[c].params - CAMERAS[c].params)[:4]
+            assert bool((error.abs() < 4.5 * joint[:4]).all())
+            assert bool((joint[:4] < spread[:4]).all())
+            assert bool((joint[4:] == 0).all())
+        # Uncertain lenses are an uncertain yaw.
+        yaw = [float(found.relative_covariance()[1, 1]) for found in (held, prior, free)]
+        assert yaw[0] / held.variance < yaw[1] / prior.variance < yaw[2] / free.variance
+
+    def test_a_prior_needs_a_covariance(self) -> None:
+        with pytest.raises(InputError, match="left: a prior needs the covariance"):
+            solve_rig(data(landmarks=landmarks()), JointOptions(intrinsics="prior"))
+
+
+class TestCovariance:
+    def test_is_the_spread(self) -> None:
+        """20 rigs: the sum of squared errors in sigmas is χ² with 120 degrees of freedom, ± 4 of its deviations."""
+        total = [0.0, 0.0]
+        for seed in range(0, 20_000, 1000):
+            found = solve_rig(data(landmarks=landmarks(noise=0.1, error=0.02, seed=seed), baselines=BASELINE))
+            assert found.left_out == ()
+            turn = vector_from_rotation(found.rotation[0].T @ ROTATION[0])
+            errors = pose_error(found), torch.cat([found.center[0] - CENTER[0], turn])
+            covariances = found.relative_covariance(), found.mounting_covariance()
+            for k, (error, covariance) in enumerate(zip(errors, covariances, strict=True)):
+                total[k] += float(error @ torch.linalg.solve(covariance, error))
+        # Of the baseline's length the truth is given here, not a draw: at most one degree of freedom in six is smaller.
+        assert 100 - 4 * (2 * 100) ** 0.5 < total[0] < 120 + 4 * (2 * 120) ** 0.5
+        assert 120 - 4 * (2 * 120) ** 0.5 < total[1] < 120 + 4 * (2 * 120) ** 0.5
+
+    def test_joint_covariance_has_the_order_of_the_rig(self) -> None:
+        found = solve_rig(data(landmarks=landmarks(noise=0.1)), JointOptions(intrinsics="fixed"))
+        joint = found.joint_covariance()
+        assert joint.shape == (26, 26)
+        assert bool((joint[:20] == 0).all())
+        torch.testing.assert_close(joint[20:, 20:], found.relative_covariance())
+
+    def test_sigmas_that_are_too_small_widen_the_covariance(self) -> None:
+        marks = landmarks(count=16, noise=0.1, error=0.02)
+        honest = solve_rig(data(landmarks=marks))
+        boast = solve_rig(data(landmarks=dataclasses.replace(marks, pixel_sigma=0.02, sigma=marks.sigma / 5)))
+        assert boast.variance > 10
+        assert any("times as large as their sigmas say" in text for text in boast.warnings)
+        ratio = boast.relative_covariance().diagonal() / honest.relative_covariance().diagonal()
+        assert bool(((ratio > 0.3) & (ratio < 3)).all())
+
+
+class TestWrong:
+    def test_a_wrong_landmark_is_named_and_left_out(self) -> None:
+        marks = landmarks(noise=0.1, error=0.02)
+        good = solve_rig(data(landmarks=dataclasses.replace(marks, pixels=_without(marks.pixels, 4))))
+        marks.points[4] += tensor(0.0, 0.0, 2.0)
+        found = solve_rig(data(landmarks=marks))
+        (wrong,) = found.left_out
+        assert (wrong.source, wrong.name) == ("landmarks", "post 4")
+        assert "off the surveyed place by" in wrong.reason
+        assert all(value is not None and value > 1 for value in wrong.pixels)
+        sigma = good.relative_covariance().diagonal().sqrt()
+        assert bool(((pose_error(found) - pose_error(good)).abs() < 1e-4 * sigma).all())
+
+    def test_two_wrong_marks_and_a_wrong_match(self) -> None:
+        marks, far = landmarks(noise=0.1, error=0.02), features(noise=0.1, known=0.1)
+        marks.pixels[7, 1] += tensor(3.0, 2.0)
+        marks.pixels[2] = marks.pixels[9]
+        far.pixels[3, 1, 1] += 4.0
+        found = solve_rig(data(landmarks=marks, features=far))
+        assert {item.name for item in found.left_out} == {"post 7", "post 2", "peak 3"}
+        seven = next(item for item in found.left_out if item.name == "post 7")
+        # The record tells in which image the mark is wrong.
+        assert seven.pixels[0] < 1.0 < 3.0 < seven.pixels[1]  # type: ignore[operator]
+        assert bool((pose_error(found).abs() < 4.5 * found.relative_covariance().diagonal().sqrt()).all())
+
+    def test_a_wrong_one_that_bends_the_solution_is_found(self) -> None:
+        """The nearest landmark by far decides where the cameras stand: its own residual stays small."""
+        marks = landmarks(noise=0.1, error=0.02)
+        near = int((marks.points - CENTER[0]).norm(dim=-1).argmin())
+        marks.pixels[near, 1] += tensor(1.5, -1.0)
+        kept = solve_rig(data(landmarks=marks), JointOptions(reject=False))
+        masked = next(item for item in kept.items if item.name == marks.names[near])
+        assert masked.sigmas < 4
+        assert [item.name for item in solve_rig(data(landmarks=marks)).left_out] == [marks.names[near]]
+
+    def test_deletions_are_what_leaving_out_does(self) -> None:
+        marks = landmarks(noise=0.1, error=0.02)
+        whole = solve_rig(data(landmarks=marks, baselines=BASELINE), JointOptions(reject=False))
+        falls = whole._problem.deletions(whole._state)[1]
+        for i in (0, 5, 11):
+            rest = data(landmarks=dataclasses.replace(marks, pixels=_without(marks.pixels, i)), baselines=BASELINE)
+            without = solve_rig(rest, JointOptions(reject=False))
+            assert float(falls[i]) == pytest.approx(whole.chi2 - without.chi2, rel=2e-2)
+
+    def test_good_ones_stay(self) -> None:
+        for seed in range(3):
+            kind = {"landmarks": landmarks(noise=0.1, error=0.02, seed=seed), "boards": boards(noise=0.1, seed=seed)}
+            assert solve_rig(data(**kind)).left_out == ()
+
+    def test_a_moment_that_was_none(self) -> None:
+        """The board moved between the exposures: one pixel in one camera."""
+        shown = boards(count=8, noise=0.05)
+        shown.pixels[5, 1] += tensor(1.0, 0.0)
+        found = solve_rig(data(boards=shown))
+        assert [item.name for item in found.left_out] == ["pair 5"]
+
+    def test_lenses_that_are_not_quite_their_models_make_no_board_wrong(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """They bend some boards more than others, by much more than corners that are this good would ever be off."""
+        shown = boards(count=8, noise=0.01)
+        u, v = shown.pixels.unbind(-1)
+        shown.pixels[..., 1] += 0.3 * ((u - 1000.0) / 900.0).clamp_min(0.0) ** 2 * torch.sin(v / 60.0)
+        assert solve_rig(data(boards=shown)).left_out == ()
+        with monkeypatch.context() as without:
+            for name in ("_LENS", "_BETWEEN"):
+                without.setattr(rig_limits, name, 0.0)
+            assert len(solve_rig(data(boards=shown)).left_out) > 0
+        # One that moved is found all the same.
+        shown.pixels[5, 1] += tensor(1.0, 0.0)
+        assert [item.name for item in solve_rig(data(boards=shown)).left_out] == ["pair 5"]
+
+    def test_names_mixed_up_are_refused_as_a_whole(self) -> None:
+        marks = landmarks(noise=0.1, error=0.02)
+        with pytest.raises(InputError, match="landmarks contradict"):
+            solve_rig(data(landmarks=dataclasses.replace(marks, points=marks.points.roll(5, 0)), boards=boards()))
+
+    def test_what_was_not_rejected_widens_the_covariance(self) -> None:
+        marks = landmarks(noise=0.1, error=0.02)
+        marks.points[4] += tensor(0.0, 0.0, 2.0)
+        found = solve_rig(data(landmarks=marks), JointOptions(reject=False))
+        assert found.left_out == ()
+        assert found.variance > 5
+
+
+class TestNotDetermined:
+    @pytest.mark.parametrize(
+        ("sources", "message"),
+        [
+            ({"features": features(known=0.1)}, "nothing tells where right stands"),
+            ({"landmarks": landmarks(count=2)}, "nothing tells where right stands"),
+            ({"boards": None}, "nothing to solve it from"),
+        ],
+    )
+    def test_too_little(self, sources: dict, message: str) -> None:
+        with pytest.raises((DegenerateError, InputError), match=message):
+            solve_rig(data(**sources))
+
+    def test_features_of_unknown_range_leave_huge_errors_not_silence(self) -> None:
+        """Epipolar geometry alone: the relative yaw hangs on what little the epipolar lines turn."""
+        known = solve_rig(data(features=features(noise=0.1, known=0.1), baselines=BASELINE))
+        free = solve_rig(data(features=features(noise=0.1), baselines=BASELINE))
+        yaw = [math.degrees(float(found.relative_covariance()[1, 1].sqrt())) for found in (known, free)]
+        assert yaw[1] > 10 * yaw[0]
+
+    def test_the_heading_is_named(self) -> None:
+        found = solve_rig(data(boards=boards(), positions=positions(1)))
+        assert found.undetermined[0] == "the heading (a turn about the vertical)"
+        assert len(found.undetermined) == 3
+        assert any("the heading" in text for text in found.warnings)
+        assert float(pose_error(found).abs().max()) < 1e-8
+
+    def test_one_mark_each_without_scale_is_refused(self) -> None:
+        far = features(count=30, noise=0.1, known=0.1)
+        with pytest.raises(DegenerateError, match="nothing tells where right stands"):
+            solve_rig(data(features=far, positions=positions(1)))
+
+
+class TestInput:
+    def test_shapes_and_values(self) -> None:
+        marks = landmarks()
+        with pytest.raises(InputError, match="every sigma must be a positive number"):
+            dataclasses.replace(marks, sigma=torch.zeros_like(marks.sigma))
+        with pytest.raises(InputError, match="'post 0' is there twice"):
+            dataclasses.replace(marks, names=("post 0",) * 12)
+        with pytest.raises(InputError, match="pixels of 2 cameras, the rig has 3"):
+            data(3, landmarks=marks)
+        with pytest.raises(InputError, match="two different cameras"):
+            Baseline(first=1, second=1, length=1.0, sigma=0.1)
+        with pytest.raises(InputError, match="fixed, prior or free"):
+            JointOptions(intrinsics="none")  # type: ignore[arg-type]
+
+    def test_farther_than(self) -> None:
+        mean, sigma = inverse_range_beyond(2000.0)
+        draws = torch.rand(200_000, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) / 2000.0
+        assert mean == pytest.approx(float(draws.mean()), rel=0.01)
+        assert sigma == pytest.approx(float(draws.std()), rel=0.01)
+
+    def test_marks_beyond_the_lens_are_warned_of(self) -> None:
+        marks = landmarks(noise=0.1, error=0.02)
+        pixels = marks.pixels.clone()
+        pixels[3, 0] = tensor(9000.0, 9000.0)
+        found = solve_rig(data(landmarks=dataclasses.replace(marks, pixels=pixels)))
+        lost = [text for text in found.warnings if "no ray" in text] or [item.name for item in found.left_out]
+        assert lost
+        assert bool((pose_error(found).abs() < 4.5 * found.relative_covariance().diagonal().sqrt()).all())
+
+
+def _without(pixels: Tensor, index: int) -> Tensor:
+    pixels = pixels.clone()
+    pixels[index] = torch.nan
+    return pixels
+
+
+def test_see_marks_what_is_outside() -> None:
+    assert bool(torch.isnan(see(CENTER[0][None] - 10.0 * ROTATION[0][2], 0)).all())

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from locate_rigs import SIZE, tensor, turned
+
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.locate.multiview import TriangulateViews
+from kcal.locate.stereo import Status
+
+METHODS = ("linear", "angular", "likelihood")
+CAMERAS = [
+    Camera.build(focal=(1600, 1602), center=(957, 541), size=SIZE, coefficients=[-0.2, 0.05]),
+    Camera.build(focal=(1200, 1200), center=(960, 540), size=SIZE, coefficients=[-0.1, 0.02]),
+    Camera.build(focal=(2400, 2395), center=(950, 545), size=SIZE, model="pinhole"),
+]
+# A world far from its origin, as in a national grid.
+SHIFT = tensor(4.0e5, 5.0e6, 100.0)
+
+
+def poses() -> torch.Tensor:
+    rows = []
+    for yaw, center in ((0.0, [0.0, 0.0, 0.0]), (1.0, [12.0, 0.3, -0.5]), (-2.0, [-20.0, -0.4, 1.0])):
+        rotation = turned(yaw, 0.3 * yaw)
+        rows.append(torch.cat([rotation, -rotation @ (tensor(*center) + SHIFT)[:, None]], -1))
+    return torch.stack(rows)
+
+
+def seen(points: torch.Tensor) -> torch.Tensor:
+    pixels = []
+    for camera, pose in zip(CAMERAS, poses(), strict=True):
+        pixel, valid = camera.project(points @ pose[:, :3].T + pose[:, 3])
+        assert valid.all()
+        pixels.append(pixel)
+    return torch.stack(pixels, -2)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_exact_marks_give_the_point_back(method: str) -> None:
+    points = tensor([3.0, 1.0, 60.0], [50.0, 20.0, 500.0], [-300.0, 40.0, 5000.0])
+    found = TriangulateViews(CAMERAS, poses(), method=method)(seen(points + SHIFT))
+    assert (found.status == Status.OK).all()
+    # The world's coordinates hold 1e-9 m, the baseline is 32 m.
+    assert ((found.points - SHIFT - points).norm(dim=-1) / points.norm(dim=-1)).max() < 1e-8
+    assert found.reprojection.max() < 1e-6
+
+
+def test_likelihood_weighs_by_covariance_and_its_covariance_is_true() -> None:
+    n = 6000
+    point = tensor([40.0, 10.0, 800.0]) + SHIFT
+    generator = torch.Generator().manual_seed(2)
+    # One camera is ten times worse than the others, along one axis.
+    roots = torch.stack([0.1 * torch.eye(2), tensor([1.0, 0.0], [0.2, 0.1]).float(), 0.1 * torch.eye(2)]).double()
+    marks = seen(point) + (roots @ torch.randn(n, 3, 2, 1, dtype=torch.float64, generator=generator))[..., 0]
+    cov = roots @ roots.mT
+    errors = {}
+    for method in METHODS:
+        found = TriangulateViews(CAMERAS, poses(), method=method)(marks, cov)
+        errors[method] = (found.points - point).square().sum(-1).mean().sqrt().item()
+    assert errors["likelihood"] < 0.7 * min(errors["linear"], errors["angular"])
+    spread, claimed = torch.cov(found.points.T), found.covariance.mean(0)
+    scale = claimed.diagonal().sqrt()
+    assert ((spread - claimed) / scale[:, None] / scale[None, :]).abs().max() < 0.06
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_gradients(method: str) -> None:
+    marks = seen(tensor([3.0, 1.0, 90.0], [20.0, 8.0, 300.0]) + SHIFT)
+    marks = marks + 0.3 * torch.randn(marks.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    module = TriangulateViews(CAMERAS, poses(), method=method)
+    # World coordinates of 5e6 m hold 1e-9: with steps of 1e-3 px that is 1e-6 m/px.
+    assert torch.autograd.gradcheck(
+        lambda marks: module(marks).points - SHIFT, marks.requires_grad_(), eps=1e-3, rtol=1e-5, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_statuses_without_nan(method: str) -> None:
+    camera = CAMERAS[2]
+    pose = torch.eye(3, 4, dtype=torch.float64).repeat(3, 1, 1)
+    pose[1, 0, 3], pose[2, 0, 3] = -10.0, -20.0
+    good = tensor([990.0, 545.0], [980.0, 545.0], [970.0, 545.0])
+    rows = [good, good[[1, 1, 1]], good[[2, 1, 0]], good.clone(), good.clone(), good.clone()]
+    rows[3][1, 0], rows[4][0, 1] = math.nan, 2000.0
+    cov = 0.01 * torch.eye(2, dtype=torch.float64).repeat(6, 3, 1, 1)
+    cov[5, 2, 1, 1] = -1.0
+    marks = torch.stack(rows).requires_grad_()
+    found = TriangulateViews([camera] * 3, pose, method=method)(marks, cov)
+    names = ["OK", "PARALLEL", "PARALLEL", "NOT_FINITE", "OUTSIDE_IMAGE", "BAD_COVARIANCE"]
+    assert [Status(s).name for s in found.status.tolist()] == names
+    for name, value in found._asdict().items():
+        assert not torch.isnan(value).any(), name
+    assert (found.points[1:] == 0).all()
+    (gradient,) = torch.autograd.grad(found.points.sum() + found.reprojection.sum(), marks)
+    assert torch.isfinite(gradient).all()
+    assert (gradient[1:] == 0).all()
+    assert (gradient[0] != 0).any()
+
+
+def test_batches() -> None:
+    marks = seen(torch.cat([torch.zeros(6, 2), torch.linspace(80, 900, 6)[:, None]], -1).double() + SHIFT)
+    module = TriangulateViews(CAMERAS, poses())
+    deep = module(marks.reshape(2, 1, 3, 3, 2))
+    assert deep.covariance.shape == (2, 1, 3, 3, 3)
+    assert torch.allclose(deep.points.reshape(6, 3), module(marks).points, rtol=1e-12)
+
+
+def test_bad_arguments() -> None:
+    with pytest.raises(InputError, match="two cameras or more"):
+        TriangulateViews(CAMERAS[:1], poses()[:1])
+    with pytest.raises(InputError, match="not a rotation"):
+        TriangulateViews(CAMERAS, 2.0 * poses())
+    with pytest.raises(InputError, match="linear, angular, likelihood"):
+        TriangulateViews(CAMERAS, poses(), method="best")
+    with pytest.raises(InputError, match=r"shape \(\.\.\., N, 3, 2\)"):
+        TriangulateViews(CAMERAS, poses())(torch.zeros(4, 2, 2))
+    with pytest.raises(DegenerateError, match="same place"):
+        TriangulateViews(CAMERAS, poses()[:1].repeat(3, 1, 1))
