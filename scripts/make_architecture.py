@@ -115,8 +115,17 @@ def draw(path: Path) -> None:
         around = to_x == left and y - to_y > 2
         start = (x - WIDTH / 2, y) if around else (x, y - HEIGHT / 2)
         style = "angle,angleA=180,angleB=90,rad=12" if around else "arc3"
-        shape = {"arrowstyle": "-|>", "mutation_scale": 13, "shrinkA": 0, "shrinkB": 1}
-        arrow = FancyArrowPatch(start, (to_x, to_y + HEIGHT / 2), connectionstyle=style, color="#555555", zorder=0.5, **shape)
+        arrow = FancyArrowPatch(
+            start,
+            (to_x, to_y + HEIGHT / 2),
+            arrowstyle="-|>",
+            connectionstyle=style,
+            mutation_scale=13,
+            shrinkA=0,
+            shrinkB=1,
+            color="#555555",
+            zorder=0.5,
+        )
         axes.add_patch(arrow)
     axes.set_xlim(left - 0.6, right + 0.6)
     axes.set_ylim(-0.45, max(level.values()) + 0.45)
