@@ -15,7 +15,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.corners.erf_fit import CrossingFit, fit_crossings
 from kcal.corners.grid import Neighbors
-from kcal.corners.saddle import MAX_MOVE, MOVE_SHARE, CornerStatus, Refined, check_arguments, inside_image, judged
+from kcal.corners.saddle import MAX_MOVE, MOVE_SHARE, CornerStatus, Refined, check_arguments, inside_image, with_status
 from kcal.errors import InputError
 
 MAX_BLUR = 0.3  # of the square side
@@ -94,7 +94,7 @@ def erf_saddle(
     low, high = levels or (-math.inf, math.inf)
     at_an_end = torch.stack([fit.window.levels <= low, fit.window.levels >= high]) * fit.window.weight
     saturated = (at_an_end.sum(-1) / fit.window.weight.sum(-1)).amax(0)
-    result, status = judged(
+    result, status = with_status(
         result,
         (
             (CornerStatus.MISSING, seen),

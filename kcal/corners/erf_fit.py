@@ -62,7 +62,7 @@ class CrossingFit(NamedTuple):
         return self.parameters[:, 4].exp()
 
 
-class _Known(NamedTuple):
+class _FitInputs(NamedTuple):
     """What a fit takes as given: pixels, curvatures of the edges (M, 2), prior, and the next lines."""
 
     window: CornerWindow
@@ -70,9 +70,9 @@ class _Known(NamedTuple):
     prior: RampPrior
     lines: LineDistances | None
 
-    def of(self, some: Tensor) -> _Known:
+    def of(self, some: Tensor) -> _FitInputs:
         lines = None if self.lines is None else LineDistances(*(value[some] for value in self.lines))
-        return _Known(self.window.of(some), self.bend[some], self.prior.of_some(some), lines)
+        return _FitInputs(self.window.of(some), self.bend[some], self.prior.of_some(some), lines)
 
 
 def fit_crossings(
@@ -98,7 +98,7 @@ def fit_crossings(
     curves = curvatures(bend, first) if bend is not None else nothing
     prior = RampPrior.of(first, nothing, nothing[:, 0], nothing[:, 0])
     # A few steps are enough to estimate the illumination of the board and which lines reach into windows.
-    parameters, cost, converged = _levenberg_marquardt(first, _Known(window, curves, prior, None), _FIRST_STEPS)
+    parameters, cost, converged = _levenberg_marquardt(first, _FitInputs(window, curves, prior, None), _FIRST_STEPS)
     usable = crosses & torch.isfinite(cost)
     lines = None
     near = torch.zeros_like(crosses)
@@ -113,9 +113,9 @@ def fit_crossings(
             window, levels = cut_windows(image, base, offset, torch.where(near & free, wide, radius))
             lines = beside.distances(parameters, window.where)
             lines = LineDistances(lines.distance, lines.turn * near[:, None, None, None])
-    known = _Known(window, curves, prior, lines)
+    inputs = _FitInputs(window, curves, prior, lines)
     # With lines each step is twice the work, so only corners near one get them. These are fitted twice, because only
-    # the first of the two fits makes the illumination well known.
+    # the first of the two fits makes the illumination well determined.
     for group, with_lines in ((~near, False), (near, True), (near, True)):
         some = group.nonzero()[:, 0]
         if not len(some):
@@ -123,21 +123,23 @@ def fit_crossings(
         light = light_at(parameters, window, curves, lines, usable.reshape(side.shape))
         place = base + parameters[:, :2].reshape(base.shape)
         slope, error = light_slope(light, place, side, usable.reshape(side.shape))
-        known = known._replace(prior=RampPrior.of(parameters, slope, error, cost / window.weight.sum(-1)))
-        chosen = (known if with_lines else known._replace(lines=None)).of(some)
+        inputs = inputs._replace(prior=RampPrior.of(parameters, slope, error, cost / window.weight.sum(-1)))
+        chosen = (inputs if with_lines else inputs._replace(lines=None)).of(some)
         done = _levenberg_marquardt(parameters[some], chosen, _STEPS)
         parameters, cost, converged = (
             value.index_copy(0, some, new) for value, new in zip((parameters, cost, converged), done, strict=True)
         )
     between = (parameters[:, 2] - parameters[:, 3]).sin().abs()
     crosses = crosses & (between > math.sin(MIN_ANGLE)) & torch.isfinite(cost)
-    noise, covariance = _noise_and_covariance(parameters, known, (crosses & converged).reshape(side.shape), least_noise)
+    noise, covariance = _noise_and_covariance(
+        parameters, inputs, (crosses & converged).reshape(side.shape), least_noise
+    )
     converged = converged & torch.isfinite(covariance).all(-1).all(-1)
-    center = _with_gradient(parameters, known, levels) if levels.requires_grad else parameters[:, :2]
+    center = _with_gradient(parameters, inputs, levels) if levels.requires_grad else parameters[:, :2]
     return CrossingFit(center, parameters, window, noise, covariance, crosses, converged, near)
 
 
-def _levenberg_marquardt(parameters: Tensor, known: _Known, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+def _levenberg_marquardt(parameters: Tensor, inputs: _FitInputs, steps: int) -> tuple[Tensor, Tensor, Tensor]:
     """Minimize for all corners at once: parameters, cost, and whether the last step was small."""
     result = parameters.clone()
     result_cost = torch.full_like(parameters[:, 0], math.inf)
@@ -145,7 +147,7 @@ def _levenberg_marquardt(parameters: Tensor, known: _Known, steps: int) -> tuple
     at = torch.arange(len(parameters), device=parameters.device)  # the corners that still move
     damping = torch.full_like(result_cost, 1e-3)
     last = result_last.clone()
-    normal, gradient, cost = _normal_equations(parameters, known)
+    normal, gradient, cost = _normal_equations(parameters, inputs)
     for _ in range(steps):
         scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).rsqrt()
         scaled = normal * scale[:, :, None] * scale[:, None, :]
@@ -154,7 +156,7 @@ def _levenberg_marquardt(parameters: Tensor, known: _Known, steps: int) -> tuple
         step = -torch.cholesky_solve((gradient * scale)[..., None], factor)[..., 0] * scale
         step = torch.nan_to_num(step, posinf=0.0, neginf=0.0)
         trial = parameters + step
-        trial_normal, trial_gradient, trial_cost = _normal_equations(trial, known)
+        trial_normal, trial_gradient, trial_cost = _normal_equations(trial, inputs)
         better = trial_cost <= cost
         length = torch.linalg.vector_norm(step[:, :2], dim=-1)
         # A rejected tiny step is rounding at the minimum; a rejected long one is not.
@@ -169,7 +171,7 @@ def _levenberg_marquardt(parameters: Tensor, known: _Known, steps: int) -> tuple
             result[at], result_cost[at], result_last[at] = parameters, cost, last
             if not len(go):
                 break
-            at, known = at[go], known.of(go)
+            at, inputs = at[go], inputs.of(go)
             parameters, normal, gradient, cost, damping, last = (
                 value[go] for value in (parameters, normal, gradient, cost, damping, last)
             )
@@ -208,10 +210,10 @@ def _least_squares(design: Tensor, values: Tensor, weight: Tensor) -> Tensor:
     return torch.nan_to_num(solution[..., 0])
 
 
-def _normal_equations(parameters: Tensor, known: _Known) -> tuple[Tensor, Tensor, Tensor]:
+def _normal_equations(parameters: Tensor, inputs: _FitInputs) -> tuple[Tensor, Tensor, Tensor]:
     """Normal matrix, gradient and cost of the weighted residuals and the prior."""
-    window, prior = known.window, known.prior
-    levels, jacobian = crossing(parameters, window.where, known.bend, known.lines)
+    window, prior = inputs.window, inputs.prior
+    levels, jacobian = crossing(parameters, window.where, inputs.bend, inputs.lines)
     weight, miss = prior.diagonal(), parameters - prior.value()
     residual = levels - window.levels
     weighted = jacobian * window.weight[:, None]
@@ -222,10 +224,10 @@ def _normal_equations(parameters: Tensor, known: _Known) -> tuple[Tensor, Tensor
 
 
 def _noise_and_covariance(
-    parameters: Tensor, known: _Known, usable: Tensor, least_noise: float
+    parameters: Tensor, inputs: _FitInputs, usable: Tensor, least_noise: float
 ) -> tuple[Tensor, Tensor]:
-    window, prior = known.window, known.prior
-    levels, jacobian = crossing(parameters, window.where, known.bend, known.lines)
+    window, prior = inputs.window, inputs.prior
+    levels, jacobian = crossing(parameters, window.where, inputs.bend, inputs.lines)
     weighted = jacobian * window.weight[:, None]
     normal = weighted @ jacobian.transpose(-1, -2) + torch.diag_embed(prior.diagonal())
     inverse, _ = torch.linalg.inv_ex(normal)
@@ -244,15 +246,15 @@ def _noise_and_covariance(
     ).reshape(-1, 2, 2)
     by_ramp = inverse[:, :2, 7:9] * (prior.weight * prior.error)[:, None, None]
     covariance = covariance + by_ramp @ by_ramp.transpose(-1, -2)
-    if known.lines is not None:
+    if inputs.lines is not None:
         gain = inverse[:, :2] @ weighted
-        covariance = covariance + line_covariance(parameters, window, known.bend, known.lines, gain, covariance)
+        covariance = covariance + line_covariance(parameters, window, inputs.bend, inputs.lines, gain, covariance)
     return noise, covariance
 
 
-def _with_gradient(parameters: Tensor, known: _Known, levels: Tensor) -> Tensor:
+def _with_gradient(parameters: Tensor, inputs: _FitInputs, levels: Tensor) -> Tensor:
     """The center as a function of the gray levels: at the minimum g(p, levels) = 0, so dp = -(∂g/∂p)⁻¹ ∂g."""
-    window, prior, lines = known.window, known.prior, known.lines
+    window, prior, lines = inputs.window, inputs.prior, inputs.lines
     if lines is None:
         far = torch.full((len(parameters), 2, 2, 1), FAR, dtype=torch.float64, device=parameters.device)
         lines = LineDistances(far, torch.zeros_like(far))
@@ -270,9 +272,9 @@ def _with_gradient(parameters: Tensor, known: _Known, levels: Tensor) -> Tensor:
         levels, jacobian = crossing(parameters, window.where, bend, LineDistances(distance, turn))
         return jacobian @ (weight * (levels - values)) + prior * (parameters - mean)
 
-    inputs = parameters, known.bend, *lines, prior.diagonal(), prior.value(), window.weight
-    hessian = torch.func.vmap(torch.func.jacfwd(gradient))(*inputs, window.levels)
+    arguments = parameters, inputs.bend, *lines, prior.diagonal(), prior.value(), window.weight
+    hessian = torch.func.vmap(torch.func.jacfwd(gradient))(*arguments, window.levels)
     inverse, _ = torch.linalg.inv_ex(hessian)
-    residual = torch.func.vmap(gradient)(*inputs, levels)
+    residual = torch.func.vmap(gradient)(*arguments, levels)
     change = -(inverse.detach() @ (residual - residual.detach())[..., None])[..., 0]
     return parameters[:, :2] + torch.nan_to_num(change[:, :2])

@@ -13,7 +13,7 @@ from kcal.errors import InputError
 
 FACTOR = 10
 HALF = 12  # pixels on each side of the point that are cropped
-MAX_MOVE = 3.0  # pixels
+MAX_POINT_MOVE = 3.0  # pixels
 _WINDOW = 4.0  # pixels: sigma of the weight of gradients around the point
 _GRADIENT_BLUR = 0.7  # pixels
 _MAX_ITERATIONS = 20
@@ -152,8 +152,8 @@ def refine_point(image: Tensor, pixel: Tensor) -> RefinedPoint:
         moved = torch.linalg.solve(normal, right)
         step = float(torch.linalg.vector_norm(moved - place))
         place = moved
-        if float(torch.linalg.vector_norm(place - start)) > MAX_MOVE * factor:
-            raise InputError(f"the nearest corner is more than {MAX_MOVE:g} px away; mark the point more closely")
+        if float(torch.linalg.vector_norm(place - start)) > MAX_POINT_MOVE * factor:
+            raise InputError(f"the nearest corner is more than {MAX_POINT_MOVE:g} px away; mark the point more closely")
         if step < _CONVERGED * factor:
             break
     else:

@@ -21,8 +21,8 @@ from kcal.corners.saddle import (
     CornerStatus,
     Refined,
     inside_image,
-    judged,
     saddle,
+    with_status,
 )
 from kcal.errors import InputError
 
@@ -105,7 +105,7 @@ def refine_corners(
         (CornerStatus.NO_SADDLE, ~failed),
         (CornerStatus.MOVED, distance < (MOVE_SHARE * side).clamp(max=MAX_MOVE)),
     )
-    return Refined(*judged(moved, checks))
+    return Refined(*with_status(moved, checks))
 
 
 def _erf(

@@ -123,7 +123,7 @@ def saddle(image: Tensor, pixels: Tensor, side: Tensor | float) -> Refined:
         (CornerStatus.MOVED, _safe_norm(moved)[..., 0] < limit),
         (CornerStatus.NOT_CONVERGED, _safe_norm(step) <= CONVERGED),
     )
-    return Refined(*judged(result, checks))
+    return Refined(*with_status(result, checks))
 
 
 def inside_image(pixels: Tensor, margin: Tensor, width: int, height: int) -> Tensor:
@@ -132,7 +132,7 @@ def inside_image(pixels: Tensor, margin: Tensor, width: int, height: int) -> Ten
     return (x >= margin) & (x <= width - 1 - margin) & (y >= margin) & (y <= height - 1 - margin)
 
 
-def judged(pixels: Tensor, checks: Sequence[tuple[CornerStatus, Tensor]]) -> tuple[Tensor, Tensor]:
+def with_status(pixels: Tensor, checks: Sequence[tuple[CornerStatus, Tensor]]) -> tuple[Tensor, Tensor]:
     """Pixels (..., N, 2), NaN where any check failed, and the status of the first check that failed, (..., N)."""
     status = torch.zeros(pixels.shape[:-1], dtype=torch.int64, device=pixels.device)
     for code, passed in reversed(checks):
