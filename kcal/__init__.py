@@ -30,10 +30,9 @@ if TYPE_CHECKING:
     from kcal.lens.lookup import LookupCamera
     from kcal.lens.model import LensModel
     from kcal.lens.modules import Unproject
+    from kcal.lens.mounting import Origin
     from kcal.lens.pinhole import new_pinhole
-    from kcal.lens.rig import StereoRig
-    from kcal.locate.covariances import RigCovariance
-    from kcal.locate.geodesy import Origin
+    from kcal.lens.rig import RigCovariance, StereoRig
     from kcal.locate.localizer import StereoLocalizer
     from kcal.locate.multiview import TriangulateViews
     from kcal.locate.stereo import Triangulate
@@ -100,8 +99,8 @@ _HOME = {
     "LevenbergMarquardt": "kcal.solve.lm",
     "LookupCamera": "kcal.lens.lookup",
     "Observations": "kcal.corners.observations",
-    "Origin": "kcal.locate.geodesy",
-    "RigCovariance": "kcal.locate.covariances",
+    "Origin": "kcal.lens.mounting",
+    "RigCovariance": "kcal.lens.rig",
     "RigData": "kcal.calibrate.rig.sources",
     "RigOptions": "kcal.calibrate.rig.from_boards",
     "StereoLocalizer": "kcal.locate.localizer",

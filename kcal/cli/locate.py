@@ -97,11 +97,12 @@ def locate(
     from kcal.errors import DegenerateError, InputError
     from kcal.files import check_writable
     from kcal.io.rig_file import RigFile
-    from kcal.locate.covariances import RigCovariance, mounting_covariance
+    from kcal.lens.rig import RigCovariance
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import check_format, write_positions
     from kcal.locate.geodesy import Origin
     from kcal.locate.marks import read_marks
+    from kcal.locate.mounting import mounting_covariance
     from kcal.locate.positions import locate as locate_pairs
     from kcal.locate.truth import misses, read_truth
     from kcal.report.figures import check_picture_format

@@ -25,7 +25,7 @@ def to_geojson(located: Located) -> dict[str, Any]:
     infinite, because JSON has no infinity; `range_high_infinite` tells that from unknown.
 
     Example:
-        >>> from kcal.locate.geodesy import Origin
+        >>> from kcal.lens.mounting import Origin
         >>> from kcal.locate.positions import Viewpoint
         >>> left = Viewpoint(name="left", enu=(0, 0, 0), geodetic=(19.07, 72.87, 14.0), azimuths_deg=None)
         >>> located = Located(positions=(), cameras=(left, left), origin=Origin(lat=19.07, lon=72.87, height=14.0),

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, keep_float64
+from kcal.checks import as_covariance, as_points, keep_float64
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.rig import StereoRig
+from kcal.io.rig_file import load_rig
+from kcal.lens.mounting import Origin
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.lens.tracing import CHUNK, is_differentiated, is_traced, known_true
-from kcal.locate.covariances import RigCovariance, checked_covariance, checked_link
 from kcal.locate.ellipsoid import mean_radius
-from kcal.locate.geodesy import Origin, anchor, enu_from_cam, place_enu
-from kcal.locate.max_likelihood import Fit, Sight, by_pose, refine
+from kcal.locate.geodesy import anchor, enu_from_cam, place_enu
+from kcal.locate.max_likelihood import Fit, Sight, by_pose, calibration_effect, inverse_covariances, refine
+from kcal.locate.mounting import by_mounting
 from kcal.locate.ranges import BEARING_SIGMAS, QUANTILE
 from kcal.locate.stereo import Status, sight_lines
 
@@ -79,19 +82,21 @@ class StereoLocalizer(nn.Module):
     of neighboring points are not independent, and averaging over frames does not reduce them.
 
     Args:
-        rig: two cameras and their relative pose.
-        origin: position of the left camera's projection center.
+        rig: two cameras and their relative pose. What is not given below is taken from the rig where it knows it.
+        origin: position of the left camera's projection center; with `heading_deg`, or neither: `rig.mounting`.
         heading_deg: of the left camera's axis, clockwise from true north; see `enu_from_cam`.
         pitch_deg: of the same axis, positive up.
         roll_deg: of the left camera, positive clockwise as seen from behind.
         pixel_sigma: standard deviation of a mark along each axis, px, where no covariance is given.
-        calibration: how well the rig is known; exact if left out.
-        mounting: (6, 6) of `mounting_covariance`; origin and attitude are exact if left out.
-        link: (P, 6) covariance of the calibration with the mounting, where both come from the same landmarks.
+        calibration: how well the rig is known; `rig.covariance` if left out, and exact if that is None.
+        mounting: (6, 6) of `mounting_covariance`; if left out, that of `rig.mounting`, and exact for an `origin` that
+            is given.
+        link: (P, 6) covariance of the calibration with the mounting, where both come from the same landmarks; that of
+            `rig.mounting` if all of origin, calibration and mounting come from the rig.
         refraction: bending of light as a share of the Earth's curvature, 0.13 in standard air; 0: straight lines.
 
     Raises:
-        InputError: an angle, sigma or covariance that cannot be.
+        InputError: an angle, sigma or covariance that cannot be, or a rig that does not say where it stands.
         DegenerateError: a rig without a baseline.
 
     Example:
@@ -120,8 +125,8 @@ class StereoLocalizer(nn.Module):
         self,
         rig: StereoRig,
         *,
-        origin: Origin,
-        heading_deg: float,
+        origin: Origin | None = None,
+        heading_deg: float | None = None,
         pitch_deg: float = 0.0,
         roll_deg: float = 0.0,
         pixel_sigma: float = 0.3,
@@ -137,8 +142,25 @@ class StereoLocalizer(nn.Module):
             raise InputError(f"refraction {refraction}: a coefficient such as 0.13 is needed, not beyond ±2")
         if not float(rig.baseline) > 0:
             raise DegenerateError("the rig's cameras stand in the same place: no range can be measured")
+        stored = rig.covariance
+        if origin is None or heading_deg is None:
+            if origin is not None or heading_deg is not None or pitch_deg or roll_deg:
+                raise InputError("origin and heading_deg belong together, and pitch_deg and roll_deg to them")
+            stands = rig.mounting
+            if stands is None:
+                raise InputError("this rig does not say where it stands; give origin and heading_deg")
+            origin, heading_deg, pitch_deg, roll_deg = (
+                stands.origin, stands.heading_deg, stands.pitch_deg, stands.roll_deg,
+            )  # fmt: skip
+            if mounting is None:
+                mounting = stands.covariance
+                link = stands.link if link is None and calibration is None else link
+        calibration = stored if calibration is None else calibration
         self.rig = rig
         self.origin = origin
+        self.attitude_deg = (heading_deg, pitch_deg, roll_deg)
+        errors = (("marks", True), ("calibration", calibration is not None), ("mounting", mounting is not None))
+        self.included = tuple(name for name, there in errors if there)
         self.pixel_sigma = float(pixel_sigma)
         self.drop = refraction / (2.0 * mean_radius(origin.lat))
         device = rig.right_from_left_rotation.device
@@ -152,10 +174,35 @@ class StereoLocalizer(nn.Module):
             known = RigCovariance.of(rig, joint=calibration.matrix).factor()
             factor = known.to(device) if known.shape[1] else None
         self.register_buffer("calibration_factor", factor)
-        standing = None if mounting is None else checked_covariance("mounting", mounting, 6).to(device)
+        standing = None if mounting is None else as_covariance("mounting", mounting, 6).to(device)
         self.register_buffer("mounting", standing)
-        joined = None if link is None else checked_link(calibration, mounting, link).to(device)
-        self.register_buffer("link", joined)
+        if link is not None:
+            if calibration is None or mounting is None:
+                raise InputError("link: it needs the covariances of both the calibration and the mounting")
+            link = calibration.checked_link(mounting, link).to(device)
+        self.register_buffer("link", link)
+
+    @classmethod
+    def from_file(cls, path: str | Path, **options: Any) -> Self:
+        """Read a rig file; `options` are those of the class, and replace what the file tells.
+
+        Raises:
+            FileError: see `kcal.load_rig`.
+
+        Example:
+            >>> import tempfile
+            >>> from kcal.io.rig_file import save_rig
+            >>> from kcal.lens.mounting import Mounting
+            >>> from kcal.locate.budget import planned_rig
+            >>> rig = planned_rig()
+            >>> rig.mounting = Mounting(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     localize = StereoLocalizer.from_file(save_rig(rig, Path(folder, "rig.json")), pixel_sigma=0.1)
+            >>> found = localize(torch.tensor([[959.5, 539.5]]), torch.tensor([[943.5, 539.5]]))
+            >>> [round(value, 1) for value in found.enu[0].tolist()]
+            [0.0, 1000.0, 0.0]
+        """
+        return cls(load_rig(path), **options)
 
     def forward(
         self, pixels_left: Tensor, pixels_right: Tensor, cov: Tensor | None = None, mask: Tensor | None = None
@@ -216,7 +263,7 @@ class StereoLocalizer(nn.Module):
             right = torch.where(wanted[..., None], right, self.rig.right.center.detach())
         with torch.no_grad():
             lines = sight_lines(self.rig, left, right)
-            weight, sound = _weights(cov)
+            weight, sound = inverse_covariances(cov)
             code = lines.status
             reasons = [(~sound, Status.BAD_COVARIANCE), (~finite, Status.NOT_FINITE)]
             reasons += [] if mask is None else [(~mask, Status.MASKED)]
@@ -230,7 +277,7 @@ class StereoLocalizer(nn.Module):
             ahead = torch.where(met[..., None], lines.points / distance[..., None], lines.rays_left)
             start = torch.where(met, scale / distance, 0.0)
         if differentiated and cov is not None:
-            weight, _ = _weights(cov)
+            weight, _ = inverse_covariances(cov)
         fit = refine(
             self._sights(), scale, (ahead, start), torch.cat([left, right], -1).mT, usable, weight,
             by_camera=self.calibration_factor is not None, differentiated=differentiated,
@@ -282,7 +329,7 @@ class StereoLocalizer(nn.Module):
             level = enu[..., :2]
             enu = torch.cat([level, enu[..., 2:] - self.drop * (level * level).sum(-1, keepdim=True)], -1)
         if self.mounting is not None:
-            turn = _turning(enu)
+            turn = by_mounting(enu)
             covariance = covariance + turn @ self.mounting @ turn.mT
             if self.link is not None and self.calibration_factor is not None:
                 mixed = by_unknown.movedim(-3, -2) @ (effect @ self.link) @ turn.mT
@@ -336,47 +383,6 @@ def _checked_pairs(pixels_left: Tensor, pixels_right: Tensor) -> tuple[Tensor, T
             f"got {tuple(left.shape)} and {tuple(right.shape)}"
         )
     return left, right
-
-
-def calibration_effect(fit: Fit, scale: Tensor) -> Tensor:
-    """(..., N, 3, P) derivatives of a, b and ρ by the parameters in the order of `RigCovariance`; `fit` of two cameras.
-
-    A rise of a parameter that moves predicted pixels acts as a measurement that moved the other way.
-    """
-    left, right = (projection.by_camera for projection in fit.projections)
-    pose = by_pose(fit, 1)
-    pose = torch.cat([pose[..., :3, :, :], pose[..., 3:, :, :] / scale], -3)
-    gain_left, gain_right = fit.gain[..., :2, :], fit.gain[..., 2:, :]
-
-    def through(gain: Tensor, moved: Tensor) -> Tensor:
-        return -(gain[..., :, None, :, :] * moved[..., None, :, :, :]).sum(-2)
-
-    effect = torch.cat([through(gain_left, left), through(gain_right, right), through(gain_right, pose)], -2)
-    return effect.movedim(-1, -3)
-
-
-def _weights(cov: Tensor | None) -> tuple[Tensor | None, Tensor]:
-    """Inverse covariances as (..., 4, 4, N), and where they exist."""
-    if cov is None:
-        return None, torch.ones((), dtype=torch.bool)
-    with torch.no_grad():
-        symmetric = (cov - cov.mT).abs().amax((-2, -1)) <= 1e-6 * cov.abs().amax((-2, -1))
-        finite = torch.isfinite(cov).all(-1).all(-1) & symmetric
-        still = torch.eye(4, dtype=cov.dtype, device=cov.device)
-        _, info = torch.linalg.cholesky_ex(torch.where(finite[..., None, None], cov, still))
-        sound = finite & (info == 0)
-    safe = torch.where(sound[..., None, None], 0.5 * (cov + cov.mT), still)
-    inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(safe)[0])
-    return inverse.movedim(-3, -1), sound
-
-
-def _turning(enu: Tensor) -> Tensor:
-    """(..., N, 3, 6) derivatives of ENU points by the origin and by small turns about the east, north and up axes."""
-    e, n, u = enu.unbind(-1)
-    zero = torch.zeros_like(e)
-    turns = torch.stack([zero, u, -n, -u, zero, e, n, -e, zero], -1).unflatten(-1, (3, 3))
-    still = torch.eye(3, dtype=enu.dtype, device=enu.device).expand(turns.shape)
-    return torch.cat([still, turns], -1)
 
 
 def _reach(inverse: Tensor, known: Tensor, usable: Tensor, otherwise: float) -> Tensor:

@@ -240,3 +240,35 @@ def by_pose(fit: Fit, number: int) -> Tensor:
     rows = step_rows(fit.projections[number].by_point, fit.turned[number])
     turn, shift = rows[..., :3, :, :], rows[..., 3:, :, :]
     return torch.cat([turn, shift * fit.inverse[..., None, None, :]], -3)
+
+
+def calibration_effect(fit: Fit, scale: Tensor) -> Tensor:
+    """(..., N, 3, P) derivatives of a, b and ρ by the parameters in the order of `RigCovariance`; `fit` of two cameras.
+
+    A rise of a parameter that moves predicted pixels acts as a measurement that moved the other way.
+    """
+    left, right = (projection.by_camera for projection in fit.projections)
+    pose = by_pose(fit, 1)
+    pose = torch.cat([pose[..., :3, :, :], pose[..., 3:, :, :] / scale], -3)
+    gain_left, gain_right = fit.gain[..., :2, :], fit.gain[..., 2:, :]
+
+    def through(gain: Tensor, moved: Tensor) -> Tensor:
+        return -(gain[..., :, None, :, :] * moved[..., None, :, :, :]).sum(-2)
+
+    effect = torch.cat([through(gain_left, left), through(gain_right, right), through(gain_right, pose)], -2)
+    return effect.movedim(-1, -3)
+
+
+def inverse_covariances(cov: Tensor | None) -> tuple[Tensor | None, Tensor]:
+    """Inverse covariances as (..., 4, 4, N), and where they exist."""
+    if cov is None:
+        return None, torch.ones((), dtype=torch.bool)
+    with torch.no_grad():
+        symmetric = (cov - cov.mT).abs().amax((-2, -1)) <= 1e-6 * cov.abs().amax((-2, -1))
+        finite = torch.isfinite(cov).all(-1).all(-1) & symmetric
+        still = torch.eye(4, dtype=cov.dtype, device=cov.device)
+        _, info = torch.linalg.cholesky_ex(torch.where(finite[..., None, None], cov, still))
+        sound = finite & (info == 0)
+    safe = torch.where(sound[..., None, None], 0.5 * (cov + cov.mT), still)
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(safe)[0])
+    return inverse.movedim(-3, -1), sound

@@ -12,11 +12,11 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.mounting import Origin
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.cep import circular_error
-from kcal.locate.covariances import RigCovariance
 from kcal.locate.datum import Geoid, geoid_heights
-from kcal.locate.geodesy import Origin, azimuth_elevation, enu_from_cam, enu_to_geodetic
+from kcal.locate.geodesy import azimuth_elevation, enu_to_geodetic
 from kcal.locate.localizer import Localization, StereoLocalizer
 from kcal.locate.stereo import Status
 
@@ -131,8 +131,8 @@ def locate(
     pixels_left: Tensor,
     pixels_right: Tensor,
     *,
-    origin: Origin,
-    heading_deg: float,
+    origin: Origin | None = None,
+    heading_deg: float | None = None,
     pitch_deg: float = 0.0,
     roll_deg: float = 0.0,
     pixel_sigma: float = 0.3,
@@ -147,7 +147,8 @@ def locate(
     """Positions on the Earth of things marked in both images of a stereo rig.
 
     Args:
-        rig: the calibrated rig.
+        rig: the calibrated rig; origin, attitude and covariances that are left out are the rig's own, as for
+            `StereoLocalizer`.
         pixels_left: (N, 2) marks in the left image, integer coordinates at pixel centers.
         pixels_right: (N, 2) the same things in the right image.
         origin: position of the left camera's projection center.
@@ -189,7 +190,6 @@ def locate(
     names = [str(i + 1) for i in range(len(pixels_left))] if names is None else list(names)
     if len(names) != len(pixels_left):
         raise InputError(f"names: {len(names)} for {len(pixels_left)} pairs of marks; one each is needed")
-    rotation = enu_from_cam(heading_deg, pitch_deg, roll_deg)
     with torch.no_grad():
         localize = StereoLocalizer(
             rig, origin=origin, heading_deg=heading_deg, pitch_deg=pitch_deg, roll_deg=roll_deg,
@@ -197,7 +197,8 @@ def locate(
         )  # fmt: skip
         slopes = [slope.tolist() for slope in localize.sensitivity(pixels_left, pixels_right)]
         result = Localization(*(tensor.cpu() for tensor in localize(pixels_left, pixels_right, cov)))
-        cameras = _viewpoints(rig, rotation, origin)
+        cameras = _viewpoints(rig, localize.enu_from_rig.cpu(), localize.origin)
+    heading, pitch, roll = localize.attitude_deg
     angles = azimuth_elevation(result.bearing).tolist()
     circles = circular_error(result.enu, result.covariance).tolist()
     sigmas = [pixel_sigma] * len(names) if cov is None else _marks_sigma(cov, len(names))
@@ -224,16 +225,15 @@ def locate(
         positions.append(position)
     if geoid is not None:
         positions = _with_geoid(positions, geoid)
-    errors = (("marks", True), ("calibration", calibration is not None), ("mounting", mounting is not None))
     return Located(
         positions=tuple(positions),
         cameras=cameras,
-        origin=origin,
-        heading_deg=heading_deg,
-        pitch_deg=pitch_deg,
-        roll_deg=roll_deg,
+        origin=localize.origin,
+        heading_deg=heading,
+        pitch_deg=pitch,
+        roll_deg=roll,
         pixel_sigma=pixel_sigma,
-        included=tuple(name for name, there in errors if there),
+        included=localize.included,
         geoid=None if geoid is None else geoid.name,
     )
 

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from kcal.calibrate.rig.sources import Features, Landmarks, MeasuredPosition, inverse_range_beyond
 from kcal.errors import FileError, InputError
-from kcal.locate.geodesy import Origin, geodetic_to_enu
+from kcal.lens.mounting import Origin
+from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.marks import PIXELS, Marks, pixel_of
 from kcal.locate.tables import Row, read_rows
 

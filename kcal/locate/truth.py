@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.locate.geodesy import Origin
+from kcal.lens.mounting import Origin
 from kcal.locate.positions import Located
 from kcal.locate.survey import read_survey
 

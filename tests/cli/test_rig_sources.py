@@ -15,8 +15,9 @@ from kcal.cli.main import main
 from kcal.io.camera_file import camera_to_file
 from kcal.io.rig_file import RigFile
 from kcal.lens.camera import Camera
+from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic
+from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 
 ORIGIN = Origin(lat=-17.5, lon=179.9999, height=40.0)
 CAMERAS = [

@@ -9,12 +9,13 @@ from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turn
 
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
+from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
-from kcal.lens.rig import StereoRig
-from kcal.locate.covariances import RigCovariance, mounting_covariance
-from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic
+from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.localizer import Localization, StereoLocalizer
+from kcal.locate.mounting import mounting_covariance
 from kcal.locate.stereo import Status, Triangulate
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)

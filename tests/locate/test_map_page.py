@@ -15,7 +15,8 @@ from locate_rigs import pinhole_rig, tensor
 from PIL import Image, TiffImagePlugin
 
 from kcal.errors import FileError, InputError
-from kcal.locate.geodesy import Origin, enu_from_cam, geodetic_to_enu
+from kcal.lens.mounting import Origin
+from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
 from kcal.locate.positions import Located, locate
 from kcal.report.backdrop import local_image, local_tiles
 from kcal.report.map_page import map_page, save_map

@@ -10,7 +10,8 @@ from locate_rigs import pinhole_rig, tensor
 from matplotlib.figure import Figure
 
 from kcal.errors import InputError
-from kcal.locate.geodesy import Origin, enu_from_cam
+from kcal.lens.mounting import Origin
+from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.positions import Located, locate
 from kcal.report.positions import positions_figure, save_positions_picture
 

@@ -16,11 +16,12 @@ import torch
 from locate_rigs import pinhole_rig, real_rig, spread_points, tensor
 
 from kcal.errors import FileError, InputError
+from kcal.lens.mounting import Origin
+from kcal.lens.rig import RigCovariance
 from kcal.locate.cot import to_cot
-from kcal.locate.covariances import RigCovariance
 from kcal.locate.datum import find_geoid
 from kcal.locate.export import to_csv, to_geojson, write_positions
-from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic, geodetic_to_enu
+from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.kml import to_kml
 from kcal.locate.positions import Located, Position, locate
 from kcal.locate.stereo import Status
