@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from kcal.lens.rig import RigCovariance, StereoRig
     from kcal.locate.localizer import StereoLocalizer
     from kcal.locate.multiview import TriangulateViews
-    from kcal.locate.stereo import Triangulate
+    from kcal.locate.triangulate import Triangulate
     from kcal.nets.inverse import InverseNet
     from kcal.nets.inverse_fit import train_inverse
     from kcal.solve.lm import LevenbergMarquardt, LMOptions
@@ -105,7 +105,7 @@ _HOME = {
     "RigOptions": "kcal.calibrate.rig.from_boards",
     "StereoLocalizer": "kcal.locate.localizer",
     "StereoRig": "kcal.lens.rig",
-    "Triangulate": "kcal.locate.stereo",
+    "Triangulate": "kcal.locate.triangulate",
     "TriangulateViews": "kcal.locate.multiview",
     "Undistort": "kcal.lens.images",
     "Unproject": "kcal.lens.modules",

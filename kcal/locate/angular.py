@@ -22,7 +22,7 @@ from kcal.lens.pose import side_axes
 from kcal.lens.tracing import CHUNK, is_differentiated, is_traced, known_true
 
 # Sine of the angle between a ray and the baseline: below, both rays meet everywhere on the line through the cameras.
-_EPIPOLE = 1e-9
+EPIPOLE = 1e-9
 # Points farther than this many baselines are at infinity for float64.
 _HORIZON = 1e12
 # Beyond this cosine (84°) the directions of the two rays around the baseline have no common plane worth the name.
@@ -79,7 +79,7 @@ def _pairs(rays_left: Tensor, rays_right: Tensor, axes: Tensor, axes_right: Tens
     norm0, norm1 = torch.addcmul(squared0, x0, x0), torch.addcmul(squared1, x1, x1)
     with torch.no_grad():
         # Not so for rays of length zero, along the baseline, or not finite.
-        usable = (squared0 > _EPIPOLE**2 * norm0) & (squared1 > _EPIPOLE**2 * norm1) & (norm0 + norm1 < torch.inf)
+        usable = (squared0 > EPIPOLE**2 * norm0) & (squared1 > EPIPOLE**2 * norm1) & (norm0 + norm1 < torch.inf)
         every = known_true(usable)
     if not every:
         x0, p0, q0 = torch.where(usable, x0, 0.0), torch.where(usable, p0, 1.0), torch.where(usable, q0, 0.0)
@@ -184,13 +184,13 @@ def _several(world: list[Tensor], shifts: Tensor) -> tuple[Tensor, Tensor]:
         scale = (p * r - q * q).reciprocal()
         first, second = (r * u - q * v) * scale, (p * v - q * u) * scale
         left = s - first * u - second * v
-        determined = left > _EPIPOLE**2
+        determined = left > EPIPOLE**2
         inverse = (h - first * f - second * g) / torch.where(determined, left, 1.0)
         a = (r * f - q * g) * scale - first * inverse
         b = (p * g - q * f) * scale - second * inverse
         direction = ray + a[..., None] * e1 + b[..., None] * e2
         seen = [direction + inverse[..., None] * shifts[..., c, :] for c in range(len(world))]
-        weights = [(point * point).sum(-1).clamp_min(_EPIPOLE**2).reciprocal() for point in seen]
+        weights = [(point * point).sum(-1).clamp_min(EPIPOLE**2).reciprocal() for point in seen]
     ahead = torch.stack([(point * w).sum(-1) > 0 for point, w in zip(seen, world, strict=True)]).all(0)
     valid = determined & (inverse * _HORIZON > 1.0) & ahead
     return spread[..., None] * direction / torch.where(valid, inverse, torch.inf)[..., None], valid

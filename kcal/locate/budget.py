@@ -20,7 +20,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.locate.stereo import Status, sight_lines
+from kcal.locate.stereo import PositionStatus, sight_lines
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -138,7 +138,7 @@ def _range(rig: StereoRig, left: Tensor, right: Tensor) -> Tensor:
     """Range from the left camera; infinite where the rays do not meet ahead."""
     lines = sight_lines(rig, left, right)
     distance = torch.linalg.vector_norm(lines.points, dim=-1)
-    return torch.where(lines.status == int(Status.OK), distance, math.inf)
+    return torch.where(lines.status == int(PositionStatus.OK), distance, math.inf)
 
 
 def _direction(rig: StereoRig, pixel: Sequence[float] | None) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.locate.stereo import Status, sight_lines
+from kcal.locate.stereo import PositionStatus, sight_lines
 
 
 class DriftEffect(NamedTuple):
@@ -64,7 +64,7 @@ def drift_effect(
         slope = [_slope(old, new, points, far, k) for k in range(3)]
     rows = torch.stack(slope, -1)
     sigma = (rows @ turn_covariance * rows).sum(-1).clamp_min(0.0).sqrt()
-    return DriftEffect(far, torch.where(lines.status == int(Status.OK), found, math.inf), sigma)
+    return DriftEffect(far, torch.where(lines.status == int(PositionStatus.OK), found, math.inf), sigma)
 
 
 def _slope(old: StereoRig, new: StereoRig, points: Tensor, far: Tensor, axis: int) -> Tensor:

@@ -18,17 +18,17 @@ from kcal.locate.cep import circular_error
 from kcal.locate.datum import Geoid, geoid_heights
 from kcal.locate.geodesy import azimuth_elevation, enu_to_geodetic
 from kcal.locate.localizer import Localization, StereoLocalizer
-from kcal.locate.stereo import Status
+from kcal.locate.stereo import PositionStatus
 
 # A reprojection error of this many sigma is not noise: two different things were marked, or the rig has moved.
 _MISMATCH_SIGMAS = 10.0
 
 _REASONS = {
-    Status.OUTSIDE_LENS: "the lens model has no ray for a mark",
-    Status.BEHIND: "the lines of sight cross behind a camera: are the marks the same thing?",
-    Status.NOT_FINITE: "a pixel coordinate is not finite",
-    Status.OUTSIDE_IMAGE: "a mark lies outside its image",
-    Status.BAD_COVARIANCE: "the covariance of the marks is none",
+    PositionStatus.OUTSIDE_LENS: "the lens model has no ray for a mark",
+    PositionStatus.BEHIND: "the lines of sight cross behind a camera: are the marks the same thing?",
+    PositionStatus.NOT_FINITE: "a pixel coordinate is not finite",
+    PositionStatus.OUTSIDE_IMAGE: "a mark lies outside its image",
+    PositionStatus.BAD_COVARIANCE: "the covariance of the marks is none",
 }
 
 
@@ -49,7 +49,7 @@ class Position:
     """
 
     name: str
-    status: Status
+    status: PositionStatus
     reason: str = ""
     lat: float | None = None
     lon: float | None = None
@@ -116,7 +116,7 @@ class Located:
     @property
     def count(self) -> int:
         """How many pairs have a position."""
-        return sum(position.status == Status.OK for position in self.positions)
+        return sum(position.status == PositionStatus.OK for position in self.positions)
 
     @property
     def enu(self) -> Tensor:
@@ -206,17 +206,17 @@ def locate(
 
     positions = []
     for i, name in enumerate(names):
-        status = Status(int(result.status[i]))
+        status = PositionStatus(int(result.status[i]))
         position = Position(name=name, status=status, reason=_reason(status, result, i, sigmas[i], baseline))
-        if status in (Status.OK, Status.BEARING_ONLY, Status.PARALLEL):
+        if status in (PositionStatus.OK, PositionStatus.BEARING_ONLY, PositionStatus.PARALLEL):
             position = dataclasses.replace(position, azimuth_deg=angles[i][0], elevation_deg=angles[i][1])
             low, high = float(result.range_low[i]), float(result.range_high[i])
             if math.isfinite(low):
                 position = dataclasses.replace(position, range_low_m=low, range_high_m=high)
-        if status in (Status.OK, Status.BEARING_ONLY):
+        if status in (PositionStatus.OK, PositionStatus.BEARING_ONLY):
             left, right = result.reprojection[i].tolist()
             position = dataclasses.replace(position, reprojection_px=(left, right))
-        if status == Status.OK:
+        if status == PositionStatus.OK:
             position = _placed(position, result, i)
             position = dataclasses.replace(
                 position, cep50_m=circles[i][0], cep95_m=circles[i][1], meters_per_pixel=slopes[0][i],
@@ -262,16 +262,16 @@ def _marks_sigma(cov: Tensor, count: int) -> list[float]:
     return [math.sqrt(value) if value > 0 else math.inf for value in variance.tolist()]
 
 
-def _reason(status: Status, result: Localization, i: int, pixel_sigma: float, baseline: float) -> str:
+def _reason(status: PositionStatus, result: Localization, i: int, pixel_sigma: float, baseline: float) -> str:
     if status in _REASONS:
         return _REASONS[status]
     low = float(result.range_low[i])
-    if status == Status.PARALLEL and math.isinf(low):
+    if status == PositionStatus.PARALLEL and math.isinf(low):
         angle = math.degrees(math.atan(-baseline * float(result.inverse_range[i])))
         return f"the lines of sight diverge by {angle:.3g}°, more than noise: not the same thing, or the rig has turned"
-    if status == Status.PARALLEL and low == 0:
+    if status == PositionStatus.PARALLEL and low == 0:
         return "a mark lies in the direction of the other camera: no range can be measured along that line"
-    if status in (Status.PARALLEL, Status.BEARING_ONLY):
+    if status in (PositionStatus.PARALLEL, PositionStatus.BEARING_ONLY):
         return f"the parallax is below three sigma: only the bearing is known, and a range of at least {low:.0f} m"
     worst = float(result.reprojection[i].max())
     if worst > _MISMATCH_SIGMAS * pixel_sigma:

@@ -21,7 +21,7 @@ from kcal.files import write_atomic
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.positions import Located, Position
 from kcal.locate.region import near, region_rings
-from kcal.locate.stereo import Status
+from kcal.locate.stereo import PositionStatus
 from kcal.report.backdrop import local_image, local_tiles
 
 ARCS_M = (250.0, 1000.0, 5000.0)
@@ -165,7 +165,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
     bearings = [
         places(fan((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0) * ends)
         for p in located.positions
-        if p.azimuth_deg is not None and p.status != Status.OK
+        if p.azimuth_deg is not None and p.status != PositionStatus.OK
         for ends in [torch.tensor([[min(p.range_low_m or 0.0, reach)], [reach]], dtype=torch.float64)]
     ]
     arrows, true = [], []

@@ -24,7 +24,7 @@ from kcal.locate.export import to_csv, to_geojson, write_positions
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.kml import to_kml
 from kcal.locate.positions import Located, Position, locate
-from kcal.locate.stereo import Status
+from kcal.locate.stereo import PositionStatus
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 RIG = pinhole_rig()  # f b = 16 000 px m, center (959.5, 539.5)
@@ -105,7 +105,7 @@ def test_each_failure_says_why_and_carries_no_number_that_could_be_mistaken() ->
 def test_a_match_that_cannot_be_right_is_called_doubtful() -> None:
     # 12 px of vertical disparity on a level rig, half of it in each image.
     position = one((975.5, 539.5), (959.5, 551.5))
-    assert position.status == Status.OK
+    assert position.status == PositionStatus.OK
     assert position.reprojection_px == pytest.approx((6.0, 6.0), abs=0.01)
     assert "doubtful" in position.reason
     assert one((975.5, 539.5), (959.5, 540.0)).reason == ""
@@ -114,7 +114,7 @@ def test_a_match_that_cannot_be_right_is_called_doubtful() -> None:
 def test_pixel_sigma_widens_the_interval() -> None:
     fine, coarse = one((975.5, 539.5), (959.5, 539.5), pixel_sigma=0.1), one((975.5, 539.5), (959.5, 539.5))
     assert coarse.range_low_m < fine.range_low_m < fine.range_m < fine.range_high_m < coarse.range_high_m
-    assert one((975.5, 539.5), (959.5, 539.5), pixel_sigma=4.0).status == Status.BEARING_ONLY
+    assert one((975.5, 539.5), (959.5, 539.5), pixel_sigma=4.0).status == PositionStatus.BEARING_ONLY
 
 
 def test_bad_input_is_refused() -> None:
