@@ -26,7 +26,7 @@ def to_cot(located: Located, *, time: datetime.datetime | None = None, stale_s: 
     the remark in each event states it. Pairs without a position are left out.
 
     Args:
-        located: from `kcal.locate.positions.locate`.
+        located: from `kcal.locate_points`.
         time: of the marks, with its time zone; now if left out.
         stale_s: seconds for which an event counts.
 

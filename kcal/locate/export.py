@@ -146,6 +146,18 @@ def write_positions(path: str | Path, located: Located) -> Path:
     Raises:
         InputError: another suffix.
         FileError: the file cannot be written; an old one is then untouched.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from kcal.lens.mounting import Origin
+        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.locate.positions import locate_points
+        >>> left, right, _ = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))
+        >>> located = locate_points(planned_rig(), left, right, origin=Origin(lat=19.07, lon=72.87, height=14.0),
+        ...                         heading_deg=0.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_positions(Path(folder, "positions.csv"), located).read_text().splitlines()[1][:4]
+        '1,ok'
     """
     check_format(path)
     return write_atomic(path, _FORMATS[Path(path).suffix.lower()](located))

@@ -8,8 +8,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kcal.calibrate.rig.result import RigSolution
 from kcal.errors import InputError
 from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.ellipsoid import ecef_from_enu_rotation
 from kcal.locate.geodesy import enu_to_geodetic
 
@@ -66,6 +68,35 @@ def mounting_of(
         covariance=both @ covariance @ both.T,
         link=None if link is None else link @ both.T,
     )
+
+
+def placed_rig(result: RigSolution, origin: Origin) -> StereoRig:
+    """The rig of a solution with its covariance, and with its mounting if the data tell where it stands on the Earth.
+
+    Args:
+        result: from `kcal.solve_rig`.
+        origin: of the frame in which landmarks and positions were given.
+
+    Example:
+        >>> from kcal.calibrate.rig.sources import Landmarks, RigData
+        >>> from kcal.calibrate.rig.solve import solve_rig
+        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.locate.geodesy import enu_from_cam
+        >>> rig, generator = planned_rig(), torch.Generator().manual_seed(0)
+        >>> points = torch.rand(12, 3, dtype=torch.float64, generator=generator) * 40 + torch.tensor([-20, -10, 60])
+        >>> landmarks = Landmarks(names=tuple("abcdefghijkl"), points=points @ enu_from_cam(0.0).T,
+        ...                       sigma=torch.full((12, 3), 0.01).double(), pixels=torch.stack(rig(points)[:2], 1))
+        >>> data = RigData(cameras=(rig.left, rig.right), names=("left", "right"), landmarks=landmarks)
+        >>> found = placed_rig(solve_rig(data), Origin(lat=19.07, lon=72.87, height=14.0))
+        >>> round(found.mounting.heading_deg, 6) % 360.0, found.covariance is None
+        (0.0, False)
+    """
+    rig = result.stereo()
+    rig.covariance = RigCovariance.of(rig, joint=result.joint_covariance())
+    covariance = result.mounting_covariance(0)
+    if result.absolute and bool(torch.isfinite(covariance).all()):
+        rig.mounting = mounting_of(result.rotation[0], result.center[0], covariance, origin, result.mounting_link())
+    return rig
 
 
 def mounting_covariance(

@@ -1,4 +1,4 @@
-"""Pixel pairs to positions on the Earth: the function `locate` and its result."""
+"""Pixel pairs to positions on the Earth: the function `locate_points` and its result."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Viewpoint:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Located:
-    """Result of `locate`: one position for each pair of marks, in order, and where the rig stood.
+    """Result of `locate_points`: one position for each pair of marks, in order, and where the rig stood.
 
     `included` names the errors that the intervals and covariances hold; `geoid` the grid of the geoid heights, None if
     there was none.
@@ -126,7 +126,7 @@ class Located:
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, 3)
 
 
-def locate(
+def locate_points(
     rig: StereoRig,
     pixels_left: Tensor,
     pixels_right: Tensor,
@@ -174,7 +174,7 @@ def locate(
     Example:
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> located = locate(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
+        >>> located = locate_points(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
         ...                  origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
         >>> position = located.positions[0]
         >>> round(position.range_m, 3), round(position.lat, 6), round(position.range_high_m, 1)

@@ -28,7 +28,7 @@ _INFINITY_SIGMA = 1e-12
 
 
 class Survey(NamedTuple):
-    """Named places.
+    """Named places with their uncertainty.
 
     Attributes:
         names: one each.
@@ -113,6 +113,13 @@ def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float) -> MarkedL
 
     Raises:
         InputError: no name is in both.
+
+    Example:
+        >>> survey = Survey(("mast", "post"), torch.rand(2, 3).double(), torch.ones(2, 3).double(), None)
+        >>> marks = Marks(("post", "tree"), torch.rand(2, 2).double(), torch.rand(2, 2).double())
+        >>> found = match_landmarks(survey, marks, pixel_sigma=0.1)
+        >>> found.landmarks.names, found.unmarked, found.unsurveyed
+        (('post',), ('mast',), ('tree',))
     """
     index = {name: i for i, name in enumerate(marks.names)}
     common = [name for name in survey.names if name in index]
@@ -183,6 +190,11 @@ def camera_positions(survey: Survey, cameras: Sequence[str]) -> tuple[MeasuredPo
 
     Raises:
         InputError: a name that is no camera's.
+
+    Example:
+        >>> survey = Survey(("right",), torch.tensor([[10.0, 0.0, 0.5]]), torch.full((1, 3), 0.02), None)
+        >>> camera_positions(survey, ("left", "right"))[0].camera
+        1
     """
     unknown = [name for name in survey.names if name not in cameras]
     if unknown:

@@ -57,7 +57,7 @@ def map_page(
     """The page: positions with 95 % regions, true ones with arrows, cameras, fields of view, arcs at 250 m to 5 km.
 
     Args:
-        located: from `kcal.locate.positions.locate`.
+        located: from `kcal.locate_points`.
         truth: (N, 3) true east, north, up in meters, NaN where unknown; an arrow leads from each to its estimate.
         tiles: a folder of map tiles `z/x/y.png` (or .jpg, .webp) in Web Mercator; those in view are embedded.
         image: a GeoTIFF to lie below, for example an orthophoto; embedded, at 2048 pixels along its longer side.

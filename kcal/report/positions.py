@@ -36,7 +36,7 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
     errors); with an arrow head it goes on to infinity.
 
     Args:
-        located: from `kcal.locate.positions.locate`.
+        located: from `kcal.locate_points`.
         truth: (N, 3) true east, north, up in meters, NaN where unknown; an arrow leads from each to its estimate.
 
     Returns:
