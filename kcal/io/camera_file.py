@@ -78,7 +78,7 @@ class FieldScaleRecord(Record):
         return FieldScale(width=self.width, left=self.left, top=self.top, columns=self.columns, rows=self.rows)
 
 
-class Intrinsics(Record):
+class IntrinsicsRecord(Record):
     """Focal lengths, principal point and skew (γ of Eq. 3), pixels."""
 
     fx: pydantic.PositiveFloat
@@ -91,7 +91,7 @@ class Intrinsics(Record):
 class ValidRegion(Record):
     """Where the lens is a lens: before it folds back or meets a pole.
 
-    Derived from the camera when the file is written, for readers that cannot compute it; kcal itself measures anew.
+    Derived from the camera when the file is written, for readers that cannot compute it; kcal itself measures it again.
 
     Args:
         radius: of the disc about the optical axis that is valid: on the plane z = 1; for a fisheye, radians off axis.
@@ -140,7 +140,7 @@ class CameraFile(NativeFile):
     name: str
     image_size: tuple[pydantic.PositiveInt, pydantic.PositiveInt]
     model: LensOrders
-    intrinsics: Intrinsics
+    intrinsics: IntrinsicsRecord
     coefficients: dict[str, float]
     standard_deviations: dict[str, pydantic.NonNegativeFloat | None] | None = None
     covariance: CovarianceRecord | None = None
@@ -305,7 +305,7 @@ def camera_to_file(
                 tilt=model.tilt,
                 fisheye=model.fisheye,
             ),
-            intrinsics=Intrinsics(**{key: stored[key] for key in INTRINSICS}),
+            intrinsics=IntrinsicsRecord(**{key: stored[key] for key in INTRINSICS}),
             coefficients={key: stored[key] for key in model.names},
             standard_deviations=standard_deviations,
             covariance=None if covariance is None else CovarianceRecord.of(covariance.detach(), camera.names),
@@ -340,7 +340,7 @@ def save_camera(camera: Camera, path: str | Path, *, name: str | None = None) ->
 
 
 def load_camera(path: str | Path) -> Camera:
-    """Read the camera of a kcal camera file; its `calibration` has what the file tells besides.
+    """Read the camera of a kcal camera file; its `calibration` has what else the file contains.
 
     Raises:
         FileError: missing, not JSON, another kind of file (a rig, say), or a field that is wrong; it names the path.

@@ -15,7 +15,7 @@ class Record(pydantic.BaseModel):
 
 
 class CovarianceRecord(Record):
-    """How the parameters of a camera scatter together: what one sigma of each does not tell.
+    """The joint covariance of a camera's parameters.
 
     Args:
         names: of the parameters that were estimated, in the order of the camera's; all others are exact.

@@ -38,7 +38,7 @@ class RigPose(Record):
     @pydantic.model_validator(mode="after")
     def _rigid(self) -> RigPose:
         rotation = self.matrix()
-        # As StereoRig asks for; told here so that the error names the file.
+        # As in StereoRig; checked here so that the error names the file.
         error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
         if not float(error) <= 1e-6 or float(torch.linalg.det(rotation)) < 0:
             raise ValueError("rotation is no rotation matrix (R Rᵀ must be 1 and det R = +1)")

@@ -1,4 +1,4 @@
-"""What a calibration tells about a camera or a rig besides its parameters: plain data that travels with it.
+"""Error bars and history of a camera or a rig: plain data that travels with it.
 
 kcal's files store these classes field by field (`kcal.io`), and check types and finite numbers when they are read.
 """
@@ -177,26 +177,26 @@ class RigCalibration:
             raise InputError(f"baseline_m is {self.baseline_m}; it must be positive")
 
 
-Value = TypeVar("Value")
+Attribute = TypeVar("Attribute")
 
 
-class UntilChanged(Generic[Value]):
+class UntilChanged(Generic[Attribute]):
     """An attribute of a module with a `fingerprint`: None until it is set, and again once the fingerprint has changed.
 
     So error bars never outlive the parameters that they belong to, however those were changed.
     """
 
-    def __init__(self, check: Callable[[Any, Value], object] = lambda module, value: None) -> None:
+    def __init__(self, check: Callable[[Any, Attribute], object] = lambda module, value: None) -> None:
         self.check = check
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
 
-    def __get__(self, module: Any, owner: type) -> Value | None:
+    def __get__(self, module: Any, owner: type) -> Attribute | None:
         fingerprint, value = module.__dict__.get(self.name, ("", None))
         return value if value is not None and fingerprint == module.fingerprint else None
 
-    def __set__(self, module: Any, value: Value | None) -> None:
+    def __set__(self, module: Any, value: Attribute | None) -> None:
         if value is not None:
             self.check(module, value)
         module.__dict__[self.name] = module.fingerprint, value

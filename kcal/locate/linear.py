@@ -5,13 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.locate.angular import checked_views
+from kcal.locate.angular import HORIZON, checked_views
 
 # Below this gap of the squared singular values (the rays have unit length, the cameras a spread of one) the answer
 # is not determined: all rays lie along the line through the camera centers.
-_GAP = 1e-18
-# Points farther than this many baselines are at infinity for float64.
-_HORIZON = 1e12
+_LEAST_GAP = 1e-18
 
 
 def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
@@ -68,7 +66,7 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Te
     system = torch.linalg.cross(*torch.broadcast_tensors(units[..., None], cameras), dim=-2).flatten(-3, -2)
     solution, determined = _null_vector(system)
     weight = solution[..., 3:]
-    nearer = weight.abs() * _HORIZON > torch.linalg.vector_norm(solution[..., :3], dim=-1, keepdim=True)
+    nearer = weight.abs() * HORIZON > torch.linalg.vector_norm(solution[..., :3], dim=-1, keepdim=True)
     finite = nearer & determined[..., None]
     local_points = torch.where(finite, solution[..., :3], 0.0) / torch.where(finite, weight, 1.0)
 
@@ -89,8 +87,8 @@ def _null_vector(system: Tensor) -> tuple[Tensor, Tensor]:
         _, singular, basis = torch.linalg.svd(system, full_matrices=False)
         squared = singular * singular
         gap = squared[..., :3] - squared[..., 3:]
-        determined = gap[..., 2] > _GAP
-        inverse_gap = torch.where(determined[..., None], 1.0 / torch.where(gap > _GAP, gap, 1.0), 0.0)
+        determined = gap[..., 2] > _LEAST_GAP
+        inverse_gap = torch.where(determined[..., None], 1.0 / torch.where(gap > _LEAST_GAP, gap, 1.0), 0.0)
         others, h = basis[..., :3, :].mT, basis[..., 3, :, None]
     for _ in range(2):
         residual = system @ h

@@ -1,4 +1,4 @@
-"""`StereoLocalizer`: a detector's pixels in, positions on the Earth and their errors out, one module."""
+"""`StereoLocalizer`: a module from a detector's pixels to positions on the Earth with their errors."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Localization(NamedTuple):
 
 
 class Sensitivity(NamedTuple):
-    """Slopes of the range, infinite where there is none; at long range they hold for small errors only.
+    """Slopes of the range, infinite where there is no range; at long range they are valid for small errors only.
 
     Attributes:
         meters_per_pixel: (..., N) by a shift of one of the two marks in its worst direction.
@@ -85,9 +85,9 @@ class StereoLocalizer(nn.Module):
     Geometry runs in float64 whatever the pipeline around it uses. There is no branch on values under `torch.compile`
     and `torch.export`; gradients by pixels, covariances and freed camera parameters are exact and finite.
 
-    Covariances: the marks' noise, the calibration (`calibration`, a joint covariance of cameras and rig) and the
-    mounting (`mounting`) are added up. What the calibration does to several points it does to them together: errors
-    of neighboring points are not independent, and averaging over frames does not reduce them.
+    The covariance of a position is the sum of three parts: noise in the marks, errors in the calibration
+    (`calibration`, a joint covariance of cameras and rig) and errors in the mounting (`mounting`). Calibration errors
+    move neighboring points together, so that averaging over frames does not reduce them.
 
     Args:
         rig: two cameras and their relative pose. What is not given below is taken from the rig where it knows it.
@@ -188,7 +188,7 @@ class StereoLocalizer(nn.Module):
 
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> Self:
-        """Read a rig file; `options` are those of the class, and replace what the file tells.
+        """Read a rig file; `options` are those of the class, and replace what the file says.
 
         Raises:
             FileError: see `kcal.load_rig`.

@@ -26,7 +26,7 @@ from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection, project_components
 from kcal.lens.tracing import known_true
 
-_STEPS = 5
+_MOST_STEPS = 5
 # The derivative of the optimum comes from this many steps with a fixed matrix; each leaves a share of about the
 # residual over the focal length, 1e-4, of the error.
 _CHORDS = 2
@@ -44,7 +44,7 @@ class RelativeCamera(NamedTuple):
     translation: Tensor
 
 
-class Fit(NamedTuple):
+class PointFit(NamedTuple):
     """Points at the optimum, in the first camera's frame; K = 3 unknowns a, b, ρ; M = 2 C pixel coordinates.
 
     Attributes:
@@ -68,7 +68,7 @@ class Fit(NamedTuple):
     turned: tuple[Tensor, ...]
 
 
-class _At(NamedTuple):
+class _Evaluated(NamedTuple):
     cost: Tensor
     jacobian: Tensor
     weighted: Tensor
@@ -101,7 +101,7 @@ def most_likely(
     *,
     by_camera: bool = False,
     differentiated: bool = False,
-) -> Fit:
+) -> PointFit:
     """Minimize the weighted squares of the reprojection errors, each point on its own.
 
     Args:
@@ -123,7 +123,7 @@ def most_likely(
     with torch.no_grad():
         theta = torch.stack([zero, zero, torch.where(usable, start[1], 0.0)], -2)
         best, step, cost, at = theta, torch.zeros_like(theta), torch.full_like(zero, torch.inf), None
-        for _ in range(_STEPS):
+        for _ in range(_MOST_STEPS):
             at = _evaluate(fixed, theta)
             better = at.cost <= cost
             every = known_true(better)
@@ -142,11 +142,11 @@ def most_likely(
     if not differentiated and not by_camera and every and at is not None:
         return _with_covariance(at, theta, fixed, usable)
     if differentiated:
-        inverse = _inverse(_normal_matrix(_evaluate(fixed, theta), usable))
+        inverse = _inverse_of_six(_normal_matrix(_evaluate(fixed, theta), usable))
         inverse = tuple(value.detach() for value in inverse)  # type: ignore[assignment]
         for _ in range(_CHORDS):
             at = _evaluate(fixed, theta)
-            theta = theta - torch.where(usable[..., None, :], _product(inverse, _gradient(at)), 0.0)
+            theta = theta - torch.where(usable[..., None, :], _product(inverse, _cost_slope(at)), 0.0)
     return _with_covariance(_evaluate(fixed._replace(wanted=wanted), theta), theta, fixed, usable)
 
 
@@ -155,7 +155,7 @@ def _least_noise(weight: Tensor | None) -> Tensor | float:
     return 1.0 if weight is None else weight.diagonal(dim1=-3, dim2=-2).amax(-1).clamp_min(1e-30).rsqrt()
 
 
-def _evaluate(fixed: _Fixed, theta: Tensor) -> _At:
+def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
     a, b, inverse = (value[..., None, :] for value in theta.unbind(-2))
     e1, e2 = fixed.sides[..., 0, :, :], fixed.sides[..., 1, :, :]
     direction = fixed.base + a * e1 + b * e2
@@ -187,10 +187,10 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _At:
     else:
         weighted = (fixed.weight[..., None, :, :, :] * jacobian[..., None, :, :]).sum(-2)
         cost = (fixed.weight * residual[..., None, :, :] * residual[..., None, :]).sum((-3, -2))
-    return _At(cost, jacobian, weighted, residual, direction, tuple(projections), tuple(turned))
+    return _Evaluated(cost, jacobian, weighted, residual, direction, tuple(projections), tuple(turned))
 
 
-def _normal_matrix(at: _At, usable: Tensor) -> Six:
+def _normal_matrix(at: _Evaluated, usable: Tensor) -> Six:
     """Jᵀ W J by its six entries 11, 12, 13, 22, 23, 33; the identity where a point is not usable."""
     j, w = at.jacobian.unbind(-3), at.weighted.unbind(-3)
     entries = []
@@ -199,15 +199,15 @@ def _normal_matrix(at: _At, usable: Tensor) -> Six:
     return tuple(entries)  # type: ignore[return-value]
 
 
-def _gradient(at: _At) -> Tensor:
+def _cost_slope(at: _Evaluated) -> Tensor:
     return (at.weighted * at.residual[..., None, :, :]).sum(-2)
 
 
-def _newton(at: _At, usable: Tensor) -> Tensor:
-    return -_product(_inverse(_normal_matrix(at, usable)), _gradient(at))
+def _newton(at: _Evaluated, usable: Tensor) -> Tensor:
+    return -_product(_inverse_of_six(_normal_matrix(at, usable)), _cost_slope(at))
 
 
-def _inverse(m: Six) -> Six:
+def _inverse_of_six(m: Six) -> Six:
     """Of symmetric positive 3x3 matrices, by their adjugate; zero where the determinant vanishes."""
     a, b, c, d, e, f = m
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
@@ -223,14 +223,16 @@ def _product(m: Six, v: Tensor) -> Tensor:
     return torch.stack([a * x + b * y + c * z, b * x + d * y + e * z, c * x + e * y + f * z], -2)
 
 
-def _with_covariance(at: _At, theta: Tensor, fixed: _Fixed, usable: Tensor) -> Fit:
-    covariance = _inverse(_normal_matrix(at, usable))
+def _with_covariance(at: _Evaluated, theta: Tensor, fixed: _Fixed, usable: Tensor) -> PointFit:
+    covariance = _inverse_of_six(_normal_matrix(at, usable))
     weighted = at.weighted.movedim(-3, -2)  # (..., M, 3, N)
     gain = torch.stack([_product(covariance, row) for row in weighted.unbind(-3)], -2)
-    return Fit(at.direction, theta[..., 2, :], fixed.sides, covariance, gain, at.residual, at.projections, at.turned)
+    return PointFit(
+        at.direction, theta[..., 2, :], fixed.sides, covariance, gain, at.residual, at.projections, at.turned
+    )
 
 
-def by_pose(fit: Fit, number: int) -> Tensor:
+def by_pose(fit: PointFit, number: int) -> Tensor:
     """Derivatives (..., 6, 2, N) of the predicted pixels of a camera by a step of its pose: rotation, translation.
 
     The step is that of `kcal.lens.pose`: a rotation vector (radians) from the left and an added translation
@@ -247,7 +249,7 @@ def symmetric(six: Sequence[Tensor]) -> Tensor:
     return torch.stack([a, b, c, b, d, e, c, e, f], -1).unflatten(-1, (3, 3))
 
 
-def position_slope(fit: Fit, scale: Tensor, ok: Tensor) -> Tensor:
+def position_slope(fit: PointFit, scale: Tensor, ok: Tensor) -> Tensor:
     """(..., N, 3, 3) derivatives of points in the first camera's frame by a, b and ρ; finite where not `ok`."""
     inverse = torch.where(ok, fit.inverse, 1.0)
     ahead = torch.where(ok[..., None, :], fit.direction / inverse[..., None, :], 0.0)
@@ -255,7 +257,7 @@ def position_slope(fit: Fit, scale: Tensor, ok: Tensor) -> Tensor:
     return ((scale / inverse)[..., None, :, None] * columns).movedim(-3, -2)
 
 
-def calibration_effect(fit: Fit, scale: Tensor) -> Tensor:
+def calibration_effect(fit: PointFit, scale: Tensor) -> Tensor:
     """(..., N, 3, P) derivatives of a, b and ρ by the parameters in the order of `RigCovariance`; `fit` of two cameras.
 
     A rise of a parameter that moves predicted pixels acts as a measurement that moved the other way.

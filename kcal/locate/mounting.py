@@ -71,7 +71,7 @@ def mounting_of(
 
 
 def placed_rig(result: RigSolution, origin: Origin) -> StereoRig:
-    """The rig of a solution with its covariance, and with its mounting if the data tell where it stands on the Earth.
+    """The rig of a solution with its covariance, and with its mounting if the data determine it.
 
     Args:
         result: from `kcal.solve_rig`.

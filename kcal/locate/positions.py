@@ -1,4 +1,4 @@
-"""Pixel pairs to positions on the Earth: the function `locate_points` and its result."""
+"""`locate_points`: pixel pairs to positions on the Earth, with everything that is told to a user."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from kcal.locate.stereo import PositionStatus
 # A reprojection error of this many sigma is not noise: two different things were marked, or the rig has moved.
 _MISMATCH_SIGMAS = 10.0
 
-_REASONS = {
+_STATUS_TEXTS = {
     PositionStatus.OUTSIDE_LENS: "the lens model has no ray for a mark",
     PositionStatus.BEHIND: "the lines of sight cross behind a camera: are the marks the same thing?",
     PositionStatus.NOT_FINITE: "a pixel coordinate is not finite",
     PositionStatus.OUTSIDE_IMAGE: "a mark lies outside its image",
-    PositionStatus.BAD_COVARIANCE: "the covariance of the marks is none",
+    PositionStatus.BAD_COVARIANCE: "the covariance of the marks is not positive definite",
 }
 
 
@@ -44,7 +44,7 @@ class Position:
 
     `height` is above the ellipsoid; `geoid_height` is that of the geoid, known only with a grid, and
     `height - geoid_height` is close to the height above the sea. `covariance` is of `enu`, to first order; `cep50_m`
-    and `cep95_m` are the radii of horizontal circles that hold the true position with 50 and 95 %, infinite where it
+    and `cep95_m` are the radii of horizontal circles that contain the true position with 50 and 95 %, infinite where it
     may lie at infinity. The sensitivities are slopes of the range by a pixel of a mark and by a degree of relative yaw.
     """
 
@@ -90,8 +90,8 @@ class Viewpoint:
 class Located:
     """Result of `locate_points`: one position for each pair of marks, in order, and where the rig stood.
 
-    `included` names the errors that the intervals and covariances hold; `geoid` the grid of the geoid heights, None if
-    there was none.
+    `included` names the errors that intervals and covariances cover; `geoid` is the grid of the geoid heights, None
+    without one.
     """
 
     positions: tuple[Position, ...]
@@ -106,12 +106,11 @@ class Located:
 
     @property
     def interval_note(self) -> str:
-        """What the intervals hold and what they do not, as a sentence without a full stop."""
+        """Which errors the intervals cover and which they do not, as a sentence without a full stop."""
         missing = [name for name in ("calibration", "mounting") if name not in self.included]
-        note = "95 % of the " + " and the ".join(
-            "marks' noise" if name == "marks" else f"{name}'s errors" for name in self.included
-        )
-        return note + (f"; {' and '.join(missing)} errors are not included" if missing else "")
+        known = [name for name in self.included if name != "marks"]
+        note = "95 % of the noise in the marks" + (f" and of the errors in {' and '.join(known)}" if known else "")
+        return note + (f"; errors in {' and '.join(missing)} are not included" if missing else "")
 
     @property
     def count(self) -> int:
@@ -207,7 +206,7 @@ def locate_points(
     positions = []
     for i, name in enumerate(names):
         status = PositionStatus(int(result.status[i]))
-        position = Position(name=name, status=status, reason=_reason(status, result, i, sigmas[i], baseline))
+        position = Position(name=name, status=status, reason=_explanation(status, result, i, sigmas[i], baseline))
         if status in (PositionStatus.OK, PositionStatus.BEARING_ONLY, PositionStatus.PARALLEL):
             position = dataclasses.replace(position, azimuth_deg=angles[i][0], elevation_deg=angles[i][1])
             low, high = float(result.range_low[i]), float(result.range_high[i])
@@ -257,14 +256,14 @@ def _with_geoid(positions: list[Position], geoid: Geoid) -> list[Position]:
 
 
 def _marks_sigma(cov: Tensor, count: int) -> list[float]:
-    """The largest standard deviation of each pair's coordinates; infinite where there is none."""
+    """The largest standard deviation of each pair's coordinates; infinite where it is not positive."""
     variance = cov.detach().cpu().double().diagonal(dim1=-2, dim2=-1).amax(-1).expand(count)
     return [math.sqrt(value) if value > 0 else math.inf for value in variance.tolist()]
 
 
-def _reason(status: PositionStatus, result: Localization, i: int, pixel_sigma: float, baseline: float) -> str:
-    if status in _REASONS:
-        return _REASONS[status]
+def _explanation(status: PositionStatus, result: Localization, i: int, pixel_sigma: float, baseline: float) -> str:
+    if status in _STATUS_TEXTS:
+        return _STATUS_TEXTS[status]
     low = float(result.range_low[i])
     if status == PositionStatus.PARALLEL and math.isinf(low):
         angle = math.degrees(math.atan(-baseline * float(result.inverse_range[i])))

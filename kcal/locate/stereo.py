@@ -18,7 +18,7 @@ from kcal.errors import DegenerateError, InputError
 from kcal.lens.rig import StereoRig
 from kcal.lens.tracing import CHUNK, is_traced, known_true
 from kcal.locate.angular import EPIPOLE, triangulate_pairs
-from kcal.locate.max_likelihood import Fit, RelativeCamera, inverse_covariances, most_likely
+from kcal.locate.max_likelihood import PointFit, RelativeCamera, inverse_covariances, most_likely
 from kcal.locate.ranges import BEARING_SIGMAS, RangeInterval, range_interval
 
 # Radians. A smaller parallax is parallel for any camera: the point would be a billion baselines away.
@@ -64,12 +64,12 @@ def checked_pairs(pixels_left: Tensor, pixels_right: Tensor) -> tuple[Tensor, Te
     return left, right
 
 
-Result = TypeVar("Result", bound=tuple)
+Tensors = TypeVar("Tensors", bound=tuple)
 
 
 def piece_by_piece(
-    locate: Callable[..., Result], left: Tensor, right: Tensor, *others: Tensor | None, differentiated: bool
-) -> Result:
+    locate: Callable[..., Tensors], left: Tensor, right: Tensor, *others: Tensor | None, differentiated: bool
+) -> Tensors:
     """Call `locate(left, right, *others)`, in pieces that fit the cache where nothing is traced or differentiated.
 
     Args:
@@ -158,7 +158,7 @@ class PairFit(NamedTuple):
         usable: (..., N) which pairs have an optimum.
     """
 
-    fit: Fit
+    fit: PointFit
     scale: Tensor
     status: Tensor
     usable: Tensor

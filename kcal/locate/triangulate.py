@@ -25,7 +25,7 @@ class Triangulation(NamedTuple):
 
     Attributes:
         points: (..., N, 3) meters in the rig frame (the left camera's); zeros unless the status is OK.
-        status: (..., N) int8, codes of `PositionStatus`; never BEARING_ONLY, which `bearing_only` tells.
+        status: (..., N) int8, codes of `PositionStatus`; never BEARING_ONLY: see `bearing_only`.
         rays: (..., N, 3) unit vectors of the most likely direction from the left camera; its optical axis where the
             lens has no ray.
         reprojection: (..., N, 2) distance in px between mark and reprojected point, left and right; zeros unless OK.

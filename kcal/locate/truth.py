@@ -1,4 +1,4 @@
-"""Positions against the truth, where somebody knows it: read it, and say how far off each one is."""
+"""Compare positions with the truth where it is known."""
 
 from __future__ import annotations
 
@@ -48,10 +48,11 @@ def read_truth(path: str | Path, located: Located) -> Tensor:
 
 
 def position_errors(located: Located, truth: Tensor) -> list[tuple[float, float, bool] | None]:
-    """How far off each position is; None where position or truth is unknown.
+    """The error of each position; None where position or truth is unknown.
 
-    For each its level distance from the truth and its range minus the true one (meters), and whether the range interval
-    holds the true range.
+    Returns:
+        for each position its horizontal distance from the truth and its range minus the true one (meters), and whether
+        the range interval contains the true range.
 
     Example:
         >>> from kcal.lens.camera import Camera

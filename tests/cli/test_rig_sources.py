@@ -133,7 +133,7 @@ def test_from_survey_to_positions(
         == 0
     )
     printed = capsys.readouterr()
-    assert "95 % of the marks' noise and the calibration's errors and the mounting's errors" in printed.out
+    assert "95 % of the noise in the marks and of the errors in calibration and mounting" in printed.out
     rows = [line.split() for line in printed.out.splitlines() if line.startswith("t")]
     assert len(rows) == 5
     assert [row[-2] for row in rows].count("yes") >= 4

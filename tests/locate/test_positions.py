@@ -214,7 +214,7 @@ def test_covariances_circles_and_slopes_of_a_position() -> None:
         RIG, tensor([975.5, 539.5]), tensor([959.5, 539.5]), origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1,
         calibration=RigCovariance.of(RIG, pose=torch.diag(tensor(0, 1e-4, 0, 0, 0, 0) ** 2)),
     )  # fmt: skip
-    assert "calibration's errors; mounting errors are not included" in wide.interval_note
+    assert "and of the errors in calibration; errors in mounting are not included" in wide.interval_note
     assert wide.positions[0].covariance[1][1] == pytest.approx(along**2 + (1e-4 * 1e6 / 10) ** 2, rel=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""What a finished calibration tells besides the camera, in the form that travels with it and is stored."""
+"""Error bars and history of a finished calibration, in the form that travels with the camera and is stored."""
 
 from __future__ import annotations
 
