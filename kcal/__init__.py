@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from kcal.locate.localizer import StereoLocalizer
     from kcal.locate.multiview import TriangulateViews
     from kcal.locate.stereo import Triangulate
-    from kcal.nets.inverse import InverseNet
-    from kcal.nets.inverse_fit import train_inverse
+    from kcal.nets.inverse import InverseNet, train_inverse
     from kcal.solve.lm import LevenbergMarquardt, LMOptions
 
 __version__ = "0.1.0"
@@ -123,7 +122,7 @@ _HOME = {
     "save_camera": "kcal.io.camera_file",
     "save_rig": "kcal.io.rig_file",
     "solve_rig": "kcal.calibrate.rig.solve",
-    "train_inverse": "kcal.nets.inverse_fit",
+    "train_inverse": "kcal.nets.inverse",
     "undistort_maps": "kcal.lens.images",
 }
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kcal.errors import InputError
 
@@ -44,3 +45,10 @@ def keep_float64(fn: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
         return tensor.to(result.device) if tensor.dtype == torch.float64 else result
 
     return moved
+
+
+class Float64Module(nn.Module):
+    """A module whose float64 tensors keep their precision under `.half()`, `.float()` and `.to(dtype)`."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
+        return super()._apply(keep_float64(fn), recurse)

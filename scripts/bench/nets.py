@@ -29,7 +29,7 @@ from kcal.lens.inverse import InverseStart
 from kcal.lens.inverse_start import start_from, without_tilt
 from kcal.lens.projection import from_pixels
 from kcal.lens.residual import FieldGrid, FieldResidual, undo_components
-from kcal.nets.inverse_fit import InverseNetOptions, train_inverse
+from kcal.nets.inverse import InverseNetOptions, train_inverse
 from scripts.bench.lens import LENS, SIZE
 from scripts.bench.lens import build as build_hd
 from scripts.shared.page import write_section

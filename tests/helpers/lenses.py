@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -28,3 +30,14 @@ def parameters(model: str, lens: Tensor) -> Tensor:
     head = torch.tensor([2.1, 1.7, 0.3, -0.2, 0.05], dtype=torch.float64)
     assert lens.shape == (LensModel.named(model).size,)
     return torch.cat([head, lens])
+
+
+def numeric(function: Callable[[Tensor], Tensor], at: Tensor, step: float) -> Tensor:
+    """Fourth-order central differences of a function of a vector, output shape (*out, len(at))."""
+    columns = []
+    for i in range(at.numel()):
+        h = torch.zeros_like(at)
+        h.view(-1)[i] = step
+        near, far = function(at + h) - function(at - h), function(at + 2 * h) - function(at - 2 * h)
+        columns.append((8.0 * near - far) / (12.0 * step))
+    return torch.stack(columns, -1)

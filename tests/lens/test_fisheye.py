@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from kornia.geometry.camera import distort_points_kannala_brandt
-from test_jacobians import numeric
+from lenses import numeric
 from torch import Tensor
 from torch.func import jacfwd
 
