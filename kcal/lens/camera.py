@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from kcal.checks import as_points, keep_float64, require_finite
 from kcal.errors import InputError
 from kcal.lens.distortion import distort_components
-from kcal.lens.inverse import Inverse, InverseStart, prepare_inverse, undistort_components
+from kcal.lens.inverse import InverseStart, PreparedInverse, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
 from kcal.lens.outline import area, image_outline
 from kcal.lens.plane import plane_from_points, rays_from_plane
@@ -275,7 +275,7 @@ class Camera(nn.Module):
         u, v, finite = finite_or(u, v, cx, cy)
         x, y, settled = self._from_sensor(u, v, values)
         usable = finite if settled is None else finite & settled
-        ready = Inverse(self.valid_region, self.inverse_start, start)
+        ready = PreparedInverse(self.valid_region, self.inverse_start, start)
         return undistort_components(x, y, usable, values[..., 5:], self.model, ready)
 
     def normalize(self, pixels: Tensor, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
