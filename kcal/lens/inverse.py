@@ -16,7 +16,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.lens.distortion import check_coefficients, distort_components
 from kcal.lens.inverse_safeguarded import solve_safeguarded
-from kcal.lens.inverse_start import fit_start, start_from, without_tilt
+from kcal.lens.inverse_start import fit_start, start_from, undo_tilt
 from kcal.lens.model import LensModel
 from kcal.lens.newton import Jacobian, inverse_jacobian, is_solved, newton_step, squared_tolerance
 from kcal.lens.region import Region, in_region, valid_region
@@ -61,7 +61,7 @@ def undistort(
     Args:
         distorted: (..., N, 2) distorted coordinates on the plane z = 1.
         coefficients: (..., P).
-        model: a `LensModel` or a preset's name.
+        model: a `LensModel` or the name of one.
         prepared: from `prepare_inverse`; computed here if not given.
 
     Returns:
@@ -70,7 +70,7 @@ def undistort(
         coordinates are then zero.
 
     Raises:
-        InputError: wrong shapes or an integer dtype.
+        InputError: a wrong shape or an integer dtype.
 
     Example:
         >>> k = torch.tensor([-0.2, 0.0, 0.0, 0.0])
@@ -123,7 +123,7 @@ def _start(
     goal_x: Tensor, goal_y: Tensor, coefficients: Tensor, model: LensModel, ready: PreparedInverse
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor, LensModel]]:
     """Where Newton's method starts, and what it solves: the goal and the lens with the tilt undone."""
-    untilted = without_tilt(goal_x, goal_y, coefficients, model)
+    untilted = undo_tilt(goal_x, goal_y, coefficients, model)
     x, y, _, rest = untilted
     guess = start_from(x, y, rest, ready.start) if ready.guess is None else ready.guess(goal_x, goal_y)
     return *guess, untilted

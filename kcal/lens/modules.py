@@ -20,8 +20,9 @@ class LearnedStart(Protocol):
 class Unproject(nn.Module):
     """Map pixels to rays: `Camera.unproject` as a module.
 
-    The module of the other direction is `Camera` itself. Compiled and exported graphs take a fixed number of Newton steps for every point. The few pixels next to a fold that
-    have not converged by then are not valid there, although an eager call may find their rays.
+    The module of the other direction is `Camera` itself. Compiled and exported graphs take a fixed number of Newton
+    steps for every point. The few pixels next to a fold that have not converged by then are not valid there, although
+    an eager call may find their rays.
 
     `kcal.io.onnx_file.save_onnx` writes the module as ONNX.
 

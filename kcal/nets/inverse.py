@@ -17,7 +17,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.inverse_start import start_from, without_tilt
+from kcal.lens.inverse_start import start_from, undo_tilt
 from kcal.lens.plane import plane_from_points, rays_from_plane
 from kcal.lens.projection import from_pixels
 from kcal.lens.residual import undo_components
@@ -83,7 +83,7 @@ class InverseNet(Network):
     def closed_form(self, x: Tensor, y: Tensor) -> Tensor:
         """The guess that the network corrects: (..., 2, N) on the chart, for distorted coordinates x, y (..., N)."""
         if self.radial:
-            x, y, _, rest = without_tilt(x, y, self.coefficients, self.model)
+            x, y, _, rest = undo_tilt(x, y, self.coefficients, self.model)
             x, y = self.to_chart(*start_from(x, y, rest, self.start))
         return torch.stack([x, y], -2)
 
@@ -106,7 +106,7 @@ class InverseNet(Network):
         """Map distorted (..., N, 2) to undistorted coordinates (..., N, 2), approximately and without a validity mask.
 
         Raises:
-            InputError: wrong shapes or an integer dtype.
+            InputError: a wrong shape or an integer dtype.
         """
         distorted = as_points("distorted", distorted, 2)
         return torch.stack(self._corrected(distorted[..., 0], distorted[..., 1], torch.float64), -1)

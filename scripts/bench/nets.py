@@ -26,7 +26,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.inverse import InverseStart
-from kcal.lens.inverse_start import start_from, without_tilt
+from kcal.lens.inverse_start import start_from, undo_tilt
 from kcal.lens.newton import TOLERANCE
 from kcal.lens.projection import from_pixels
 from kcal.lens.residual import FieldGrid, FieldResidual, undo_components
@@ -82,7 +82,7 @@ def steps_from(camera: Camera, pixels: Tensor, start: InverseStart | None) -> Te
     if camera.field is not None:
         goal_x, goal_y, _ = undo_components(goal_x, goal_y, camera.field)
     if start is None:
-        x, y, _, rest = without_tilt(goal_x, goal_y, camera.coefficients, camera.model)
+        x, y, _, rest = undo_tilt(goal_x, goal_y, camera.coefficients, camera.model)
         x, y = start_from(x, y, rest, camera.inverse_start)
     else:
         x, y = start(goal_x, goal_y)
