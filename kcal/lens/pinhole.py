@@ -60,8 +60,8 @@ def new_pinhole(camera: Camera, alpha: float = 0.0, size: tuple[int, int] | None
     every border pixel of the new image.
 
     Parts of the image where the lens model folds or has no preimage do not count. A pinhole cannot show 180°: with a
-    very wide lens and alpha 1, the middle of the image becomes small. For such a lens, above all a fisheye, choose the new
-    focal length yourself: `Camera.build(..., model="pinhole")`.
+    very wide lens and alpha 1, the middle of the image becomes small. For such a lens, above all a fisheye, choose the
+    new focal length yourself: `Camera.build(..., model="pinhole")`.
 
     Args:
         camera: a camera or a batch of cameras.

@@ -10,11 +10,11 @@ import itertools
 
 import pytest
 import torch
-from lenses import MODELS, numeric, parameters, strong
+from lenses import MODELS, distort_with_jacobian, numeric, parameters, strong
 from torch import Tensor
 from torch.func import jacfwd
 
-from kcal.lens.distortion import distort, distort_components
+from kcal.lens.distortion import distort
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 
@@ -93,10 +93,8 @@ class TestProjection:
     def test_distortion_alone(self, model: str, kind: str) -> None:
         at = state(model, kind)[5:]
         normalized = (POINTS[:2] / POINTS[2]).T
-        found = distort_components(*normalized.T, at, LensModel.named(model), range(at.numel()))
-        by_point = torch.stack(found.point, -1).unflatten(-1, (2, 2))
-        by_coefficients = torch.stack([torch.stack(pair, -1) for pair in found.coefficients], -1)
-        assert torch.equal(torch.stack([found.x, found.y], -1), distort(normalized, at, model))
+        value, by_point, by_coefficients = distort_with_jacobian(normalized, at, model)
+        assert torch.equal(value, distort(normalized, at, model))
         torch.testing.assert_close(
             by_coefficients, jacfwd(lambda c: distort(normalized, c, model))(at), rtol=1e-12, atol=1e-14
         )
