@@ -291,8 +291,6 @@ class FieldResidual(Float64Module):
         >>> moved = field(point)
         >>> bool((moved[0, 0] > 0.1) & (moved[0, 0] < 0.11)), moved[1].tolist()
         (True, [30.0, 0.0])
-        >>> bool(torch.allclose(field.undo(moved)[0], point, rtol=0, atol=1e-13))
-        True
     """
 
     weights: Tensor
@@ -332,12 +330,6 @@ class FieldResidual(Float64Module):
         distorted = as_points("distorted", distorted, 2)
         moved = correct_components(distorted[..., 0], distorted[..., 1], self.field, slopes=False)
         return torch.stack([moved.x, moved.y], -1)
-
-    def undo(self, corrected: Tensor) -> tuple[Tensor, Tensor]:
-        """The inverse of `forward`: d (..., N, 2) and a mask (..., N) of solved points; see `undo_components`."""
-        corrected = as_points("corrected", corrected, 2)
-        x, y, solved = undo_components(corrected[..., 0], corrected[..., 1], self.field)
-        return torch.stack([x, y], -1), solved
 
     def extra_repr(self) -> str:
         """Units of each width and the largest displacement, for `repr`."""
