@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -42,14 +40,3 @@ def distort_with_jacobian(normalized: Tensor, lens: Tensor, model: str | LensMod
         by_lens[..., 0, i], by_lens[..., 1, i] = du, dv
     by_point = torch.stack(found.point, -1).unflatten(-1, (2, 2))
     return torch.stack([found.x, found.y], -1), by_point, by_lens
-
-
-def numeric(function: Callable[[Tensor], Tensor], at: Tensor, step: float) -> Tensor:
-    """Fourth-order central differences of a function of a vector, output shape (*out, len(at))."""
-    columns = []
-    for i in range(at.numel()):
-        h = torch.zeros_like(at)
-        h.view(-1)[i] = step
-        near, far = function(at + h) - function(at - h), function(at + 2 * h) - function(at - 2 * h)
-        columns.append((8.0 * near - far) / (12.0 * step))
-    return torch.stack(columns, -1)

@@ -10,7 +10,8 @@ import itertools
 
 import pytest
 import torch
-from lenses import MODELS, distort_with_jacobian, numeric, parameters, strong
+from differences import numeric
+from lenses import MODELS, distort_with_jacobian, parameters, strong
 from torch import Tensor
 from torch.func import jacfwd
 
