@@ -124,10 +124,10 @@ from kcal.locate.triangulate import Triangulate as Triangulate
 from kcal.locate.triangulate import Triangulation as Triangulation
 from kcal.locate.truth import position_errors as position_errors
 from kcal.locate.truth import read_truth as read_truth
+from kcal.nets.inverse import InverseFit as InverseFit
 from kcal.nets.inverse import InverseNet as InverseNet
-from kcal.nets.inverse_fit import InverseFit as InverseFit
-from kcal.nets.inverse_fit import InverseNetOptions as InverseNetOptions
-from kcal.nets.inverse_fit import train_inverse as train_inverse
+from kcal.nets.inverse import InverseNetOptions as InverseNetOptions
+from kcal.nets.inverse import train_inverse as train_inverse
 from kcal.report.budget import save_budget_picture as save_budget_picture
 from kcal.report.calibration import save_calibration_picture as save_calibration_picture
 from kcal.report.gallery import save_coverage as save_coverage

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kcal.errors import InputError
 
@@ -67,3 +68,10 @@ def as_covariance(name: str, matrix: Tensor | None, size: int) -> Tensor:
     if not torch.allclose(unit, unit.T, atol=1e-9) or (size and float(torch.linalg.eigvalsh(unit)[0]) < -1e-9 * size):
         raise InputError(f"{name}: not a covariance; it must be symmetric and have no negative eigenvalue")
     return 0.5 * (matrix + matrix.T)
+
+
+class Float64Module(nn.Module):
+    """A module whose float64 tensors keep their precision under `.half()`, `.float()` and `.to(dtype)`."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
+        return super()._apply(keep_float64(fn), recurse)
