@@ -17,7 +17,7 @@ from kcal.lens.distortion import distort_components
 from kcal.lens.inverse import InverseStart, PreparedInverse, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
 from kcal.lens.outline import image_outline, polygon_area
-from kcal.lens.plane import plane_from_points, rays_from_plane
+from kcal.lens.plane import entrance_pupil, plane_from_points, rays_from_plane
 from kcal.lens.projection import INTRINSICS, from_pixels, parameter_names, to_pixels
 from kcal.lens.region import Region, in_region, surely_in_region
 from kcal.lens.residual import Field
@@ -240,6 +240,8 @@ class Camera(Float64Module):
 
         def one(points: Tensor) -> tuple[Tensor, Tensor]:
             X, Y, Z = split_coordinates(points)
+            if self.model.learned:
+                Z = Z - entrance_pupil(X, Y, Z, coefficients).depth
             x, y = plane_from_points(X, Y, Z, self.model)
             with torch.no_grad():
                 valid, settled = self._possibly_valid(x, y, Z)
@@ -262,7 +264,7 @@ class Camera(Float64Module):
         """Points that are usable and within the outline of the valid region; whether that settles their validity."""
         # A point infinitely far ahead would be projected to the axis.
         usable = Z.abs() < torch.inf
-        if not self.model.fisheye:
+        if not self.model.wide:
             usable = usable & (Z > 0)
         if self.model.radial:
             return usable & self.valid_region.covers(x, y), True
@@ -307,7 +309,7 @@ class Camera(Float64Module):
 
         def one(pixels: Tensor) -> tuple[Tensor, Tensor]:
             x, y, valid = self._to_plane(pixels, start)
-            if self.model.fisheye:
+            if self.model.wide:
                 X, Y, Z = rays_from_plane(x, y, self.model)
                 valid = valid & (math.cos(math.radians(89.0)) < Z)
                 x, y = (torch.where(valid, value, 0.0) / torch.where(valid, Z, 1.0) for value in (X, Y))

@@ -25,7 +25,9 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
+from kcal.lens.learned import learned_terms
 from kcal.lens.model import LensModel
+from kcal.lens.zernike import unbind_last
 
 
 class Distorted(NamedTuple):
@@ -46,14 +48,6 @@ class Distorted(NamedTuple):
         """Determinant of the Jacobian: positive before the lens folds."""
         a, b, d, e = self.point
         return torch.addcmul(a * e, b, d, value=-1.0)
-
-
-def unbind_last(values: Tensor) -> tuple[Tensor, ...]:
-    """Split the last dimension of (..., P) into P tensors that broadcast against (..., N).
-
-    A single vector gives scalars without dimensions, which elementwise kernels take as constants.
-    """
-    return (values if values.ndim == 1 else values.unsqueeze(-2)).unbind(-1)
 
 
 def polynomial(s: Tensor, coefficients: Sequence[Tensor], constant: float, slopes: bool) -> tuple[Tensor, Tensor]:
@@ -89,6 +83,8 @@ def distort_components(
         wanted: indices of the coefficients by which `Distorted.coefficients` are derivatives, in that order.
         slopes: whether `Distorted.point` is needed; leaving it out saves a third of the work.
     """
+    if model.learned:
+        return Distorted(*learned_terms(x, y, coefficients, model.learned, wanted, slopes))
     c = unbind_last(coefficients)
     xx, xy, yy = x * x, x * y, y * y
     s = xx + yy

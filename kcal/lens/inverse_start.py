@@ -11,9 +11,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.lens.distortion import distort_components, polynomial, unbind_last
+from kcal.lens.distortion import distort_components, polynomial
 from kcal.lens.model import LensModel
 from kcal.lens.region import direction_limits
+from kcal.lens.zernike import unbind_last
 
 _DEGREE = 11
 _NODES = 96
@@ -33,9 +34,12 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = _D
     Returns:
         (..., 1 + 12): D², then the coefficients by rising powers of 2 √(1 - r_D² / D²) - 1.
     """
-    radial = LensModel(numerator=model.numerator, denominator=model.denominator, fisheye=model.fisheye)
-    chosen = [model.names.index(name) for name in radial.names]
-    own = coefficients[..., chosen]
+    if model.learned:
+        radial, kept = model, torch.tensor([name in model.learned.radial_names for name in model.names])
+        own = torch.where(kept.to(coefficients.device), coefficients, 0.0)
+    else:
+        radial = LensModel(numerator=model.numerator, denominator=model.denominator, fisheye=model.fisheye)
+        own = coefficients[..., [model.names.index(name) for name in radial.names]]
     limit = direction_limits(own, radial, 1)
 
     def distorted(radius: Tensor) -> Tensor:
@@ -50,7 +54,7 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = _D
         low, high = torch.where(beyond, low, middle), torch.where(beyond, middle, high)
     # Evenly in angle: for a wide lens, equal steps on the plane would nearly all lie at its edge.
     steps = torch.linspace(1.0 / _NODES, 1.0, _NODES, dtype=torch.float64, device=own.device)
-    radius = high * steps if model.fisheye else torch.tan(torch.atan(high) * steps)
+    radius = high * steps if model.wide else torch.tan(torch.atan(high) * steps)
     values = distorted(radius)
     largest = values[..., -1:] ** 2
     variable = 2.0 * torch.sqrt(torch.clamp(1.0 - values * values / largest, min=0.0)) - 1.0
@@ -68,7 +72,7 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = _D
 
 def start_from(x: Tensor, y: Tensor, model: LensModel, start: Tensor) -> tuple[Tensor, Tensor]:
     """Guess the undistorted coordinates for distorted ones (..., N) whose tilt is undone."""
-    if not (model.numerator or model.denominator):
+    if not (model.numerator or model.denominator or model.learned):
         return x, y
     largest, constant, *rest = unbind_last(start)
     square = torch.addcmul(x * x, y, y)

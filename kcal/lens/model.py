@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from kcal.errors import InputError
+from kcal.lens.learned import LearnedForm
 
 # The term and the order of every coefficient, in storage order: OpenCV's 14 first, so that its models are prefixes,
 # then the higher orders of Eq. 10 of the paper and their continuation. A name means the same in every model.
@@ -35,6 +36,7 @@ class LensModel:
         fisheye: whether the numerator's series acts on the angle θ from the axis instead of its tangent
             (Kannala-Brandt): r_D = θ (1 + k1 θ² + k2 θ⁴ + ...). A fisheye has no other terms, and its coefficients are
             called k1, k2, k3, ... in this order, as in `cv2.fisheye`.
+        learned: the constants of a hybrid lens (`kcal.lens.learned`), which has no other terms.
 
     Attributes:
         names: names of the coefficients in storage order: OpenCV's 14 first, then higher orders.
@@ -60,6 +62,7 @@ class LensModel:
     prism: int = 0
     tilt: bool = False
     fisheye: bool = False
+    learned: LearnedForm | None = None
 
     # Computed once: compilers cannot trace lazily computed attributes.
     names: tuple[str, ...] = dataclasses.field(init=False, repr=False, compare=False)
@@ -76,6 +79,8 @@ class LensModel:
                 raise InputError(f"lens model: {name} must be a whole number from 0 to {limit}, got {value!r}")
         if self.fisheye and (self.denominator or self.tangential or self.prism or self.tilt):
             raise InputError("lens model: a fisheye has a numerator only; leave out the other terms")
+        if self.learned and (self.numerator or self.denominator or self.tangential or self.prism or self.tilt):
+            raise InputError("lens model: a hybrid lens has its own terms only; leave out the others")
         highest = {
             "numerator": self.numerator, "denominator": self.denominator, "tangential": self.tangential,
             "prism_x": self.prism, "prism_y": self.prism, "tilt": self.tilt,
@@ -87,7 +92,7 @@ class LensModel:
             return tuple(i for i, term in enumerate(terms.values()) if term in chosen)
 
         derived = {
-            "names": tuple(terms),
+            "names": self.learned.names if self.learned else tuple(terms),
             "numerator_index": index("numerator"),
             "denominator_index": index("denominator"),
             "prism_index": (index("prism_x"), index("prism_y")),
@@ -118,7 +123,12 @@ class LensModel:
     @property
     def radial(self) -> bool:
         """Whether the lens is symmetric about its axis."""
-        return not (self.tangential or self.prism or self.tilt)
+        return not (self.tangential or self.prism or self.tilt or self.learned)
+
+    @property
+    def wide(self) -> bool:
+        """Whether points beside the camera and behind it have a place on the lens's plane."""
+        return self.fisheye or self.learned is not None
 
     @property
     def untilted(self) -> LensModel:
@@ -127,9 +137,11 @@ class LensModel:
 
     def contains(self, other: LensModel) -> bool:
         """Whether every lens of `other` is also a lens of this model."""
-        return self.fisheye == other.fisheye and set(other.names) <= set(self.names)
+        return self.fisheye == other.fisheye and self.learned == other.learned and set(other.names) <= set(self.names)
 
     def __str__(self) -> str:
+        if self.learned:
+            return "hybrid"
         kind = "fisheye " if self.fisheye else ""
         return next((name for name, model in PRESETS.items() if model == self), f"{kind}({', '.join(self.names)})")
 

@@ -13,11 +13,14 @@ exact to rounding, smooth on the axis, and uses only operations that every runti
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from kcal.lens.base_map import angle_over_radius, radius_over_angle
 from kcal.lens.model import LensModel
+from kcal.lens.zernike import unbind_last
 
 _HALVINGS = 4
 # Series of arctan t / t in t², for t up to tan(180° / 16) = 0.199.
@@ -32,6 +35,8 @@ _COS = [(-1.0) ** n / math.factorial(2 * n) for n in range(7)]
 
 def largest_radius(model: LensModel) -> float:
     """Largest distance of a point from the origin of the plane: tan 89°, or 179° in radians for a fisheye."""
+    if model.learned:
+        return model.learned.radius
     return math.radians(179.0) if model.fisheye else math.tan(math.radians(89.0))
 
 
@@ -63,22 +68,52 @@ def plane_from_points(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
         >>> plane_from_points(X, Y, Z, LensModel(fisheye=True))[0].tolist()  # 90° to the right, and straight ahead
         [1.5707963267948966, 0.0]
     """
-    if not model.fisheye:
+    if not model.wide:
         inverse = Z.reciprocal()
         return X * inverse, Y * inverse
     ratio = _angle_over_distance(X, Y, Z)
+    if model.learned:
+        ratio = ratio * radius_over_angle(model.learned.shape * ratio * ratio * (X * X + Y * Y))
     return ratio * X, ratio * Y
+
+
+class Pupil(NamedTuple):
+    """Depth (..., N) of the entrance pupil on the axis, meters, and its derivatives.
+
+    Attributes:
+        depth: ζ₁ θ² + ζ₂ θ⁴.
+        by_point: by X, Y and Z of the point.
+        square: θ².
+    """
+
+    depth: Tensor
+    by_point: tuple[Tensor, Tensor, Tensor]
+    square: Tensor
+
+
+def entrance_pupil(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor) -> Pupil:
+    """The entrance pupil of a hybrid lens (..., P) for points (..., N)."""
+    first, second = unbind_last(coefficients[..., 1:3])
+    ratio = _angle_over_distance(X, Y, Z)
+    across = X * X + Y * Y
+    square = ratio * ratio * across
+    by_square = first + 2.0 * second * square
+    # dθ² = 2 θ dθ, and dθ = (Z dρ - ρ dZ) / R².
+    rate = 2.0 * by_square * ratio / (across + Z * Z)
+    return Pupil((first + second * square) * square, (rate * Z * X, rate * Z * Y, -rate * across), square)
 
 
 def plane_with_slopes(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tuple[Tensor, ...]:
     """As `plane_from_points`, with the derivatives: x, y, ∂x/∂X, ∂x/∂Y = ∂y/∂X, ∂y/∂Y, ∂x/∂Z, ∂y/∂Z."""
-    if not model.fisheye:
+    if not model.wide:
         inverse = Z.reciprocal()
         x, y = X * inverse, Y * inverse
         return x, y, inverse, torch.zeros_like(x), inverse, -x * inverse, -y * inverse
     ratio = _angle_over_distance(X, Y, Z)
     square = X * X + Y * Y
     by_distance = (square + Z * Z).reciprocal()
+    if model.learned:
+        return _learned_with_slopes(X, Y, Z, ratio, square, by_distance, model.learned.shape)
     # h is the derivative of θ / ρ by ρ, divided by ρ; near the axis the difference would cancel.
     near = (square < _SERIES_LIMIT * Z * Z) & (Z > 0)
     depth = torch.where(near, Z, 1.0)
@@ -87,6 +122,20 @@ def plane_with_slopes(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
     cross = X * Y * h
     return (
         ratio * X, ratio * Y, ratio + X * X * h, cross, ratio + Y * Y * h, -X * by_distance, -Y * by_distance,
+    )  # fmt: skip
+
+
+def _learned_with_slopes(
+    X: Tensor, Y: Tensor, Z: Tensor, ratio: Tensor, square: Tensor, by_distance: Tensor, shape: float
+) -> tuple[Tensor, ...]:
+    ratio = ratio * radius_over_angle(shape * ratio * ratio * square)
+    # Along the direction across the axis the slope is m' Z / R², beside it m / ρ; on the axis both are equal.
+    rate = (1.0 + shape * ratio * ratio * square) * by_distance
+    inverse = torch.where(square > 0, square, 1.0).reciprocal()
+    xx, xy, yy = X * X * inverse, X * Y * inverse, Y * Y * inverse
+    difference = torch.where(square > 0, rate * Z - ratio, 0.0)
+    return (
+        ratio * X, ratio * Y, ratio + difference * xx, difference * xy, ratio + difference * yy, -rate * X, -rate * Y,
     )  # fmt: skip
 
 
@@ -99,9 +148,12 @@ def rays_from_plane(x: Tensor, y: Tensor, model: LensModel) -> tuple[Tensor, Ten
         [0.6, 0.0, 0.8]
     """
     square = x * x + y * y
-    if not model.fisheye:
+    if not model.wide:
         z = torch.sqrt(1.0 + square).reciprocal()
         return x * z, y * z, z
+    if model.learned:
+        stretch = angle_over_radius(model.learned.shape * square)
+        x, y, square = x * stretch, y * stretch, square * stretch * stretch
     near = square < _SERIES_LIMIT
     t = torch.where(near, square, 0.0)
     angle = torch.sqrt(torch.where(near, 1.0, square))

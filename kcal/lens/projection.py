@@ -16,10 +16,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.distortion import Distorted, distort_components, unbind_last
+from kcal.lens.distortion import Distorted, distort_components
 from kcal.lens.model import LensModel
-from kcal.lens.plane import plane_with_slopes
+from kcal.lens.plane import entrance_pupil, plane_with_slopes
 from kcal.lens.residual import Field, correct_components
+from kcal.lens.zernike import unbind_last
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "skew")
 
@@ -77,8 +78,11 @@ def project_components(
         field: a residual field after the lens, or None.
     """
     X, Y, Z = points[..., 0, :], points[..., 1, :], points[..., 2, :]
-    x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(X, Y, Z, model)
     offset = len(INTRINSICS)
+    pupil = entrance_pupil(X, Y, Z, parameters[..., offset:]) if model.learned else None
+    if pupil:
+        Z = Z - pupil.depth
+    x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(X, Y, Z, model)
     lens_wanted = [i - offset for i in wanted or () if i >= offset]
     lens = distort_components(x, y, parameters[..., offset:], model, lens_wanted)
     fx, fy, _, _, skew = unbind_last(parameters[..., :offset])
@@ -87,7 +91,7 @@ def project_components(
         # The field is one-to-one, so it neither makes nor removes folds.
         lens = _with_field(lens, field)
     pixels = torch.stack(to_pixels(lens.x, lens.y, parameters), -2)
-    if not model.fisheye:
+    if not model.wide:
         regular = regular & (Z > 0)
     if wanted is None:
         empty = pixels.new_zeros((*pixels.shape[:-2], 0, *pixels.shape[-2:]))
@@ -95,7 +99,7 @@ def project_components(
 
     a, b, d, e = lens.point
     ux, uy, vx, vy = fx * a + skew * d, fx * b + skew * e, fy * d, fy * e
-    if model.fisheye:
+    if model.wide:
         columns = [
             ux * x_X + uy * x_Y, vx * x_X + vy * x_Y, ux * x_Y + uy * y_Y, vx * x_Y + vy * y_Y,
             ux * x_Z + uy * y_Z, vx * x_Z + vy * y_Z,
@@ -104,6 +108,11 @@ def project_components(
         ux, uy, vx, vy = ux * x_X, uy * x_X, vx * x_X, vy * x_X
         columns = [ux, vx, uy, vy, -(ux * x + uy * y), -(vx * x + vy * y)]
     by_point = torch.stack(torch.broadcast_tensors(*columns), -2).unflatten(-2, (3, 2))
+
+    if pupil:
+        by_depth = by_point[..., 2, :, :]
+        moved = torch.stack(torch.broadcast_tensors(*pupil.by_point), -2)[..., None, :]
+        by_point = by_point - by_depth[..., None, :, :] * moved
 
     zero, one = torch.zeros_like(lens.x), torch.ones_like(lens.x)
     intrinsic = [(lens.x, zero), (zero, lens.y), (one, zero), (zero, one), (lens.y, zero)]
@@ -119,6 +128,10 @@ def project_components(
         by_camera = torch.stack(torch.broadcast_tensors(*flat), -2).unflatten(-2, (len(wanted), 2))
     else:
         by_camera = pixels.new_zeros((*pixels.shape[:-2], 0, *pixels.shape[-2:]))
+    if pupil:
+        for power, place in ((pupil.square, offset + 1), (pupil.square * pupil.square, offset + 2)):
+            if place in wanted:
+                by_camera[..., list(wanted).index(place), :, :] = -by_depth * power[..., None, :]
     return Projection(pixels, by_point, by_camera, regular)
 
 

@@ -19,10 +19,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.distortion import Distorted, check_coefficients, distort_components, unbind_last
+from kcal.lens.distortion import Distorted, check_coefficients, distort_components
 from kcal.lens.model import LensModel
 from kcal.lens.plane import largest_radius
 from kcal.lens.tracing import known_true
+from kcal.lens.zernike import unbind_last
 
 DIRECTIONS = 64
 _HARMONICS = 6
@@ -113,8 +114,8 @@ def direction_limits(coefficients: Tensor, model: LensModel, count: int) -> Tens
 
     # Outward in steps of 1/6°; then the interval is split in 32 again and again, until it is as narrow as rounding.
     top = largest_radius(model)
-    steps = torch.linspace(0, top if model.fisheye else math.atan(top), 535, dtype=torch.float64)
-    radii = (steps if model.fisheye else torch.tan(steps)).to(coefficients.device)[:, None].expand(-1, count)
+    steps = torch.linspace(0, top if model.wide else math.atan(top), 535, dtype=torch.float64)
+    radii = (steps if model.wide else torch.tan(steps)).to(coefficients.device)[:, None].expand(-1, count)
     fractions = torch.linspace(0, 1, 33, dtype=torch.float64, device=coefficients.device)[:, None]
     for _ in range(11):
         regular = count_regular(radii)

@@ -166,7 +166,7 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
             ahead, along, across = camera.rotation @ direction, camera.rotation @ e1, camera.rotation @ e2
         seen = ahead + inverse * shift[:, None]
         with torch.no_grad():
-            good = fixed.usable if camera.camera.model.fisheye else fixed.usable & (seen[..., 2, :] > 1e-6)
+            good = fixed.usable if camera.camera.model.wide else fixed.usable & (seen[..., 2, :] > 1e-6)
         if not known_true(good):
             # The axis is a harmless stand-in: no NaN in values or gradients.
             seen = torch.where(good[..., None, :], seen, seen.new_tensor([[0.0], [0.0], [1.0]]))

@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 
 def on_host(models: tuple[LensModel, ...], *tensors: Tensor) -> bool:
     """Whether the functions of this module may be used."""
-    return len(models) == 1 and not models[0].fisheye and plain_on_host(*tensors)
+    return len(models) == 1 and not models[0].wide and plain_on_host(*tensors)
 
 
 def camera_rows(points: Array, parameters: Array, model: LensModel, free: Free, out: Array, extra: int) -> Array:

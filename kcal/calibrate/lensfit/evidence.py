@@ -1,0 +1,169 @@
+"""How large each family of unknowns may be, told by the data: amplitudes and noise that maximize the evidence.
+
+Near a solution residuals are linear in lens and board: chi²(x) = c - 2 gᵀx + xᵀKx, poses eliminated. With Gaussian
+priors of variances D(h) the unknowns can be integrated out, and
+
+    -2 ln p(data | h, σ²) = ν ln σ² + rss/σ² + |y|² + ln |I + √D K √D / σ²|,   x = √D y at its best,
+
+is minimized over the hyperparameters h (log amplitudes and decays) and the noise, together with a broad log-normal
+prior on h (type-II maximum likelihood, MacKay 1992; restricted maximum likelihood, Patterson and Thompson 1971).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import minimize as lbfgs
+from torch import Tensor
+
+from kcal.calibrate.lensfit.board_modes import BoardModes
+from kcal.lens.learned import LearnedForm
+from kcal.lens.zernike import ASPECT, RADIAL
+
+# ln amplitude of the four families of fields (in units of R), decays per degree of radial and of other fields,
+# pupil (in units of the board's range), board: bending, stretch, print (in units of its extent): mean and sd of ln.
+_MEAN = np.log([5e-4, 3e-4, 5e-5, 4e-5, 0.5, 0.6, 2e-4, 5e-4, 5e-4, 2e-4])
+_SD = np.array([1.75, 1.5, 1.75, 1.75, 0.7, 0.5, 2.0, 1.5, 1.5, 1.5])
+_DECAY, _PUPIL, _BOARD = 4, 6, 7
+# Degree at which each family of fields begins: amplitudes refer to it.
+_FIRST_DEGREE = torch.tensor([5.0, 2.0, 3.0, 2.0, 1.0], dtype=torch.float64)
+# Unequal and skewed axes, in units of R: pixels are square.
+SQUARE, ANALOG = 1e-4, 2e-3
+# Of the principal point about the middle, in diagonals.
+_CENTER = 0.05
+
+
+class PriorFamilies(NamedTuple):
+    """Which hyperparameters set the standard deviation of each unknown: ln sd = ln unit + ln h[amplitude] - h[decay] x.
+
+    Attributes:
+        mean: (S,).
+        log_unit: (S,).
+        amplitude: (S,) index of the log amplitude, -1 where the standard deviation is the unit.
+        decay: (S,) index of the log decay, -1 where there is none.
+        degree: (S,) x above.
+    """
+
+    mean: Tensor
+    log_unit: Tensor
+    amplitude: Tensor
+    decay: Tensor
+    degree: Tensor
+
+    def deviation(self, h: Tensor) -> Tensor:
+        """(S,) prior standard deviations."""
+        out = self.log_unit + torch.where(self.amplitude >= 0, h[self.amplitude], 0.0)
+        return torch.exp(out - torch.where(self.decay >= 0, torch.exp(h[self.decay]), 0.0) * self.degree)
+
+    def slopes(self, h: Tensor) -> Tensor:
+        """(H, S) derivatives of 2 ln sd by h."""
+        out = torch.zeros(len(h), len(self.mean), dtype=h.dtype)
+        column = torch.arange(len(self.mean))
+        some = self.amplitude >= 0
+        out[self.amplitude[some], column[some]] = 2.0
+        some = self.decay >= 0
+        out[self.decay[some], column[some]] -= 2.0 * torch.exp(h[self.decay[some]]) * self.degree[some]
+        return out
+
+
+def prior_families(
+    form: LearnedForm,
+    focal: float,
+    board: BoardModes,
+    size: tuple[int, int],
+    distance: float,
+    square: float = SQUARE,
+) -> PriorFamilies:
+    """The priors of a camera and the board that it saw.
+
+    Args:
+        form: constants of the lens.
+        focal: F₀, pixels.
+        board: modes of the board.
+        size: of the image.
+        distance: typical distance of the board, meters.
+        square: standard deviation of aspect and skew.
+    """
+    diagonal = math.hypot(*size)
+    corner = math.atan(0.5 * diagonal / focal)
+    leading = [focal, _CENTER * diagonal, _CENTER * diagonal, 1.0 + 0.5 / corner**2, distance, distance]
+    mean = torch.zeros(len(leading) + len(form.modes) + len(board.unit), dtype=torch.float64)
+    mean[:4] = torch.tensor([focal, (size[0] - 1) / 2, (size[1] - 1) / 2, 0.5 - form.shape])
+    _, _, family, degree = torch.tensor(form.modes.real_modes).T
+    above = (degree - _FIRST_DEGREE[family]).clamp_min(-1.0)
+    field_unit = torch.full((len(family),), math.log(form.radius), dtype=torch.float64)
+    field_unit[family == ASPECT] += math.log(square)
+    none = torch.full((len(leading),), -1)
+    pupils = torch.tensor([-1, -1, -1, -1, _PUPIL, _PUPIL])
+    zeros = torch.zeros(len(leading), dtype=torch.float64)
+    return PriorFamilies(
+        mean,
+        torch.cat([torch.tensor(leading, dtype=torch.float64).log(), field_unit, board.unit.log()]),
+        torch.cat([pupils, torch.where(family == ASPECT, -1, family), _BOARD + board.family]),
+        torch.cat(
+            [
+                none,
+                torch.where(family == ASPECT, -1, torch.where(family == RADIAL, _DECAY, _DECAY + 1)),
+                torch.full_like(board.family, -1),
+            ]
+        ),
+        torch.cat([zeros, torch.where(family == ASPECT, 0.0, above), torch.zeros_like(board.unit)]),
+    )
+
+
+def typical_hyperparameters() -> Tensor:
+    """(H,) means of the hyperprior."""
+    return torch.from_numpy(_MEAN.copy())
+
+
+def maximize_evidence(
+    K: Tensor, g: Tensor, c: float, freedom: float, families: PriorFamilies, h: Tensor, variance: float
+) -> tuple[Tensor, float, float]:
+    """The hyperparameters and the noise variance of largest evidence, and its negative logarithm.
+
+    Args:
+        K: (S, S) information of the shared unknowns, poses eliminated.
+        g: (S,), see above.
+        c: likewise.
+        freedom: ν, residuals without those that poses take up.
+        families: the priors.
+        h: start.
+        variance: start.
+    """
+    K_, g_, S = K.numpy(), g.numpy(), len(g)
+
+    def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
+        here, log_variance = torch.from_numpy(v[:-1]), v[-1]
+        s2 = math.exp(log_variance)
+        d = families.deviation(here).numpy()
+        A = torch.from_numpy(K_ * d[:, None] * d / s2)
+        A.diagonal().add_(1.0)
+        root, info = torch.linalg.cholesky_ex(A)
+        if int(info):
+            return 1e30, np.zeros_like(v)
+        inverse = torch.linalg.solve_triangular(root, torch.eye(S, dtype=A.dtype), upper=False).numpy()
+        y = inverse.T @ (inverse @ (d * g_ / s2))
+        kept = (inverse**2).sum(0)
+        x = d * y
+        rss = c - 2 * g_ @ x + x @ (K_ @ x)
+        value = 0.5 * (freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
+        by_variance = 0.5 * (1 - y * y - kept)
+        by_h = families.slopes(here).numpy() @ by_variance
+        z = (v[:-1] - _MEAN) / _SD
+        by_noise = 0.5 * (freedom - (S - kept.sum()) - rss / s2)
+        return value + 0.5 * z @ z, np.append(by_h + z / _SD, by_noise)
+
+    start = np.append(h.numpy(), math.log(variance))
+    bounds = [(m - 5 * s, m + 5 * s) for m, s in zip(_MEAN, _SD, strict=True)] + [(start[-1] - 8, start[-1] + 8)]
+    found = lbfgs(
+        objective,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": 80, "ftol": 1e-8, "gtol": 2e-2},
+    )
+    return torch.from_numpy(found.x[:-1].copy()), math.exp(found.x[-1]), float(found.fun)
