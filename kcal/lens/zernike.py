@@ -134,7 +134,7 @@ class ZernikeModes:
         t = 2.0 * (x * x + y * y) - 1.0
         f = g = f_x = f_y = g_x = g_y = torch.zeros_like(x)
         f_t = g_t = f
-        power = torch.ones_like(x), torch.zeros_like(x)
+        power = before = torch.ones_like(x), torch.zeros_like(x)
         slices, matrix = self._layout
         coefficients = unbind_last(weights @ matrix.to(weights.device))
         for a, places in enumerate(slices):

@@ -70,7 +70,7 @@ class Curvature(NamedTuple):
         gram = self.local.new_zeros(len(self.local), L + S + 1, L + S + 1)
         gram[:, :L, :L], gram[:, :L, L:-1], gram[:, :L, -1] = self.local, self.coupling, local
         gram[0, L:-1, L:-1], gram[0, L:-1, -1] = self.shared, shared
-        return SchurLinearization(gram, L)
+        return SchurLinearization.of_gram(gram, L)
 
 
 def curvature(cost: SteppedCost, shared: Tensor, local: Tensor) -> tuple[State, Curvature]:

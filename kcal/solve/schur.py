@@ -19,26 +19,37 @@ class SchurLinearization:
     """Normal equations built from what each view contributes.
 
     Args:
-        gram: (..., V, L + S + 1, L + S + 1): for each view the products of its rows, see `SchurProblem.rows`.
-        local_size: L.
-        shared_rows: (..., S + 1, Q): likewise of Q residuals that depend on the shared parameters alone, or None.
+        local: (..., V, L, L) products of the derivatives by the local parameters.
+        right: (..., V, L, S + 1) their products with the derivatives by the shared ones, and last the gradient.
+        total: (..., S + 1, S + 1) summed over the views: products of the derivatives by the shared parameters, their
+            gradient, and the sum of squares.
     """
 
-    def __init__(self, gram: Tensor, local_size: int, shared_rows: Tensor | None = None) -> None:
-        L = local_size
-        total = gram[..., L:, L:].sum(-3)
-        if shared_rows is not None:
-            total = total + shared_rows @ shared_rows.transpose(-1, -2)
-        shared, gradient, right = total[..., :-1, :-1], total[..., :-1, -1], gram[..., :L, L:]
-        self._local_scale = _inverse_root(gram[..., :L, :L].diagonal(dim1=-2, dim2=-1))
+    def __init__(self, local: Tensor, right: Tensor, total: Tensor) -> None:
+        shared, gradient = total[..., :-1, :-1], total[..., :-1, -1]
+        self._local_scale = _inverse_root(local.diagonal(dim1=-2, dim2=-1))
         self._shared_scale = _inverse_root(shared.diagonal(dim1=-2, dim2=-1))
         scale = torch.cat([self._shared_scale, torch.ones_like(total[..., -1, -1:])], -1)
-        self._local = gram[..., :L, :L] * self._local_scale[..., :, None] * self._local_scale[..., None, :]
-        # The coupling with the shared parameters, and last the gradient.
+        self._local = local * self._local_scale[..., :, None] * self._local_scale[..., None, :]
         self._right = right * self._local_scale[..., :, None] * scale[..., None, None, :]
         self._shared = shared * self._shared_scale[..., :, None] * self._shared_scale[..., None, :]
         self._shared_gradient = gradient * self._shared_scale
         self.cost = 0.5 * total[..., -1, -1]
+
+    @classmethod
+    def of_gram(cls, gram: Tensor, local_size: int, shared_rows: Tensor | None = None) -> SchurLinearization:
+        """From what each view contributes.
+
+        Args:
+            gram: (..., V, L + S + 1, L + S + 1): for each view the products of its rows, see `SchurProblem.rows`.
+            local_size: L.
+            shared_rows: (..., S + 1, Q): rows of Q residuals that depend on the shared parameters alone, or None.
+        """
+        L = local_size
+        total = gram[..., L:, L:].sum(-3)
+        if shared_rows is not None:
+            total = total + shared_rows @ shared_rows.transpose(-1, -2)
+        return cls(gram[..., :L, :L], gram[..., :L, L:], total)
 
     def blend(self, mask: Tensor, other: SchurLinearization) -> SchurLinearization:
         """See `Linearization.blend`."""
@@ -160,4 +171,4 @@ class SchurProblem(ABC):
 
     def linearize(self, state: State) -> SchurLinearization:
         """See `Problem.linearize`."""
-        return SchurLinearization(self.gram(state), self.local_size, self.shared_rows(state))
+        return SchurLinearization.of_gram(self.gram(state), self.local_size, self.shared_rows(state))

@@ -68,7 +68,7 @@ class TestStep:
         lam = torch.full(size[0], damping, dtype=torch.float64)
         # Elements of a batch differ in damping, too.
         lam = lam * (1.0 + torch.arange(lam.numel(), dtype=torch.float64).reshape(size[0]))
-        schur, dense = SchurLinearization(rows @ rows.mT, local), DenseLinearization(residuals, jacobian)
+        schur, dense = SchurLinearization.of_gram(rows @ rows.mT, local), DenseLinearization(residuals, jacobian)
         torch.testing.assert_close(schur.cost, dense.cost, rtol=1e-13, atol=0)
         step, predicted = schur.step(lam)
         (expected,), decrease = dense.step(lam)
@@ -80,7 +80,7 @@ class TestStep:
         """(JᵀJ + λ diag JᵀJ) δ = -Jᵀr, and the predicted decrease is that of the linear model."""
         rows, local = random_rows(*size), size[2]
         residuals, jacobian = dense_form(rows, local)
-        step, predicted = SchurLinearization(rows @ rows.mT, local).step(
+        step, predicted = SchurLinearization.of_gram(rows @ rows.mT, local).step(
             torch.full(size[0], damping, dtype=torch.float64)
         )
         delta = joined(step)
@@ -103,7 +103,7 @@ def test_information_is_the_inverse_covariance(size: tuple) -> None:
     scaled = jacobian / norm[..., None, :]
     shared = size[3]
     covariance = torch.linalg.inv(scaled.transpose(-1, -2) @ scaled)[..., :shared, :shared]
-    matrix, scale = SchurLinearization(rows @ rows.mT, local).information()
+    matrix, scale = SchurLinearization.of_gram(rows @ rows.mT, local).information()
     torch.testing.assert_close(scale, 1.0 / norm[..., :shared], rtol=1e-13, atol=0)
     # Two inverses of matrices with condition numbers up to 1e4.
     torch.testing.assert_close(torch.linalg.inv(matrix), covariance, rtol=1e-9, atol=1e-9)
@@ -122,7 +122,7 @@ def test_columns_of_zeros_stay_and_disturb_nothing(where: str) -> None:
         rows[..., :3, :] = 0.0
     residuals, jacobian = dense_form(rows, 3)
     lam = torch.full((2,), 1e-3, dtype=torch.float64)
-    step, predicted = SchurLinearization(rows @ rows.mT, 3).step(lam)
+    step, predicted = SchurLinearization.of_gram(rows @ rows.mT, 3).step(lam)
     (expected,), decrease = DenseLinearization(residuals, jacobian).step(lam)
     delta = joined(step)
     dead = torch.linalg.vector_norm(jacobian, dim=-2) == 0
@@ -136,12 +136,12 @@ def test_what_cannot_be_solved_is_not_predicted() -> None:
     """NaN rows, and a damping too small for twin columns, give no finite prediction, in their element alone."""
     rows = random_rows((3,), 4, 2, 3, 9, spread=0.0)
     rows[1, 2, 0, 3] = torch.nan
-    _, predicted = SchurLinearization(rows @ rows.mT, 2).step(torch.full((3,), 1e-3, dtype=torch.float64))
+    _, predicted = SchurLinearization.of_gram(rows @ rows.mT, 2).step(torch.full((3,), 1e-3, dtype=torch.float64))
     assert torch.isfinite(predicted).tolist() == [True, False, True]
     # A shared column that is minus another's, and of a smooth size, so that rounding cannot hide it.
     rows = random_rows((), 4, 2, 3, 9, spread=0.0).sign()
     rows[..., 3, :] = -rows[..., 2, :]
-    _, predicted = SchurLinearization(rows @ rows.mT, 2).step(torch.tensor(-1e-3, dtype=torch.float64))
+    _, predicted = SchurLinearization.of_gram(rows @ rows.mT, 2).step(torch.tensor(-1e-3, dtype=torch.float64))
     assert not bool(torch.isfinite(predicted))
 
 

@@ -101,7 +101,7 @@ def covariance(linear: SchurLinearization, residual_count: int, parameter_count:
 
     Example:
         >>> gram = torch.eye(8, dtype=torch.float64)[None]  # one view: six of its pose, one shared, the residuals
-        >>> found = covariance(SchurLinearization(gram, 6), residual_count=9, parameter_count=7)
+        >>> found = covariance(SchurLinearization.of_gram(gram, 6), residual_count=9, parameter_count=7)
         >>> found.shared.tolist(), round(float(found.poses[0].trace()), 9)
         ([[0.5]], 3.0)
     """

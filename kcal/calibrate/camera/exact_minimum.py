@@ -46,7 +46,7 @@ class RecordedProblem(BoardProblem):
     def linearize(self, state: State) -> SchurLinearization:
         """See `Problem.linearize`."""
         rows = self.rows(state)
-        return SchurLinearization(rows @ rows.transpose(-1, -2), self.local_size, self.shared_rows(state))
+        return SchurLinearization.of_gram(rows @ rows.transpose(-1, -2), self.local_size, self.shared_rows(state))
 
 
 def settle(problem: BoardProblem, state: State) -> tuple[State, Curvature]:

@@ -127,7 +127,7 @@ class LearnedProblem:
         x = self.shared(state)
         prior = torch.diag(torch.cat([self.precision, (self.precision * x * x).sum()[None]]))
         prior[:-1, -1] = prior[-1, :-1] = self.precision * x
-        return SchurLinearization.of_blocks(torch.cat(local), torch.cat(right), total + prior)
+        return SchurLinearization(torch.cat(local), torch.cat(right), total + prior)
 
     def retract(self, state: LearnedState, step: State) -> LearnedState:
         """See `Problem.retract`."""

@@ -240,7 +240,7 @@ class RigProblem:
 
     def linearize(self, state: State) -> SchurLinearization:
         """See `Problem.linearize`."""
-        linear = SchurLinearization(self._gram(state), LOCAL_SIZE, self.term_rows(state))
+        linear = SchurLinearization.of_gram(self._gram(state), LOCAL_SIZE, self.term_rows(state))
         if self.loss is not None:
             linear.cost = self.cost(state)
         return linear

@@ -184,9 +184,9 @@ class TestWhatCannotBeComputed:
 
     def test_no_derivatives_no_covariance(self) -> None:
         gram = torch.eye(8, dtype=torch.float64)[None].clone()
-        assert uncertainty_of(SchurLinearization(gram, 6), 9, 7).computed
+        assert uncertainty_of(SchurLinearization.of_gram(gram, 6), 9, 7).computed
         gram[0, 3, 6] = gram[0, 6, 3] = torch.nan
-        found = uncertainty_of(SchurLinearization(gram, 6), 9, 7)
+        found = uncertainty_of(SchurLinearization.of_gram(gram, 6), 9, 7)
         assert not found.computed
         assert bool(found.covariance.isnan().all())
         assert not bool(found.determined.any())
