@@ -68,6 +68,7 @@ from kcal.lens.calibration import RigCalibration as RigCalibration
 from kcal.lens.calibration import RigSource as RigSource
 from kcal.lens.camera import Camera as Camera
 from kcal.lens.hybrid import HybridCamera as HybridCamera
+from kcal.lens.hybrid_terms import HybridForm as HybridForm
 from kcal.lens.images import Undistort as Undistort
 from kcal.lens.images import UndistortMaps as UndistortMaps
 from kcal.lens.images import undistort_maps as undistort_maps
@@ -84,6 +85,7 @@ from kcal.lens.residual import FieldScale as FieldScale
 from kcal.lens.rig import RigCovariance as RigCovariance
 from kcal.lens.rig import StereoRig as StereoRig
 from kcal.lens.spline import Spline as Spline
+from kcal.lens.zernike import ZernikeModes as ZernikeModes
 from kcal.locate.budget import BudgetErrors as BudgetErrors
 from kcal.locate.budget import RangeError as RangeError
 from kcal.locate.budget import planned_rig as planned_rig

@@ -17,33 +17,13 @@ import torch
 import kcal
 from kcal.errors import InputError
 from kcal.files import NativeFile
+from kcal.io.lens_record import LensOrders
 from kcal.io.record import CovarianceRecord, Record
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid import HybridCamera
-from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.residual import Field, FieldGrid, FieldResidual, FieldScale
-
-
-class LensOrders(Record):
-    """The lens model by its orders, so that the file does not depend on the names of presets."""
-
-    numerator: int
-    denominator: int
-    tangential: bool
-    prism: int
-    tilt: bool
-    fisheye: bool = False
-
-    @pydantic.model_validator(mode="after")
-    def _known(self) -> LensOrders:
-        self.model()
-        return self
-
-    def model(self) -> LensModel:
-        """The `LensModel` with these orders."""
-        return LensModel(**self.model_dump())
 
 
 class FieldScaleRecord(Record):
@@ -94,7 +74,8 @@ class ValidRegion(Record):
     Derived from the camera when the file is written, for readers that cannot compute it; kcal itself measures it again.
 
     Args:
-        radius: of the disc about the optical axis that is valid: on the plane z = 1; for a fisheye, radians off axis.
+        radius: of the disc about the optical axis that is valid: on the plane z = 1; for a fisheye, radians off axis;
+            for a hybrid lens, on the plane of its base projection.
         polygon: (u, v) pixels around the part of the image that has rays, clockwise as one sees it, to 0.001 px; the
             image's own outline where that is all of it.
     """
@@ -112,7 +93,7 @@ class CameraFile(NativeFile):
     Args:
         name: free text that tells cameras apart, for example `"left"`.
         image_size: (width, height) in pixels.
-        model: orders of the lens model.
+        model: orders of the lens model, or the constants of a hybrid lens.
         intrinsics: fx, fy, cx, cy, skew in pixels.
         coefficients: name -> value, exactly the names of the model.
         standard_deviations: name -> one sigma of the parameter, None where it was held fixed; the whole is None
@@ -159,7 +140,7 @@ class CameraFile(NativeFile):
         missing, unknown = [n for n in names if n not in value], [n for n in value if n not in names]
         if missing or unknown:
             what = f"{missing[0]} is missing" if missing else f"{unknown[0]} is unknown"
-            raise ValueError(f"{what}; the lens model needs exactly {', '.join(names) or 'nothing'}")
+            raise ValueError(f"{what}; the lens model needs exactly {_listed(names) or 'nothing'}")
         return {name: value[name] for name in names}
 
     @pydantic.field_validator("covariance")
@@ -170,7 +151,7 @@ class CameraFile(NativeFile):
         names = (*INTRINSICS, *info.data["model"].model().names)
         unknown = [name for name in value.names if name not in names]
         if unknown:
-            raise ValueError(f"covariance: {unknown[0]} is unknown; the lens model has {', '.join(names)}")
+            raise ValueError(f"covariance: {unknown[0]} is unknown; the lens model has {_listed(names)}")
         return value
 
     def covariance_matrix(self) -> torch.Tensor | None:
@@ -217,6 +198,12 @@ class CameraFile(NativeFile):
             except InputError as error:
                 raise ValueError(str(error)) from error
         return self
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    """Names for a message; the first and the last of very many."""
+    shown = names if len(names) <= 40 else (*names[:12], "...", names[-1])
+    return ", ".join(shown)
 
 
 def _residual(field: Field | None) -> tuple[FieldScaleRecord, ...] | None:
@@ -292,21 +279,13 @@ def camera_to_file(
             f"covariance: this camera has {len(camera.names)} parameters, got shape {tuple(covariance.shape)}"
         )
     stored = dict(zip(camera.names, values.tolist(), strict=True))
-    model = camera.model
     try:
         return CameraFile(
             name=known.name if name is None else name,
             image_size=camera.size,
-            model=LensOrders(
-                numerator=model.numerator,
-                denominator=model.denominator,
-                tangential=model.tangential,
-                prism=model.prism,
-                tilt=model.tilt,
-                fisheye=model.fisheye,
-            ),
+            model=LensOrders.of(camera.model),
             intrinsics=IntrinsicsRecord(**{key: stored[key] for key in INTRINSICS}),
-            coefficients={key: stored[key] for key in model.names},
+            coefficients={key: stored[key] for key in camera.model.names},
             standard_deviations=standard_deviations,
             covariance=None if covariance is None else CovarianceRecord.of(covariance.detach(), camera.names),
             residual=_residual(camera.field),

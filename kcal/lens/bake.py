@@ -80,11 +80,11 @@ def bake(camera: Camera, tolerance: float = 1e-3) -> LookupCamera:
         return torch.stack([p, q], -1), valid, valid & camera.inside(pixels)
 
     def reprojection_errors(pixels: Tensor, chart: Tensor, _: Tensor) -> Tensor:
-        again, seen = camera.project(rays_from_chart(chart))
+        again, seen = camera.project_rays(rays_from_chart(chart))
         return torch.where(seen, torch.linalg.vector_norm(again - pixels, dim=-1), torch.inf)
 
     def to_pixels(chart: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        pixels, valid = camera.project(rays_from_chart(chart))
+        pixels, valid = camera.project_rays(rays_from_chart(chart))
         return pixels, valid, valid & camera.inside(pixels)
 
     def pixel_errors(_: Tensor, pixels: Tensor, exact: Tensor) -> Tensor:

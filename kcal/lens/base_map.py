@@ -1,14 +1,19 @@
-"""The base projections: image radius by angle off the axis, with one shape number from pinhole to fisheye and beyond.
+"""Map angles to image radii by the base projection of the hybrid lens: one formula from pinhole to fisheye and beyond.
+
+A ray at the angle θ from the optical axis is seen at the distance m from the principal point, in focal lengths:
 
     m(θ; s) = tan(√s θ) / √s,   for s < 0: tanh(√-s θ) / √-s
 
-in focal lengths. s = 1 is the pinhole, 1/4 the stereographic and 0 the equidistant projection. m' = 1 + s m². All that
-is needed are ratios that are smooth on the axis, written in q = s θ² or in u = s m²:
+The shape s is 1 for the pinhole, 1/4 for the stereographic and 0 for the equidistant projection (m = θ). The derivative
+by θ is 1 + s m². The functions of this module are ratios that are smooth on the axis, in q = s θ² or u = s m²:
 
     T(q) = m / θ,   A(u) = θ / m,   G(u) = (A(u) (1 + u) - 1) / (2 u),   ∂m/∂s = m³ G(u)
 """
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -16,14 +21,16 @@ from torch import Tensor
 # Where |q| or |u| is below this, the series are exact to rounding and the closed forms cancel.
 _SMALL = 0.02
 _TAN = (1.0, 1 / 3, 2 / 15, 17 / 315, 62 / 2835, 1382 / 155925, 21844 / 6081075, 929569 / 638512875)
-_ARCTAN = tuple((-1.0) ** k / (2 * k + 1) for k in range(9))
-# (A(u)(1 + u) - 1) / (2 u) from A's series: coefficients of u^k are (a_k + a_(k+1)) / 2.
-_GROWTH = tuple(0.5 * (_ARCTAN[k] + _ARCTAN[k + 1]) for k in range(8))
-# The tangent grows without bound towards π/2: beyond this angle √s θ the projection is not used.
-STEEPEST = 1.5
+_ARCTAN = tuple((-1.0) ** k / (2 * k + 1) for k in range(11))
+# (A(u) (1 + u) - 1) / (2 u) from the series of A: the coefficient of u^k is (a_k + a_(k+1)) / 2.
+_GROWTH = tuple(0.5 * (_ARCTAN[k] + _ARCTAN[k + 1]) for k in range(10))
+# Largest angle √|s| θ: the tangent grows without bound towards π/2, and tanh is almost flat beyond 3.
+_STEEPEST, _FLATTEST = 1.5, 3.0
+_WIDEST = math.radians(179.0)
 
 
-def _series(coefficients: tuple[float, ...], t: Tensor) -> Tensor:
+def series(coefficients: Sequence[float], t: Tensor) -> Tensor:
+    """Evaluate a polynomial with the coefficients of t⁰, t¹, ..."""
     # As a tensor: ONNX would write plain numbers as float32.
     *rest, value = torch.tensor(coefficients, dtype=t.dtype, device=t.device).unbind()
     for coefficient in reversed(rest):
@@ -31,12 +38,26 @@ def _series(coefficients: tuple[float, ...], t: Tensor) -> Tensor:
     return value
 
 
+def largest_base_radius(shape: float) -> float:
+    """Largest m that the projection is used for: that of 179°, or of 86° / √s where the tangent becomes too steep.
+
+    Example:
+        >>> round(largest_base_radius(0.0), 3), round(largest_base_radius(1.0), 3)
+        (3.124, 13.808)
+    """
+    root = math.sqrt(abs(shape))
+    # A little less than where `radius_over_angle` holds the tangent.
+    limit = 0.999 * _STEEPEST if shape > 0 else _FLATTEST
+    angle = min(_WIDEST, limit / root) if root else _WIDEST
+    return float(radius_over_angle(torch.tensor(shape * angle * angle, dtype=torch.float64))) * angle
+
+
 def radius_over_angle(q: Tensor) -> Tensor:
-    """T(q) = m / θ for q = s θ²; the tangent is held at its value at `STEEPEST`."""
+    """T(q) = m / θ for q = s θ²; the tangent is held beyond an angle √s θ of 86°."""
     slow = q.abs() < _SMALL
     root = torch.sqrt(torch.where(slow, 1.0, q).abs())
-    closed = torch.where(q > 0, torch.tan(root.clamp(max=STEEPEST)), torch.tanh(root)) / root
-    return torch.where(slow, _series(_TAN, torch.where(slow, q, 0.0)), closed)
+    closed = torch.where(q > 0, torch.tan(root.clamp(max=_STEEPEST)), torch.tanh(root)) / root
+    return torch.where(slow, series(_TAN, torch.where(slow, q, 0.0)), closed)
 
 
 def angle_over_radius(u: Tensor) -> Tensor:
@@ -44,7 +65,7 @@ def angle_over_radius(u: Tensor) -> Tensor:
     slow = u.abs() < _SMALL
     root = torch.sqrt(torch.where(slow, 1.0, u).abs())
     closed = torch.where(u > 0, torch.atan(root), torch.atanh(torch.where(u < 0, root, 0.0))) / root
-    return torch.where(slow, _series(_ARCTAN, torch.where(slow, u, 0.0)), closed)
+    return torch.where(slow, series(_ARCTAN, torch.where(slow, u, 0.0)), closed)
 
 
 def growth_by_shape(u: Tensor) -> tuple[Tensor, Tensor]:
@@ -55,4 +76,4 @@ def growth_by_shape(u: Tensor) -> tuple[Tensor, Tensor]:
     value = (ratio * (1.0 + far) - 1.0) / (2.0 * far)
     slope = (0.5 * ratio - 1.5 * value) / far
     by_u = tuple(k * c for k, c in enumerate(_GROWTH))[1:]
-    return torch.where(slow, _series(_GROWTH, near), value), torch.where(slow, _series(by_u, near), slope)
+    return torch.where(slow, series(_GROWTH, near), value), torch.where(slow, series(by_u, near), slope)

@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcal.checks import Float64Module, as_points, require_finite
+from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration, UntilChanged
+from kcal.lens.camera_parameters import CameraParameters
 from kcal.lens.distortion import distort_components
 from kcal.lens.inverse import InverseStart, PreparedInverse, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
 from kcal.lens.outline import image_outline, polygon_area
-from kcal.lens.plane import entrance_pupil, plane_from_points, rays_from_plane
-from kcal.lens.projection import INTRINSICS, from_pixels, parameter_names, to_pixels
+from kcal.lens.plane import angle_over_distance, plane_from_points, rays_from_plane
+from kcal.lens.projection import from_pixels, to_pixels
+from kcal.lens.pupil import pupil_depth, ray_starts
 from kcal.lens.region import Region, in_region, surely_in_region
 from kcal.lens.residual import Field
 from kcal.lens.tracing import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
 
 
-class Camera(Float64Module):
+class Camera(CameraParameters):
     """Project points to pixels (`project`) and unproject pixels to rays (`unproject`), both with a validity mask.
 
     Make one from plain numbers with `Camera.build`, or load one with `kcal.load_camera`.
@@ -60,26 +61,13 @@ class Camera(Float64Module):
         True
     """
 
-    params: Tensor
-    free_mask: Tensor
     valid_radius: Tensor
     valid_edge: Tensor
     inverse_start: Tensor
     calibration = UntilChanged[CameraCalibration](lambda camera, value: value.check(len(camera.names)))
 
     def __init__(self, parameters: Tensor, *, size: tuple[int, int], model: LensModel | str = "opencv5") -> None:
-        super().__init__()
-        self.model = LensModel.named(model)
-        self.size = (int(size[0]), int(size[1]))
-        parameters = as_points("camera parameters", parameters, 5 + self.model.size)
-        require_finite("camera parameters", parameters)
-        if not bool((parameters[..., :2] > 0).all()):
-            raise InputError("camera parameters: focal lengths must be positive, in pixels")
-        if min(self.size) < 1:
-            raise InputError(f"image size {self.size}: width and height must be positive")
-        self.params = nn.Parameter(parameters.detach().clone(), requires_grad=False)
-        everything = torch.ones(5 + self.model.size, dtype=torch.bool, device=parameters.device)
-        self.register_buffer("free_mask", everything)
+        super().__init__(parameters, size, LensModel.named(model))
         # They follow from the parameters, so they are not part of the saved state.
         for name, value in self._measured_region().items():
             self.register_buffer(name, value, persistent=False)
@@ -103,76 +91,6 @@ class Camera(Float64Module):
         lens += [0.0] * (model.size - len(lens))
         values = [*map(float, focal), *map(float, center), float(skew), *lens]
         return cls(torch.tensor(values, dtype=torch.float64), size=size, model=model)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters in storage order: fx, fy, cx, cy, skew, then the lens coefficients."""
-        return parameter_names(self.model)
-
-    @property
-    def values(self) -> Tensor:
-        """(..., 5 + P) the parameters; gradients reach only the free ones."""
-        if not self.params.requires_grad:
-            return self.params
-        return torch.where(self.free_mask, self.params, self.params.detach())
-
-    @property
-    def free_names(self) -> tuple[str, ...]:
-        """Names of the parameters that receive gradients; empty while the camera is frozen."""
-        if not self.params.requires_grad:
-            return ()
-        return tuple(name for name, free in zip(self.names, self.free_mask.tolist(), strict=True) if free)
-
-    def free(self, *names: str) -> Self:
-        """Let gradients reach these parameters only; without names, all but skew. Return the camera itself.
-
-        The choice is part of the state (`free_mask`). Frozen parameters get a gradient of exactly zero, but weight
-        decay in an optimizer would still move them. `requires_grad_(False)` freezes the whole camera again.
-
-        Raises:
-            InputError: an unknown parameter name.
-
-        Example:
-            >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480)).free("fx", "k1")
-            >>> camera.project(torch.tensor([[1.0, 1.0, 4.0]]))[0].sum().backward()
-            >>> [name for name, g in zip(camera.names, camera.params.grad) if g != 0]
-            ['fx', 'k1']
-        """
-        unknown = [name for name in names if name not in self.names]
-        if unknown:
-            raise InputError(f"unknown parameter {unknown[0]!r}: the camera has {', '.join(self.names)}")
-        chosen = names or tuple(name for name in self.names if name != "skew")
-        with torch.no_grad():
-            self.free_mask.copy_(torch.tensor([name in chosen for name in self.names]))
-        return self.requires_grad_(True)
-
-    @property
-    def focal(self) -> Tensor:
-        """(..., 2) focal lengths fx, fy in pixels."""
-        return self.values[..., 0:2]
-
-    @property
-    def center(self) -> Tensor:
-        """(..., 2) principal point cx, cy in pixels."""
-        return self.values[..., 2:4]
-
-    @property
-    def coefficients(self) -> Tensor:
-        """(..., P) lens coefficients in the order of `model.names`."""
-        return self.values[..., len(INTRINSICS) :]
-
-    @property
-    def matrix(self) -> Tensor:
-        """(..., 3, 3) intrinsic matrix A of Eq. 3."""
-        fx, fy, cx, cy, skew = self.values[..., :5].unbind(-1)
-        zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-        return torch.stack([fx, skew, cx, zero, fy, cy, zero, zero, one], -1).unflatten(-1, (3, 3))
-
-    @property
-    def fingerprint(self) -> str:
-        """Twelve hex digits that change with any parameter, the model or the image size."""
-        text = repr((self.size, self.model.names, self.params.detach().flatten().tolist()))
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     @property
     def field(self) -> Field | None:
@@ -221,13 +139,17 @@ class Camera(Float64Module):
     def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
         """Map points to pixels.
 
+        The entrance pupil of a hybrid lens moves with the angle, so that the distance of a point counts, too. For
+        directions there is `project_rays`.
+
         Args:
-            points_cam: (..., N, 3) in the camera frame.
+            points_cam: (..., N, 3) in the camera frame, meters.
 
         Returns:
             pixels (..., N, 2) and valid (..., N). Valid points are finite, in front of the camera (for a fisheye:
-            within its monotone angle), and not beyond a fold of the lens model. They need not lie inside the image;
-            `inside` tells that. Pixels that are not valid are set to the principal point.
+            within its monotone angle; for a hybrid lens: on the disc of its field), and not beyond a fold of the lens
+            model. They need not lie inside the image; `inside` tells that. Pixels that are not valid are set to the
+            principal point.
 
         Raises:
             InputError: a wrong shape or an integer dtype.
@@ -240,16 +162,15 @@ class Camera(Float64Module):
 
         def one(points: Tensor) -> tuple[Tensor, Tensor]:
             X, Y, Z = split_coordinates(points)
-            if self.model.learned:
-                Z = Z - entrance_pupil(X, Y, Z, coefficients).depth
-            x, y = plane_from_points(X, Y, Z, self.model)
+            x, y, usable = self._plane_from_points(X, Y, Z)
             with torch.no_grad():
                 valid, settled = self._possibly_valid(x, y, Z)
+                valid = valid if usable is None else valid & usable
                 all_valid = known_true(valid)
             if not all_valid:
                 # The axis as a stand-in keeps NaN out of values and gradients.
                 X, Y, Z = torch.where(valid, X, 0.0), torch.where(valid, Y, 0.0), torch.where(valid, Z, 1.0)
-                x, y = plane_from_points(X, Y, Z, self.model)
+                x, y, _ = self._plane_from_points(X, Y, Z)
             lens = distort_components(x, y, coefficients, self.model, slopes=not (settled or differentiated))
             if not settled:
                 with torch.no_grad():
@@ -259,6 +180,53 @@ class Camera(Float64Module):
             return pixels if all_valid and settled else torch.where(valid[..., None], pixels, center), valid
 
         return self._in_chunks(one, points)
+
+    def project_rays(self, rays: Tensor) -> tuple[Tensor, Tensor]:
+        """Map directions (..., N, 3), that is points at infinity, to pixels (..., N, 2), and valid (..., N).
+
+        This is the inverse of `unproject`. It differs from `project` for a hybrid lens only.
+
+        Raises:
+            InputError: a wrong shape or an integer dtype.
+        """
+        # Scaling by a power of two rounds nothing. At 10¹² m an entrance pupil has no effect.
+        return self.project(as_points("rays", rays, 3) * 2.0**40)
+
+    def ray_origins(self, rays: Tensor) -> Tensor:
+        """Find where rays start: (0, 0, ζ₁ θ² + ζ₂ θ⁴) for a hybrid lens (`kcal.lens.pupil`), the origin for others.
+
+        With a ray of `unproject`, every point `ray_origin + t * ray` with t > 0 is projected to the pixel of the ray,
+        except for t of the order of the pupil's movement, where rays intersect each other.
+
+        Args:
+            rays: (..., N, 3) directions in the camera frame, of any length.
+
+        Returns:
+            (..., N, 3) in the camera frame, meters.
+
+        Raises:
+            InputError: a wrong shape or an integer dtype.
+
+        Example:
+            >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
+            >>> camera.ray_origins(torch.tensor([[0.0, 0.6, 0.8]])).tolist()
+            [[0.0, 0.0, 0.0]]
+        """
+        rays = as_points("rays", rays, 3)
+        X, Y, Z = rays.unbind(-1)
+        depth = torch.zeros_like(Z)
+        if self.model.hybrid:
+            ratio = angle_over_distance(X, Y, Z)
+            depth = pupil_depth(ratio * ratio * (X * X + Y * Y), self.coefficients)
+        zero = torch.zeros_like(depth)
+        return torch.stack([zero, zero, depth], -1)
+
+    def _plane_from_points(self, X: Tensor, Y: Tensor, Z: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Map points (..., N) to the plane of the lens, with a mask of where that was found; None: everywhere."""
+        if not self.model.hybrid:
+            return *plane_from_points(X, Y, Z, self.model), None
+        depth, found = ray_starts(X, Y, Z, self.coefficients)
+        return *plane_from_points(X, Y, Z - depth, self.model), found
 
     def _possibly_valid(self, x: Tensor, y: Tensor, Z: Tensor) -> tuple[Tensor, bool]:
         """Points that are usable and within the outline of the valid region; whether that settles their validity."""
@@ -326,9 +294,9 @@ class Camera(Float64Module):
                 affects run time only, not the result.
 
         Returns:
-            rays (..., N, 3) of length one, and valid (..., N). A pixel that is not finite or that the lens model cannot
-            produce is not valid, and its ray is the optical axis. Gradients by pixels and parameters follow the
-            implicit function theorem.
+            rays (..., N, 3) of length one, and valid (..., N). They are directions; `ray_origins` tells where they
+            start. A pixel that is not finite or that the lens model cannot produce is not valid, and its ray is the
+            optical axis. Gradients by pixels and parameters follow the implicit function theorem.
 
         Raises:
             InputError: a wrong shape or an integer dtype.

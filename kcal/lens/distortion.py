@@ -25,7 +25,7 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
-from kcal.lens.learned import learned_terms
+from kcal.lens.hybrid_terms import hybrid_terms
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import unbind_last
 
@@ -83,8 +83,8 @@ def distort_components(
         wanted: indices of the coefficients by which `Distorted.coefficients` are derivatives, in that order.
         slopes: whether `Distorted.point` is needed; leaving it out saves a third of the work.
     """
-    if model.learned:
-        return Distorted(*learned_terms(x, y, coefficients, model.learned, wanted, slopes))
+    if model.hybrid:
+        return Distorted(*hybrid_terms(x, y, coefficients, model.hybrid, wanted, slopes))
     c = unbind_last(coefficients)
     xx, xy, yy = x * x, x * y, y * y
     s = xx + yy

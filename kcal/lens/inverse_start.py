@@ -34,8 +34,8 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = _D
     Returns:
         (..., 1 + 12): D², then the coefficients by rising powers of 2 √(1 - r_D² / D²) - 1.
     """
-    if model.learned:
-        radial, kept = model, torch.tensor([name in model.learned.radial_names for name in model.names])
+    if model.hybrid:
+        radial, kept = model, torch.tensor([name in model.hybrid.radial_names for name in model.names])
         own = torch.where(kept.to(coefficients.device), coefficients, 0.0)
     else:
         radial = LensModel(numerator=model.numerator, denominator=model.denominator, fisheye=model.fisheye)
@@ -72,7 +72,7 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = _D
 
 def start_from(x: Tensor, y: Tensor, model: LensModel, start: Tensor) -> tuple[Tensor, Tensor]:
     """Guess the undistorted coordinates for distorted ones (..., N) whose tilt is undone."""
-    if not (model.numerator or model.denominator or model.learned):
+    if not (model.numerator or model.denominator or model.hybrid):
         return x, y
     largest, constant, *rest = unbind_last(start)
     square = torch.addcmul(x * x, y, y)

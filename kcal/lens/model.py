@@ -1,11 +1,11 @@
-"""Which distortion terms a lens model has, and the names and order of its coefficients."""
+"""Which terms a lens model has, and the names and order of its coefficients."""
 
 from __future__ import annotations
 
 import dataclasses
 
 from kcal.errors import InputError
-from kcal.lens.learned import LearnedForm
+from kcal.lens.hybrid_terms import HybridForm
 
 # The term and the order of every coefficient, in storage order: OpenCV's 14 first, so that its models are prefixes,
 # then the higher orders of Eq. 10 of the paper and their continuation. A name means the same in every model.
@@ -36,7 +36,8 @@ class LensModel:
         fisheye: whether the numerator's series acts on the angle θ from the axis instead of its tangent
             (Kannala-Brandt): r_D = θ (1 + k1 θ² + k2 θ⁴ + ...). A fisheye has no other terms, and its coefficients are
             called k1, k2, k3, ... in this order, as in `cv2.fisheye`.
-        learned: the constants of a hybrid lens (`kcal.lens.learned`), which has no other terms.
+        hybrid: the constants of a hybrid lens (base projection, field and entrance pupil; `kcal.lens.hybrid_terms`),
+            which has no other terms.
 
     Attributes:
         names: names of the coefficients in storage order: OpenCV's 14 first, then higher orders.
@@ -47,7 +48,7 @@ class LensModel:
         untilted_index: indices of the coefficients of `untilted`.
 
     Raises:
-        InputError: an order out of range, or a fisheye with other terms.
+        InputError: an order out of range, or a fisheye or hybrid lens with other terms.
 
     Example:
         >>> LensModel(numerator=3, tangential=True).names
@@ -62,7 +63,7 @@ class LensModel:
     prism: int = 0
     tilt: bool = False
     fisheye: bool = False
-    learned: LearnedForm | None = None
+    hybrid: HybridForm | None = None
 
     # Computed once: compilers cannot trace lazily computed attributes.
     names: tuple[str, ...] = dataclasses.field(init=False, repr=False, compare=False)
@@ -79,8 +80,9 @@ class LensModel:
                 raise InputError(f"lens model: {name} must be a whole number from 0 to {limit}, got {value!r}")
         if self.fisheye and (self.denominator or self.tangential or self.prism or self.tilt):
             raise InputError("lens model: a fisheye has a numerator only; leave out the other terms")
-        if self.learned and (self.numerator or self.denominator or self.tangential or self.prism or self.tilt):
-            raise InputError("lens model: a hybrid lens has its own terms only; leave out the others")
+        others = (self.numerator, self.denominator, self.tangential, self.prism, self.tilt, self.fisheye)
+        if self.hybrid and any(others):
+            raise InputError("lens model: a hybrid lens has terms of its own; leave out the others")
         highest = {
             "numerator": self.numerator, "denominator": self.denominator, "tangential": self.tangential,
             "prism_x": self.prism, "prism_y": self.prism, "tilt": self.tilt,
@@ -92,7 +94,7 @@ class LensModel:
             return tuple(i for i, term in enumerate(terms.values()) if term in chosen)
 
         derived = {
-            "names": self.learned.names if self.learned else tuple(terms),
+            "names": self.hybrid.names if self.hybrid else tuple(terms),
             "numerator_index": index("numerator"),
             "denominator_index": index("denominator"),
             "prism_index": (index("prism_x"), index("prism_y")),
@@ -123,12 +125,12 @@ class LensModel:
     @property
     def radial(self) -> bool:
         """Whether the lens is symmetric about its axis."""
-        return not (self.tangential or self.prism or self.tilt or self.learned)
+        return not (self.tangential or self.prism or self.tilt or self.hybrid)
 
     @property
     def wide(self) -> bool:
         """Whether points beside the camera and behind it have a place on the lens's plane."""
-        return self.fisheye or self.learned is not None
+        return self.fisheye or self.hybrid is not None
 
     @property
     def untilted(self) -> LensModel:
@@ -137,10 +139,10 @@ class LensModel:
 
     def contains(self, other: LensModel) -> bool:
         """Whether every lens of `other` is also a lens of this model."""
-        return self.fisheye == other.fisheye and self.learned == other.learned and set(other.names) <= set(self.names)
+        return self.fisheye == other.fisheye and self.hybrid == other.hybrid and set(other.names) <= set(self.names)
 
     def __str__(self) -> str:
-        if self.learned:
+        if self.hybrid:
             return "hybrid"
         kind = "fisheye " if self.fisheye else ""
         return next((name for name, model in PRESETS.items() if model == self), f"{kind}({', '.join(self.names)})")

@@ -23,12 +23,12 @@ _SIDE_SAMPLES = 129
 _WIDEST = math.radians(89.0)
 
 
-def source_pixels(camera: Camera, points_cam: Tensor) -> tuple[Tensor, Tensor]:
-    """Project points to pixels, and say whether the image has a value there.
+def source_pixels(camera: Camera, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Project directions to pixels, and say whether the image has a value there.
 
     Args:
         camera: the camera that took the image.
-        points_cam: (..., N, 3), rays for example.
+        rays: (..., N, 3) of any length.
 
     Returns:
         pixels (..., N, 2) and seen (..., N): valid for the lens, and between the centers of the outer pixels, so that
@@ -40,7 +40,7 @@ def source_pixels(camera: Camera, points_cam: Tensor) -> tuple[Tensor, Tensor]:
         >>> pixels[0].tolist(), seen.tolist()
         ([75.0, 40.0], [True, True, False])
     """
-    pixels, valid = camera.project(points_cam)
+    pixels, valid = camera.project_rays(rays)
     last = torch.tensor(camera.size, dtype=pixels.dtype, device=pixels.device) - 1
     near = ((pixels >= -_SLACK) & (pixels <= last + _SLACK)).all(-1)
     # On the bounds themselves, clamp still passes gradients.
@@ -212,7 +212,7 @@ def _valid_rim(camera: Camera) -> Tensor:
     # Bisection to rounding.
     for _ in range(52):
         middle = (low + high) / 2
-        _, valid = camera.project(_on_plane(circle * torch.tan(middle)[..., None]))
+        _, valid = camera.project_rays(_on_plane(circle * torch.tan(middle)[..., None]))
         low, high = torch.where(valid, middle, low), torch.where(valid, high, middle)
     return circle * torch.tan(low)[..., None]
 

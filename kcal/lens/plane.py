@@ -8,19 +8,20 @@ angle θ from the optical axis lies at distance θ from the origin, in the same 
 so that points beside and behind the camera have a place too (Kannala and Brandt, 2006). For θ / ρ, the angle is halved
 four times, tan(θ/2) = ρ / (R + Z) and tan(φ/2) = tan φ / (1 + √(1 + tan² φ)), and a series does the rest. This is
 exact to rounding, smooth on the axis, and uses only operations that every runtime has in float64.
+
+A hybrid lens works on the plane of its base projection (`kcal.lens.base_map`), where that point lies at the distance
+m(θ). Its points are those of the camera frame minus the start of their rays (`kcal.lens.pupil`).
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.lens.base_map import angle_over_radius, radius_over_angle
+from kcal.lens.base_map import angle_over_radius, radius_over_angle, series
 from kcal.lens.model import LensModel
-from kcal.lens.zernike import unbind_last
 
 _HALVINGS = 4
 # Series of arctan t / t in t², for t up to tan(180° / 16) = 0.199.
@@ -34,28 +35,20 @@ _COS = [(-1.0) ** n / math.factorial(2 * n) for n in range(7)]
 
 
 def largest_radius(model: LensModel) -> float:
-    """Largest distance of a point from the origin of the plane: tan 89°, or 179° in radians for a fisheye."""
-    if model.learned:
-        return model.learned.radius
+    """Largest distance of a point from the origin of the plane; tan 89° for perspective lenses, 179° for a fisheye."""
+    if model.hybrid:
+        return model.hybrid.reach
     return math.radians(179.0) if model.fisheye else math.tan(math.radians(89.0))
 
 
-def _series(coefficients: list[float], t: Tensor) -> Tensor:
-    # As a tensor: ONNX would write plain numbers as float32.
-    *rest, value = torch.tensor(coefficients, dtype=t.dtype, device=t.device).unbind()
-    for coefficient in reversed(rest):
-        value = torch.addcmul(coefficient, value, t)
-    return value
-
-
-def _angle_over_distance(X: Tensor, Y: Tensor, Z: Tensor) -> Tensor:
-    """θ / ρ."""
+def angle_over_distance(X: Tensor, Y: Tensor, Z: Tensor) -> Tensor:
+    """θ / ρ of points (..., N); infinite or NaN on the axis behind the camera."""
     square = X * X + Y * Y
     # tan(angle) / ρ of the half angle, the quarter, ...
     ratio = (torch.sqrt(square + Z * Z) + Z).reciprocal()
     for _ in range(_HALVINGS - 1):
         ratio = ratio / (1.0 + torch.sqrt(1.0 + square * ratio * ratio))
-    return 2.0**_HALVINGS * ratio * _series(_ARCTAN, square * ratio * ratio)
+    return 2.0**_HALVINGS * ratio * series(_ARCTAN, square * ratio * ratio)
 
 
 def plane_from_points(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:
@@ -71,36 +64,10 @@ def plane_from_points(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
     if not model.wide:
         inverse = Z.reciprocal()
         return X * inverse, Y * inverse
-    ratio = _angle_over_distance(X, Y, Z)
-    if model.learned:
-        ratio = ratio * radius_over_angle(model.learned.shape * ratio * ratio * (X * X + Y * Y))
+    ratio = angle_over_distance(X, Y, Z)
+    if model.hybrid:
+        ratio = ratio * radius_over_angle(model.hybrid.shape * ratio * ratio * (X * X + Y * Y))
     return ratio * X, ratio * Y
-
-
-class Pupil(NamedTuple):
-    """Depth (..., N) of the entrance pupil on the axis, meters, and its derivatives.
-
-    Attributes:
-        depth: ζ₁ θ² + ζ₂ θ⁴.
-        by_point: by X, Y and Z of the point.
-        square: θ².
-    """
-
-    depth: Tensor
-    by_point: tuple[Tensor, Tensor, Tensor]
-    square: Tensor
-
-
-def entrance_pupil(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor) -> Pupil:
-    """The entrance pupil of a hybrid lens (..., P) for points (..., N)."""
-    first, second = unbind_last(coefficients[..., 1:3])
-    ratio = _angle_over_distance(X, Y, Z)
-    across = X * X + Y * Y
-    square = ratio * ratio * across
-    by_square = first + 2.0 * second * square
-    # dθ² = 2 θ dθ, and dθ = (Z dρ - ρ dZ) / R².
-    rate = 2.0 * by_square * ratio / (across + Z * Z)
-    return Pupil((first + second * square) * square, (rate * Z * X, rate * Z * Y, -rate * across), square)
 
 
 def plane_with_slopes(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tuple[Tensor, ...]:
@@ -109,23 +76,23 @@ def plane_with_slopes(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
         inverse = Z.reciprocal()
         x, y = X * inverse, Y * inverse
         return x, y, inverse, torch.zeros_like(x), inverse, -x * inverse, -y * inverse
-    ratio = _angle_over_distance(X, Y, Z)
+    ratio = angle_over_distance(X, Y, Z)
     square = X * X + Y * Y
     by_distance = (square + Z * Z).reciprocal()
-    if model.learned:
-        return _learned_with_slopes(X, Y, Z, ratio, square, by_distance, model.learned.shape)
+    if model.hybrid:
+        return _base_with_slopes(X, Y, Z, ratio, square, by_distance, model.hybrid.shape)
     # h is the derivative of θ / ρ by ρ, divided by ρ; near the axis the difference would cancel.
     near = (square < _SERIES_LIMIT * Z * Z) & (Z > 0)
     depth = torch.where(near, Z, 1.0)
-    series = _series(_ARCTAN_SLOPE, torch.where(near, square / (depth * depth), 0.0)) / (depth * depth * depth)
-    h = torch.where(near, series, (Z * by_distance - ratio) / torch.where(near, 1.0, square))
+    nearby = series(_ARCTAN_SLOPE, torch.where(near, square / (depth * depth), 0.0)) / (depth * depth * depth)
+    h = torch.where(near, nearby, (Z * by_distance - ratio) / torch.where(near, 1.0, square))
     cross = X * Y * h
     return (
         ratio * X, ratio * Y, ratio + X * X * h, cross, ratio + Y * Y * h, -X * by_distance, -Y * by_distance,
     )  # fmt: skip
 
 
-def _learned_with_slopes(
+def _base_with_slopes(
     X: Tensor, Y: Tensor, Z: Tensor, ratio: Tensor, square: Tensor, by_distance: Tensor, shape: float
 ) -> tuple[Tensor, ...]:
     ratio = ratio * radius_over_angle(shape * ratio * ratio * square)
@@ -151,11 +118,11 @@ def rays_from_plane(x: Tensor, y: Tensor, model: LensModel) -> tuple[Tensor, Ten
     if not model.wide:
         z = torch.sqrt(1.0 + square).reciprocal()
         return x * z, y * z, z
-    if model.learned:
-        stretch = angle_over_radius(model.learned.shape * square)
+    if model.hybrid:
+        stretch = angle_over_radius(model.hybrid.shape * square)
         x, y, square = x * stretch, y * stretch, square * stretch * stretch
     near = square < _SERIES_LIMIT
     t = torch.where(near, square, 0.0)
     angle = torch.sqrt(torch.where(near, 1.0, square))
-    sinc = torch.where(near, _series(_SINC, t), torch.sin(angle) / angle)
-    return x * sinc, y * sinc, torch.where(near, _series(_COS, t), torch.cos(angle))
+    sinc = torch.where(near, series(_SINC, t), torch.sin(angle) / angle)
+    return x * sinc, y * sinc, torch.where(near, series(_COS, t), torch.cos(angle))

@@ -5,7 +5,8 @@ Camera parameters are one vector (..., 5 + P): fx, fy, cx, cy, skew, then the le
     x = X / Z, y = Y / Z;  (x_D, y_D) = distortion(x, y);  u = fx x_D + skew y_D + cx,  v = fy y_D + cy
 
 (Eq. 1 to 4 of the paper). A residual field (`kcal.lens.residual`) moves (x_D, y_D) before the last step. Skew is γ of
-Eq. 3; `cv2.fisheye` stores it as alpha = skew / fx. A fisheye replaces the first step (`kcal.lens.plane`).
+Eq. 3; `cv2.fisheye` stores it as alpha = skew / fx. Fisheyes and hybrid lenses replace the first step
+(`kcal.lens.plane`), and rays of hybrid lenses start at their entrance pupil (`kcal.lens.pupil`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from torch import Tensor
 
 from kcal.lens.distortion import Distorted, distort_components
 from kcal.lens.model import LensModel
-from kcal.lens.plane import entrance_pupil, plane_with_slopes
+from kcal.lens.plane import plane_with_slopes
+from kcal.lens.pupil import entrance_pupil
 from kcal.lens.residual import Field, correct_components
 from kcal.lens.zernike import unbind_last
 
@@ -79,7 +81,7 @@ def project_components(
     """
     X, Y, Z = points[..., 0, :], points[..., 1, :], points[..., 2, :]
     offset = len(INTRINSICS)
-    pupil = entrance_pupil(X, Y, Z, parameters[..., offset:]) if model.learned else None
+    pupil = entrance_pupil(X, Y, Z, parameters[..., offset:]) if model.hybrid else None
     if pupil:
         Z = Z - pupil.depth
     x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(X, Y, Z, model)
@@ -87,6 +89,8 @@ def project_components(
     lens = distort_components(x, y, parameters[..., offset:], model, lens_wanted)
     fx, fy, _, _, skew = unbind_last(parameters[..., :offset])
     regular = lens.positive & (lens.determinant > 0)
+    if pupil:
+        regular = regular & pupil.found
     if field is not None:
         # The field is one-to-one, so it neither makes nor removes folds.
         lens = _with_field(lens, field)
@@ -111,7 +115,7 @@ def project_components(
 
     if pupil:
         by_depth = by_point[..., 2, :, :]
-        moved = torch.stack(torch.broadcast_tensors(*pupil.by_point), -2)[..., None, :]
+        moved = torch.stack(torch.broadcast_tensors(*pupil.by_point(X, Y, Z)), -2)[..., None, :]
         by_point = by_point - by_depth[..., None, :, :] * moved
 
     zero, one = torch.zeros_like(lens.x), torch.ones_like(lens.x)
@@ -129,9 +133,9 @@ def project_components(
     else:
         by_camera = pixels.new_zeros((*pixels.shape[:-2], 0, *pixels.shape[-2:]))
     if pupil:
-        for power, place in ((pupil.square, offset + 1), (pupil.square * pupil.square, offset + 2)):
+        for place, rate in enumerate(pupil.by_coefficients(), offset + 1):
             if place in wanted:
-                by_camera[..., list(wanted).index(place), :, :] = -by_depth * power[..., None, :]
+                by_camera[..., list(wanted).index(place), :, :] = -by_depth * rate[..., None, :]
     return Projection(pixels, by_point, by_camera, regular)
 
 

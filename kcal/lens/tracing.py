@@ -65,6 +65,11 @@ def is_differentiated(*tensors: Tensor) -> bool:
     return not is_traced() and any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
 
 
+def may_overwrite(*tensors: Tensor) -> bool:
+    """Whether intermediate results of these tensors may be overwritten: nothing is differentiated, traced or mapped."""
+    return may_branch(*tensors) and not is_differentiated(*tensors)
+
+
 def plain_on_host(*tensors: Tensor) -> bool:
     """Whether NumPy may do the work: on the CPU, with nothing differentiated, traced or mapped."""
     if torch.is_grad_enabled() or is_traced() or any(tensor.device.type != "cpu" for tensor in tensors):

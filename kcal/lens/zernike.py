@@ -1,13 +1,15 @@
-"""Smooth vector fields on a disc: complex Zernike modes, sorted by how they turn with the azimuth.
+"""Evaluate smooth vector fields on a disc: sums of Zernike modes, sorted by how they turn with the azimuth.
 
-A displacement (u, v) at the place z = x + i y of the unit disc is written as u + i v = Σ c_jk Z_jk(z) with
+The displacement (u, v) at the place z = x + i y of the unit disc is u + i v = Σ c_nj Z_nj(z), with complex weights and
 
-    Z_jk = √(n+1) z^j P_k^(0,|j|)(2|z|² - 1),   n = |j| + 2k   (for j < 0 the conjugate of z to the power -j)
+    Z_nj = √(n+1) z^j P_k^(0,|j|)(2 |z|² - 1),   n = |j| + 2k   (for j < 0 the conjugate of z to the power -j)
 
-(Zernike 1934; P are Jacobi polynomials). Seen from the center, Z_jk turns m = j - 1 times around the image: m = 0 are
-radial profiles and swirls, |m| = 1 decentering and prism, |m| = 2 astigmatism. Constants are the principal point, the
-radial mode of degree 1 the focal length, its twin the roll of the camera, and the radial mode of degree 3 the shape of
-the base projection (`kcal.lens.base_map`): these are left out.
+These are the circle polynomials of Zernike (1934); P are Jacobi polynomials. On the disc the mean of |Z_nj|² is 1, and
+modes are orthogonal. Relative to the direction from the center, Z_nj turns m = j - 1 times around the image: m = 0 are
+radial profiles (real weight) and swirls (imaginary weight), |m| = 1 decentering and prism, |m| = 2 astigmatism.
+
+Modes that other parameters of a hybrid lens stand for are left out: constants (principal point), n = j = 1 (focal
+length and roll of the camera), and the real weight of n = 3, j = 1 (shape of the base projection).
 """
 
 from __future__ import annotations
@@ -16,23 +18,48 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.errors import InputError
+from kcal.lens.tracing import may_overwrite
+
 RADIAL, DECENTERED, ASTIGMATIC, OTHER, ASPECT = range(5)
+
+# The coefficients of Jacobi polynomials by powers of t grow by 2.4 with each second degree: 5e7 at degree 40.
+_HIGHEST = 40
+# Real and imaginary part of a complex number for each point.
+_Complex = tuple[Tensor, Tensor]
+# Where the real and the imaginary coefficients of a polynomial Q_j(t) stand; None: it is zero.
+_Place = tuple[slice, slice] | None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ZernikeModes:
-    """Which modes there are, by their highest degrees.
+    """Which modes a field has, by their highest degrees.
 
     Args:
-        radial: of m = 0; a webcam's W-shaped profile needs 31.
+        radial: of m = 0. The W-shaped profile of a webcam's lens needs 31.
         decentered: of |m| = 1.
         astigmatic: of |m| = 2.
-        other: of all others.
+        other: of all other m.
+
+    Attributes:
+        complex_modes: (j, n) of each complex mode.
+        real_modes: (complex mode, part, family, degree) of each real weight: part 0 multiplies the mode, part 1
+            multiplies i times the mode. Families are `RADIAL`, `DECENTERED`, `ASTIGMATIC`, `OTHER`, and `ASPECT` for
+            unequal and skewed axes.
+        names: of the real weights: "z5+3" is that of the mode n = 5, j = 3, and "z5+3i" that of i times this mode.
+
+    Raises:
+        InputError: a degree that is not a whole number from 0 to 40, beyond which rounding would show.
+
+    Example:
+        >>> ZernikeModes(radial=5, decentered=2, astigmatic=1, other=0).names
+        ('z1-1', 'z2+0', 'z5+1', 'z2+2', 'z1-1i', 'z2+0i', 'z3+1i', 'z5+1i', 'z2+2i')
     """
 
     radial: int = 33
@@ -40,152 +67,124 @@ class ZernikeModes:
     astigmatic: int = 9
     other: int = 8
 
-    @functools.cached_property
-    def complex_modes(self) -> tuple[tuple[int, int], ...]:
-        """(j, n) of each complex mode."""
+    # Computed once: compilers cannot trace lazily computed attributes.
+    complex_modes: tuple[tuple[int, int], ...] = dataclasses.field(init=False, repr=False, compare=False)
+    real_modes: tuple[tuple[int, int, int, int], ...] = dataclasses.field(init=False, repr=False, compare=False)
+    names: tuple[str, ...] = dataclasses.field(init=False, repr=False, compare=False)
+    _chains: tuple[tuple[_Place, ...], tuple[_Place, ...]] = dataclasses.field(init=False, repr=False, compare=False)
+    _matrix: Tensor = dataclasses.field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("radial", "decentered", "astigmatic", "other"):
+            degree = getattr(self, name)
+            if not isinstance(degree, int) or isinstance(degree, bool) or not 0 <= degree <= _HIGHEST:
+                raise InputError(f"Zernike modes: {name} must be a whole number from 0 to {_HIGHEST}, got {degree!r}")
+        complex_modes = tuple(self._list_complex_modes())
+        real_modes = []
+        for part in (0, 1):
+            for i, (j, n) in enumerate(complex_modes):
+                m = abs(j - 1)
+                if (j, n) == (1, 1) or ((j, n) == (1, 3) and part == 0):
+                    continue
+                family = ASPECT if (j, n) == (-1, 1) else (OTHER if part else RADIAL) if m == 0 else min(m, 3)
+                real_modes.append((i, part, family, n))
+        modes = ((*complex_modes[i], part) for i, part, _, _ in real_modes)
+        chains, matrix = _polynomial_layout(complex_modes, [(i, part) for i, part, _, _ in real_modes])
+        derived = {
+            "complex_modes": complex_modes,
+            "real_modes": tuple(real_modes),
+            "names": tuple(f"z{n}{j:+d}{'i' * part}" for j, n, part in modes),
+            "_chains": chains,
+            "_matrix": matrix,
+        }
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)
+
+    def _list_complex_modes(self) -> list[tuple[int, int]]:
         highest = (self.radial, self.decentered, self.astigmatic)
         top = max(*highest, self.other)
         found = []
         for j in range(-top, top + 1):
             m = abs(j - 1)
-            limit = highest[m] if m < 3 else self.other
+            limit = highest[m] if m < len(highest) else self.other
             found += [(j, n) for n in range(abs(j), limit + 1, 2) if n]
-        return tuple(found)
-
-    @functools.cached_property
-    def real_modes(self) -> tuple[tuple[int, int, int, int], ...]:
-        """(complex mode, part, family, degree) of each real coefficient: part 0 multiplies the mode, part 1 i times it.
-
-        Families: `RADIAL`, `DECENTERED`, `ASTIGMATIC`, `OTHER`, and `ASPECT` for unequal and skewed axes.
-        """
-        found = []
-        for part in (0, 1):
-            for i, (j, n) in enumerate(self.complex_modes):
-                m = abs(j - 1)
-                if (j, n) == (1, 1) or ((j, n) == (1, 3) and part == 0):
-                    continue
-                family = ASPECT if (j, n) == (-1, 1) else (OTHER if part else RADIAL) if m == 0 else min(m, 3)
-                found.append((i, part, family, n))
-        return tuple(found)
+        return found
 
     def __len__(self) -> int:
-        """Number of real coefficients."""
+        """Number of real weights."""
         return len(self.real_modes)
 
-    @functools.cached_property
-    def names(self) -> tuple[str, ...]:
-        """Of the real coefficients: `z+3,5` multiplies the mode j = 3, n = 5, and `y+3,5` multiplies i times it."""
-        return tuple("zy"[part] + "{:+d},{}".format(*self.complex_modes[i]) for i, part, _, _ in self.real_modes)
-
-    @functools.cached_property
-    def _place(self) -> dict[tuple[int, int], int]:
-        """Where the coefficient of (complex mode, part) stands."""
-        return {(i, part): place for place, (i, part, _, _) in enumerate(self.real_modes)}
-
-    @functools.cached_property
-    def _rows(self) -> dict[int, list[tuple[int, int]]]:
-        """For each j the (k, complex mode)."""
-        rows: dict[int, list[tuple[int, int]]] = {}
-        for i, (j, n) in enumerate(self.complex_modes):
-            rows.setdefault(j, []).append(((n - abs(j)) // 2, i))
-        return rows
-
-    def _polynomials(self, t: Tensor, slopes: bool) -> dict[int, tuple[Tensor, Tensor]]:
-        """For each |j|: P_k^(0,|j|)(t) and their derivatives, (K + 1, ...) each."""
-        highest: dict[int, int] = {}
-        for j, row in self._rows.items():
-            highest[abs(j)] = max(highest.get(abs(j), 0), row[-1][0])
-        out = {}
-        for a, top in highest.items():
-            values = torch.stack(_jacobi(top, 0, a, t))
-            derivative = values[:0]
-            if slopes:
-                lower = _jacobi(max(top - 1, 0), 1, a + 1, t)
-                derivative = torch.stack(
-                    [torch.zeros_like(t), *((k + a + 1) / 2 * lower[k - 1] for k in range(1, top + 1))]
-                )
-            out[a] = values, derivative
-        return out
-
     def columns(self, x: Tensor, y: Tensor) -> Tensor:
-        """Each real mode at places (x, y) (...) of the unit disc: (M, 2, ...)."""
-        powers = _powers(x, y, max(abs(j) for j in self._rows))
-        polynomials = self._polynomials(2 * (x * x + y * y) - 1, slopes=False)
-        real, imaginary = {}, {}
-        for j, row in self._rows.items():
+        """Evaluate each real mode at places (x, y) (...) of the unit disc: (M, 2, ...)."""
+        highest: dict[int, int] = {}
+        for j, n in self.complex_modes:
+            highest[abs(j)] = max(highest.get(abs(j), 0), (n - abs(j)) // 2)
+        t = 2.0 * (x * x + y * y) - 1.0
+        powers = _powers(x, y, max(highest))
+        polynomials = {j: _jacobi(top, j, t) for j, top in highest.items()}
+        values = []
+        for j, n in self.complex_modes:
+            scaled = math.sqrt(n + 1) * polynomials[abs(j)][(n - abs(j)) // 2]
             re, im = powers[abs(j)]
-            for k, i in row:
-                scaled = math.sqrt(self.complex_modes[i][1] + 1) * polynomials[abs(j)][0][k]
-                real[i], imaginary[i] = scaled * re, scaled * (im if j >= 0 else -im)
-        flat = []
+            values.append((scaled * re, scaled * (im if j >= 0 else -im)))
+        flat: list[Tensor] = []
         for i, part, _, _ in self.real_modes:
-            flat += [-imaginary[i], real[i]] if part else [real[i], imaginary[i]]
+            re, im = values[i]
+            flat += (-im, re) if part else (re, im)
         return torch.stack(flat).unflatten(0, (len(self), 2))
 
     def field(self, weights: Tensor, x: Tensor, y: Tensor, slopes: bool = True) -> tuple[Tensor, ...]:
-        """The sum of all modes: the displacement (f, g), and if wanted its slopes f_x, f_y, g_x, g_y; each (..., N).
+        """Evaluate the sum of all modes: the displacement (f, g), and if wanted its slopes f_x, f_y, g_x, g_y.
 
         Args:
-            weights: (..., M), broadcast against the leading shape of the places (..., N) of the unit disc.
-            x: (..., N).
+            weights: (..., M), broadcast against the leading shape of the places.
+            x: (..., N) places on the unit disc.
             y: (..., N).
             slopes: whether these are needed.
+
+        Returns:
+            Two or six tensors (..., N).
         """
-        t = 2.0 * (x * x + y * y) - 1.0
-        f = g = f_x = f_y = g_x = g_y = torch.zeros_like(x)
-        f_t = g_t = f
-        power = before = torch.ones_like(x), torch.zeros_like(x)
-        slices, matrix = self._layout
-        coefficients = unbind_last(weights @ matrix.to(weights.device))
-        for a, places in enumerate(slices):
-            # f = Re z^a A - Im z^a B and g = Re z^a C + Im z^a D, with polynomials A, B, C, D of t.
-            (A, A_t), (B, B_t), (C, C_t), (D, D_t) = (_horner(coefficients[place], t, slopes) for place in places)
-            re, im = power
-            f, g = torch.addcmul(f, re, A), torch.addcmul(g, re, C)
-            if a:
-                f, g = torch.addcmul(f, im, B, value=-1.0), torch.addcmul(g, im, D)
-            if slopes:
-                f_t, g_t = torch.addcmul(f_t, re, A_t), torch.addcmul(g_t, re, C_t)
-                if a:
-                    f_t, g_t = torch.addcmul(f_t, im, B_t, value=-1.0), torch.addcmul(g_t, im, D_t)
-                    # d z^a = a z^(a-1) (dx + i dy); `before` is z^(a-1).
-                    low_re, low_im = a * before[0], a * before[1]
-                    f_x = torch.addcmul(torch.addcmul(f_x, low_re, A), low_im, B, value=-1.0)
-                    f_y = torch.addcmul(torch.addcmul(f_y, low_im, A, value=-1.0), low_re, B, value=-1.0)
-                    g_x = torch.addcmul(torch.addcmul(g_x, low_re, C), low_im, D)
-                    g_y = torch.addcmul(torch.addcmul(g_y, low_im, C, value=-1.0), low_re, D)
-            before, power = power, (re * x - im * y, re * y + im * x)
+        t = 2.0 * torch.addcmul(x * x, y, y) - 1.0
+        coefficients = unbind_last(weights @ self._matrix.to(weights.device))
+        reuse = may_overwrite(weights, x, y)
+        # Σ z^j Q_j(t) by Horner's rule in z, with complex polynomials Q_j of t; then the same in the conjugate of z.
+        ahead, back = (
+            _horner_in_z(places, coefficients, z, t, slopes, reuse)
+            for places, z in zip(self._chains, ((x, y), (x, -y)), strict=True)
+        )
+        (f, g), (f_back, g_back) = ahead[0], back[0]
         if not slopes:
-            return f, g
-        twice_x, twice_y = 4.0 * x, 4.0 * y
+            return f + f_back, g + g_back
+        # By z, its conjugate, and t; z grows by 1 with x and by i with y, t by 4 x and 4 y.
+        (re, im), (re_back, im_back) = ahead[1], back[1]
+        f_t, g_t = 4.0 * (ahead[2][0] + back[2][0]), 4.0 * (ahead[2][1] + back[2][1])
         return (
-            f, g, torch.addcmul(f_x, twice_x, f_t), torch.addcmul(f_y, twice_y, f_t),
-            torch.addcmul(g_x, twice_x, g_t), torch.addcmul(g_y, twice_y, g_t),
+            f + f_back, g + g_back,
+            torch.addcmul(re + re_back, x, f_t), torch.addcmul(im_back - im, y, f_t),
+            torch.addcmul(im + im_back, x, g_t), torch.addcmul(re - re_back, y, g_t),
         )  # fmt: skip
 
-    @functools.cached_property
-    def _layout(self) -> tuple[tuple[tuple[slice, ...], ...], Tensor]:
-        """For each |j| where the coefficients of A, B, C, D of `field` stand; and the matrix (M, Q) that makes them."""
-        signs = {
-            (0, True): ((0, 1.0), (3, 1.0)), (0, False): ((0, 1.0), (3, -1.0)),
-            (1, True): ((1, 1.0), (2, 1.0)), (1, False): ((1, -1.0), (2, 1.0)),
-        }  # fmt: skip
-        slices, columns = [], []
-        for a in range(max(abs(j) for j in self._rows) + 1):
-            own = [(j, k, i) for j in {a, -a} for k, i in self._rows.get(j, [])]
-            count = max(k for _, k, _ in own) + 1
-            block = np.zeros((len(self), 4, count))
-            for j, k, i in own:
-                for part in (0, 1):
-                    place = self._place.get((i, part))
-                    if place is not None:
-                        for which, sign in signs[part, j >= 0]:
-                            scale = sign * math.sqrt(self.complex_modes[i][1] + 1)
-                            block[place, which, : k + 1] += scale * np.array(_jacobi_monomial(k, a))
-            begin = sum(column.shape[1] for column in columns)
-            slices.append(tuple(slice(begin + q * count, begin + (q + 1) * count) for q in range(4)))
-            columns.append(block.reshape(len(self), -1))
-        return tuple(slices), torch.from_numpy(np.concatenate(columns, 1))
+
+def _polynomial_layout(
+    complex_modes: Sequence[tuple[int, int]], real_modes: Sequence[tuple[int, int]]
+) -> tuple[tuple[tuple[_Place, ...], tuple[_Place, ...]], Tensor]:
+    """The polynomials Q_j for j = J, ..., 0 and for j = -J, ..., -1 and 0; the matrix (M, Q) of their coefficients."""
+    places: dict[int, tuple[slice, slice]] = {}
+    begin = 0
+    for j in sorted({j for j, _ in complex_modes}):
+        count = max((n - abs(j)) // 2 for other, n in complex_modes if other == j) + 1
+        places[j] = slice(begin, begin + count), slice(begin + count, begin + 2 * count)
+        begin += 2 * count
+    matrix = np.zeros((len(real_modes), begin))
+    for row, (i, part) in enumerate(real_modes):
+        j, n = complex_modes[i]
+        k = (n - abs(j)) // 2
+        start = places[j][part].start
+        matrix[row, start : start + k + 1] = math.sqrt(n + 1) * np.array(_jacobi_coefficients(k, abs(j)))
+    ahead, back = (range(top, -1, -1) for top in (max(0, *places), max(0, *(-j for j in places))))
+    chains = tuple(places.get(j) for j in ahead), tuple(places.get(-j) if j else None for j in back)
+    return chains, torch.from_numpy(matrix)
 
 
 def unbind_last(values: Tensor) -> tuple[Tensor, ...]:
@@ -196,30 +195,57 @@ def unbind_last(values: Tensor) -> tuple[Tensor, ...]:
     return (values if values.ndim == 1 else values.unsqueeze(-2)).unbind(-1)
 
 
-def _horner(coefficients: Sequence[Tensor], t: Tensor, slopes: bool) -> tuple[Tensor, Tensor]:
+def _horner_in_z(
+    places: Sequence[_Place], coefficients: Sequence[Tensor], z: _Complex, t: Tensor, slopes: bool, reuse: bool
+) -> tuple[_Complex, _Complex, _Complex]:
+    """Σ z^j Q_j(t), highest first, and its derivatives by z and t."""
+    nothing = torch.zeros_like(t)
+    zero = (nothing, nothing)
+    value = by_z = by_t = zero
+    for number, place in enumerate(places):
+        own = reuse and place is not None
+        added = added_t = zero
+        if place:
+            (p, p_t), (q, q_t) = (_horner(coefficients[part], t, slopes, reuse) for part in place)
+            added, added_t = (p, q), (p_t, q_t)
+        if slopes:
+            by_z = _times_plus(by_z, z, value, False) if number > 1 else value
+            by_t = _times_plus(by_t, z, added_t, own) if number else added_t
+        value = _times_plus(value, z, added, own) if number else added
+    return value, by_z, by_t
+
+
+def _horner(coefficients: Sequence[Tensor], t: Tensor, slopes: bool, reuse: bool) -> tuple[Tensor, Tensor]:
     """A polynomial by rising powers of t, and its derivative if wanted."""
     *rest, value = coefficients
     slope = torch.zeros_like(value)
     for coefficient in reversed(rest):
+        own = reuse and value.shape == t.shape
         if slopes:
-            slope = torch.addcmul(value, slope, t)
-        value = torch.addcmul(coefficient, value, t)
+            slope = torch.addcmul(value, slope, t, out=slope if own and slope.shape == t.shape else None)
+        value = torch.addcmul(coefficient, value, t, out=value if own else None)
     return value, slope
 
 
+def _times_plus(value: _Complex, z: _Complex, added: _Complex, reuse: bool) -> _Complex:
+    """Value z + added; `reuse`: the memory of `added` may receive the result."""
+    (a, b), (x, y), (p, q) = value, z, added
+    if reuse and p.shape == q.shape == torch.broadcast_shapes(a.shape, x.shape):
+        return p.addcmul_(a, x).addcmul_(b, y, value=-1.0), q.addcmul_(b, x).addcmul_(a, y)
+    return (
+        torch.addcmul(torch.addcmul(p, a, x), b, y, value=-1.0),
+        torch.addcmul(torch.addcmul(q, b, x), a, y),
+    )
+
+
 @functools.cache
-def _jacobi_monomial(k: int, b: int) -> tuple[float, ...]:
-    """P_k^(0,b)(t) by rising powers of t."""
-    basis = np.polynomial.Polynomial([0.0, 1.0])
-    out = [np.polynomial.Polynomial([1.0]), (b + 2) * (basis - 1.0) / 2 + 1.0]
-    for n in range(2, k + 1):
-        c = 2 * n + b
-        top = ((c - 1) * c * (c - 2) * basis - (c - 1) * b * b) * out[-1] - 2 * (n - 1) * (n + b - 1) * c * out[-2]
-        out.append(top / (2 * n * (n + b) * (c - 2)))
-    return tuple(float(value) for value in out[k].coef)
+def _jacobi_coefficients(k: int, b: int) -> tuple[float, ...]:
+    """The coefficients of P_k^(0,b)(t) by rising powers of t."""
+    t = np.polynomial.Polynomial([0.0, 1.0])
+    return tuple(float(value) for value in _jacobi(k, b, t)[k].coef)
 
 
-def _powers(x: Tensor, y: Tensor, highest: int) -> list[tuple[Tensor, Tensor]]:
+def _powers(x: Tensor, y: Tensor, highest: int) -> list[_Complex]:
     """Real and imaginary parts of (x + i y)^j for j from 0."""
     out = [(torch.ones_like(x), torch.zeros_like(x))]
     for _ in range(highest):
@@ -228,14 +254,11 @@ def _powers(x: Tensor, y: Tensor, highest: int) -> list[tuple[Tensor, Tensor]]:
     return out
 
 
-def _jacobi(highest: int, a: int, b: int, t: Tensor) -> list[Tensor]:
-    """Jacobi polynomials P_k^(a,b)(t) for k up to `highest`, by their recurrence (DLMF 18.9.2)."""
-    out = [torch.ones_like(t)]
-    if highest:
-        out.append((a + 1) + (a + b + 2) * (t - 1) / 2)
-    for n in range(2, highest + 1):
-        c = 2 * n + a + b
-        first = 2 * n * (n + a + b) * (c - 2)
-        slope, constant, last = (c - 1) * c * (c - 2), (c - 1) * (a * a - b * b), 2 * (n + a - 1) * (n + b - 1) * c
-        out.append(((slope * t + constant) * out[-1] - last * out[-2]) / first)
+def _jacobi(highest: int, b: int, t: Any) -> list[Any]:
+    """Jacobi polynomials P_k^(0,b)(t) for k up to `highest`, by their recurrence (DLMF 18.9.2)."""
+    out = [0.0 * t + 1.0, 0.5 * (b + 2) * (t - 1.0) + 1.0]
+    for k in range(2, highest + 1):
+        c = 2 * k + b
+        middle = ((c - 1) * c * (c - 2) * t - (c - 1) * b * b) * out[-1]
+        out.append((middle - 2 * (k - 1) * (k + b - 1) * c * out[-2]) * (1.0 / (2 * k * (k + b) * (c - 2))))
     return out

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
+from kcal.lens.base_map import radius_over_angle
+from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort_components
+from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
+from kcal.lens.zernike import ASPECT, ASTIGMATIC, DECENTERED, OTHER, RADIAL, ZernikeModes
 
 MODELS = ("opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "ext20", "ext24")
+# A hybrid lens with modes of every family; points with |x|, |y| <= 0.6 are well inside its disc.
+FEW_MODES = ZernikeModes(radial=5, decentered=4, astigmatic=3, other=3)
+HYBRID = LensModel(hybrid=HybridForm(shape=0.7, radius=1.4, modes=FEW_MODES))
 
 # Strong, but before any fold or pole for |x|, |y| <= 0.6.
 _STRONG = {
@@ -19,12 +28,42 @@ _STRONG = {
 }  # fmt: skip
 
 
-def strong(model: str) -> Tensor:
-    """Large coefficients for a preset, all of them different from zero."""
-    return torch.tensor([_STRONG[name] for name in LensModel.named(model).names], dtype=torch.float64)
+def strong(model: str | LensModel) -> Tensor:
+    """Large coefficients for a model, all of them different from zero."""
+    model = LensModel.named(model)
+    if model.hybrid:
+        weights = torch.sin(torch.arange(1.0, model.size - 2.0, dtype=torch.float64)) * 0.01
+        return torch.cat([torch.tensor([0.2, 0.011, -0.004], dtype=torch.float64), weights])
+    return torch.tensor([_STRONG[name] for name in model.names], dtype=torch.float64)
 
 
-def parameters(model: str, lens: Tensor) -> Tensor:
+# Amplitude in radii of the disc, decay per degree and first degree of each family of modes, as in calibrated lenses.
+_TYPICAL = {
+    RADIAL: (5e-4, 0.5, 5), DECENTERED: (3e-4, 0.6, 2), ASTIGMATIC: (5e-5, 0.6, 3), OTHER: (4e-5, 0.6, 2),
+    ASPECT: (1e-4, 0.0, 1),
+}  # fmt: skip
+# Shape of the base projection and angle of the image's corner off axis, degrees.
+KINDS = {"webcam": (0.9, 36.0), "wide": (0.2, 75.0), "pinhole": (1.0, 30.0), "tanh": (-0.3, 60.0)}
+
+
+def hybrid_camera(kind: str, seed: int = 0, modes: ZernikeModes | None = None) -> Camera:
+    """A camera with a hybrid lens such as a calibration finds: random weights of typical size, decaying with degree."""
+    size, (shape, corner) = (1920, 1080), KINDS[kind]
+    half, angle = 0.5 * math.hypot(*size), math.radians(corner)
+    q = torch.tensor(shape * angle * angle, dtype=torch.float64)
+    focal = half / (float(radius_over_angle(q)) * angle)
+    form = HybridForm(shape=shape, radius=1.08 * half / focal, modes=modes or ZernikeModes())
+    deviations = []
+    for _, _, family, degree in form.modes.real_modes:
+        amplitude, decay, first = _TYPICAL[family]
+        deviations.append(amplitude * math.exp(-decay * (degree - first)) * form.radius)
+    noise = torch.randn(len(form.modes), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    head = [focal, 1.0005 * focal, 963.0, 536.0, 0.0, 0.01, 2e-3, 1e-3]
+    parameters = torch.cat([torch.tensor(head, dtype=torch.float64), noise * torch.tensor(deviations).double()])
+    return Camera(parameters, size=size, model=LensModel(hybrid=form))
+
+
+def parameters(model: str | LensModel, lens: Tensor) -> Tensor:
     """A small camera with all intrinsics unlike: derivatives of order one, so that tolerances bite."""
     head = torch.tensor([2.1, 1.7, 0.3, -0.2, 0.05], dtype=torch.float64)
     assert lens.shape == (LensModel.named(model).size,)

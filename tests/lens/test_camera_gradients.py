@@ -6,13 +6,14 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from lenses import MODELS, distort_with_jacobian, parameters, strong
+from lenses import HYBRID, MODELS, distort_with_jacobian, parameters, strong
 from torch import Tensor, nn
 from torch.autograd import gradcheck, gradgradcheck
 from torch.func import functional_call, jacrev
 
 from kcal.lens.camera import Camera
 from kcal.lens.inverse import undistort
+from kcal.lens.model import LensModel
 
 POINTS = torch.tensor([[0.1, -0.2, 1.1], [-0.6, 0.5, 1.3], [1.2, 0.9, 2.5]], dtype=torch.float64)
 
@@ -39,12 +40,12 @@ def of_parameters(camera: Camera, name: str) -> Callable[[Tensor, Tensor], Tenso
     return function
 
 
-def small_camera(model: str) -> Camera:
+def small_camera(model: str | LensModel) -> Camera:
     return Camera(parameters(model, strong(model)), size=(4, 3), model=model)
 
 
-@pytest.mark.parametrize("model", ["pinhole", *MODELS])
-def test_first_derivatives(model: str) -> None:
+@pytest.mark.parametrize("model", ["pinhole", *MODELS, HYBRID], ids=str)
+def test_first_derivatives(model: str | LensModel) -> None:
     vector = parameters(model, strong(model))
     camera = Camera(vector, size=(4, 3), model=model)
     pixels = camera.project(POINTS)[0]
@@ -55,8 +56,8 @@ def test_first_derivatives(model: str) -> None:
     assert gradcheck(of_parameters(camera, "unproject"), (pixels.clone().requires_grad_(True), vector), **tolerance)
 
 
-@pytest.mark.parametrize("model", ["opencv5", "opencv14", "ext20"])
-def test_second_derivatives_of_the_inverse(model: str) -> None:
+@pytest.mark.parametrize("model", ["opencv5", "opencv14", "ext20", HYBRID], ids=str)
+def test_second_derivatives_of_the_inverse(model: str | LensModel) -> None:
     vector = parameters(model, strong(model))
     camera = Camera(vector, size=(4, 3), model=model)
     pixels = camera.project(POINTS)[0].requires_grad_(True)
@@ -64,8 +65,8 @@ def test_second_derivatives_of_the_inverse(model: str) -> None:
     assert gradgradcheck(of_parameters(camera, "unproject"), (pixels, vector), eps=1e-6, atol=1e-7, rtol=1e-5)
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_inverse_has_the_inverse_jacobian(model: str) -> None:
+@pytest.mark.parametrize("model", [*MODELS, HYBRID], ids=str)
+def test_inverse_has_the_inverse_jacobian(model: str | LensModel) -> None:
     """The implicit function theorem, written out: dx/dx_D = J⁻¹ and dx/dc = -J⁻¹ ∂x_D/∂c."""
     lens = strong(model)
     normalized = POINTS[:, :2] / POINTS[:, 2:]
@@ -103,8 +104,9 @@ def test_invalid_pixels_leave_no_nan_in_gradients() -> None:
     assert float(pixels.grad[0, 0]) > 0.009
 
 
-def test_invalid_points_leave_no_nan_in_gradients() -> None:
-    camera = small_camera("opencv14").requires_grad_(True)
+@pytest.mark.parametrize("model", ["opencv14", HYBRID], ids=str)
+def test_invalid_points_leave_no_nan_in_gradients(model: str | LensModel) -> None:
+    camera = small_camera(model).requires_grad_(True)
     points = torch.tensor([[0.1, 0.1, 1.0], [0.0, 0.0, 0.0], [1.0, 1.0, -1.0], [float("nan"), 0.0, 1.0]]).double()
     points.requires_grad_(True)
     pixels, valid = camera.project(points)

@@ -7,17 +7,18 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from lenses import parameters, strong
+from lenses import HYBRID, parameters, strong
 from torch import nn
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
 from kcal.lens.rig import StereoRig
 
 POINTS = torch.tensor([[0.1, -0.2, 1.1], [-0.6, 0.5, 1.3], [1.2, 0.9, 2.5]], dtype=torch.float64)
 
 
-def make_camera(model: str = "opencv14") -> Camera:
+def make_camera(model: str | LensModel = "opencv14") -> Camera:
     vector = parameters(model, strong(model))
     # Values that no lower precision can hold.
     vector[0] = 1600.0 / 3.0
@@ -45,7 +46,7 @@ CASTS: dict[str, Callable[[nn.Module], nn.Module]] = {
 class TestPrecision:
     @pytest.mark.parametrize("cast", CASTS.values(), ids=CASTS)
     def test_casts_do_not_round(self, cast: Callable[[nn.Module], nn.Module]) -> None:
-        for module in (make_camera(), make_rig()):
+        for module in (make_camera(), make_camera(HYBRID), make_rig()):
             before = {name: value.clone() for name, value in module.state_dict().items()}
             after = cast(module).state_dict()
             assert before.keys() == after.keys()
@@ -57,9 +58,10 @@ class TestPrecision:
         assert network[0].weight.dtype == torch.float16
         assert network[1].params.dtype == torch.float64
 
+    @pytest.mark.parametrize("model", ["opencv14", HYBRID], ids=str)
     @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
-    def test_inputs_are_promoted(self, dtype: torch.dtype) -> None:
-        camera = make_camera()
+    def test_inputs_are_promoted(self, dtype: torch.dtype, model: str | LensModel) -> None:
+        camera = make_camera(model)
         low = POINTS.to(dtype)
         assert torch.equal(camera.project(low)[0], camera.project(low.double())[0])
         pixels = torch.tensor([[5.0, 3.0]], dtype=dtype)
@@ -131,8 +133,9 @@ class TestState:
 
 
 class TestBatches:
-    def test_points_in_any_leading_shape(self) -> None:
-        camera = make_camera()
+    @pytest.mark.parametrize("model", ["opencv14", HYBRID], ids=str)
+    def test_points_in_any_leading_shape(self, model: str | LensModel) -> None:
+        camera = make_camera(model)
         flat, _ = camera.project(POINTS)
         for shape in ((1, 3, 3), (3, 1, 3)):
             pixels, valid = camera.project(POINTS.reshape(shape))
@@ -140,15 +143,16 @@ class TestBatches:
             assert valid.shape == shape[:-1]
             assert torch.equal(pixels.reshape(3, 2), flat)
 
-    def test_batch_equals_each_alone(self) -> None:
-        vectors = torch.stack([parameters("ext20", scale * strong("ext20")) for scale in (0.0, 0.5, 1.0, 1.1)])
-        batch = Camera(vectors.reshape(2, 2, -1), size=(4, 3), model="ext20")
+    @pytest.mark.parametrize("model", ["ext20", HYBRID], ids=str)
+    def test_batch_equals_each_alone(self, model: str | LensModel) -> None:
+        vectors = torch.stack([parameters(model, scale * strong(model)) for scale in (0.0, 0.5, 1.0, 1.1)])
+        batch = Camera(vectors.reshape(2, 2, -1), size=(4, 3), model=model)
         pixels, valid = batch.project(POINTS)
         rays, found = batch.unproject(pixels)
         assert pixels.shape == (2, 2, 3, 2)
         assert valid.shape == found.shape == (2, 2, 3)
         for i, vector in enumerate(vectors):
-            alone = Camera(vector, size=(4, 3), model="ext20")
+            alone = Camera(vector, size=(4, 3), model=model)
             own, _ = alone.project(POINTS)
             # Vectorized kernels may round otherwise: one unit in the last place of numbers near one.
             torch.testing.assert_close(pixels[i // 2, i % 2], own, rtol=0, atol=1e-14)

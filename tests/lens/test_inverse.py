@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lenses import MODELS, distort_with_jacobian, parameters, strong
+from lenses import HYBRID, MODELS, distort_with_jacobian, parameters, strong
 from torch import Tensor
 
 from kcal.errors import InputError
@@ -37,7 +37,7 @@ def check_round_trip(camera: Camera, pixels: Tensor) -> Tensor:
     torch.testing.assert_close(
         torch.linalg.vector_norm(rays, dim=-1), torch.ones_like(rays[..., 0]), rtol=0, atol=1e-15
     )
-    again, projected = camera.project(rays[valid] * 7.0)
+    again, projected = camera.project(camera.ray_origins(rays[valid]) + rays[valid] * 7.0)
     assert bool(projected.all())
     error = torch.linalg.vector_norm(again - pixels[valid], dim=-1)
     assert bool((error < allowed_error(camera, camera.normalize(pixels)[0])[valid]).all())
@@ -53,16 +53,16 @@ def allowed_error(camera: Camera, normalized: Tensor) -> Tensor:
 
 
 class TestRoundTrip:
-    @pytest.mark.parametrize("model", ["pinhole", *MODELS])
-    def test_strong_lens(self, model: str) -> None:
+    @pytest.mark.parametrize("model", ["pinhole", *MODELS, HYBRID], ids=str)
+    def test_strong_lens(self, model: str | LensModel) -> None:
         vector = parameters(model, strong(model))
         vector[:5] = torch.tensor([2000.0, 2010.0, 950.0, 545.0, 2.0])
         camera = Camera(vector, size=(1920, 1080), model=model)
         # The corners lie 0.55 off axis, before any of these lenses folds: every pixel has a ray.
         assert bool(check_round_trip(camera, image_grid(camera)).all())
 
-    @pytest.mark.parametrize("model", MODELS)
-    def test_from_points(self, model: str) -> None:
+    @pytest.mark.parametrize("model", [*MODELS, HYBRID], ids=str)
+    def test_from_points(self, model: str | LensModel) -> None:
         normalized = torch.rand(500, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 1.2 - 0.6
         back, valid = undistort(distort(normalized, strong(model), model), strong(model), model)
         assert bool(valid.all())

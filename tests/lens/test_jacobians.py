@@ -11,7 +11,7 @@ import itertools
 import pytest
 import torch
 from differences import numeric
-from lenses import MODELS, distort_with_jacobian, parameters, strong
+from lenses import HYBRID, MODELS, distort_with_jacobian, parameters, strong
 from torch import Tensor
 from torch.func import jacfwd
 
@@ -31,15 +31,15 @@ POINTS = torch.tensor(
 )
 
 
-def state(model: str, kind: str) -> Tensor:
+def state(model: str | LensModel, kind: str) -> Tensor:
     lens = strong(model)
     return parameters(model, lens if kind == "strong" else torch.zeros_like(lens))
 
 
 @pytest.mark.parametrize("kind", STATES)
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", [*MODELS, HYBRID], ids=str)
 class TestProjection:
-    def test_by_camera(self, model: str, kind: str) -> None:
+    def test_by_camera(self, model: str | LensModel, kind: str) -> None:
         lens, at = LensModel.named(model), state(model, kind)
 
         def pixels(values: Tensor) -> Tensor:
@@ -53,7 +53,7 @@ class TestProjection:
         # Fourth-order differences with this step leave rounding (1e-16 / 1e-3) and truncation near 1e-12.
         torch.testing.assert_close(analytic, numeric(pixels, at, 1e-3), rtol=0, atol=1e-10)
 
-    def test_by_point(self, model: str, kind: str) -> None:
+    def test_by_point(self, model: str | LensModel, kind: str) -> None:
         lens, at = LensModel.named(model), state(model, kind)
         result = project_components(POINTS, at, lens, range(5))
         for n in range(POINTS.shape[1]):
@@ -67,7 +67,7 @@ class TestProjection:
             # As above; derivatives by the point are steeper at the edge, hence ten times the room.
             torch.testing.assert_close(analytic, numeric(pixels, point, 1e-3), rtol=0, atol=1e-9)
 
-    def test_any_subset_of_blocks(self, model: str, kind: str) -> None:
+    def test_any_subset_of_blocks(self, model: str | LensModel, kind: str) -> None:
         """Freeing fewer parameters gives the same columns, bit for bit, in the order asked for."""
         lens, at = LensModel.named(model), state(model, kind)
         full = project_components(POINTS, at, lens, range(at.numel())).by_camera
@@ -78,9 +78,12 @@ class TestProjection:
             "skew": [4],
             "numerator": [5 + i for i in lens.numerator_index],
             "denominator": [5 + i for i in lens.denominator_index],
-            "tangential": [names.index("p1"), names.index("p2")],
+            "tangential": [names.index("p1"), names.index("p2")] if lens.tangential else [],
             "prism": [5 + i for row in lens.prism_index for i in row],
             "tilt": [names.index("tau_x"), names.index("tau_y")] if lens.tilt else [],
+            "shape": [names.index("shape")] if lens.hybrid else [],
+            "pupil": [names.index("pupil1"), names.index("pupil2")] if lens.hybrid else [],
+            "Zernike": [i for i, name in enumerate(names) if name.startswith("z")],
         }
         present = [rows for rows in blocks.values() if rows]
         chosen = (c for r in range(len(present) + 1) for c in itertools.combinations(present, r))
@@ -91,7 +94,7 @@ class TestProjection:
             part = project_components(POINTS, at, lens, wanted)
             assert torch.equal(part.by_camera, full[wanted]), [names[i] for i in wanted]
 
-    def test_distortion_alone(self, model: str, kind: str) -> None:
+    def test_distortion_alone(self, model: str | LensModel, kind: str) -> None:
         at = state(model, kind)[5:]
         normalized = (POINTS[:2] / POINTS[2]).T
         value, by_point, by_coefficients = distort_with_jacobian(normalized, at, model)
@@ -106,7 +109,7 @@ class TestProjection:
 
 def test_states_reach_every_term() -> None:
     """The strong state is strong: without any one of its coefficients the pixels would be elsewhere."""
-    for model in MODELS:
+    for model in (*MODELS, HYBRID):
         at = state(model, "strong")
         pixels = project_components(POINTS, at, LensModel.named(model)).pixels
         for i in range(5, at.numel()):

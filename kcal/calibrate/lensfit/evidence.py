@@ -20,7 +20,7 @@ from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
 from kcal.calibrate.lensfit.board_modes import BoardModes
-from kcal.lens.learned import LearnedForm
+from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.zernike import ASPECT, RADIAL
 
 # ln amplitude of the four families of fields (in units of R), decays per degree of radial and of other fields,
@@ -70,7 +70,7 @@ class PriorFamilies(NamedTuple):
 
 
 def prior_families(
-    form: LearnedForm,
+    form: HybridForm,
     focal: float,
     board: BoardModes,
     size: tuple[int, int],

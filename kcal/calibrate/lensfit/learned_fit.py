@@ -15,7 +15,7 @@ from kcal.calibrate.lensfit.learned_problem import LearnedProblem, LearnedState
 from kcal.errors import InputError
 from kcal.lens.base_map import angle_over_radius
 from kcal.lens.camera import Camera
-from kcal.lens.learned import LearnedForm
+from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions, minimize
@@ -76,11 +76,11 @@ def fit_learned(
     freedom = 2 * int(seen.sum()) - 6 * len(pixels)
 
     def constants(focal: float, shape: float) -> LensModel:
-        return LensModel(learned=LearnedForm(shape=shape, radius=radius / focal, modes=modes))
+        return LensModel(hybrid=HybridForm(shape=shape, radius=radius / focal, modes=modes))
 
     h = typical_hyperparameters()
     model = constants(focal, shape)
-    families = prior_families(model.learned, focal, board, size, distance)
+    families = prior_families(model.hybrid, focal, board, size, distance)
     held = torch.ones(len(families.mean), dtype=torch.bool)
     held[:4] = False
     params = torch.zeros(5 + model.size, dtype=torch.float64)
@@ -103,7 +103,7 @@ def fit_learned(
         scale, bend = float(state.params[0]) / focal - 1.0, float(state.params[5])
         focal, shape = float(state.params[0]), shape + min(max(bend, -1.0), 1.0)
         model = constants(focal, shape)
-        families = prior_families(model.learned, focal, board, size, distance)
+        families = prior_families(model.hybrid, focal, board, size, distance)
         params = state.params.clone()
         params[5] = 0.0
         state = state._replace(params=params)

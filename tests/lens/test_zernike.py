@@ -1,0 +1,123 @@
+"""Zernike modes are what they are said to be: orthogonal, of the stated turn, and summed with the right slopes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.func import jacfwd
+
+from kcal.errors import InputError
+from kcal.lens.zernike import ASPECT, ASTIGMATIC, DECENTERED, OTHER, RADIAL, ZernikeModes
+
+MODES = ZernikeModes()
+FEW = ZernikeModes(radial=5, decentered=4, astigmatic=3, other=3)
+
+
+def disc(rings: int = 40, directions: int = 64) -> tuple[Tensor, Tensor, Tensor]:
+    """x, y and weights of a quadrature rule that is exact for polynomials of degree 63 on the unit disc; mean of 1."""
+    nodes, weights = np.polynomial.legendre.leggauss(rings)
+    # In s = r² the area element is constant.
+    radius = torch.from_numpy(np.sqrt((nodes + 1) / 2))[:, None]
+    angle = torch.arange(directions, dtype=torch.float64) * (2 * math.pi / directions)
+    weight = torch.from_numpy(weights)[:, None].expand(-1, directions) / (2 * directions)
+    return (radius * torch.cos(angle)).flatten(), (radius * torch.sin(angle)).flatten(), weight.flatten()
+
+
+def test_orthogonal_with_mean_square_one() -> None:
+    x, y, weight = disc(40, 80)
+    columns = MODES.columns(x, y)
+    gram = torch.einsum("acn,bcn,n->ab", columns, columns, weight)
+    torch.testing.assert_close(gram, torch.eye(len(MODES), dtype=torch.float64), rtol=0, atol=1e-10)
+
+
+def test_turns_with_the_azimuth() -> None:
+    """Rotating the place by an angle rotates the displacement by it, and m = j - 1 times more."""
+    generator = torch.Generator().manual_seed(1)
+    radius, azimuth = (
+        0.9 * torch.rand(7, generator=generator).double(),
+        6.0 * torch.rand(7, generator=generator).double(),
+    )
+    turn = 0.7
+    before = MODES.columns(radius * torch.cos(azimuth), radius * torch.sin(azimuth))
+    after = MODES.columns(radius * torch.cos(azimuth + turn), radius * torch.sin(azimuth + turn))
+    for number, (i, _, family, degree) in enumerate(MODES.real_modes):
+        j, n = MODES.complex_modes[i]
+        assert degree == n
+        value, turned = torch.complex(*before[number]), torch.complex(*after[number])
+        m = j - 1
+        torch.testing.assert_close(turned, value * np.exp(1j * turn * (m + 1)), rtol=0, atol=1e-12)
+        expected = {0: (RADIAL, OTHER), 1: (DECENTERED,), 2: (ASTIGMATIC, ASPECT)}
+        assert family in expected.get(abs(m), (OTHER,))
+
+
+def test_radial_modes_point_outward_and_swirls_around() -> None:
+    x, y = torch.tensor([0.3, -0.5], dtype=torch.float64), torch.tensor([0.4, 0.2], dtype=torch.float64)
+    columns = MODES.columns(x, y)
+    for number, (i, part, family, _) in enumerate(MODES.real_modes):
+        u, v = columns[number]
+        if family == RADIAL:
+            assert float((u * y - v * x).abs().max()) < 1e-14
+        if MODES.complex_modes[i][0] == 1 and part == 1:
+            assert float((u * x + v * y).abs().max()) < 1e-14
+
+
+def test_left_out() -> None:
+    """Constants, focal length, roll and the shape of the base projection are other parameters of the lens."""
+    assert not {"z0+0", "z0+0i", "z1+1", "z1+1i", "z3+1"} & set(MODES.names)
+    assert {"z3+1i", "z5+1", "z33+1", "z33+1i", "z18+2", "z18+0", "z9+3", "z9-1", "z1-1", "z8-8i"} <= set(MODES.names)
+    assert len(set(MODES.names)) == len(MODES.names) == len(MODES)
+
+
+def test_a_low_mode_written_out() -> None:
+    """Z_2,0 = √3 (2 r² - 1): a displacement along x, the same in all directions."""
+    x, y = torch.tensor([0.6], dtype=torch.float64), torch.tensor([0.3], dtype=torch.float64)
+    column = MODES.columns(x, y)[MODES.names.index("z2+0")]
+    torch.testing.assert_close(column, torch.tensor([[math.sqrt(3) * -0.1], [0.0]], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("modes", [MODES, FEW, ZernikeModes(radial=5, decentered=0, astigmatic=0, other=0)])
+@pytest.mark.parametrize("lead", [(), (2,), (2, 3)])
+def test_field_is_the_sum_of_its_modes(modes: ZernikeModes, lead: tuple[int, ...]) -> None:
+    x, y, _ = disc(5, 9)
+    weights = torch.randn(*lead, len(modes), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    expected = torch.einsum("...m,mcn->c...n", weights, modes.columns(x, y))
+    scale = float(expected.abs().max())
+    f, g = modes.field(weights, x, y, slopes=False)
+    # The highest modes by powers of t cancel by five digits, and all have weight one here.
+    torch.testing.assert_close(torch.stack([f, g]), expected, rtol=0, atol=1e-11 * scale)
+    again = modes.field(weights, x, y)
+    assert torch.equal(torch.stack(again[:2]), torch.stack([f, g]))
+
+
+@pytest.mark.parametrize("modes", [MODES, FEW])
+def test_slopes(modes: ZernikeModes) -> None:
+    x, y, _ = disc(4, 5)
+    x, y = torch.cat([x, torch.zeros(1).double()]), torch.cat([y, torch.zeros(1).double()])
+    weights = torch.randn(len(modes), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+    def total(place: Tensor) -> Tensor:
+        return torch.stack([part.sum() for part in modes.field(weights, place[0], place[1], slopes=False)])
+
+    automatic = jacfwd(total)(torch.stack([x, y]))
+    closed = torch.stack(modes.field(weights, x, y)[2:]).unflatten(0, (2, 2))
+    torch.testing.assert_close(closed, automatic, rtol=1e-11, atol=1e-11)
+
+
+def test_inputs_and_weights_are_not_overwritten() -> None:
+    x, y, _ = disc(3, 5)
+    weights = torch.randn(len(FEW), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    kept = x.clone(), y.clone(), weights.clone()
+    first = FEW.field(weights, x, y)
+    second = FEW.field(weights, x, y)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(kept, (x, y, weights), strict=True))
+
+
+@pytest.mark.parametrize("degree", [-1, 41, 3.0, True])
+def test_impossible_degrees(degree: int) -> None:
+    with pytest.raises(InputError, match="astigmatic must be a whole number from 0 to 40"):
+        ZernikeModes(astigmatic=degree)
