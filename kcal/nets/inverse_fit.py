@@ -16,7 +16,7 @@ from kcal.lens.residual import undo_components
 from kcal.nets.fit import NetProblem
 from kcal.nets.inverse import InverseNet
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import Status
+from kcal.solve.result import SolverStatus
 
 # Nets correct well inside the data they have seen: pixels up to 5 % beyond the image's edges are in it.
 _MARGIN = 1.05
@@ -68,7 +68,7 @@ class InverseFit:
     start_rms: float
     start_largest: float
     iterations: int
-    status: Status
+    status: SolverStatus
 
 
 @torch.no_grad()
@@ -123,7 +123,7 @@ def train_inverse(camera: Camera, options: InverseNetOptions | None = None) -> I
         start_rms=_rms(before),
         start_largest=float(before.max()),
         iterations=int(result.iterations),
-        status=Status(int(result.status)),
+        status=SolverStatus(int(result.status)),
     )
 
 

@@ -15,7 +15,7 @@ from kcal.errors import InputError
 from kcal.solve.dense import DenseProblem
 from kcal.solve.implicit import attach_implicit_gradient
 from kcal.solve.problem import Problem
-from kcal.solve.result import Result, State, Status, blend
+from kcal.solve.result import Result, SolverStatus, State, blend
 
 # Called after each trial step with (trial, cost (...)); returning True stops.
 Callback = Callable[[int, Tensor], bool | None]
@@ -101,14 +101,14 @@ def _minimize(problem: Problem, start: State, options: LMOptions, callback: Call
     cost = on_host(linear.cost)
     damping, growth = np.full_like(cost, options.initial_damping), np.full_like(cost, 2.0)
     iterations = np.zeros(cost.shape, np.int64)
-    status = np.where(np.isfinite(cost), int(Status.RUNNING), int(Status.BAD_START))
+    status = np.where(np.isfinite(cost), int(SolverStatus.RUNNING), int(SolverStatus.BAD_START))
     floor = 0.5 * problem.residual_count * options.residual_floor**2
-    status = np.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
+    status = np.where((status == 0) & (cost <= floor), int(SolverStatus.EXACT), status)
     history = [cost]
     whole: _Whole | None = None
 
     for trial in range(1, options.max_iterations + 1):
-        running = status == Status.RUNNING
+        running = status == SolverStatus.RUNNING
         if not running.any():
             break
         if _worth_leaving_out(running) and not torch.is_grad_enabled():
@@ -149,29 +149,29 @@ def _minimize(problem: Problem, start: State, options: LMOptions, callback: Call
         cost = np.where(accept, new_cost, cost)
         history.append(cost if whole is None else whole.costs(history[-1], cost))
 
-        status = np.where(flat, int(Status.CONVERGED), status)
-        status = np.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
+        status = np.where(flat, int(SolverStatus.CONVERGED), status)
+        status = np.where((status == 0) & (cost <= floor), int(SolverStatus.EXACT), status)
         stalled = (status == 0) & ~accept & (damping > _HIGHEST_DAMPING)
         if stalled.any():
             # Where the residual stays large and curved, steps need damping even at the minimum and end in rounding:
             # whether it is one is told by the step that would be free of damping.
             _, free = linear.step(on_device(np.full_like(damping, _LITTLE_DAMPING)))
             at_minimum = stalled & (on_host(free) <= options.tolerance * cost)
-            status = np.where(at_minimum, int(Status.CONVERGED), status)
-            status = np.where(stalled & ~at_minimum, int(Status.STALLED), status)
+            status = np.where(at_minimum, int(SolverStatus.CONVERGED), status)
+            status = np.where(stalled & ~at_minimum, int(SolverStatus.STALLED), status)
         if options.flatness and trial >= _PATIENCE:
             before = history[-1 - _PATIENCE]
             slow = (before if whole is None else before[whole.index]) - cost <= options.flatness * cost
-            status = np.where((status == 0) & slow, int(Status.FLAT), status)
+            status = np.where((status == 0) & slow, int(SolverStatus.FLAT), status)
         if callback is not None and callback(trial, on_device(history[-1])):
-            status = np.where(status == 0, int(Status.INTERRUPTED), status)
+            status = np.where(status == 0, int(SolverStatus.INTERRUPTED), status)
         if (accept & (status == 0)).any():
             if joint is None:
                 linear = problem.linearize(state)
             else:
                 linear = joint if accept.all() else linear.blend(on_device(accept), joint)
 
-    status = np.where(status == 0, int(Status.ITERATION_LIMIT), status)
+    status = np.where(status == 0, int(SolverStatus.ITERATION_LIMIT), status)
     if whole is not None:
         whole.put(state, status, iterations)
         state, status, iterations = whole.state, whole.status, whole.iterations

@@ -32,7 +32,7 @@ def pick(state: State, index: int) -> State:
     return tuple(tensor[index] for tensor in state)
 
 
-class Status(enum.IntEnum):
+class SolverStatus(enum.IntEnum):
     """Why the solver stopped; one for each element of a batch.
 
     `CONVERGED`: no step can lower the cost by more than the tolerance. `EXACT`: the residual is zero to rounding.
@@ -59,15 +59,15 @@ class Status(enum.IntEnum):
 
 
 _MESSAGES = {
-    Status.RUNNING: "still running",
-    Status.CONVERGED: "converged: no step lowers the cost by more than the tolerance",
-    Status.EXACT: "converged: the residual is zero to rounding",
-    Status.ITERATION_LIMIT: "stopped at the iteration limit while still improving",
-    Status.STALLED: "stalled: no step lowers the cost although one was predicted",
-    Status.BAD_START: "the cost at the start is not finite",
-    Status.AT_BOUND: "stopped at a bound: lower costs lie beyond what is allowed",
-    Status.FLAT: "stopped in a flat valley: the last steps lowered the cost by too little to matter",
-    Status.INTERRUPTED: "interrupted; this is the best state so far",
+    SolverStatus.RUNNING: "still running",
+    SolverStatus.CONVERGED: "converged: no step lowers the cost by more than the tolerance",
+    SolverStatus.EXACT: "converged: the residual is zero to rounding",
+    SolverStatus.ITERATION_LIMIT: "stopped at the iteration limit while still improving",
+    SolverStatus.STALLED: "stalled: no step lowers the cost although one was predicted",
+    SolverStatus.BAD_START: "the cost at the start is not finite",
+    SolverStatus.AT_BOUND: "stopped at a bound: lower costs lie beyond what is allowed",
+    SolverStatus.FLAT: "stopped in a flat valley: the last steps lowered the cost by too little to matter",
+    SolverStatus.INTERRUPTED: "interrupted; this is the best state so far",
 }
 
 
@@ -78,7 +78,7 @@ class Result:
     Args:
         state: the best state found, in the problem's own form.
         cost: (...) half the sum of squared residuals there.
-        status: (...) int64 values of `Status`.
+        status: (...) int64 values of `SolverStatus`.
         iterations: (...) int64, trial steps taken.
         history: (iterations + 1, ...) cost after each trial step, the start first.
     """
@@ -97,11 +97,11 @@ class Result:
     @property
     def converged(self) -> Tensor:
         """(...) whether the element is at a minimum: `CONVERGED` or `EXACT`."""
-        return (self.status == Status.CONVERGED) | (self.status == Status.EXACT)
+        return (self.status == SolverStatus.CONVERGED) | (self.status == SolverStatus.EXACT)
 
     @property
     def message(self) -> str:
         """The reason for stopping in words; for a batch, each reason with its count."""
         found, counts = torch.unique(self.status, return_counts=True)
-        parts = [(Status(int(value)).message, int(n)) for value, n in zip(found, counts, strict=True)]
+        parts = [(SolverStatus(int(value)).message, int(n)) for value, n in zip(found, counts, strict=True)]
         return parts[0][0] if self.status.ndim == 0 else "; ".join(f"{n} x {text}" for text, n in parts)

@@ -31,7 +31,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import minimize
-from kcal.solve.result import State, Status
+from kcal.solve.result import SolverStatus, State
 from scripts.shared.page import write_section
 from scripts.shared.timing import show
 
@@ -77,7 +77,7 @@ def ladder(sets: dict[str, Observations]) -> list[str]:
         cells, rises, before = [], [], np.inf
         for coefficients in LADDER:
             result = calibrate_camera(seen, options(coefficients))
-            mark = {Status.AT_BOUND: "ᵇ", Status.FLAT: "ᶠ"}.get(result.status, "")
+            mark = {SolverStatus.AT_BOUND: "ᵇ", SolverStatus.FLAT: "ᶠ"}.get(result.status, "")
             cells.append(f"{result.rms:.6f}{mark}")
             if result.rms > before * (1 + SAME_RMS):
                 rises.append(f"{coefficients}: {result.rms / before - 1:+.1e}")
@@ -108,7 +108,7 @@ class End:
 
     rms: float
     residuals: Tensor
-    status: Status
+    status: SolverStatus
 
 
 def _public(seen: Observations, coefficients: int, focal: float | None, weak: float | None) -> End | None:
@@ -147,7 +147,7 @@ def _alone(
         return None
     errors = problem.pixel_errors(solved.state)[:, 0].transpose(-1, -2)
     residuals = torch.where(problem.seen[:, 0, :, None], errors, torch.nan)
-    return End(float(torch.sqrt(4 * solved.cost / problem.residual_count)), residuals, Status(int(solved.status)))
+    return End(float(torch.sqrt(4 * solved.cost / problem.residual_count)), residuals, SolverStatus(int(solved.status)))
 
 
 def starts(sets: dict[str, Observations], count: int) -> list[str]:

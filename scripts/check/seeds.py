@@ -23,7 +23,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import Status
+from kcal.solve.result import SolverStatus
 from scripts.bench.solver import MODELS, SIZE, flipped_views, image_error, observed, simulate
 from scripts.shared.page import write_section
 from scripts.shared.timing import show
@@ -48,7 +48,7 @@ class Outcome(NamedTuple):
     flipped: int
     focal_error: float
     image_error: float
-    status: Status
+    status: SolverStatus
     seconds: float
 
     @property

@@ -43,7 +43,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import State, Status
+from kcal.solve.result import SolverStatus, State
 from kcal.solve.robust import RobustLoss
 
 __all__ = ["CalibrationOptions", "CameraCalibrationResult", "calibrate_camera", "calibrate_cameras"]
@@ -252,7 +252,7 @@ def _robust_residuals(
         loss = RobustLoss(kind="cauchy", scale=scale)
         result = yield Solve(corner_problem(some, options, solved.minimum, solved.variance, loss), state, _ROUGH)
         spent += int(result.iterations)
-        if result.status == Status.BAD_START:
+        if result.status == SolverStatus.BAD_START:
             break
         state = result.state
     residuals = _weighted_residuals(whole, state)
@@ -287,7 +287,7 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
         # Unknown is not the same as undetermined by the views.
         determined = torch.ones_like(determined)
         doubts = [NO_ERROR_BARS, *doubts]
-    status = Status(int(solved.status))
+    status = SolverStatus(int(solved.status))
     return CameraCalibrationResult(
         camera=camera,
         rms=rms,

@@ -21,7 +21,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import State, Status
+from kcal.solve.result import SolverStatus, State
 
 # A first fit worse than this many pixels is retried from other focal lengths.
 _SUSPICIOUS_RMS = 2.0
@@ -68,7 +68,7 @@ def first_model(
         for start in ((lens, *rest), cold):
             result = yield Solve(problem, start, solver)
             spent += int(result.iterations)
-            if result.status != Status.BAD_START:
+            if result.status != SolverStatus.BAD_START:
                 break
         state, flipped = yield from unflipping(board, pixels[:, None], [model], result.state)
         if flipped:

@@ -15,7 +15,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Status
+from kcal.solve.result import SolverStatus
 from kcal.solve.robust import RobustLoss
 
 
@@ -154,7 +154,7 @@ class CameraCalibrationResult:
     board_warp: Tensor | None
     sigma: dict[str, float | None]
     covariance: Tensor
-    status: Status
+    status: SolverStatus
     iterations: int
     warnings: tuple[str, ...]
     fixed: tuple[str, ...] = ()

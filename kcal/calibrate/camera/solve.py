@@ -23,7 +23,7 @@ from kcal.calibrate.search.direct_solve import step
 from kcal.calibrate.search.model_ladder import LEAST_NOISE, Minimum, Progress, climb, steps_to
 from kcal.errors import DegenerateError, InputError
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Result, Status
+from kcal.solve.result import Result, SolverStatus
 from kcal.solve.robust import RobustLoss
 
 _MINIMUM_VIEWS = 3
@@ -135,7 +135,7 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
 
     # The first model's poses were looked at; look once more under another lens.
     result = minimum.result
-    if result.status == Status.BAD_START:
+    if result.status == SolverStatus.BAD_START:
         raise InputError(
             "the lens cannot show all corners where they are: are all views of this board and this camera?"
         )

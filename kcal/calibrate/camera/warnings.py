@@ -15,7 +15,7 @@ from kcal.calibrate.search.model_ladder import Minimum
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
-from kcal.solve.result import State, Status
+from kcal.solve.result import SolverStatus, State
 
 # A focal length known to worse than this is not a calibration: 5 % of range at every distance.
 _MAX_FOCAL_SIGMA = 0.05
@@ -129,11 +129,11 @@ def warnings_of(
     per_view: Tensor,
     determined: Tensor,
     names: list[str],
-    status: Status,
+    status: SolverStatus,
 ) -> list[str]:
     """Sentences about what the user should doubt."""
     found = []
-    if status not in (Status.CONVERGED, Status.EXACT):
+    if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         found.append(f"the solver {status.message}")
     if rms > 1.0:
         found.append(f"RMS {rms:.2f} px is high: corners, board or lens model do not fit each other")

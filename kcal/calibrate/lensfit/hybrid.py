@@ -28,7 +28,7 @@ from kcal.corners.observations import Observations
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.model import LensModel
 from kcal.lens.residual import FieldResidual
-from kcal.solve.result import Status
+from kcal.solve.result import SolverStatus
 
 # A field of fewer weights in effect is what chance leaves of none.
 _LEAST = 3.0
@@ -214,7 +214,7 @@ def _result(setting: GroupedViews, size: tuple[int, int], base: FieldFit, settle
             camera.names[i]: float(of_all[i, i].sqrt()) if bool(torch.isfinite(of_all[i, i])) else None for i in free
         },
         covariance=of_all,
-        status=Status.CONVERGED,
+        status=SolverStatus.CONVERGED,
         iterations=base.solved.spent,
         warnings=(),
     )

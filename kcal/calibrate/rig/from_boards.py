@@ -23,7 +23,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation
 from kcal.lens.rig import StereoRig
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import State, Status
+from kcal.solve.result import SolverStatus, State
 
 # A pair this many times worse than the median pair, and worse than the floor in pixels, is left out: roughly aligned,
 # and after the joint solve.
@@ -88,7 +88,7 @@ class RigCalibrationResult:
     covariance: Tensor
     disagreement: Tensor
     pixels: Tensor
-    status: Status
+    status: SolverStatus
     warnings: tuple[str, ...]
 
 
@@ -208,7 +208,7 @@ def calibrate_rig(
         )  # fmt: skip
         result = minimize(problem, result.state, options.solver)
     used = [names[i] for i in keep.nonzero()[:, 0].tolist()]
-    solved = _result(problem, problem.tidy(result.state), Status(int(result.status)), cameras, pixels[keep], used)
+    solved = _result(problem, problem.tidy(result.state), SolverStatus(int(result.status)), cameras, pixels[keep], used)
     if settled:
         lost += [f"pair {names[i][0]}, {names[i][1]}: {reason}; was it one moment?" for i, reason in suspects]
     return dataclasses.replace(
@@ -278,7 +278,7 @@ def _pixels(
 def _result(
     problem: BoardProblem,
     state: State,
-    status: Status,
+    status: SolverStatus,
     cameras: tuple[Camera, Camera],
     pixels: Tensor,
     used: list[Pair],
@@ -299,7 +299,7 @@ def _result(
     warnings = []
     if len(used) < 3:
         warnings.append(f"{len(used)} pair(s) only: a wrong one could not be noticed; 5 or more are good")
-    if status not in (Status.CONVERGED, Status.EXACT):
+    if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         warnings.append(f"the solver {status.message}")
     rms = float(torch.sqrt(squared.sum() / seen.sum()))
     if rms > 1.0:

@@ -13,7 +13,7 @@ from kcal.calibrate.rig.uncertainty import SharedSpread, mounting_rows, paramete
 from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
-from kcal.solve.result import State, Status
+from kcal.solve.result import SolverStatus, State
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -102,7 +102,7 @@ class RigSolution:
     variance: float
     sigma_corner: float | None
     undetermined: tuple[str, ...]
-    status: Status
+    status: SolverStatus
     warnings: tuple[str, ...]
     _problem: RigProblem
     _state: State

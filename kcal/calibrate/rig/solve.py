@@ -19,7 +19,7 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedSpread
 from kcal.errors import InputError
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Result, Status
+from kcal.solve.result import Result, SolverStatus
 
 # Guess of a corner's noise before the boards themselves tell it, px.
 _CORNER_SIGMA = 0.2
@@ -189,8 +189,8 @@ def _solution(
         )
     if freedom <= 0:
         warnings.append("nothing is left over to check the solution with: a wrong measurement could not be noticed")
-    status = Status(int(result.status))
-    if status not in (Status.CONVERGED, Status.EXACT):
+    status = SolverStatus(int(result.status))
+    if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         warnings.append(f"the solver {status.message}")
     spread = SharedSpread(problem, state, variance)
     undetermined = spread.open_directions(data.names, absolute=data.absolute)

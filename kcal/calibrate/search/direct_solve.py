@@ -8,7 +8,7 @@ from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.search.model_ladder import MANY_CORNERS, SUSPICIOUS_RMS, Minimum, Progress, embed, minimum_of, walls
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import State, Status, pick
+from kcal.solve.result import SolverStatus, State, pick
 
 # What priors count is told by this solution's noise, so that it is solved again.
 _ROUGH = LMOptions(max_iterations=60, tolerance=1e-6, initial_damping=1e-5)
@@ -47,7 +47,7 @@ def step(views: Views, first: State, small: LensModel, model: LensModel, progres
             state = near
     result = yield Solve(problem, state, _ROUGH)
     minimum = minimum_of(views, result, wall, model, [start], spent + int(result.iterations))
-    if int(minimum.result.status) not in (Status.CONVERGED, Status.EXACT):
+    if int(minimum.result.status) not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         return None
     progress(str(model))
     return minimum

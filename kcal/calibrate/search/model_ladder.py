@@ -29,7 +29,7 @@ from kcal.calibrate.search.starts import wide_starts
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Result, State, Status, pick, stack
+from kcal.solve.result import Result, SolverStatus, State, pick, stack
 
 # For each start of a batch; the best one is then taken to convergence.
 _SCOUT = LMOptions(max_iterations=150, tolerance=1e-9, flatness=1e-5)
@@ -240,7 +240,7 @@ def minimum_of(
     cost = plain.cost(result.state)
     status = result.status
     if result.converged and float(result.cost - cost) > _AT_WALL * float(cost) / plain.residual_count:
-        status = torch.full_like(status, int(Status.AT_BOUND))
+        status = torch.full_like(status, int(SolverStatus.AT_BOUND))
     result = dataclasses.replace(result, cost=cost, status=status)
     rivals = tuple((float(plain.cost(state)), state) for state in others)
     return Minimum(result=result, iterations=spent, rivals=rivals, terms=terms)
@@ -324,11 +324,15 @@ def _finish(views: Views, start: State, model: LensModel, options: LMOptions) ->
             if views.trouble(result.state, model) > limit:
                 break
             state = result.state
-            if int(result.status) != Status.ITERATION_LIMIT:
+            if int(result.status) != SolverStatus.ITERATION_LIMIT:
                 break
-        result = dataclasses.replace(result, state=state, status=torch.full_like(result.status, int(Status.AT_BOUND)))
+        result = dataclasses.replace(
+            result, state=state, status=torch.full_like(result.status, int(SolverStatus.AT_BOUND))
+        )
         ends.append((float(plain.cost(state)) + price * limit, result, terms))
-    fallback = dataclasses.replace(result, state=start, status=torch.full_like(result.status, int(Status.AT_BOUND)))
+    fallback = dataclasses.replace(
+        result, state=start, status=torch.full_like(result.status, int(SolverStatus.AT_BOUND))
+    )
     ends.append((before + price * limit, fallback, terms))
     _, result, terms = min((end for end in ends if math.isfinite(end[0]) or end[1] is fallback), key=lambda end: end[0])
     return dataclasses.replace(result, cost=plain.cost(result.state)), terms

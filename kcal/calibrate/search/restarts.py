@@ -17,7 +17,7 @@ import torch
 from kcal.calibrate.bundle.batching import Solve, Steps
 from kcal.calibrate.bundle.board_problem import BoardProblem
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Result, State, Status, pick, stack
+from kcal.solve.result import Result, SolverStatus, State, pick, stack
 
 # How many of the weakest directions are followed, and how far: standard deviations.
 _DIRECTIONS = 4
@@ -45,7 +45,7 @@ def escape(
         the lowest accepted solution, its iterations those of all searches.
     """
     spent = 0
-    for _ in range(_ROUNDS if int(result.status) != Status.EXACT else 0):
+    for _ in range(_ROUNDS if int(result.status) != SolverStatus.EXACT else 0):
         starts = restart_states(problem, result.state)
         if not starts:
             break

@@ -25,7 +25,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import State, Status, stack
+from kcal.solve.result import SolverStatus, State, stack
 
 CPU = torch.device("cpu")
 
@@ -155,11 +155,11 @@ class TestJoined:
         joined, start = join_boards(problems, starts, CPU)
         found = split_boards(minimize(joined, start, options), problems)
         assert [result.state[-1].shape[0] for result in found] == [6, 10, 6]
-        assert int(found[2].status) == Status.BAD_START
+        assert int(found[2].status) == SolverStatus.BAD_START
         assert math.isnan(float(found[2].cost))
         for result, problem, begin in zip(found[:2], problems, starts, strict=False):
             alone = minimize(problem, begin, options)
-            assert int(result.status) == int(alone.status) == Status.CONVERGED
+            assert int(result.status) == int(alone.status) == SolverStatus.CONVERGED
             assert float(result.cost) == pytest.approx(float(alone.cost), rel=1e-10)
 
     def test_searches_on_folded_views(self) -> None:

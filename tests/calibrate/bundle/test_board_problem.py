@@ -15,7 +15,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import parameter_names
 from kcal.solve.lm import LevenbergMarquardt, LMOptions, minimize
-from kcal.solve.result import State, Status
+from kcal.solve.result import SolverStatus, State
 
 BOARD = Board(columns=4, rows=3, square=0.1)
 VIEWS = 3
@@ -224,7 +224,7 @@ class TestResiduals:
         assert bool(torch.isnan(problem.cost(state)))
         # A start there is told as such.
         assert bool(torch.isnan(problem.linearize(state).cost))
-        assert int(minimize(problem, state).status) == Status.BAD_START
+        assert int(minimize(problem, state).status) == SolverStatus.BAD_START
         hidden = pixels.clone()
         hidden[1, 0, lost] = torch.nan
         problem = BoardProblem(BOARD.points, hidden, models, [()])

@@ -17,7 +17,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibratio
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import State, Status
+from kcal.solve.result import SolverStatus, State
 
 
 def solve(pixels: Tensor, model: str = "opencv5", **options: object) -> CameraCalibrationResult:
@@ -46,7 +46,7 @@ class TestNoiseFree:
         truth = camera(model)
         poses = motions(truth, 8, 1)
         result = solve(pixels_of(truth, poses), model)
-        assert result.status == Status.EXACT
+        assert result.status == SolverStatus.EXACT
         assert result.rms < 1e-11
         assert result.warnings == ()
         assert far_apart(result.camera, truth) < 1e-8
@@ -81,7 +81,7 @@ class TestNoiseFree:
         pixels, _ = truth.project(bent @ rotation.transpose(-1, -2) + translation[:, None])
         result = solve(pixels, board_warp=True)
         assert result.board_warp is not None
-        assert result.status == Status.EXACT
+        assert result.status == SolverStatus.EXACT
         expected = torch.tensor([0.002, -0.001], dtype=torch.float64)
         torch.testing.assert_close(result.board_warp, expected, rtol=0, atol=1e-9)
         assert far_apart(result.camera, truth) < 1e-8
@@ -95,7 +95,7 @@ class TestNoiseFree:
         """A third and six times the image's width, far from the guesses; all coefficients small or zero."""
         truth = Camera.build(focal=(focal, 1.01 * focal), center=(325.8, 235.3), size=SIZE, model=model)
         result = solve(pixels_of(truth, motions(truth, 12, 3, tilt=45)), model)
-        assert result.status == Status.EXACT
+        assert result.status == SolverStatus.EXACT
         # A telephoto lens leaves some digits of its principal point to the poses.
         assert far_apart(result.camera, truth) < 1e-5
         assert float(result.camera.focal[0]) == pytest.approx(focal, rel=1e-7)
@@ -107,7 +107,7 @@ class TestNoiseFree:
         hidden[3, 21:] = True
         pixels[hidden] = torch.nan
         result = solve(pixels)
-        assert result.status == Status.EXACT
+        assert result.status == SolverStatus.EXACT
         assert far_apart(result.camera, truth) < 1e-8
         assert torch.equal(torch.isnan(result.residuals[..., 0]), hidden)
         assert bool(torch.isfinite(result.per_view_rms).all())
@@ -368,7 +368,7 @@ class TestWarnings:
         truth = camera()
         pixels = pixels_of(truth, motions(truth, 8, 2), noise=0.1)
         result = solve(pixels, solver=LMOptions(max_iterations=1))
-        assert result.status == Status.ITERATION_LIMIT
+        assert result.status == SolverStatus.ITERATION_LIMIT
         assert any("iteration limit" in text for text in result.warnings)
 
     def test_not_determined(self) -> None:

@@ -16,7 +16,7 @@ from kcal.corners.board import Board
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.solve.result import Status
+from kcal.solve.result import SolverStatus
 
 # 8 x 6 corners: the colors are the same after half a turn, so that a detector cannot know the first corner.
 AMBIGUOUS = Board(columns=8, rows=6, square=0.04)
@@ -68,7 +68,7 @@ class TestTruth:
     @pytest.mark.parametrize("count", [1, 2, 5])
     def test_comes_back(self, count: int) -> None:
         result = solve(views(count, 1))
-        assert result.status == Status.EXACT
+        assert result.status == SolverStatus.EXACT
         assert result.rms < 1e-11
         assert max(off(result)) < 1e-11
         assert result.pairs == tuple(names(count))
@@ -86,7 +86,7 @@ class TestTruth:
         hidden = torch.rand(pixels.shape[:-1], generator=torch.Generator().manual_seed(1)) < 0.4
         pixels[hidden] = torch.nan
         result = solve(pixels)
-        assert result.status == Status.EXACT
+        assert result.status == SolverStatus.EXACT
         assert max(off(result)) < 1e-10
         assert torch.equal(torch.isnan(result.pixels[..., 0]), hidden)
 

@@ -38,7 +38,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.residual import FieldGrid, FieldResidual
-from kcal.solve.result import State, Status
+from kcal.solve.result import SolverStatus, State
 
 APART = float((CENTER[0] - CENTER[1]).norm())
 BASELINE = (Baseline(first=0, second=1, length=APART, sigma=0.005),)
@@ -203,7 +203,7 @@ class TestRecovery:
     @pytest.mark.parametrize("kind", list(SOURCES))
     def test_exact_data_give_the_truth(self, kind: str, count: int) -> None:
         found = solve_rig(data(count, **SOURCES[kind](count)))
-        assert found.status in (Status.EXACT, Status.CONVERGED)
+        assert found.status in (SolverStatus.EXACT, SolverStatus.CONVERGED)
         assert found.left_out == ()
         if kind in ("features and positions", "boards and positions") and count == 2:
             # Two measured positions leave a turn about their line open; what the cameras are to each other is known.
