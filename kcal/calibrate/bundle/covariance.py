@@ -106,7 +106,7 @@ def covariance(linear: SchurLinearization, residual_count: int, parameter_count:
         ([[0.5]], 3.0)
     """
     shared, determined = uncertainty_of(linear, residual_count, parameter_count)
-    answer, own = linear.answers()
+    answer, own = linear.local_response()
     return Covariance(shared, determined, answer, own * _noise(linear, residual_count, parameter_count))
 
 

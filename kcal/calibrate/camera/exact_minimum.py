@@ -62,7 +62,7 @@ def settle(problem: BoardProblem, state: State) -> tuple[State, Curvature]:
             return problem.cost(problem.retract(here, (shared, local)))
 
         gradient, found = curvature(cost, *zero)
-        step, decrease = found.beside(*gradient).step(zero[0].new_zeros(()))
+        step, decrease = found.system(*gradient).step(zero[0].new_zeros(()))
         left = float(decrease)
         if best is not None and not left < best[0]:
             break
@@ -78,7 +78,7 @@ def settle(problem: BoardProblem, state: State) -> tuple[State, Curvature]:
         )
     _, state, found = best
     if problem.shared_size:
-        linear = found.beside(*zero)
+        linear = found.system(*zero)
         linear.cost = problem.cost(state)
         known = uncertainty_of(linear, problem.residual_count, problem.shared_size + zero[1].numel())
         groups = _unknowns(problem)

@@ -77,7 +77,7 @@ def restart_states(problem: BoardProblem, state: State) -> list[State]:
     """
     linear = problem.linearize(state)
     information, scale = linear.information()
-    answers, _ = linear.answers()
+    answers, _ = linear.local_response()
     values, vectors = torch.linalg.eigh(information)
     noise = math.sqrt(2.0 * float(linear.cost) / problem.residual_count)
     if not (math.isfinite(noise) and bool(answers.isfinite().all())):
