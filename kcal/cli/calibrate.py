@@ -121,7 +121,7 @@ def calibrate(
 
     from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
     from kcal.calibrate.camera.outliers import OutlierRejection
-    from kcal.calibrate.search.model_ladder import steps_to
+    from kcal.calibrate.search.model_ladder import nested_models
     from kcal.corners.observations import Observations
     from kcal.solve.robust import RobustLoss
 
@@ -143,7 +143,7 @@ def calibrate(
         reject=rejection,
     )
     seen = Observations.load(observations)
-    with steps("calibrating", 1 + max(1, len(steps_to(lens)) - 1)) as advance:
+    with steps("calibrating", 1 + max(1, len(nested_models(lens)) - 1)) as advance:
         result = calibrate_camera(seen, options, advance)
     file = record(result, seen, name or observations.name.split(".")[0], observations.name)
     file.save(output)

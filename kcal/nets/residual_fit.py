@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.nets.residual import GlobalResidual
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import Result, State
@@ -34,21 +34,23 @@ class GlobalProblem(SchurProblem):
 
     def residuals(self, state: State) -> Tensor:
         """See `SchurProblem.residuals`."""
-        return self._board.residuals(state[1:])
+        return self._board.residuals(BoardState(*state[1:]))
 
     def rows(self, state: State) -> Tensor:
         """See `SchurProblem.rows`; by the camera's parameters, see `linearize`."""
-        return self._board.rows(state[1:])
+        return self._board.rows(BoardState(*state[1:]))
 
     def shared_rows(self, state: State) -> Tensor | None:
         """See `SchurProblem.shared_rows`."""
-        return self._board.shared_rows(state[1:])
+        return self._board.shared_rows(BoardState(*state[1:]))
 
     def linearize(self, state: State) -> SchurLinearization:
         """See `Problem.linearize`: derivatives by the parameters times those of the parameters by the weights."""
         warp = torch.eye(self._warp, dtype=torch.float64, device=state[0].device)
         slopes = torch.block_diag(self._residual.slopes(state[0]), warp)
-        return SchurLinearization(self._board.gram(state[1:]), self.local_size, self.shared_rows(state), slopes)
+        return SchurLinearization(
+            self._board.gram(BoardState(*state[1:])), self.local_size, self.shared_rows(state), slopes
+        )
 
     def retract(self, state: State, step: State) -> State:
         """See `SchurProblem.retract`."""
@@ -59,7 +61,9 @@ class GlobalProblem(SchurProblem):
         parameters = self._residual.parameters_at(weights)
         # Only the warp and the poses move by a step of the board problem itself.
         still = shared.new_zeros((*shared.shape[:-1], len(self._residual.corrected)))
-        moved = self._board.retract((parameters, *board), (torch.cat([still, shared[..., count:]], -1), local))
+        moved = self._board.retract(
+            BoardState(parameters, *board), (torch.cat([still, shared[..., count:]], -1), local)
+        )
         return (weights, *moved)
 
 

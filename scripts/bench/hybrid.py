@@ -34,7 +34,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from kcal.calibrate.bundle.board_problem import BoardState
 from kcal.calibrate.bundle.poses import refine_poses
+from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.lensfit.hybrid import HybridOptions, calibrate_hybrid
 from kcal.calibrate.rig.board_consensus import Poses, pose_alone
@@ -88,11 +90,10 @@ def held_out(camera: Camera, warp: torch.Tensor, seen: Observations, weight: np.
     pixels = seen.pixels()
     alone: Poses
     alone, _ = pose_alone(seen.board.points, pixels, camera, LMOptions(max_iterations=50))
-    parameters = camera.params.detach()
-    none = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
-    state = (parameters, warp, *none, alone.rotation, alone.translation)
-    weights = torch.from_numpy(weight)[:, None, :, None, None] * torch.eye(2, dtype=torch.float64)
-    _, cost = refine_poses(seen.board.points, pixels[:, None], [camera.model], state, EXACT, [camera.field], weights)
+    state = BoardState(camera.params.detach(), warp, alone.rotation, alone.translation)
+    weights = torch.from_numpy(weight)[..., None, None] * torch.eye(2, dtype=torch.float64)
+    views = Views(board_points=seen.board.points, pixels=pixels, whitening=weights)
+    _, cost = refine_poses(views, camera.model, state, EXACT, camera.field)
     return 2.0 * float(torch.nan_to_num(cost, nan=math.inf).sum()), int((weight > 0).sum())
 
 

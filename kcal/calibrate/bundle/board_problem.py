@@ -133,6 +133,11 @@ class BoardProblem(SchurProblem[BoardState]):
         self.shared_size = len(self.free) + 2 * free_warp
 
     @property
+    def pixels(self) -> Tensor:
+        """(..., V, N, 2) observed corners; NaN where not seen."""
+        return torch.where(self.seen[..., None], self._target.transpose(-1, -2), torch.nan)
+
+    @property
     def elements(self) -> int:
         """How many states are solved side by side."""
         return math.prod(self.batch)
@@ -197,12 +202,11 @@ class BoardProblem(SchurProblem[BoardState]):
                     parts[-1][:, shape[0] :] = fill
             return torch.cat(parts).to(device)
 
-        pixels = [p._target.transpose(-1, -2).where(p.seen[..., None], torch.nan) for p in problems]
         whitening = [p.whitening.movedim(-1, -3) for p in problems if p.whitening is not None]
         terms = joined_terms([problem.terms for problem in problems], counts, (sum(counts),))
         joined = cls(
             first.board_points.to(device),
-            by_view(pixels, 3, torch.nan),
+            by_view([problem.pixels for problem in problems], 3, torch.nan),
             first.model,
             first.free,
             free_warp=first.free_warp,

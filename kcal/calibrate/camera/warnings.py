@@ -86,8 +86,8 @@ def rival_warnings(
             rms = (2.0 * variance * other / cost) ** 0.5
             where = ", ".join(f"{name} {shift:+.1f} px" for name, shift in apart.items())
             return [
-                f"another solution fits almost as well (RMS {rms:.4f} px) with {where}: the views do not determine "
-                "this lens model; choose a smaller model or add views"
+                f"another solution fits almost as well (RMS {rms:.4f} px) with {where}: do not trust this model's "
+                "parameters; choose a smaller model or add views"
             ]
     return []
 

@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.rig.blocks import BoardGroup, FeatureGroup, Group, LandmarkGroup
 from kcal.calibrate.rig.initial_poses import Start
@@ -88,7 +88,7 @@ class Adjustment:
             for build, mask, count in zip(self._groups, masks, TENSORS, strict=True)
         ]
         count = len(self.data.cameras)
-        free = [Free((), ())] * count if held else self.free
+        free = [FreeParameters((), ())] * count if held else self.free
         turning, moving = ([not held and one for one in each] for each in (self._turning, self._moving))
         models, fields = [c.model for c in self.data.cameras], [c.field for c in self.data.cameras]
         return RigProblem(models, fields, groups, () if held else self.terms, free, turning, moving, loss)
@@ -172,12 +172,12 @@ def typical_excess(squares: Tensor, freedom: Tensor) -> float:
     return float((squares[known] / chi2_quantile(freedom[known].double(), 0.5)).median())
 
 
-def _free(data: RigData, camera: int, intrinsics: Intrinsics) -> Free:
+def _free(data: RigData, camera: int, intrinsics: Intrinsics) -> FreeParameters:
     model = data.cameras[camera].model
     if intrinsics == "fixed":
-        return Free((), ())
+        return FreeParameters((), ())
     if intrinsics == "free":
-        return Free.of(free_parameters(model))
+        return FreeParameters.of(free_parameters(model))
     covariance = None if data.covariances is None else data.covariances[camera]
     if covariance is None:
         raise InputError(f"{data.names[camera]}: a prior needs the covariance of the camera's parameters")
@@ -188,10 +188,10 @@ def _free(data: RigData, camera: int, intrinsics: Intrinsics) -> Free:
         )
     if not bool(torch.isfinite(covariance).all()):
         raise InputError(f"{data.names[camera]}: the covariance of its parameters is not finite; calibrate it anew")
-    return Free.of((covariance.diagonal() > 0).nonzero()[:, 0].tolist())
+    return FreeParameters.of((covariance.diagonal() > 0).nonzero()[:, 0].tolist())
 
 
-def _terms(data: RigData, priors: list[Free] | None) -> list[SharedTerm]:
+def _terms(data: RigData, priors: list[FreeParameters] | None) -> list[SharedTerm]:
     terms: list[SharedTerm] = [DistanceTerm(b.first, b.second, b.length, b.sigma) for b in data.baselines]
     terms += [PlaceTerm(p.camera, p.point, p.sigma) for p in data.positions]
     for c, free in enumerate(priors or ()):

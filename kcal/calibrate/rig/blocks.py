@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.twist import apply_twist
 from kcal.lens.model import LensModel
 from kcal.lens.pose import side_axes, step_rows
@@ -36,7 +36,7 @@ class Sight(NamedTuple):
     field: Field | None
     rotation: Tensor
     center: Tensor
-    free: Free
+    free: FreeParameters
     inner: slice
     turn: slice | None
     shift: slice | None

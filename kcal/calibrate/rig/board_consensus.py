@@ -8,13 +8,13 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
 from kcal.calibrate.bundle.poses import refine_poses, unflip
+from kcal.calibrate.bundle.views import Views
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import State
 
 MINIMUM_CORNERS = 6
 # A camera that leaves its own boards this far off (pixels) is not the camera that took them.
@@ -55,18 +55,15 @@ def pose_alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions)
         return Poses(torch.empty(0), torch.empty(0)), math.inf
     homography = homographies(board, normalized)
     pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    rotation, translation = poses_from_homographies(homography, pinhole)
-    nothing = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
-    parameters = camera.params.detach()
-    state: State = (parameters, torch.zeros(2, dtype=torch.float64), *nothing, rotation, translation)
-    view = pixels[:, None]
-    state, _ = refine_poses(board, view, [camera.model], state, solver, [camera.field])
-    state, flipped = unflip(board, view, [camera.model], state, [camera.field])
+    state = BoardState.flat(camera.params.detach(), *poses_from_homographies(homography, pinhole))
+    views = Views(board_points=board, pixels=pixels)
+    state, _ = refine_poses(views, camera.model, state, solver, camera.field)
+    state, flipped = unflip(views, camera.model, state, camera.field)
     if flipped:
-        state, _ = refine_poses(board, view, [camera.model], state, solver, [camera.field])
-    problem = BoardProblem(board, pixels[:, None], [camera.model], [()], fields=[camera.field])
-    rms = float(pair_rms(problem, state, pixels[:, None]).median())
-    return Poses(state[-2], state[-1]), rms if math.isfinite(rms) else math.inf
+        state, _ = refine_poses(views, camera.model, state, solver, camera.field)
+    problem = views.problem(camera.model, field=camera.field)
+    rms = float(torch.sqrt((problem.residuals(state) ** 2).sum(-1) / problem.seen.sum(-1)).median())
+    return Poses(state.rotation, state.translation), rms if math.isfinite(rms) else math.inf
 
 
 def check_fit(
@@ -88,7 +85,7 @@ def check_fit(
             )
 
 
-def pair_rms(problem: BoardProblem, state: State, pixels: Tensor) -> Tensor:
+def pair_rms(problem: BoardProblem, state: BoardState, pixels: Tensor) -> Tensor:
     """RMS (V,) in pixels of each view, over all cameras."""
     residuals = problem.residuals(state)
     count = torch.isfinite(pixels).all(-1).sum((-2, -1))

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.rig.adjustment import Adjustment, chi2_quantile, typical_excess
 from kcal.calibrate.rig.blocks import LOCAL_SIZE, BoardGroup
 from kcal.calibrate.rig.problem import RigProblem
@@ -94,7 +94,7 @@ def _alone(work: Adjustment, mask: Tensor) -> tuple[Tensor, Tensor]:
             [camera.field for camera in cameras],
             [(BoardGroup(pixels, whitening[some], boards.board.points), 2)],
             (),
-            [Free((), ())] * len(cameras),
+            [FreeParameters((), ())] * len(cameras),
             held,
             held,
         )

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardState
+from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.rig.adjustment import chi2_quantile, typical_excess
 from kcal.calibrate.rig.board_consensus import Poses
 from kcal.lens.camera import Camera
@@ -34,11 +35,9 @@ def alone_squares(
         views: each camera's own board poses.
     """
     total, freedom = torch.zeros(len(pixels), dtype=torch.float64), 0
-    nothing = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
     for c, (camera, poses) in enumerate(zip(cameras, views, strict=True)):
-        problem = BoardProblem(board, pixels[:, c : c + 1], [camera.model], [()], fields=[camera.field])
-        warp = torch.zeros(2, dtype=torch.float64)
-        state = (camera.params.detach(), warp, *nothing, poses.rotation, poses.translation)
+        problem = Views(board_points=board, pixels=pixels[:, c]).problem(camera.model, field=camera.field)
+        state = BoardState.flat(camera.params.detach(), poses.rotation, poses.translation)
         total = total + 2.0 * problem.view_cost(state)
         freedom += 2 * int(torch.isfinite(pixels[:, c]).all(-1).sum()) - 6 * len(pixels)
     return total, float(total.sum()) / max(freedom, 1)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.rig.blocks import LOCAL_SIZE, Group, Sight
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, rotation_from_vector
@@ -119,7 +119,7 @@ class RigProblem:
         fields: Sequence[Field | None],
         groups: Sequence[tuple[Group, int]],
         terms: Sequence[SharedTerm],
-        free: Sequence[Free],
+        free: Sequence[FreeParameters],
         turning: Sequence[bool],
         moving: Sequence[bool],
         loss: RobustLoss | None = None,

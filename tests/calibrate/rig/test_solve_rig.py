@@ -25,7 +25,7 @@ from rig_scenes import (
 )
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.rig import limits
 from kcal.calibrate.rig.blocks import BoardGroup, FeatureGroup, Group, LandmarkGroup
 from kcal.calibrate.rig.problem import DistanceTerm, ParameterTerm, PlaceTerm, RigProblem
@@ -102,7 +102,7 @@ def mixed_problem() -> tuple[RigProblem, State]:
         [None] * 3,
         groups,
         terms,
-        [Free((0, 1, 7), (0, 0, 1)), Free.of(index), Free((), ())],
+        [FreeParameters((0, 1, 7), (0, 0, 1)), FreeParameters.of(index), FreeParameters((), ())],
         [True, True, False],
         [False, True, True],
     )
