@@ -191,7 +191,7 @@ class TestNumbers:
         for name, sigma in zip(result.sigma, sigmas.tolist(), strict=True):
             # As above.
             assert sigma == pytest.approx(known[name], rel=1e-5 if model == "opencv5" else 1e-3), name
-            # What is reported is no less: with eight coefficients it includes the difference from a weak prior's solution.
+            # What is reported is no less: of eight coefficients it includes the difference to a weak prior's solution.
             reported = result.sigma[name] or 0.0
             assert reported == pytest.approx(sigma, rel=1e-6) if model == "opencv5" else reported > 0.95 * sigma
 
