@@ -10,6 +10,7 @@ import torch
 from kcal.calibrate.bundle.views import Views, free_parameters
 from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.assess import assess
+from kcal.calibrate.camera.record import camera_calibration
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.solve import Solution, solve
 from kcal.calibrate.lensfit.field_fit import (
@@ -142,6 +143,7 @@ def calibrate_hybrid(
     else:
         model = base.model if rival is None else LensModel.named(rival.name)
         calibration = assess(observations, solutions[model], options.parametric(model))
+    calibration.camera.calibration = camera_calibration(calibration, observations)
     return HybridResult(
         calibration=calibration,
         kept=kept,
