@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from kcal.calibrate.camera.layer import CalibrationLayer
     from kcal.calibrate.lensfit.hybrid import HybridOptions, calibrate_hybrid
     from kcal.calibrate.rig.drift import measure_drift
-    from kcal.calibrate.rig.from_boards import RigOptions, calibrate_rig
-    from kcal.calibrate.rig.solve import JointOptions, solve_rig
+    from kcal.calibrate.rig.from_boards import calibrate_rig
+    from kcal.calibrate.rig.solve import RigOptions, solve_rig
     from kcal.calibrate.rig.sources import RigData
     from kcal.corners.board import Board
     from kcal.corners.detect import detect_images
@@ -51,7 +51,6 @@ __all__ = [
     "HybridCamera",
     "HybridOptions",
     "InverseNet",
-    "JointOptions",
     "KcalError",
     "LMOptions",
     "LensModel",
@@ -93,7 +92,6 @@ _HOME = {
     "HybridCamera": "kcal.lens.hybrid",
     "HybridOptions": "kcal.calibrate.lensfit.hybrid",
     "InverseNet": "kcal.nets.inverse",
-    "JointOptions": "kcal.calibrate.rig.solve",
     "KcalError": "kcal.errors",
     "LMOptions": "kcal.solve.lm",
     "LensModel": "kcal.lens.model",
@@ -103,7 +101,7 @@ _HOME = {
     "Origin": "kcal.locate.geodesy",
     "RigCovariance": "kcal.locate.covariances",
     "RigData": "kcal.calibrate.rig.sources",
-    "RigOptions": "kcal.calibrate.rig.from_boards",
+    "RigOptions": "kcal.calibrate.rig.solve",
     "StereoLocalizer": "kcal.locate.localizer",
     "StereoRig": "kcal.lens.rig",
     "Triangulate": "kcal.locate.stereo",
