@@ -23,7 +23,6 @@ PUBLIC = {
     "HybridCamera",
     "HybridOptions",
     "InverseNet",
-    "JointOptions",
     "KcalError",
     "LMOptions",
     "LensModel",

@@ -316,7 +316,7 @@ class TestRig:
         assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, *more) == 0
         printed = capsys.readouterr()
         assert printed.out.startswith("source")
-        assert "turned by 180°: left01.png right01.png (right)" in printed.out
+        assert "turned by 180°: left01.png right01.png (right; the board" in printed.out
         assert (cameras / "rig.png").read_bytes().startswith(b"\x89PNG")
         file = RigFile.load(cameras / "joint.json")
         assert file.calibration is not None
@@ -349,8 +349,8 @@ class TestRig:
         (cameras / "right.obs.json").write_text(json.dumps(content))
         assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json") == 0
         printed = capsys.readouterr()
-        assert "turned by 180°: left01.png, right01.png" in printed.out
-        assert "left out: left04.png, right04.png: " in printed.err
+        assert "turned by 180°: left01.png right01.png (right; the board" in printed.out
+        assert "left out: board left04.png right04.png: " in printed.err
         record = RigFile.load(cameras / "rig.json").calibration
         assert record is not None
         assert record.flipped == ("left01.png right01.png",)

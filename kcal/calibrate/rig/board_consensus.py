@@ -117,7 +117,7 @@ def half_turn(board: Tensor) -> Poses:
 def consensus(
     board: Tensor, pixels: Tensor, cameras: tuple[Camera, Camera], left: Poses, right: Poses
 ) -> tuple[Poses, Tensor, Tensor]:
-    """Find the relative pose that most pairs agree with; also which pairs are turned under it, and each one's error (px).
+    """Find the relative pose that most pairs agree with, which pairs are turned under it, and each pair's error (px).
 
     Every pair proposes a relative pose, with the corners as read and with the second camera's order turned by 180°.
     """

@@ -162,8 +162,8 @@ class RigResult:
     def pair_rms(self) -> Tensor:
         """(P,) sqrt(mean ‖r‖²) of each board used, over the corners of all cameras, pixels."""
         count = torch.isfinite(self.pixels).all(-1).sum(-1)
-        rms = torch.tensor([[value or 0.0 for value in item.pixels] for item in self._boards_used], dtype=torch.float64)
-        return ((count * rms.square()).sum(-1) / count.sum(-1)).sqrt()
+        rms = torch.tensor([value or 0.0 for item in self._boards_used for value in item.pixels], dtype=torch.float64)
+        return ((count * rms.reshape(count.shape).square()).sum(-1) / count.sum(-1)).sqrt()
 
     @property
     def sigma_rotation(self) -> Tensor:

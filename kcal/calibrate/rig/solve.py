@@ -7,7 +7,6 @@ import dataclasses
 import math
 
 import torch
-from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import Adjustment, Intrinsics
 from kcal.calibrate.rig.blocks import KINDS, PerKind

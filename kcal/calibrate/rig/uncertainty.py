@@ -1,4 +1,4 @@
-"""Tell how well the data determine a rig: goodness of fit, joint covariances, and names for what the data leave open."""
+"""Tell how well the data determine a rig: goodness of fit, joint covariances, names for what the data leave open."""
 
 from __future__ import annotations
 
@@ -123,28 +123,26 @@ def _named_motions(
         for axis, word in zip(_IDENTITY, ("east", "north", "up"), strict=True):
             rig_motion(f"where the rig stands ({word})", zero, axis.expand_as(center))
         along = center[1] - center[0]
-        turns = [(_IDENTITY[2], "the heading (a turn about the vertical)")]
-        turns += [
+        axes_of_turns = [(_IDENTITY[2], "the heading (a turn about the vertical)")]
+        axes_of_turns += [
             (axis, f"a tilt of the rig about the {word} axis")
             for axis, word in zip(_IDENTITY[:2], ("east", "north"), strict=True)
         ]
         if bool(along.any()):
-            turns.append((along / torch.linalg.vector_norm(along), "a turn of the rig about its baseline"))
-        for axis, label in turns:
+            axes_of_turns.append((along / torch.linalg.vector_norm(along), "a turn of the rig about its baseline"))
+        for axis, label in axes_of_turns:
             for pivot in (middle, *center):
                 rig_motion(label, axis, torch.linalg.cross(axis.expand_as(center), center - pivot))
     fixed = center[0] if problem.shift[0] is None else middle
     rig_motion("the scale (how far apart the cameras stand)", zero, center - fixed)
     for c, name in enumerate(names):
-        for slot, words, axes, label in (
-            (problem.turn[c], ("pitch", "yaw", "roll"), _IDENTITY, "the {word} of {name}"),
-            (problem.shift[c], ("sideways", "up and down", "along its axis"), rotation[c], "where {name} stands ({word})"),
-        ):  # fmt: skip
-            for word, axis in zip(words, axes, strict=True):
-                if slot is not None:
-                    motion = torch.zeros(problem.shared_size, dtype=torch.float64)
-                    motion[slot] = axis
-                    out.append((label.format(word=word, name=name), motion))
+        turns = [f"the {word} of {name}" for word in ("pitch", "yaw", "roll")]
+        shifts = [f"where {name} stands ({word})" for word in ("sideways", "up and down", "along its axis")]
+        for slot, labels, axes in ((problem.turn[c], turns, _IDENTITY), (problem.shift[c], shifts, rotation[c])):
+            for label, axis in zip(labels if slot else (), axes, strict=False):
+                motion = torch.zeros(problem.shared_size, dtype=torch.float64)
+                motion[slot] = axis
+                out.append((label, motion))
     single = torch.eye(problem.shared_size, dtype=torch.float64)
     return out + [(label, axis) for label, axis in zip(_labels(problem, names), single, strict=True) if label]
 

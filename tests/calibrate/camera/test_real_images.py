@@ -118,9 +118,7 @@ def rigs(seen: dict[str, Observations], solved: Solve) -> dict[bool, RigResult]:
     cameras = [solved(side, "opencv5").camera for side in SIDES]
     pairs = pair_by_name(seen["left"].names, seen["right"].names)
     options = {refine: RigOptions(intrinsics="free" if refine else "fixed", reject=False) for refine in (False, True)}
-    return {
-        refine: calibrate_rig(*cameras, seen["left"], seen["right"], pairs, option) for refine, option in options.items()
-    }
+    return {refine: calibrate_rig(*cameras, *seen.values(), pairs, option) for refine, option in options.items()}
 
 
 class TestRig:

@@ -104,7 +104,8 @@ class TestTruth:
         pixels[2, 1, :9] = torch.nan
         result = solve(pixels)
         seen = torch.isfinite(pixels[..., 0]).sum(-1).double()
-        both = ((result.rms_px[0] ** 2 * seen[:, 0].sum() + result.rms_px[1] ** 2 * seen[:, 1].sum()) / seen.sum()) ** 0.5
+        left, right = result.rms_px
+        both = ((left**2 * seen[:, 0].sum() + right**2 * seen[:, 1].sum()) / seen.sum()) ** 0.5
         assert result.rms == pytest.approx(float(both), rel=1e-12)
         squared = (result.pair_rms**2 * seen.sum(-1)).sum() / seen.sum()
         assert result.rms == pytest.approx(float(squared**0.5), rel=1e-9)
