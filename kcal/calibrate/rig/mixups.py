@@ -20,6 +20,8 @@ from kcal.errors import InputError
 _SIDEWAYS = 0.5
 # A feature is behind the cameras if its inverse range is negative by so many of its standard deviations.
 _BEHIND_SIGMAS = 4.0
+# A single wrong match counts no more than an item that is three times worse than its sigmas.
+_MOST_BEHIND = 9.0
 # Fewer equal pixels may be equal by chance.
 _EQUAL_PIXELS = 4
 
@@ -70,6 +72,21 @@ def swap_warnings(data: RigData, problem: RigProblem, state: RigState, covarianc
             "marks are swapped, or are not of the same things"
         )
     return found
+
+
+def cost_of_features_behind(problem: RigProblem, state: RigState) -> float:
+    """Half the squares, in sigmas, of how far marks of features behind the cameras are from those at infinity.
+
+    A rig and its mirror image, in which the baseline is reversed and inverse ranges are negative, fit features of
+    unknown range alike. This cost tells them apart.
+    """
+    posed, cost = problem.posed(state), 0.0
+    for block in problem.blocks:
+        if isinstance(block, FeatureBlock):
+            by_inverse_range = block.rows(posed, state, problem.shared_size)[:, block.size - 1]
+            squares = (state.inverse_range.clamp_max(0.0)[:, None] * by_inverse_range).square().sum(-1)
+            cost += 0.5 * float(squares.clamp_max(_MOST_BEHIND).sum())
+    return cost
 
 
 def _rightward(data: RigData, state: RigState, left: int, right: int) -> Tensor:

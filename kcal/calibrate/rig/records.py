@@ -136,8 +136,8 @@ def _contradiction(work: Adjustment, kind: Kind, pixels: Sequence[float | None],
         return f"its marks are off the surveyed place by {text} ({sigmas:.0f} sigma): a wrong mark or survey"
     if kind == "features":
         return f"its marks do not meet: off by {text} ({sigmas:.0f} sigma): not the same thing, or it moved"
-    why = "not taken at the same moment, or where a lens is not its model?"
-    return f"it does not fit the other boards: {text} ({sigmas:.1f} times typical): {why}"
+    why = "it moved between the views, or a lens differs from its model"
+    return f"it does not fit the other boards: off by {text} ({sigmas:.1f} sigma): {why}"
 
 
 def _measurement_records(work: Adjustment) -> list[ItemResidual]:

@@ -12,7 +12,7 @@ from kcal.calibrate.rig.adjustment import Adjustment, Intrinsics
 from kcal.calibrate.rig.blocks import KINDS, PerKind
 from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
-from kcal.calibrate.rig.mixups import refuse_same_camera, swap_warnings
+from kcal.calibrate.rig.mixups import cost_of_features_behind, refuse_same_camera, swap_warnings
 from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible, without_wrong
 from kcal.calibrate.rig.records import Reasons, item_records, places, source_records
 from kcal.calibrate.rig.result import RigResult
@@ -174,8 +174,9 @@ def _robust(initial: InitialPoses, masks: PerKind, options: RigOptions) -> Adjus
         work = Adjustment(initial.data, start, options.intrinsics, sigma, board_warp=options.board_warp)
         here = possible(work, masks)
         work.fit_corners(here, robust=True)
-        _, result = work.solve(here, _SCREENING, LOSS)
-        cost = float(result.cost) + 1e6 * sum(int((a & ~b).sum()) for a, b in zip(masks, here, strict=True))
+        problem, result = work.solve(here, _SCREENING, LOSS)
+        cost = float(result.cost) + cost_of_features_behind(problem, work.part(here))
+        cost += 1e6 * sum(int((a & ~b).sum()) for a, b in zip(masks, here, strict=True))
         if best is None or cost < best[0]:
             best = (cost, work, here)
     assert best is not None

@@ -9,12 +9,15 @@ from typing import Any
 import pytest
 import torch
 from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, observe, pixels_of
+from rig_scenes import CAMERAS, landmarks, tensor
 from torch import Tensor
 
+from kcal.calibrate.bundle.board_problem import warp_shape
 from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.pairs import pair_by_name, read_pairs
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions
+from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.calibrate.rig.sources import RigData
 from kcal.corners.board import Board
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
@@ -138,6 +141,31 @@ class TestTruth:
             assert bool((found.mean(0).abs() < 4.5 * (predicted / 40).sqrt()).all()), sigma
 
 
+class TestBoardWarp:
+    def test_comes_back(self) -> None:
+        """A board that bulges by 3 mm along its rows and is flat along its columns."""
+        rotation, translation = poses(8, 3, BOARD)
+        bent = BOARD.points.clone()
+        bent[:, 2] += tensor(0.003, 0.0) @ warp_shape(BOARD.points)
+        points = bent @ rotation.transpose(-1, -2) + translation[:, None]
+        pixels = torch.stack([LEFT.project(points)[0], RIGHT.project(points @ ROTATION.T + TRANSLATION)[0]], 1)
+        flat = solve(pixels, reject=False)
+        assert flat.board_warp is None
+        assert off(flat)[1] > 1e-4
+        for intrinsics in ("fixed", "free"):
+            result = solve(pixels, board_warp=True, intrinsics=intrinsics)
+            assert result.board_warp is not None
+            torch.testing.assert_close(result.board_warp, tensor(0.003, 0.0), rtol=0, atol=1e-9)
+            assert max(off(result)) < 1e-8
+
+    def test_needs_boards(self) -> None:
+        marks = landmarks()
+        with pytest.raises(InputError, match="cannot be estimated without boards"):
+            solve_rig(
+                RigData(cameras=CAMERAS[:2], names=("left", "right"), landmarks=marks), RigOptions(board_warp=True)
+            )
+
+
 class TestWeights:
     def test_corners_count_by_their_covariances(self) -> None:
         """Half the corners five times worse, and known to be: the scatter of the yaw falls."""
@@ -237,6 +265,15 @@ class TestWrongPairs:
         assert len(result.pair_rms) == len(result.pixels) == 6
         kept = torch.tensor([0, 1, 3, 4, 6, 7])
         assert float(result.stereo().baseline) == pytest.approx(float(solve(pixels[kept]).stereo().baseline), rel=1e-6)
+
+    def test_stay_and_are_named_where_nothing_is_rejected(self) -> None:
+        pixels = views(8, 2, noise=0.1)
+        pixels[3, 1] += 40.0
+        result = solve(pixels, reject=False)
+        assert result.left_out == ()
+        assert result.pairs == tuple(labels(8))
+        assert any(text.startswith("board l3 r3: ") and text.endswith("it was kept") for text in result.warnings)
+        assert any("px is high" in text for text in result.warnings)
 
     @pytest.mark.parametrize("shift", [(0.0, 4.0), (4.0, 0.0), (0.0, 8.0), (15.0, 0.0)])
     def test_a_board_that_moved_between_the_exposures(self, shift: tuple[float, float]) -> None:
