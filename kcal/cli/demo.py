@@ -73,7 +73,7 @@ def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: flo
     from kcal.cli.console import err
     from kcal.io.rig_file import load_rig
     from kcal.locate.export import write_positions
-    from kcal.locate.positions import locate
+    from kcal.locate.positions import locate_points
     from kcal.report.map_page import save_map
     from kcal.report.positions import save_positions_picture
 
@@ -90,7 +90,7 @@ def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: flo
     both = torch.isfinite(left).all(-1) & torch.isfinite(right).all(-1)
     chosen = [name for name, ok in zip(names, both.tolist(), strict=True) if ok]
     write_marks(output / "points.csv", chosen, left[both], right[both])
-    located = locate(
+    located = locate_points(
         load_rig(output / "rig.json"), left[both], right[both], origin=origin, heading_deg=heading, names=chosen
     )
     write_positions(output / "points.geojson", located)
@@ -161,14 +161,13 @@ def _solve_rig(
     from kcal.calibrate.rig.from_boards import calibrate_rig
     from kcal.calibrate.rig.pairs import pair_by_name
     from kcal.cli.console import err, out
-    from kcal.cli.rig import rig_file
-    from kcal.io.camera_file import CameraFile
+    from kcal.io.camera_file import load_camera
     from kcal.locate.check import triangulated_sides
 
-    files = CameraFile.load(output / "left.camera.json"), CameraFile.load(output / "right.camera.json")
+    cameras = load_camera(output / "left.camera.json"), load_camera(output / "right.camera.json")
     pairs = pair_by_name(left.names, right.names)
-    result = calibrate_rig(files[0].camera(), files[1].camera(), left, right, pairs)
-    rig_file(result, files, None).save(output / "rig.json")
+    result = calibrate_rig(*cameras, left, right, pairs)
+    result.save(output / "rig.json")
     sides = triangulated_sides(result.stereo(), left.board.columns, left.board.rows, result.pixels)
     out.print(
         f"rig: {len(result.pairs)} of {len(pairs)} pairs, RMS {result.rms:.4f} px, baseline "

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from kcal.calibrate.rig.result import RigResult
     from kcal.cli.rig_sources import Sources
     from kcal.corners.observations import Observations
-    from kcal.locate.mounting import Mounting
+    from kcal.lens.mounting import Mounting
     from kcal.locate.positions import Located
     from kcal.sim.scene import DemoScene
 
@@ -28,9 +28,9 @@ def simulated(output: Path, seed: int) -> None:
     from kcal.cli.console import out
     from kcal.corners.board import Board
     from kcal.io.rig_file import load_rig
-    from kcal.locate.covariances import RigCovariance
+    from kcal.lens.rig import RigCovariance
     from kcal.locate.export import write_positions
-    from kcal.locate.positions import locate
+    from kcal.locate.positions import locate_points
     from kcal.report.map_page import save_map
     from kcal.report.positions import save_positions_picture
     from kcal.sim.scene import DemoScene
@@ -60,7 +60,7 @@ def simulated(output: Path, seed: int) -> None:
     write_marks(output / "points.csv", targets.names, marks.left, marks.right)
     rig = load_rig(output / "rig.json")
     locate_marks = partial(
-        locate,
+        locate_points,
         rig,
         origin=there.origin,
         heading_deg=there.heading_deg,
@@ -147,23 +147,27 @@ def _write_sources(scene: DemoScene, output: Path) -> Sources:
 def _solve(sources: Sources, output: Path) -> tuple[RigResult, Mounting]:
     from kcal.calibrate.rig.solve import solve_rig
     from kcal.cli.console import steps
-    from kcal.cli.rig import mounting_of_left, print_rig, rig_file, rig_lines
+    from kcal.cli.rig import print_rig, rig_lines
     from kcal.cli.rig_sources import read_sources
     from kcal.errors import DegenerateError
-    from kcal.io.camera_file import CameraFile
+    from kcal.io.camera_file import load_camera
+    from kcal.io.rig_file import save_rig
+    from kcal.locate.mounting import placed_rig
     from kcal.report.rig import save_rig_picture
 
-    cameras = CameraFile.load(output / _FILES[0]), CameraFile.load(output / _FILES[1])
+    cameras = load_camera(output / _FILES[0]), load_camera(output / _FILES[1])
     data, origin, unpaired = read_sources(cameras, sources, prior=False)
+    assert origin is not None
     with steps("solving the rig", 1) as advance:
         solution = solve_rig(data)
         advance("done")
-    there = mounting_of_left(solution, origin)
+    rig = placed_rig(solution, origin)
+    there = rig.mounting
     if there is None:
         raise DegenerateError("the landmarks do not say where the cameras stand")
-    rig_file(solution, cameras, there).save(output / "rig.json")
+    save_rig(rig, output / "rig.json")
     save_rig_picture(output / "rig.png", solution)
-    print_rig(solution, rig_lines(solution, there, unpaired))
+    print_rig(solution, rig_lines(solution, rig, unpaired))
     return solution, there
 
 

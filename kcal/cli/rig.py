@@ -14,10 +14,7 @@ from kcal.errors import InputError
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.result import RigResult
-    from kcal.io.camera_file import CameraFile
-    from kcal.io.rig_file import RigFile
-    from kcal.locate.geodesy import Origin
-    from kcal.locate.mounting import Mounting
+    from kcal.lens.rig import StereoRig
 
 
 class _RigGroup(TyperGroup):
@@ -105,7 +102,9 @@ def solve(
     from kcal.cli.console import out, steps
     from kcal.cli.rig_sources import Sources, read_sources
     from kcal.files import check_writable
-    from kcal.io.camera_file import CameraFile
+    from kcal.io.camera_file import load_camera
+    from kcal.io.rig_file import save_rig
+    from kcal.locate.mounting import placed_rig
     from kcal.report.figures import check_picture_format
     from kcal.report.rig import save_rig_picture
 
@@ -123,15 +122,14 @@ def solve(
         if intrinsics == "prior":
             raise InputError("--refine-cameras lets the cameras free, --intrinsics prior does not; choose one")
         intrinsics = "free"
-    cameras = CameraFile.load(left), CameraFile.load(right)
-    data, frame, unpaired = read_sources(cameras, sources, prior=intrinsics == "prior")
+    data, frame, unpaired = read_sources((load_camera(left), load_camera(right)), sources, prior=intrinsics == "prior")
     with steps("solving the rig", 1) as advance:
         result = solve_rig(data, RigOptions(intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all))
         advance("done")
-    mounting = mounting_of_left(result, frame)
+    rig = result.stereo() if frame is None else placed_rig(result, frame)
     # Everything that can fail comes before the file.
-    lines = rig_lines(result, mounting, unpaired)
-    rig_file(result, cameras, mounting).save(output)
+    lines = rig_lines(result, rig, unpaired)
+    save_rig(rig, output)
     if picture is not None:
         save_rig_picture(picture, result)
     print_rig(result, lines)
@@ -139,72 +137,7 @@ def solve(
         out.print(f"wrote {path}", markup=False)
 
 
-def mounting_of_left(result: RigResult, origin: Origin | None) -> Mounting | None:
-    """How the left camera stands on the Earth; None where no latitude is known or the data leave it open."""
-    import torch
-
-    from kcal.locate.mounting import mounting_of
-
-    covariance = result.mounting_covariance()
-    if origin is None or not result.absolute or not bool(torch.isfinite(covariance).all()):
-        return None
-    return mounting_of(result.rotation[0], result.center[0], covariance, origin, result.mounting_link())
-
-
-def rig_file(result: RigResult, cameras: tuple[CameraFile, CameraFile], mounting: Mounting | None) -> RigFile:
-    """The rig file of a result; camera files are kept whole where the cameras were not solved again."""
-    from kcal.io.camera_file import Exclusion, provenance
-    from kcal.io.rig_file import RigCalibration, RigMounting, RigSource, rig_to_file
-
-    rig = result.stereo()
-    fixed = all(found is given for found, given in zip(result.cameras, result.data.cameras, strict=True))
-    rms = [0.0 if math.isnan(value) else value for value in result.rms_px]
-    stands = None if mounting is None else RigMounting(
-        lat=mounting.origin.lat,
-        lon=mounting.origin.lon,
-        height=mounting.origin.height,
-        heading_deg=mounting.heading_deg,
-        pitch_deg=mounting.pitch_deg,
-        roll_deg=mounting.roll_deg,
-        covariance=tuple(map(tuple, mounting.covariance.tolist())),
-        link=tuple(map(tuple, mounting.link.tolist())),
-    )  # fmt: skip
-    return rig_to_file(
-        rig,
-        left=cameras[0] if fixed else None,
-        right=cameras[1] if fixed else None,
-        covariance=result.joint_covariance(),
-        mounting=stands,
-        calibration=RigCalibration(
-            rms=result.rms,
-            rms_left=rms[0],
-            rms_right=rms[1],
-            pairs=len(result.pairs),
-            per_pair_rms=dict(zip(result.pairs, result.pair_rms.tolist(), strict=True)),
-            flipped=tuple(turned.board for turned in result.flipped),
-            # Boards by their names alone, as in `per_pair_rms`.
-            excluded=tuple(
-                Exclusion(name=f"{item.source} {item.name}".removeprefix("boards "), reason=item.reason)
-                for item in result.left_out
-            ),
-            sources=tuple(
-                RigSource(
-                    name=source.source,
-                    used=source.used,
-                    left_out=source.left_out,
-                    rms_px=source.rms_px,
-                    rms_m=source.rms_m,
-                    sigmas=None if math.isnan(source.sigmas) else source.sigmas,
-                )
-                for source in result.sources
-            ),
-            baseline_m=float(rig.baseline),
-            **provenance(),
-        ),
-    )
-
-
-def rig_lines(result: RigResult, mounting: Mounting | None, unpaired: int = 0) -> list[str]:
+def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
     """What a result says: residuals by source, the relative pose with its sigmas, the board's squares, the mounting."""
     from kcal.locate.check import triangulated_sides
 
@@ -215,7 +148,7 @@ def rig_lines(result: RigResult, mounting: Mounting | None, unpaired: int = 0) -
         rows.append([source.source, f"{source.used}", f"{source.left_out}", *cells, sigmas])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
-    rig, boards = result.stereo(), result.data.boards
+    boards, mounting = result.data.boards, rig.mounting
     exact = all(found is given for found, given in zip(result.cameras, result.data.cameras, strict=True))
     pitch, yaw, roll = (math.degrees(value) for value in result.sigma_rotation.tolist())
     lines += [
@@ -232,7 +165,7 @@ def rig_lines(result: RigResult, mounting: Mounting | None, unpaired: int = 0) -
                 f"triangulated squares: {1e3 * side:.4f} mm ± {1e3 * spread:.4f} mm, the board's are "
                 f"{1e3 * boards.board.square:.4f} mm"
             )
-    if mounting is not None:
+    if mounting is not None and mounting.covariance is not None:
         sigma = mounting.covariance.diagonal().sqrt().tolist()
         place = mounting.origin
         lines.append(

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData
-    from kcal.io.camera_file import CameraFile
-    from kcal.locate.geodesy import Origin
+    from kcal.lens.camera import Camera
+    from kcal.lens.mounting import Origin
 
 CAMERAS = ("left", "right")
 
@@ -65,19 +65,18 @@ def parse_baseline(text: str) -> Baseline:
     return Baseline(first=0, second=1, length=length, sigma=sigma)
 
 
-def read_sources(files: tuple[CameraFile, CameraFile], sources: Sources, *, prior: bool) -> RigInput:
+def read_sources(cameras: tuple[Camera, Camera], sources: Sources, *, prior: bool) -> RigInput:
     """Read everything; warnings about it are printed."""
     from kcal.calibrate.rig.pairs import pair_by_name, paired_boards, read_pairs
     from kcal.calibrate.rig.sources import RigData
     from kcal.cli.console import err
     from kcal.corners.observations import Observations
-    from kcal.locate.geodesy import Origin
+    from kcal.lens.mounting import Origin
     from kcal.locate.marks import read_marks
     from kcal.locate.survey import camera_positions, match_landmarks, read_features, read_survey
 
     if (sources.landmarks is None) != (sources.marks is None):
         raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
-    cameras = files[0].camera(), files[1].camera()
     if cameras[0].fingerprint == cameras[1].fingerprint:
         raise InputError("both camera files hold the same camera: this is the same camera twice; give two cameras")
     origin = None if sources.origin is None else Origin.parse(sources.origin)
@@ -104,7 +103,7 @@ def read_sources(files: tuple[CameraFile, CameraFile], sources: Sources, *, prio
     data = RigData(
         cameras=cameras,
         names=CAMERAS,
-        covariances=tuple(map(_prior_covariance, files, CAMERAS)) if prior else None,
+        covariances=tuple(map(_prior_covariance, cameras, CAMERAS)) if prior else None,
         boards=boards,
         landmarks=landmarks,
         features=None if sources.features is None else read_features(sources.features, sources.mark_sigma),
@@ -119,10 +118,10 @@ def read_sources(files: tuple[CameraFile, CameraFile], sources: Sources, *, prio
     return RigInput(data, origin, unpaired)
 
 
-def _prior_covariance(file: CameraFile, name: str) -> Tensor:
+def _prior_covariance(camera: Camera, name: str) -> Tensor:
     import torch
 
-    if file.standard_deviations is None:
+    if camera.calibration is None or camera.calibration.sigma is None:
         raise InputError(f"the {name} camera file has no standard deviations to hold its parameters with")
-    sigma = [file.standard_deviations[key] or 0.0 for key in file.camera().names]
+    sigma = [camera.calibration.sigma[key] or 0.0 for key in camera.names]
     return torch.diag(torch.tensor(sigma, dtype=torch.float64) ** 2)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -14,8 +15,10 @@ from kcal.calibrate.rig.initial_poses import TurnedBoard
 from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, parameter_rows, relative_rows
+from kcal.io.rig_file import save_rig
+from kcal.lens.calibration import Exclusion, RigCalibration, RigSource
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.solve.result import Status
 
 Source = Literal["boards", "landmarks", "features", "baselines", "positions"]
@@ -125,6 +128,7 @@ class RigResult:
     _state: RigState
     _covariance: SharedCovariance
     _places: dict[Source, dict[str, Tensor]]
+    _provenance: dict[str, Any]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -178,15 +182,53 @@ class RigResult:
     @property
     def sigma_baseline(self) -> float:
         """Standard deviation of the distance between the first two cameras, meters."""
-        rig = self.stereo()
-        along = rig.right_from_left_translation / rig.baseline
+        shift = self.rotation[1] @ (self.center[0] - self.center[1])
+        along = shift / torch.linalg.vector_norm(shift)
         return math.sqrt(float(along @ self.relative_covariance()[3:, 3:] @ along))
 
     def stereo(self, first: int = 0, second: int = 1) -> StereoRig:
-        """Two of the cameras as a rig."""
+        """Two of the cameras as a rig, with its covariance and with how it was solved.
+
+        `kcal.placed_rig` adds where it stands on the Earth. The covariance is left out where the data do not determine
+        all parameters of the cameras.
+        """
         rotation = self.rotation[second] @ self.rotation[first].T
         translation = self.rotation[second] @ (self.center[first] - self.center[second])
-        return StereoRig(self.cameras[first], self.cameras[second], rotation, translation)
+        rig = StereoRig(self.cameras[first], self.cameras[second], rotation, translation)
+        joint = self.joint_covariance(first, second)
+        if bool(torch.isfinite(joint).all()):
+            rig.covariance = RigCovariance(matrix=joint)
+        rms = [0.0 if math.isnan(self.rms_px[camera]) else self.rms_px[camera] for camera in (first, second)]
+        rig.calibration = RigCalibration(
+            rms=self.rms,
+            rms_left=rms[0],
+            rms_right=rms[1],
+            pairs=len(self.pairs),
+            per_pair_rms=dict(zip(self.pairs, self.pair_rms.tolist(), strict=True)),
+            flipped=tuple(dict.fromkeys(turned.board for turned in self.flipped)),
+            # Boards by their names alone, as in `per_pair_rms`.
+            excluded=tuple(
+                Exclusion(f"{item.source} {item.name}".removeprefix("boards "), item.reason) for item in self.left_out
+            ),
+            sources=tuple(
+                RigSource(
+                    name=source.source,
+                    used=source.used,
+                    left_out=source.left_out,
+                    rms_px=source.rms_px,
+                    rms_m=source.rms_m,
+                    sigmas=None if math.isnan(source.sigmas) else source.sigmas,
+                )
+                for source in self.sources
+            ),
+            baseline_m=float(rig.baseline),
+            **self._provenance,
+        )
+        return rig
+
+    def save(self, path: str | Path) -> Path:
+        """Write the rig of the first two cameras as `stereo` gives it; see `kcal.save_rig`."""
+        return save_rig(self.stereo(), path)
 
     def places(self) -> dict[Source, dict[str, Tensor]]:
         """Where boards (their middle), landmarks and features are: (3,) meters in the local frame, by name.
@@ -200,7 +242,7 @@ class RigResult:
         return self._covariance.of(relative_rows(self._problem, self._state, first, second))[0]
 
     def joint_covariance(self, first: int = 0, second: int = 1) -> Tensor:
-        """Of both cameras' parameters (zeros where held) and their relative pose, ordered as in `RigCovariance`."""
+        """Of both cameras' parameters (zeros where held) and their relative pose, in the order of `RigCovariance`."""
         return self._covariance.of(self._joint_rows(first, second))[0]
 
     def mounting_link(self, first: int = 0, second: int = 1) -> Tensor:

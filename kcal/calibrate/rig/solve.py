@@ -19,6 +19,7 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, relative_rows
 from kcal.errors import DegenerateError, InputError
+from kcal.io.camera_file import provenance
 from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, Status
 
@@ -262,4 +263,5 @@ def _result(
         _state=state,
         _covariance=covariance,
         _places=places(work),
+        _provenance=provenance(),
     )
