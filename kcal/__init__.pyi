@@ -113,6 +113,8 @@ from kcal.locate.positions import Located as Located
 from kcal.locate.positions import Position as Position
 from kcal.locate.positions import Viewpoint as Viewpoint
 from kcal.locate.positions import locate_points as locate_points
+from kcal.locate.relock import check_rig as check_rig
+from kcal.locate.relock import relocked as relocked
 from kcal.locate.stereo import PositionStatus as PositionStatus
 from kcal.locate.survey import MarkedLandmarks as MarkedLandmarks
 from kcal.locate.survey import Survey as Survey

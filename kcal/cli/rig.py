@@ -165,6 +165,9 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
                 f"triangulated squares: {1e3 * side:.4f} mm ± {1e3 * spread:.4f} mm, the board's are "
                 f"{1e3 * boards.board.square:.4f} mm"
             )
+    if result.board_warp is not None:
+        x, y = (1e3 * result.board_warp).tolist()
+        lines.append(f"board warp: {x:+.3f} mm along its rows, {y:+.3f} mm along its columns")
     if mounting is not None and mounting.covariance is not None:
         sigma = mounting.covariance.diagonal().sqrt().tolist()
         place = mounting.origin

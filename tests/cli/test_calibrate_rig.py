@@ -381,7 +381,9 @@ class TestRig:
         )
         arguments = ["left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json", "--match", "pairs.csv"]
         assert run(monkeypatch, "rig", *arguments, "--refine-cameras", "--board-warp") == 0
-        assert "3 of 3 pairs used, 6 views without partner" in capsys.readouterr().out
+        printed = capsys.readouterr().out
+        assert "3 of 3 pairs used, 6 views without partner" in printed
+        assert "mm along its rows" in printed
         (cameras / "pairs.csv").write_text("left,right\nleft01.png,right77.png\n")
         (cameras / "rig.json").unlink()
         text = refuse(cameras, monkeypatch, capsys, "rig", *arguments)
