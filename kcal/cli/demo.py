@@ -161,25 +161,26 @@ def _solve_rig(
     from kcal.calibrate.rig.from_boards import calibrate_rig
     from kcal.calibrate.rig.pairs import pair_by_name
     from kcal.cli.console import err, out
-    from kcal.cli.rig import rig_record
-    from kcal.io.camera_file import CameraFile
+    from kcal.io.camera_file import load_camera
     from kcal.locate.check import triangulated_sides
 
-    files = CameraFile.load(output / "left.camera.json"), CameraFile.load(output / "right.camera.json")
+    cameras = load_camera(output / "left.camera.json"), load_camera(output / "right.camera.json")
     pairs = pair_by_name(left.names, right.names)
-    result = calibrate_rig(files[0].camera(), files[1].camera(), left, right, pairs)
-    rig_record(result, files).save(output / "rig.json")
-    sides = triangulated_sides(result.rig, left.board.columns, left.board.rows, result.pixels)
+    result = calibrate_rig(*cameras, left, right, pairs)
+    result.save(output / "rig.json")
+    sides = triangulated_sides(result.stereo(), left.board.columns, left.board.rows, result.pixels)
     out.print(
         f"rig: {len(result.pairs)} of {len(pairs)} pairs, RMS {result.rms:.4f} px, baseline "
-        f"{float(result.rig.baseline):.5f} m; squares {1e3 * sides.mean:.3f} ± {1e3 * sides.spread:.3f} mm, "
+        f"{float(result.stereo().baseline):.5f} m; squares {1e3 * sides.mean:.3f} ± {1e3 * sides.spread:.3f} mm, "
         f"true {1e3 * left.board.square:g} mm"
     )
-    for pair, reason in result.excluded:
-        err.print("  [yellow]left out:[/]", f"{pair[0]}, {pair[1]}: {reason}")
-    for text in (*(f"turned by 180°: {a}, {b}" for a, b in result.flipped), *result.warnings):
+    for item in result.left_out:
+        err.print("  [yellow]left out:[/]", f"{item.label}: {item.reason}")
+    for text in (*(f"turned by 180°: {turned.board}" for turned in result.flipped), *result.warnings):
         err.print(f"  [yellow]warning:[/] {text}")
-    return result.pairs, result.pixels
+    assert result.data.boards is not None
+    named = zip(pairs, result.data.boards.names, strict=True)
+    return tuple(pair for pair, name in named if name in result.pairs), result.pixels
 
 
 def write_marks(path: Path, names: tuple[str, ...] | list[str], left: torch.Tensor, right: torch.Tensor) -> None:

@@ -13,8 +13,8 @@ from kcal.cli.demo_tables import print_results, print_truth, truth_rows
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.calibrate import CameraCalibrationResult
-    from kcal.calibrate.rig.result import RigSolution
-    from kcal.cli.rig_joint import Sources
+    from kcal.calibrate.rig.result import RigResult
+    from kcal.cli.rig_sources import Sources
     from kcal.corners.observations import Observations
     from kcal.lens.mounting import Mounting
     from kcal.locate.positions import Located
@@ -126,7 +126,7 @@ def _render(scene: DemoScene, folder: Path) -> dict[tuple[str, str], list[Path]]
 
 def _write_sources(scene: DemoScene, output: Path) -> Sources:
     """What the rig is solved from: boards, and landmarks with their marks, as a surveyor would hand them over."""
-    from kcal.cli.rig_joint import Sources
+    from kcal.cli.rig_sources import Sources
     from kcal.files import write_atomic
 
     surveyed, marks = scene.surveyed(scene.landmarks), scene.landmark_marks
@@ -144,25 +144,30 @@ def _write_sources(scene: DemoScene, output: Path) -> Sources:
     )
 
 
-def _solve(sources: Sources, output: Path) -> tuple[RigSolution, Mounting]:
+def _solve(sources: Sources, output: Path) -> tuple[RigResult, Mounting]:
     from kcal.calibrate.rig.solve import solve_rig
     from kcal.cli.console import steps
-    from kcal.cli.rig_joint import gather, mounting, record, show
+    from kcal.cli.rig import print_rig, rig_lines
+    from kcal.cli.rig_sources import read_sources
     from kcal.errors import DegenerateError
-    from kcal.io.camera_file import CameraFile
+    from kcal.io.camera_file import load_camera
+    from kcal.io.rig_file import save_rig
+    from kcal.locate.mounting import placed_rig
     from kcal.report.rig import save_rig_picture
 
-    cameras = CameraFile.load(output / _FILES[0]), CameraFile.load(output / _FILES[1])
-    data, origin = gather(cameras, sources, prior=False)
+    cameras = load_camera(output / _FILES[0]), load_camera(output / _FILES[1])
+    data, origin, unpaired = read_sources(cameras, sources, prior=False)
+    assert origin is not None
     with steps("solving the rig", 1) as advance:
         solution = solve_rig(data)
         advance("done")
-    there = mounting(solution, origin)
+    rig = placed_rig(solution, origin)
+    there = rig.mounting
     if there is None:
         raise DegenerateError("the landmarks do not say where the cameras stand")
-    record(solution, cameras, there, fixed=True).save(output / "rig.json")
+    save_rig(rig, output / "rig.json")
     save_rig_picture(output / "rig.png", solution)
-    show(solution, there)
+    print_rig(solution, rig_lines(solution, rig, unpaired))
     return solution, there
 
 
@@ -181,7 +186,7 @@ def _write_summary(
     scene: DemoScene,
     seen: dict[tuple[str, str], Observations],
     cameras: dict[str, CameraCalibrationResult],
-    solution: RigSolution,
+    solution: RigResult,
     table: list[list[str]],
     again: str,
     located: Located,

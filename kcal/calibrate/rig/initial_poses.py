@@ -1,23 +1,25 @@
-"""Where the cameras of a rig stand, roughly, before everything is adjusted together."""
+"""Find roughly where the cameras and boards of a rig stand, before everything is adjusted together."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.closed_form import spread_out
-from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, Poses, consensus, pose_alone
+from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, Poses, check_cameras, consensus, half_turn, pose_alone
 from kcal.calibrate.rig.resection import consensus_pose, consensus_rotation, rotation_between
 from kcal.calibrate.rig.sources import Boards, RigData
 from kcal.errors import DegenerateError
 from kcal.solve.lm import LMOptions
 
-# A board farther from where the other boards put it (pixels, and times the median) does not belong.
-_ROUGH = (10.0, 10.0)
-# Weight of "cameras are held upright" where measured positions leave a turn open.
+# A board that is farther from where the other boards put it than both (pixels, and times the median) does not belong.
+_FOREIGN_PX, _FOREIGN_TIMES = 10.0, 10.0
+# Weight of "cameras are held upright" where measured positions leave a turn open: enough to decide, without effect on
+# what the positions tell.
 _LEVEL = 1e-3
 
 
@@ -38,21 +40,28 @@ class Start:
     board_translation: Tensor
 
 
+class TurnedBoard(NamedTuple):
+    """A board that one camera had read from its other end, by the names of both."""
+
+    board: str
+    camera: str
+
+
 @dataclasses.dataclass(kw_only=True, eq=False)
 class InitialPoses:
     """What a solve begins with.
 
     Args:
         data: with boards turned where they had been read from the other end.
-        starts: rivals; the best solution decides.
+        starts: possible starts; the one with the best solution is used.
         flipped: boards that were turned.
-        foreign: boards that do not belong, with the reason.
-        usable: (V,) boards that two cameras at least see well.
+        foreign: indices of boards that do not belong, with the reason.
+        usable: (V,) boards that at least two cameras see well.
     """
 
     data: RigData
     starts: list[Start]
-    flipped: list[str]
+    flipped: list[TurnedBoard]
     foreign: dict[int, str]
     usable: Tensor
 
@@ -82,7 +91,7 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
     """Find a pose for every camera and board, from landmarks, then boards, then features and measured positions.
 
     Raises:
-        DegenerateError: nothing ties a camera to the others; it is named.
+        DegenerateError: nothing connects a camera with the others; it is named.
     """
     count = len(data.cameras)
     known, views = _Known(count), _BoardViews(data, solver)
@@ -104,7 +113,7 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
                 f"nothing tells where {names} stands: it needs boards seen together with another camera, three or "
                 "better four landmarks, or features together with its position or the baseline"
             )
-    views.settle(known)
+    views.turn_all()
     starts = headings or _starts(data, known, open_ends)
     if data.absolute and not placed and headings is None:
         for start in starts:
@@ -117,7 +126,7 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
 
 
 def _measured_starts(data: RigData) -> list[Start] | None:
-    """Starts for cameras whose positions are all measured and that only features tie: level, in eight headings."""
+    """Starts for cameras whose positions are all measured and that only features connect: level, in eight headings."""
     if (
         data.features is None
         or data.boards is not None
@@ -214,7 +223,7 @@ def _starts(data: RigData, known: _Known, open_ends: list[int]) -> list[Start]:
 
 
 def _into_frame(data: RigData, start: Start) -> None:
-    """Turn and shift a rig that stands in its first camera's frame to where its cameras were measured."""
+    """Move a rig from its first camera's frame to where its cameras were measured."""
     index = [p.camera for p in data.positions]
     there = torch.stack([p.point for p in data.positions])
     here = start.center[index]
@@ -228,13 +237,14 @@ def _into_frame(data: RigData, start: Start) -> None:
 
 
 class _BoardViews:
-    """Each camera's boards, found by it alone, and what they say of two cameras that saw the same ones."""
+    """Board poses from each camera alone, and the relative poses of cameras that saw the same boards."""
 
     def __init__(self, data: RigData, solver: LMOptions) -> None:
         self.data = data
-        self.flipped: list[str] = []
+        self.flipped: list[TurnedBoard] = []
         self.foreign: dict[int, str] = {}
         self._alone: list[Poses] = []
+        rms: list[float] = []
         self._good = torch.zeros(0, len(data.cameras), dtype=torch.bool)
         boards = data.boards
         if boards is None:
@@ -247,14 +257,18 @@ class _BoardViews:
             rotation = torch.full((len(enough), 3, 3), math.nan, dtype=torch.float64)
             translation = torch.full((len(enough), 3), math.nan, dtype=torch.float64)
             if bool(enough.any()):
-                found, _ = pose_alone(points, boards.pixels[enough, c], camera, solver)
+                found, own = pose_alone(points, boards.pixels[enough, c], camera, solver)
+                rms.append(own)
                 rotation[enough], translation[enough] = found.rotation, found.translation
+            else:
+                rms.append(0.0)
             self._alone.append(Poses(rotation, translation))
             good.append(enough)
         self._good = torch.stack(good, -1)
+        check_cameras(data, self._good, rms, solver)
 
     def link(self, known: _Known, waiting: list[int]) -> bool:
-        """Place the waiting camera that shares most boards with one that is placed."""
+        """Place the waiting camera that shares the most boards with one that is placed."""
         shared = [(int((self._good[:, c] & self._good[:, o]).sum()), c, o) for c in waiting for o in known.ready]
         number, camera, other = max(shared)
         if number == 0:
@@ -264,10 +278,9 @@ class _BoardViews:
         known.put(camera, pose.rotation, -(pose.rotation.T @ pose.translation))
         return True
 
-    def settle(self, known: _Known) -> None:
+    def turn_all(self) -> None:
         """Turn boards that were read from the other end also for cameras that landmarks have placed."""
-        boards = self.data.boards
-        if boards is None:
+        if self.data.boards is None:
             return
         for camera in range(1, len(self.data.cameras)):
             if bool((self._good[:, 0] & self._good[:, camera]).any()):
@@ -283,9 +296,10 @@ class _BoardViews:
         relative, turned, error = consensus(boards.board.points, pixels, cameras, one, two)
         if bool(turned.any()):
             self._turn(boards, both[turned], second)
-        limit = max(_ROUGH[0] * float(error.median()), _ROUGH[1])
+        limit = max(_FOREIGN_TIMES * float(error.median()), _FOREIGN_PX)
         for i in (error > limit).nonzero()[:, 0].tolist():
-            self.foreign[int(both[i])] = f"its board is {float(error[i]):.0f} px away from where the others put it"
+            reason = f"its board is {float(error[i]):.0f} px away from where the other boards put it"
+            self.foreign[int(both[i])] = reason
         return relative
 
     def _turn(self, boards: Boards, views: Tensor, camera: int) -> None:
@@ -298,16 +312,13 @@ class _BoardViews:
         self.data = dataclasses.replace(
             self.data, boards=dataclasses.replace(boards, pixels=pixels, covariance=covariance)
         )
-        # The pose of a board that is read from its other end: half a turn about its middle.
-        half = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
-        turn = Poses(half, boards.board.points.amin(0) + boards.board.points.amax(0))
         alone = self._alone[camera]
-        new = Poses(alone.rotation[views], alone.translation[views]).after(turn)
+        new = Poses(alone.rotation[views], alone.translation[views]).after(half_turn(boards.board.points))
         alone.rotation[views], alone.translation[views] = new.rotation, new.translation
-        self.flipped += [f"{boards.names[i]} ({self.data.names[camera]})" for i in views.tolist()]
+        self.flipped += [TurnedBoard(boards.names[i], self.data.names[camera]) for i in views.tolist()]
 
     def world(self, start: Start) -> tuple[Tensor, Tensor]:
-        """world_from_board by the first camera that sees each board well; where none does, any pose."""
+        """world_from_board from the first camera that sees each board well; where none does, an arbitrary pose."""
         count = len(self._good)
         rotation = torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
         translation = torch.zeros(count, 3, dtype=torch.float64)
