@@ -12,7 +12,8 @@ if TYPE_CHECKING:
 
     from kcal.calibrate.camera.calibrate import CameraCalibrationResult
     from kcal.corners.observations import Observations
-    from kcal.io.camera_file import CameraFile, Exclusion
+    from kcal.io.camera_file import CameraFile
+    from kcal.lens.calibration import Exclusion
 
 
 def calibrate(
@@ -212,7 +213,8 @@ def _priors(texts: list[str]) -> dict[str, tuple[float, float]]:
 
 def record(result: CameraCalibrationResult, seen: Observations, name: str, source: str) -> CameraFile:
     """The camera file of a result."""
-    from kcal.io.camera_file import BoardRecord, CameraCalibration, camera_to_file, provenance
+    from kcal.io.camera_file import camera_to_file, provenance
+    from kcal.lens.calibration import BoardRecord, CalibrationRecord
 
     warp = result.board_warp
     return camera_to_file(
@@ -220,7 +222,7 @@ def record(result: CameraCalibrationResult, seen: Observations, name: str, sourc
         name=name,
         standard_deviations=result.sigma,
         covariance=result.covariance if bool(result.covariance.isfinite().all()) else None,
-        calibration=CameraCalibration(
+        calibration=CalibrationRecord(
             rms=result.rms,
             views=len(seen.views) - len(result.rejected_views),
             points=int((result.residuals[..., 0] == result.residuals[..., 0]).sum()),
@@ -240,7 +242,7 @@ def record(result: CameraCalibrationResult, seen: Observations, name: str, sourc
 
 def _excluded(result: CameraCalibrationResult) -> list[Exclusion]:
     """What was left out, views first."""
-    from kcal.io.camera_file import Exclusion
+    from kcal.lens.calibration import Exclusion
 
     views = [Exclusion(name=view.view, reason=view.reason) for view in result.rejected_views]
     corners = [Exclusion(name=f"{c.view} corner {c.corner}", reason=c.reason) for c in result.rejected_corners]

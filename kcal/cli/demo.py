@@ -73,7 +73,7 @@ def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: flo
     from kcal.cli.console import err
     from kcal.io.rig_file import load_rig
     from kcal.locate.export import write_positions
-    from kcal.locate.positions import locate
+    from kcal.locate.positions import locate_points
     from kcal.report.map_page import save_map
     from kcal.report.positions import save_positions_picture
 
@@ -90,7 +90,7 @@ def _real(output: Path, folder: Path, board: Board, origin: Origin, heading: flo
     both = torch.isfinite(left).all(-1) & torch.isfinite(right).all(-1)
     chosen = [name for name, ok in zip(names, both.tolist(), strict=True) if ok]
     write_marks(output / "points.csv", chosen, left[both], right[both])
-    located = locate(
+    located = locate_points(
         load_rig(output / "rig.json"), left[both], right[both], origin=origin, heading_deg=heading, names=chosen
     )
     write_positions(output / "points.geojson", located)

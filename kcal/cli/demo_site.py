@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from kcal.calibrate.rig.result import RigSolution
     from kcal.cli.rig_joint import Sources
     from kcal.corners.observations import Observations
-    from kcal.locate.mounting import Mounting
+    from kcal.lens.mounting import Mounting
     from kcal.locate.positions import Located
     from kcal.sim.scene import DemoScene
 
@@ -28,9 +28,9 @@ def simulated(output: Path, seed: int) -> None:
     from kcal.cli.console import out
     from kcal.corners.board import Board
     from kcal.io.rig_file import load_rig
-    from kcal.locate.covariances import RigCovariance
+    from kcal.lens.rig import RigCovariance
     from kcal.locate.export import write_positions
-    from kcal.locate.positions import locate
+    from kcal.locate.positions import locate_points
     from kcal.report.map_page import save_map
     from kcal.report.positions import save_positions_picture
     from kcal.sim.scene import DemoScene
@@ -60,7 +60,7 @@ def simulated(output: Path, seed: int) -> None:
     write_marks(output / "points.csv", targets.names, marks.left, marks.right)
     rig = load_rig(output / "rig.json")
     locate_marks = partial(
-        locate,
+        locate_points,
         rig,
         origin=there.origin,
         heading_deg=there.heading_deg,

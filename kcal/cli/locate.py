@@ -97,13 +97,14 @@ def locate(
     from kcal.errors import DegenerateError, InputError
     from kcal.files import check_writable
     from kcal.io.rig_file import RigFile
-    from kcal.locate.covariances import RigCovariance, mounting_covariance
+    from kcal.lens.rig import RigCovariance
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import check_format, write_positions
     from kcal.locate.geodesy import Origin
     from kcal.locate.marks import read_marks
-    from kcal.locate.positions import locate as locate_pairs
-    from kcal.locate.truth import misses, read_truth
+    from kcal.locate.mounting import mounting_covariance
+    from kcal.locate.positions import locate_points
+    from kcal.locate.truth import position_errors, read_truth
     from kcal.report.figures import check_picture_format
     from kcal.report.map_page import check_map_format, save_map
     from kcal.report.positions import save_positions_picture
@@ -146,7 +147,7 @@ def locate(
         if stored.link is not None:
             link = torch.tensor(stored.link, dtype=torch.float64)
     heights = find_geoid(geoid)
-    located = locate_pairs(
+    located = locate_points(
         solved,
         marks.left,
         marks.right,
@@ -174,7 +175,7 @@ def locate(
         if web_map is not None:
             save_map(web_map, located, true, tiles=tiles, image=image, online=online)
             advance(web_map.name)
-    for line in _table(located, None if true is None else misses(located, true)):
+    for line in _table(located, None if true is None else position_errors(located, true)):
         out.print(line, markup=False)
     for position in located.positions:
         if position.reason:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from kcal.checks import Float64Module, as_points, require_finite
 from kcal.errors import InputError
+from kcal.lens.calibration import CameraCalibration, UntilChanged
 from kcal.lens.distortion import distort_components
 from kcal.lens.inverse import InverseStart, PreparedInverse, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
@@ -34,6 +35,10 @@ class Camera(Float64Module):
     The parameters do not require gradients until asked (`camera.free("fx", "k1")`), so that training a network around a
     camera does not change its calibration. The region where the lens is valid is computed when the camera is made and
     when a state is loaded. After changing parameters in any other way, call `update_valid_region()`.
+
+    The attribute `calibration` (a `CameraCalibration`) has the name, the error bars and the history of a camera that
+    was calibrated or loaded; `kcal.save_camera` stores it, and projection does not use it. It is None until it is set,
+    and again once a parameter has changed.
 
     Args:
         parameters: (..., 5 + P): fx, fy, cx, cy, skew, then the lens coefficients in the order of `model.names`.
@@ -60,6 +65,7 @@ class Camera(Float64Module):
     valid_radius: Tensor
     valid_edge: Tensor
     inverse_start: Tensor
+    calibration = UntilChanged[CameraCalibration](lambda camera, value: value.check(len(camera.names)))
 
     def __init__(self, parameters: Tensor, *, size: tuple[int, int], model: LensModel | str = "opencv5") -> None:
         super().__init__()

@@ -23,14 +23,13 @@ from kcal.calibrate.rig.result import RigSolution
 from kcal.calibrate.rig.solve import JointOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, Features, Landmarks, MeasuredPosition, RigData
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.lens.rig import StereoRig
-from kcal.locate.covariances import RigCovariance
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import drift_effect
 from kcal.report.rig import save_rig_picture
 from scripts.bench.locate import ORIGIN, RANGES, rig
-from scripts.shared.page import DOCS
+from scripts.shared.page import CONCLUSIONS, DOCS
 from scripts.shared.timing import row, show
 
 HEADING = 35.0
@@ -301,6 +300,8 @@ def main() -> None:
     lines = show(
         [
             "# Rigs from a survey, measured",
+            "",
+            CONCLUSIONS["rig.md"],
             "",
             f"Made by `scripts/check/rig.py` with kcal {kcal.__version__} and torch {torch.__version__}. Two cameras "
             f"{BASELINE:.1f} m apart, f 1600 px, distorting lenses that are known; 12 landmarks 100 m to 2.6 km away, "
