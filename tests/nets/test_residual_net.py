@@ -107,6 +107,10 @@ def test_derivatives_of_the_problem_are_numeric_ones() -> None:
     def cost(step: Tensor) -> Tensor:
         return whole.cost(whole.retract(at, (step[:count], step[count:].reshape(views, 6))))
 
+    rows = whole.rows(at)
+    assert rows.shape[-2] == 6 + count + 1
+    torch.testing.assert_close(whole.gram(at), rows @ rows.transpose(-1, -2), rtol=1e-9, atol=1e-9)
+
     generator = torch.Generator().manual_seed(8)
     linear = whole.linearize(at)
     assert float(linear.cost) == pytest.approx(float(whole.cost(at)), rel=1e-12)
