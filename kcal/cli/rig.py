@@ -109,7 +109,7 @@ def solve(
     """
     from kcal.cli.rig_joint import Sources
     from kcal.files import check_writable
-    from kcal.report.figures import check_picture_format
+    from kcal.report.figures import check_picture
 
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
@@ -117,8 +117,7 @@ def solve(
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     if picture is not None:
-        check_picture_format(picture)
-        check_writable(picture)
+        check_picture(picture)
     if sources.only_boards and sources.pairs is None:
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     if sources.only_boards and sources.pairs is not None and not picture and intrinsics == "fixed":

@@ -225,6 +225,7 @@ def _calibrate_rejecting(
 
     return dataclasses.replace(
         found,
+        observations=observations,
         per_view_rms=spread_over(found.per_view_rms),
         residuals=spread_over(found.residuals),
         cam_from_board_rotation=spread_over(found.cam_from_board_rotation),
@@ -308,6 +309,7 @@ def _result(observations: Observations, found: Solved, options: CalibrationOptio
         iterations=found.spent,
         covariance=_by_parameter(uncertainty, free, len(camera.names)),
         warnings=(*warnings_of(observations, camera, rms, per_view, determined, names, status), *doubts),
+        observations=observations,
     )
 
 

@@ -130,7 +130,7 @@ def calibrate_hybrid(
     wins = settled is not None and better
     kept = settled is not None and (wins or not options.gate)
     if settled is not None and kept:
-        calibration = _result(setting, observations.image_size, base, settled)
+        calibration = _result(observations, setting, base, settled)
     else:
         model = base.model if rival is None else LensModel.named(rival.name)
         calibration = judged(observations, solutions[model], options.parametric(model))
@@ -187,13 +187,18 @@ def _reason(base: FieldFit, rival: Contender | None, wins: bool, settled: bool, 
     return f"better than a parametric model, {sure}: {found}"
 
 
-def _result(setting: GroupedViews, size: tuple[int, int], base: FieldFit, settled: Settled) -> CameraCalibrationResult:
+def _result(
+    observations: Observations, setting: GroupedViews, base: FieldFit, settled: Settled
+) -> CameraCalibrationResult:
     field, covariance = settled.field, field_covariance(base, settled.forms)
     problem = setting.problem(base.model, range(len(setting.pixels)), field)
     state = problem.tidy(settled.state)
     s = problem.unpack(state)
     camera = HybridCamera(
-        s.parameters[0], size=size, model=base.model, residual=FieldResidual(field.grid, field.weights)
+        s.parameters[0],
+        size=observations.image_size,
+        model=base.model,
+        residual=FieldResidual(field.grid, field.weights),
     )
     residuals = problem.pixel_errors(state)[:, 0].transpose(-1, -2)
     seen = problem.seen[:, 0]
@@ -217,6 +222,7 @@ def _result(setting: GroupedViews, size: tuple[int, int], base: FieldFit, settle
         status=Status.CONVERGED,
         iterations=base.solved.spent,
         warnings=(),
+        observations=observations,
     )
 
 
