@@ -6,8 +6,8 @@ import math
 
 import pytest
 import torch
+from differences import numeric
 from kornia.geometry.camera import distort_points_kannala_brandt
-from test_jacobians import numeric
 from torch import Tensor
 from torch.func import jacfwd
 

@@ -7,10 +7,10 @@ This shows that derivatives fit the values; that the values are right is shown b
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 
 import pytest
 import torch
+from differences import numeric
 from lenses import MODELS, parameters, strong
 from torch import Tensor
 from torch.func import jacfwd
@@ -34,17 +34,6 @@ POINTS = torch.tensor(
 def state(model: str, kind: str) -> Tensor:
     lens = strong(model)
     return parameters(model, lens if kind == "strong" else torch.zeros_like(lens))
-
-
-def numeric(function: Callable[[Tensor], Tensor], at: Tensor, step: float) -> Tensor:
-    """Fourth-order central differences of a function of a vector, output shape (*out, len(at))."""
-    columns = []
-    for i in range(at.numel()):
-        h = torch.zeros_like(at)
-        h.view(-1)[i] = step
-        near, far = function(at + h) - function(at - h), function(at + 2 * h) - function(at - 2 * h)
-        columns.append((8.0 * near - far) / (12.0 * step))
-    return torch.stack(columns, -1)
 
 
 @pytest.mark.parametrize("kind", STATES)

@@ -9,12 +9,13 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
-from kcal.calibrate import mono, rig_adjust
 from kcal.calibrate.bundle.board_problem import BoardProblem
 from kcal.calibrate.bundle.covariance import Covariance, covariance, projection_covariance, uncertainty_of
 from kcal.calibrate.bundle.views import free_parameters
+from kcal.calibrate.camera import calibrate
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.warnings import check_focal
+from kcal.calibrate.rig import adjustment
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
@@ -212,8 +213,8 @@ class TestWhatCannotBeComputed:
             return _uncertainty(*given, **named)  # type: ignore[arg-type]
 
         # Only after the solution was found.
-        _uncertainty = mono._uncertainty
-        monkeypatch.setattr(mono, "_uncertainty", count)
+        _uncertainty = calibrate._uncertainty
+        monkeypatch.setattr(calibrate, "_uncertainty", count)
         monkeypatch.setattr(BoardProblem, "linearize", folded)
         result = calibrate_camera(seen, CalibrationOptions(model="opencv14"))
         assert calls
@@ -229,4 +230,4 @@ class TestWhatCannotBeComputed:
         unknown = torch.full((size, size), torch.nan, dtype=torch.float64)
         data = RigData(cameras=cameras, names=("left", "right"), covariances=(unknown, unknown))
         with pytest.raises(InputError, match="not finite"):
-            rig_adjust._free(data, 0, "prior")
+            adjustment._free(data, 0, "prior")

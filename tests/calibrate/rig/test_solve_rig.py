@@ -25,8 +25,8 @@ from rig_scenes import (
 )
 from torch import Tensor
 
-from kcal.calibrate import rig_limits
 from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.rig import limits
 from kcal.calibrate.rig.blocks import BoardGroup, FeatureGroup, Group, LandmarkGroup
 from kcal.calibrate.rig.problem import DistanceTerm, ParameterTerm, PlaceTerm, RigProblem
 from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
@@ -433,7 +433,7 @@ class TestWrong:
         assert solve_rig(data(boards=shown)).left_out == ()
         with monkeypatch.context() as without:
             for name in ("_LENS", "_BETWEEN"):
-                without.setattr(rig_limits, name, 0.0)
+                without.setattr(limits, name, 0.0)
             assert len(solve_rig(data(boards=shown)).left_out) > 0
         # One that moved is found all the same.
         shown.pixels[5, 1] += tensor(1.0, 0.0)
