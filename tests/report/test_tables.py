@@ -46,9 +46,7 @@ def test_diagonals_of_pairs_whose_ends_were_both_located() -> None:
     board = Board(columns=5, rows=4, square=1.0)
     points = tensor([0.0, 0.0, 100.0], [4.0, 3.01, 100.0], [0.0, 0.0, 50.0])
     left, right, _ = pinhole_rig()(points)
-    located = locate(
-        pinhole_rig(), left, right, origin=ORIGIN, heading_deg=0.0, names=["a first", "a last", "b first"]
-    )
+    located = locate(pinhole_rig(), left, right, origin=ORIGIN, heading_deg=0.0, names=["a first", "a last", "b first"])
     _, row = diagonal_rows(located, board)
     assert row[0] == "a"
     assert row[2:] == ["5000.00", "5006.01", "+6.01"]
