@@ -94,7 +94,7 @@ def detect_command(
     from kcal.corners.detect import detect_images
     from kcal.corners.images import expand_images
     from kcal.corners.orientation import turned_images
-    from kcal.corners.video import SUFFIXES, detect_video, is_stream, source_name
+    from kcal.corners.video import VIDEO_SUFFIXES, detect_video, is_stream, source_name
 
     turned: list[Path] = []
     streams = [source_name(image) for image in images if is_stream(image)]
@@ -102,7 +102,7 @@ def detect_command(
         raise InputError(f"{streams[0]}: a stream is searched alone, without other images")
     if keep is not None and not keep.is_dir():
         raise FileError(f"{keep}: no such folder")
-    if streams or (len(images) == 1 and Path(images[0]).suffix.lower() in SUFFIXES):
+    if streams or (len(images) == 1 and Path(images[0]).suffix.lower() in VIDEO_SUFFIXES):
         searched = 0
 
         def count(_: str) -> None:

@@ -1,4 +1,4 @@
-"""Calibration boards: how many inner corners, how large, and where each one lies."""
+"""Describe a calibration board: its inner corners, the size of its squares, its markers."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from kcal.errors import InputError
 DICTIONARIES = {
     f"{bits}x{bits}_{count}": count for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)
 }  # fmt: skip
-_DICTIONARY, _MARKER_SHARE = "4x4_50", 0.7
+_DEFAULT_DICTIONARY, _MARKER_SHARE = "4x4_50", 0.7
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 
 
 class Board(pydantic.BaseModel):
     """A checkerboard, described by its inner corners.
 
-    Convention: corner `row * columns + column` lies at `(column * square, row * square, 0)` meters; x runs along a
-    row, y down the columns, z into the board, so that a board seen from its front has z pointing away from the
-    camera. The square diagonally outside corner 0 is black (dark).
+    Convention: corner `row * columns + column` lies at `(column * square, row * square, 0)` meters. x runs along a
+    row, y down the columns, z into the board, away from a camera in front of it. The square diagonally outside
+    corner 0 is dark.
 
     Args:
         columns: inner corners in a row (one less than the squares).
         rows: inner corners in a column.
         square: side of a square in meters.
-        dictionary: for a ChArUco board, the name of OpenCV's dictionary (`4x4_50`) whose markers lie in the light
+        dictionary: of a ChArUco board, the name of OpenCV's dictionary (`4x4_50`) whose markers lie in the light
             squares, numbered row by row; None for a plain checkerboard.
-        marker: side of a marker in meters, for a ChArUco board.
+        marker: side of a marker in meters, of a ChArUco board.
 
     Example:
         >>> Board(columns=9, rows=6, square=0.025).points.shape
@@ -49,14 +49,14 @@ class Board(pydantic.BaseModel):
     @pydantic.model_validator(mode="after")
     def _markers(self) -> Board:
         if (self.dictionary is None) != (self.marker is None):
-            raise ValueError("a ChArUco board has a dictionary and a marker's side, a checkerboard neither")
+            raise ValueError("a ChArUco board has a dictionary and a marker size, a checkerboard neither")
         if self.dictionary is None or self.marker is None:
             return self
         if self.dictionary not in DICTIONARIES:
             raise ValueError(f"dictionary {self.dictionary!r}: choose one of {', '.join(DICTIONARIES)}")
         needed = (self.columns + 1) * (self.rows + 1) // 2
         if needed > DICTIONARIES[self.dictionary]:
-            raise ValueError(f"the board has {needed} markers, dictionary {self.dictionary} fewer")
+            raise ValueError(f"the board needs {needed} markers, dictionary {self.dictionary} fewer")
         if not self.marker < self.square:
             raise ValueError("a marker must be smaller than its square")
         return self
@@ -65,8 +65,8 @@ class Board(pydantic.BaseModel):
     def parse(cls, size: str, square: str) -> Board:
         """Read `"9x6"` (inner corners, columns by rows) and `"25mm"` (units: mm, cm, m, in).
 
-        A ChArUco board is `"charuco:9x6"`, with a dictionary other than 4x4_50 `"charuco:9x6:5x5_100"`, and with
-        markers other than 0.7 of the square `"charuco:9x6:5x5_100:15mm"`.
+        A ChArUco board is `"charuco:9x6"`. `"charuco:9x6:5x5_100"` names a dictionary other than 4x4_50, and
+        `"charuco:9x6:5x5_100:15mm"` markers other than 0.7 of the square.
 
         Raises:
             InputError: a size or a length that cannot be read, or a length without its unit.
@@ -83,7 +83,7 @@ class Board(pydantic.BaseModel):
         match = re.fullmatch(r"\s*(\d+)\s*[xX×]\s*(\d+)\s*", size)
         if not match:
             raise InputError(f"board {size!r}: write inner corners as COLUMNSxROWS, for example 9x6")
-        side = _length("square", square)
+        side = _parse_length("square", square)
         columns, rows = int(match.group(1)), int(match.group(2))
         if not (2 <= columns <= 500 and 2 <= rows <= 500):
             raise InputError(f"board {size!r}: 2 to 500 inner corners each way are needed")
@@ -95,8 +95,8 @@ class Board(pydantic.BaseModel):
         if len(more) > 2:
             raise InputError(f"board 'charuco:{text}': write charuco:COLUMNSxROWS[:DICTIONARY[:MARKER]]")
         plain = cls.parse(size, square)
-        dictionary = more[0].lower().removeprefix("dict_") if more else _DICTIONARY
-        marker = _length("marker", more[1]) if len(more) > 1 else _MARKER_SHARE * plain.square
+        dictionary = more[0].lower().removeprefix("dict_") if more else _DEFAULT_DICTIONARY
+        marker = _parse_length("marker", more[1]) if len(more) > 1 else _MARKER_SHARE * plain.square
         try:
             return cls(
                 columns=plain.columns, rows=plain.rows, square=plain.square, dictionary=dictionary, marker=marker
@@ -107,24 +107,19 @@ class Board(pydantic.BaseModel):
 
     @property
     def corners(self) -> int:
-        """How many inner corners the board has."""
+        """Number of inner corners."""
         return self.columns * self.rows
 
     @property
     def points(self) -> Tensor:
         """Corner positions on the flat board, (corners, 3) float64 meters, row by row."""
-        y, x = torch.meshgrid(
-            torch.arange(self.rows, dtype=torch.float64),
-            torch.arange(self.columns, dtype=torch.float64),
-            indexing="ij",
-        )
-        return torch.stack([x.reshape(-1), y.reshape(-1), torch.zeros(self.corners, dtype=torch.float64)], -1) * (
-            self.square
-        )
+        rows, columns = (torch.arange(count, dtype=torch.float64) for count in (self.rows, self.columns))
+        yx = torch.cartesian_prod(rows, columns)
+        return torch.nn.functional.pad(yx.flip(-1), (0, 1)) * self.square
 
     @property
     def unambiguous(self) -> bool:
-        """Whether the board can be told from itself turned by 180°: by markers, or with one count odd and one even."""
+        """Whether the board differs from itself turned by 180°: it has markers, or one count is odd and one even."""
         return self.dictionary is not None or (self.columns + self.rows) % 2 == 1
 
     def __str__(self) -> str:
@@ -132,8 +127,8 @@ class Board(pydantic.BaseModel):
         return plain if self.marker is None else f"{plain}, {self.marker * 1000:g} mm markers {self.dictionary}"
 
 
-def _length(name: str, text: str) -> float:
-    """A length with its unit in meters."""
+def _parse_length(name: str, text: str) -> float:
+    """A text such as `25mm` in meters."""
     length = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?\d+)?)\s*([a-z]*)\s*", text)
     try:
         value = float(length.group(1)) if length else float("nan")

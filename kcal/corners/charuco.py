@@ -1,7 +1,7 @@
-"""ChArUco boards: checkerboards whose light squares hold markers, so that a part of one is enough.
+"""Find ChArUco boards: checkerboards with markers in their light squares, so that a visible part is enough.
 
-A part seen at the image's border is what pins a lens down there. OpenCV's `aruco.CharucoDetector` finds the markers and
-between them the corners; refinement is kcal's own, within what the markers leave free.
+Parts seen at the image's border determine the lens there. OpenCV's `aruco.CharucoDetector` finds the markers and the
+corners between them; kcal refines the corners, within what the markers leave free.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from kcal.corners.grid import as_grid, local_side
 from kcal.errors import InputError
 
 MIN_CORNERS = 6
-_FREE = 0.85  # of the way from a corner to the nearest marker may be used; the rest is blur
+_FREE_SHARE = 0.85  # of the distance from a corner to the nearest marker; the rest is left for blur
 
 
 def find_charuco(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
@@ -42,14 +42,14 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
 
 
 def enough(pixels: Tensor, board: Board) -> bool:
-    """Whether the corners that are seen determine a pose."""
+    """Whether the seen corners determine a pose."""
     seen = torch.isfinite(as_grid(pixels, board.columns, board.rows)).all(-1)
     spread = min(int((seen.sum(side) >= 2).sum()) for side in (0, 1))
     return int(seen.sum()) >= MIN_CORNERS and spread >= 2
 
 
 def free_side(pixels: Tensor, board: Board) -> Tensor:
-    """What to give refinement as the side of the squares, (corners,), so that no marker comes into its window.
+    """The side of the squares (corners,) to pass to refinement, so that its window contains no marker.
 
     Raises:
         InputError: the board has no markers.
@@ -57,11 +57,11 @@ def free_side(pixels: Tensor, board: Board) -> Tensor:
     if board.marker is None:
         raise InputError(f"{board}: not a ChArUco board")
     side = local_side(pixels, board.columns, board.rows)
-    # A corner without a neighbor takes the typical side of the others.
+    # A corner without a neighbor gets the median side of the others.
     known = torch.isfinite(side)
     side = torch.where(known, side, side[known].median() if bool(known.any()) else 1.0)
     free = (board.square - board.marker) / board.square / math.sqrt(2.0)
-    return side * min(1.0, _FREE * free / SHARE)
+    return side * min(1.0, _FREE_SHARE * free / SHARE)
 
 
 def marker_cells(board: Board) -> list[npt.NDArray[np.bool_]]:

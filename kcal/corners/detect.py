@@ -1,4 +1,4 @@
-"""Find a checkerboard in an image, and in many."""
+"""Find a board in one image, or in all images of a camera."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.order import canonical_order
 from kcal.corners.refine import Refinement, refine_corners
-from kcal.corners.saddle import Refined, Status
+from kcal.corners.saddle import CornerStatus, Refined
 from kcal.errors import FileError, InputError
 
-SEARCH_SIDES = (1200, 2400)  # pixels: the longer side of the image that is searched, small first
-MIN_CLIMB_SIDE = 8.0  # pixels: squares smaller than this in a shrunk image are not refined there
-MIN_GOOD = 0.5  # share of the corners that must survive refinement
+SEARCH_SIDES = (1200, 2400)  # pixels: longer sides of the searched image, small first
+MIN_REFINED_SIDE = 8.0  # pixels: smaller squares in a reduced image are not refined there
+MIN_GOOD = 0.5  # share of the corners that must be refined successfully
 
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTOR = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-_REASONS = {
-    Status.OUTSIDE: "too near the image's edge",
-    Status.NO_SADDLE: "not a corner",
-    Status.MOVED: "moved too far",
-    Status.RESTLESS: "did not settle",
-    Status.SATURATED: "over- or underexposed",
-    Status.OCCLUDED: "covered or glaring",
-    Status.BLURRED: "too blurred",
+_STATUS_TEXTS = {
+    CornerStatus.OUTSIDE: "too near the image's edge",
+    CornerStatus.NO_SADDLE: "not a corner",
+    CornerStatus.MOVED: "moved too far",
+    CornerStatus.NOT_CONVERGED: "did not converge",
+    CornerStatus.SATURATED: "over- or underexposed",
+    CornerStatus.OCCLUDED: "covered or glaring",
+    CornerStatus.BLURRED: "too blurred",
 }
 
 
@@ -47,9 +47,9 @@ class Detection(NamedTuple):
     """A board in an image.
 
     Args:
-        pixels: (corners, 2) float64 in the board's order, NaN where not seen; None where there is no board.
-        reason: why there is none.
-        covariance: (corners, 2, 2) px², where the refinement tells.
+        pixels: (corners, 2) float64 in the board's order, NaN where not seen; None if no board was found.
+        reason: why none was found.
+        covariance: (corners, 2, 2) px², if the refinement estimates it.
     """
 
     pixels: Tensor | None
@@ -58,12 +58,12 @@ class Detection(NamedTuple):
 
 
 def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detection:
-    """Find the inner corners of a checkerboard, or those of a ChArUco board that are seen.
+    """Find the inner corners of a checkerboard, or the visible ones of a ChArUco board.
 
     OpenCV's `findChessboardCorners` searches first; where it fails, `findChessboardCornersSB` (A. Duda and U. Frese,
-    BMVC 2018). Images above 1200 px are searched small and refined upwards in steps of two. What was found must look
-    like the whole board (`kcal.corners.grid.grid_trouble`) and is put into the board's order
-    (`kcal.corners.order.canonical_order`) before it is refined at the image's full size and depth.
+    BMVC 2018). Images above 1200 px are searched at a reduced size and refined in steps of two. The grid found must
+    look like the whole board (`kcal.corners.grid.grid_trouble`). It is put into the board's order
+    (`kcal.corners.order.canonical_order`) and refined at the image's full size and depth.
 
     Args:
         image: (H, W) uint8 or uint16.
@@ -89,21 +89,23 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"image: (H, W) uint8 or uint16 is needed, got {image.shape} {image.dtype}")
     if min(board.columns, board.rows) < 3:
-        raise InputError(f"board {board.columns}x{board.rows}: at least 3 inner corners each way can be detected")
+        raise InputError(
+            f"board {board.columns}x{board.rows}: at least 3 inner corners in each direction are needed for detection"
+        )
     if refine not in get_args(Refinement):
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
     if board.dictionary is not None:
         return _detect_charuco(image, board, refine)
-    pixels, factor, reason = _search(to_8bit(image), board)
+    pixels, factor, reason = _find_in_order(to_8bit(image), board)
     if pixels is None:
         return Detection(None, reason)
     if refine != "none":
-        pixels = _climb(image, pixels, board, factor)
+        pixels = _refine_through_sizes(image, pixels, board, factor)
     if sharpness(image, pixels, board.columns, board.rows) < MIN_SHARPNESS:
-        return Detection(None, "too blurred: edges are nearly as wide as the squares; focus, hold still or come closer")
+        return Detection(None, "too blurred: edges are nearly as wide as the squares; focus, hold still or move closer")
     side = local_side(pixels, board.columns, board.rows)
     refined = refine_corners(image, pixels, side, refine, (board.columns, board.rows))
-    good = int((refined.status == Status.GOOD).sum())
+    good = int((refined.status == CornerStatus.GOOD).sum())
     if good < MIN_GOOD * board.corners:
         return Detection(None, _too_few(refined, board.corners))
     return Detection(refined.pixels, covariance=refined.covariance)
@@ -112,7 +114,7 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
 def _detect_charuco(image: Gray, board: Board, refine: Refinement) -> Detection:
     pixels = find_charuco(to_8bit(image), board)
     if pixels is None:
-        return Detection(None, f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on a line")
+        return Detection(None, f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on one line")
     seen = torch.isfinite(pixels).all(-1)
     refined = refine_corners(image, pixels, free_side(pixels, board), refine, (board.columns, board.rows))
     if not enough(refined.pixels, board):
@@ -121,10 +123,10 @@ def _detect_charuco(image: Gray, board: Board, refine: Refinement) -> Detection:
 
 
 def _too_few(refined: Refined, found: int) -> str:
-    good = int((refined.status == Status.GOOD).sum())
+    good = int((refined.status == CornerStatus.GOOD).sum())
     counts = Counter(refined.status.tolist())
-    why = ", ".join(f"{counts[code]} {text}" for code, text in _REASONS.items() if counts[code])
-    return f"only {good} of {found} corners are sharp enough to be refined ({why})"
+    why = ", ".join(f"{counts[code]} {text}" for code, text in _STATUS_TEXTS.items() if counts[code])
+    return f"only {good} of {found} corners could be refined ({why})"
 
 
 def detect_images(
@@ -136,7 +138,7 @@ def detect_images(
 ) -> Observations:
     """Find the board in the images of one camera.
 
-    An image that cannot be read or shows no board becomes a `Failure` with its reason; the others become views, named
+    An image that cannot be read or shows no board becomes a `Failure` with its reason. The others become views, named
     by their file names (with folders where two files share one).
 
     Args:
@@ -144,7 +146,7 @@ def detect_images(
         board: the board.
         refine: see `kcal.corners.refine.refine_corners`.
         progress: called with each image's name when it is done.
-        time_limit: seconds after which an image is given up and becomes a failure; none by default. See
+        time_limit: seconds after which an image becomes a failure; no limit by default. See
             `kcal.corners.limited.Limited`.
 
     Raises:
@@ -197,13 +199,13 @@ def detect_images(
 
 
 def limit_threads(count: int) -> None:
-    """Let OpenCV and torch use so many threads each in this process, for work that is spread over processes already."""
+    """Limit the threads of OpenCV and of torch in this process, for work that is already spread over processes."""
     cv2.setNumThreads(count)
     torch.set_num_threads(count)
 
 
 def view_of(found: Detection, name: str, image: str | None = None, sha256: str | None = None) -> View:
-    """A detection as a view of an observations file.
+    """Convert a detection to a view of an observations file.
 
     Raises:
         InputError: nothing was detected.
@@ -218,8 +220,8 @@ def view_of(found: Detection, name: str, image: str | None = None, sha256: str |
     return View(name=name, pixels=pixels, covariance=spread, image=image, sha256=sha256)
 
 
-def _search(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor | None, float, str]:
-    """Corners to about a pixel of the searched size, how much smaller that size was, and a reason if there are none."""
+def _find_in_order(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor | None, float, str]:
+    """Corners to about a pixel of the searched size, the factor by which that is smaller, and why none were found."""
     reason = f"no board of {board.columns}x{board.rows} inner corners found"
     tried: set[float] = set()
     for longest in SEARCH_SIDES:
@@ -227,7 +229,7 @@ def _search(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor | None, 
         if factor in tried:
             break
         tried.add(factor)
-        small, scale = _shrunk(image, factor, _size(image))
+        small, scale = _reduced(image, factor, _size(image))
         for find in (_find_classic, _find_sector):
             corners = find(small, board)
             if corners is None:
@@ -246,8 +248,8 @@ def _find_classic(image: Gray, board: Board) -> Tensor | None:
 
 
 def _find_sector(image: Gray, board: Board) -> Tensor | None:
-    # It draws from OpenCV's random numbers, whose state is a thread's own: in a new thread the same image gives the
-    # same corners, whatever was called before, and the caller's state is left alone.
+    # OpenCV's random numbers have one state per thread. In a new thread the same image always gives the same corners,
+    # and the caller's state does not change.
     with ThreadPoolExecutor(1) as fresh:
         found, corners = fresh.submit(
             cv2.findChessboardCornersSB, image, (board.columns, board.rows), flags=_SECTOR
@@ -255,33 +257,33 @@ def _find_sector(image: Gray, board: Board) -> Tensor | None:
     return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
 
 
-def _climb(image: Gray, pixels: Tensor, board: Board, factor: float) -> Tensor:
-    """Bring corners found on an image `factor` times smaller near enough for refinement at full size.
+def _refine_through_sizes(image: Gray, pixels: Tensor, board: Board, factor: float) -> Tensor:
+    """Refine corners found on an image `factor` times smaller until refinement at full size can start from them.
 
-    The first steps are on images four and two times smaller still, because OpenCV leaves single corners 3 px off
-    where its own refinement failed, out of reach at full size. The squares must still be large enough there.
+    The first steps use images four and two times smaller still: where OpenCV's own refinement failed, it leaves single
+    corners 3 px off, too far for full size. Squares too small for refinement are left as they are.
     """
     factors = []
     factor = 4 * factor
     while factor > 1:
         factors.append(factor)
         factor = factor / 2
-    # Each from the one twice as large: shrinking a large image is what takes the time.
+    # Each is reduced from the one twice as large, because reducing the largest image takes the time.
     steps, source = [], image
     for factor in reversed(factors):
-        source, scale = _shrunk(source, factor, _size(image))
+        source, scale = _reduced(source, factor, _size(image))
         steps.append((source, scale))
     for small, scale in reversed(steps):
         start = (pixels + 0.5) / scale - 0.5
         side = local_side(start, board.columns, board.rows)
         refined = refine_corners(small, start, side, "saddle")
-        good = ((refined.status == Status.GOOD) & (side >= MIN_CLIMB_SIDE))[:, None]
+        good = ((refined.status == CornerStatus.GOOD) & (side >= MIN_REFINED_SIDE))[:, None]
         pixels = _scaled(torch.where(good, refined.pixels, start), scale)
     return pixels
 
 
-def _shrunk(image: Gray, factor: float, whole: tuple[int, int]) -> tuple[Gray, Tensor]:
-    """What was once `whole` (width, height) made `factor` times smaller by averaging, and the exact scale back."""
+def _reduced(image: Gray, factor: float, whole: tuple[int, int]) -> tuple[Gray, Tensor]:
+    """An image of the original size `whole` made `factor` times smaller by averaging, and the exact scale back."""
     width, height = whole
     if factor <= 1:
         return image, torch.ones(2, dtype=torch.float64)
@@ -291,7 +293,7 @@ def _shrunk(image: Gray, factor: float, whole: tuple[int, int]) -> tuple[Gray, T
 
 
 def _scaled(pixels: Tensor, scale: Tensor) -> Tensor:
-    """Pixels of a shrunk image as pixels of the image: edges coincide at -0.5, not the centers of the first pixels."""
+    """Convert pixels of a reduced image to the original's: edges coincide at -0.5, not centers of the first pixels."""
     return (pixels + 0.5) * scale - 0.5
 
 
@@ -314,7 +316,7 @@ def _sizes_differ(files: list[Path], names: list[str]) -> str:
 
 
 def _hint(files: list[Path], board: Board) -> str:
-    """The usual slip: squares were counted instead of inner corners."""
+    """Advice where squares were counted instead of inner corners, the usual mistake."""
     if min(board.columns, board.rows) < 4 or board.dictionary is not None:
         return ""
     fewer = Board(columns=board.columns - 1, rows=board.rows - 1, square=board.square)
@@ -323,6 +325,6 @@ def _hint(files: list[Path], board: Board) -> str:
             image = decode_gray(read_bytes(file), file)
         except FileError:
             continue
-        if _search(to_8bit(image), fewer)[0] is not None:
-            return f"; a board of {fewer.columns}x{fewer.rows} is there: count inner corners, not squares"
+        if _find_in_order(to_8bit(image), fewer)[0] is not None:
+            return f"; a board of {fewer.columns}x{fewer.rows} was found: count inner corners, not squares"
     return ""

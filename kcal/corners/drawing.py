@@ -1,7 +1,6 @@
-"""Black shapes and short texts on a page of known size, written as SVG or PDF at true scale.
+"""Write black shapes and short texts as SVG or PDF at true scale.
 
-Both formats are vector text of a few kilobytes, without dates or tool names, so that the same board always gives the
-same bytes.
+The files contain no dates or tool names, so that the same board always gives the same bytes.
 """
 
 from __future__ import annotations
@@ -54,13 +53,13 @@ def to_svg(drawing: Drawing) -> str:
         >>> "M1 1h2.5v3h-2.5z" in to_svg(page)
         True
     """
-    width, height = _number(drawing.width), _number(drawing.height)
+    width, height = _decimal(drawing.width), _decimal(drawing.height)
     path = "".join(
-        f"M{_number(r.x)} {_number(r.y)}h{_number(r.width)}v{_number(r.height)}h{_number(-r.width)}z"
+        f"M{_decimal(r.x)} {_decimal(r.y)}h{_decimal(r.width)}v{_decimal(r.height)}h{_decimal(-r.width)}z"
         for r in drawing.rectangles
     )
     texts = "".join(
-        f'<text x="{_number(t.x)}" y="{_number(t.y)}" font-size="{_number(t.size)}">{escape(t.text)}</text>\n'
+        f'<text x="{_decimal(t.x)}" y="{_decimal(t.y)}" font-size="{_decimal(t.size)}">{escape(t.text)}</text>\n'
         for t in drawing.texts
     )
     return (
@@ -88,19 +87,19 @@ def to_pdf(drawing: Drawing) -> bytes:
     """
 
     def flip(y: float) -> str:
-        return _number((drawing.height - y) * _POINT)
+        return _decimal((drawing.height - y) * _POINT)
 
     content = ["0 g"]
     for r in drawing.rectangles:
-        corner = f"{_number(r.x * _POINT)} {flip(r.y + r.height)}"
-        content.append(f"{corner} {_number(r.width * _POINT)} {_number(r.height * _POINT)} re")
+        corner = f"{_decimal(r.x * _POINT)} {flip(r.y + r.height)}"
+        content.append(f"{corner} {_decimal(r.width * _POINT)} {_decimal(r.height * _POINT)} re")
     content.append("f" if drawing.rectangles else "")
     for t in drawing.texts:
         content.append(
-            f"BT /F1 {_number(t.size * _POINT)} Tf {_number(t.x * _POINT)} {flip(t.y)} Td ({_literal(t.text)}) Tj ET"
+            f"BT /F1 {_decimal(t.size * _POINT)} Tf {_decimal(t.x * _POINT)} {flip(t.y)} Td ({_literal(t.text)}) Tj ET"
         )
     stream = _latin("\n".join(content))
-    box = f"[0 0 {_number(drawing.width * _POINT)} {_number(drawing.height * _POINT)}]"
+    box = f"[0 0 {_decimal(drawing.width * _POINT)} {_decimal(drawing.height * _POINT)}]"
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
         b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
@@ -123,7 +122,7 @@ def to_pdf(drawing: Drawing) -> bytes:
     )
 
 
-def _number(value: float) -> str:
+def _decimal(value: float) -> str:
     """A number to 0.1 micrometer, without a needless fraction."""
     return f"{value:.4f}".rstrip("0").rstrip(".")
 
@@ -136,4 +135,4 @@ def _latin(text: str) -> bytes:
     try:
         return text.encode("latin-1")
     except UnicodeEncodeError as error:
-        raise InputError(f"{text!r}: a PDF text can hold Latin-1 characters only") from error
+        raise InputError(f"{text!r}: a PDF text can contain Latin-1 characters only") from error

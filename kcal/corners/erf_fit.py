@@ -1,7 +1,7 @@
-"""The fit of blurred, crossing edges to the pixels round each corner: Levenberg-Marquardt for all corners at once.
+"""Fit blurred, crossing edges to the pixels around each corner: Levenberg-Marquardt for all corners at once.
 
-First each corner is fitted by itself. What these fits know together (how light falls on the board, how wide edges are
-blurred) then goes into a second one.
+First each corner is fitted alone. What these fits know together (illumination of the board, width of the edges) then
+goes into a second fit.
 """
 
 from __future__ import annotations
@@ -12,53 +12,72 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.corners.crossing import ODD, PARAMETERS, Beside, crossing
-from kcal.corners.erf_board import Prior, curvatures, light_at, light_slope, line_spread, lines_beside
-from kcal.corners.erf_spread import spread
-from kcal.corners.erf_window import Window, look
+from kcal.corners.crossing import ODD, PARAMETERS, LineDistances, crossing
+from kcal.corners.erf_board import FAR, RampPrior, curvatures, light_at, light_slope, line_covariance, neighbor_lines
+from kcal.corners.erf_spread import center_covariance
+from kcal.corners.erf_window import CornerWindow, cut_windows
 from kcal.corners.grid import Neighbors
 
-MIN_ANGLE = math.radians(25.0)  # between the edges; below, the series of `crossing` ends too early
-SHARE = 0.5  # of the smallest square side: the radius of the window
-# The same where blur is a good part of the square, and the lines beyond are known and fitted, too: the window of half a
-# square would then hardly determine ten numbers.
+MIN_ANGLE = math.radians(25.0)  # between the edges; below, the series of `crossing` is too short
+# Radius of the window as a share of the smallest square side. 0.4 was 5 to 20 % worse at squares of 8 to 20 px; 0.6 is
+# wrong where blur is a fifth of the square.
+SHARE = 0.5
+# The same where blur is a good part of the square and the next lines belong to the model; half a square would hardly
+# determine ten parameters then.
 WIDE_SHARE = 0.75
 MAX_RADIUS = 12.0  # pixels
-MIN_RADIUS = 2.5  # pixels: fewer would not determine ten numbers
-# Sigmas from the window's rim to the next line beyond which its blur is forgotten: 3e-4 of the contrast.
+MIN_RADIUS = 2.5  # pixels: fewer would not determine ten parameters
+# The next line is left out where it is more sigmas of blur from the window's rim: 3e-4 of the contrast.
 REACH = 3.5
-_NOWHERE = 1e6  # pixels
 _FIRST_STEPS, _STEPS = 4, 20
-_STILL = 1e-5  # pixels
+_CONVERGED = 1e-5  # pixels
 
 
-class Fit(NamedTuple):
+class CrossingFit(NamedTuple):
     """What was fitted to each of M corners.
 
     Args:
-        center: (M, 2) pixels from the pixel the start is in; differentiable with respect to the image.
+        center: (M, 2) pixels from the pixel that contains the start; differentiable with respect to the image.
         parameters: (M, 10), see `crossing`.
         window: the pixels used.
         noise: (M,) variance of the gray levels.
         covariance: (M, 2, 2) px².
         crosses: (M,) whether there are two edges.
-        still: (M,) whether the last step was small.
-        near: (M,) whether the next lines were fitted, too.
+        converged: (M,) whether the last step was small.
+        near: (M,) whether the next lines were part of the model.
     """
 
     center: Tensor
     parameters: Tensor
-    window: Window
+    window: CornerWindow
     noise: Tensor
     covariance: Tensor
     crosses: Tensor
-    still: Tensor
+    converged: Tensor
     near: Tensor
+
+    @property
+    def blur(self) -> Tensor:
+        """Sigma of the edges' Gaussian, (M,) pixels."""
+        return self.parameters[:, 4].exp()
+
+
+class _FitInputs(NamedTuple):
+    """What a fit takes as given: pixels, curvatures of the edges (M, 2), prior, and the next lines."""
+
+    window: CornerWindow
+    bend: Tensor
+    prior: RampPrior
+    lines: LineDistances | None
+
+    def of(self, some: Tensor) -> _FitInputs:
+        lines = None if self.lines is None else LineDistances(*(value[some] for value in self.lines))
+        return _FitInputs(self.window.of(some), self.bend[some], self.prior.of_some(some), lines)
 
 
 def fit_crossings(
     image: Tensor, start: Tensor, side: Tensor, bend: Tensor | None, around: Neighbors | None, least_noise: float
-) -> Fit:
+) -> CrossingFit:
     """Fit two crossing edges to the surroundings of each corner.
 
     Args:
@@ -67,70 +86,68 @@ def fit_crossings(
         side: (B, N) smallest sides of the squares.
         bend: (M, 2, 2) curvature vectors of the lines through each corner, M = B N.
         around: steps to the next corners, (M, 4, 2), or None.
-        least_noise: variance that the gray levels have at least.
+        least_noise: lower bound of the variance of the gray levels.
     """
     base = start.round()
     offset = (start - base).reshape(-1, 2)
     flat_side = side.reshape(-1)
     radius = (SHARE * flat_side).clamp(MIN_RADIUS, MAX_RADIUS)
-    window, patches = look(image, base, offset, radius)
+    window, levels = cut_windows(image, base, offset, radius)
     first, crosses = _start(window)
-    curves = curvatures(bend, first) if bend is not None else torch.zeros_like(first[:, :2])
     nothing = torch.zeros_like(first[:, :2])
-    prior = Prior.of(first, nothing, torch.zeros_like(side).reshape(-1), nothing[:, 0])
-    # What the first steps find is enough to know how light falls on the board, and which lines reach into windows.
-    parameters, cost, still = _minimize(first, window, curves, prior, None, _FIRST_STEPS)
+    curves = curvatures(bend, first) if bend is not None else nothing
+    prior = RampPrior.of(first, nothing, nothing[:, 0], nothing[:, 0])
+    # A few steps are enough to estimate the illumination of the board and which lines reach into windows.
+    parameters, cost, converged = _levenberg_marquardt(first, _FitInputs(window, curves, prior, None), _FIRST_STEPS)
     usable = crosses & torch.isfinite(cost)
-    beside = None
+    lines = None
     near = torch.zeros_like(crosses)
     if around is not None:
-        lines = lines_beside(around, parameters)
+        beside = neighbor_lines(around, parameters)
         blur = parameters[:, 4].exp().clamp(max=0.5 * flat_side)
-        near = usable & (lines.distance.amin((-2, -1)) - radius < REACH * blur)
+        near = usable & (beside.distance.amin((-2, -1)) - radius < REACH * blur)
         if bool(near.any()):
-            # Where markers leave less than half a square free, so it stays.
+            # Markers may leave less than half a square free; the window stays inside that.
             free = flat_side >= 0.95 * torch.linalg.vector_norm(around.step, dim=-1).nan_to_num(math.inf).amin(-1)
             wide = (WIDE_SHARE * flat_side).clamp(MIN_RADIUS, MAX_RADIUS)
-            window, patches = look(image, base, offset, torch.where(near & free, wide, radius))
-            known = lines.beside(parameters, window.where)
-            beside = Beside(known.distance, known.turn * near[:, None, None, None])
-    # With lines beside, each step is twice the work, and only then is it known well how light falls on the board.
-    for group, others in ((~near, None), (near, beside), (near, beside)):
+            window, levels = cut_windows(image, base, offset, torch.where(near & free, wide, radius))
+            lines = beside.distances(parameters, window.where)
+            lines = LineDistances(lines.distance, lines.turn * near[:, None, None, None])
+    inputs = _FitInputs(window, curves, prior, lines)
+    # With lines each step is twice the work, so only corners near one get them. These are fitted twice, because only
+    # the first of the two fits makes the illumination well determined.
+    for group, with_lines in ((~near, False), (near, True), (near, True)):
         some = group.nonzero()[:, 0]
         if not len(some):
             continue
-        light = light_at(parameters, window, curves, beside, usable.reshape(side.shape))
+        light = light_at(parameters, window, curves, lines, usable.reshape(side.shape))
         place = base + parameters[:, :2].reshape(base.shape)
-        slope, doubt = light_slope(light, place, side, usable.reshape(side.shape))
-        noise = cost / window.weight.sum(-1)
-        prior = Prior.of(parameters, slope, doubt, noise)
-        chosen = None if others is None else Beside(*(value[some] for value in others))
-        done = _minimize(parameters[some], window.of(some), curves[some], prior.of_some(some), chosen, _STEPS)
-        parameters, cost, still = (
-            value.index_copy(0, some, new) for value, new in zip((parameters, cost, still), done, strict=True)
+        slope, error = light_slope(light, place, side, usable.reshape(side.shape))
+        inputs = inputs._replace(prior=RampPrior.of(parameters, slope, error, cost / window.weight.sum(-1)))
+        chosen = (inputs if with_lines else inputs._replace(lines=None)).of(some)
+        done = _levenberg_marquardt(parameters[some], chosen, _STEPS)
+        parameters, cost, converged = (
+            value.index_copy(0, some, new) for value, new in zip((parameters, cost, converged), done, strict=True)
         )
     between = (parameters[:, 2] - parameters[:, 3]).sin().abs()
     crosses = crosses & (between > math.sin(MIN_ANGLE)) & torch.isfinite(cost)
-    learn = (crosses & still).reshape(side.shape)
-    noise, covariance = _spread(parameters, window, curves, prior, beside, learn, least_noise)
-    still = still & torch.isfinite(covariance).all(-1).all(-1)
-    center = parameters[:, :2]
-    if patches.requires_grad:
-        center = _with_gradient(parameters, window, curves, prior, beside, patches)
-    return Fit(center, parameters, window, noise, covariance, crosses, still, near)
+    noise, covariance = _noise_and_covariance(
+        parameters, inputs, (crosses & converged).reshape(side.shape), least_noise
+    )
+    converged = converged & torch.isfinite(covariance).all(-1).all(-1)
+    center = _with_gradient(parameters, inputs, levels) if levels.requires_grad else parameters[:, :2]
+    return CrossingFit(center, parameters, window, noise, covariance, crosses, converged, near)
 
 
-def _minimize(
-    parameters: Tensor, window: Window, bend: Tensor, prior: Prior, beside: Beside | None, steps: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Levenberg-Marquardt for all corners at once: parameters, cost, and whether the last step was small."""
+def _levenberg_marquardt(parameters: Tensor, inputs: _FitInputs, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Minimize for all corners at once: parameters, cost, and whether the last step was small."""
     result = parameters.clone()
     result_cost = torch.full_like(parameters[:, 0], math.inf)
     result_last = result_cost.clone()
     at = torch.arange(len(parameters), device=parameters.device)  # the corners that still move
     damping = torch.full_like(result_cost, 1e-3)
     last = result_last.clone()
-    normal, gradient, cost = _normal(parameters, window, bend, prior, beside)
+    normal, gradient, cost = _normal_equations(parameters, inputs)
     for _ in range(steps):
         scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).rsqrt()
         scaled = normal * scale[:, :, None] * scale[:, None, :]
@@ -139,32 +156,31 @@ def _minimize(
         step = -torch.cholesky_solve((gradient * scale)[..., None], factor)[..., 0] * scale
         step = torch.nan_to_num(step, posinf=0.0, neginf=0.0)
         trial = parameters + step
-        trial_normal, trial_gradient, trial_cost = _normal(trial, window, bend, prior, beside)
+        trial_normal, trial_gradient, trial_cost = _normal_equations(trial, inputs)
         better = trial_cost <= cost
         length = torch.linalg.vector_norm(step[:, :2], dim=-1)
         # A rejected tiny step is rounding at the minimum; a rejected long one is not.
-        last = torch.where(better | (length < _STILL), length, last)
+        last = torch.where(better | (length < _CONVERGED), length, last)
         parameters = torch.where(better[:, None], trial, parameters)
         normal = torch.where(better[:, None, None], trial_normal, normal)
         gradient = torch.where(better[:, None], trial_gradient, gradient)
         cost = torch.where(better, trial_cost, cost)
         damping = torch.where(better, damping * 0.1, damping * 10.0).clamp(1e-9, 1e6)
-        go = (last >= _STILL).nonzero()[:, 0]
-        if 2 * len(go) < len(at):  # leave those behind that have arrived
+        go = (last >= _CONVERGED).nonzero()[:, 0]
+        if 2 * len(go) < len(at):  # go on with those that have not converged
             result[at], result_cost[at], result_last[at] = parameters, cost, last
             if not len(go):
                 break
-            at, window, bend, prior = at[go], window.of(go), bend[go], prior.of_some(go)
-            beside = None if beside is None else Beside(*(value[go] for value in beside))
+            at, inputs = at[go], inputs.of(go)
             parameters, normal, gradient, cost, damping, last = (
                 value[go] for value in (parameters, normal, gradient, cost, damping, last)
             )
     result[at], result_cost[at], result_last[at] = parameters, cost, last
-    return result, result_cost, result_last < 10 * _STILL
+    return result, result_cost, result_last < 10 * _CONVERGED
 
 
-def _start(window: Window) -> tuple[Tensor, Tensor]:
-    """Edge directions from the asymptotes of a quadratic, then mean, contrast and ramp by linear least squares."""
+def _start(window: CornerWindow) -> tuple[Tensor, Tensor]:
+    """Edge directions from the asymptotes of a quadratic, then mean and contrast by linear least squares."""
     x, y = (window.where - window.offset[:, None]).unbind(-1)
     one = torch.ones_like(x)
     weight = window.weight
@@ -194,11 +210,10 @@ def _least_squares(design: Tensor, values: Tensor, weight: Tensor) -> Tensor:
     return torch.nan_to_num(solution[..., 0])
 
 
-def _normal(
-    parameters: Tensor, window: Window, bend: Tensor, prior: Prior, beside: Beside | None
-) -> tuple[Tensor, Tensor, Tensor]:
+def _normal_equations(parameters: Tensor, inputs: _FitInputs) -> tuple[Tensor, Tensor, Tensor]:
     """Normal matrix, gradient and cost of the weighted residuals and the prior."""
-    levels, jacobian = crossing(parameters, window.where, bend, beside)
+    window, prior = inputs.window, inputs.prior
+    levels, jacobian = crossing(parameters, window.where, inputs.bend, inputs.lines)
     weight, miss = prior.diagonal(), parameters - prior.value()
     residual = levels - window.levels
     weighted = jacobian * window.weight[:, None]
@@ -208,49 +223,41 @@ def _normal(
     return normal, gradient, torch.nan_to_num(cost, nan=math.inf)
 
 
-def _spread(
-    parameters: Tensor,
-    window: Window,
-    bend: Tensor,
-    prior: Prior,
-    beside: Beside | None,
-    usable: Tensor,
-    least_noise: float,
+def _noise_and_covariance(
+    parameters: Tensor, inputs: _FitInputs, usable: Tensor, least_noise: float
 ) -> tuple[Tensor, Tensor]:
-    levels, jacobian = crossing(parameters, window.where, bend, beside)
+    window, prior = inputs.window, inputs.prior
+    levels, jacobian = crossing(parameters, window.where, inputs.bend, inputs.lines)
     weighted = jacobian * window.weight[:, None]
     normal = weighted @ jacobian.transpose(-1, -2) + torch.diag_embed(prior.diagonal())
     inverse, _ = torch.linalg.inv_ex(normal)
-    usable = usable & torch.isfinite(inverse).all(-1).all(-1).reshape(usable.shape)
     images = usable.shape
     residual = levels - window.levels
     freedom = (window.weight.sum(-1) - PARAMETERS).clamp_min(1.0)
     noise = (window.weight * residual.square()).sum(-1) / freedom
-    covariance = spread(
+    covariance = center_covariance(
         window.patches(residual).unflatten(0, images),
         window.patches(window.weight).unflatten(0, images),
         window.patches(jacobian[:, ODD]).unflatten(0, images),
         inverse.reshape(*images, PARAMETERS, PARAMETERS)[:, :, ODD][..., ODD],
         parameters[:, :2].reshape(*images, 2),
-        usable,
+        usable & torch.isfinite(inverse).all(-1).all(-1).reshape(images),
         least_noise,
-    )
-    covariance = covariance.reshape(-1, 2, 2)
-    by_ramp = inverse[:, :2, 7:9] * (prior.weight * prior.doubt)[:, None, None]
+    ).reshape(-1, 2, 2)
+    by_ramp = inverse[:, :2, 7:9] * (prior.weight * prior.error)[:, None, None]
     covariance = covariance + by_ramp @ by_ramp.transpose(-1, -2)
-    if beside is None:
-        return noise, covariance
-    gain = inverse[:, :2] @ weighted
-    return noise, covariance + line_spread(parameters, window, bend, beside, gain, covariance)
+    if inputs.lines is not None:
+        gain = inverse[:, :2] @ weighted
+        covariance = covariance + line_covariance(parameters, window, inputs.bend, inputs.lines, gain, covariance)
+    return noise, covariance
 
 
-def _with_gradient(
-    parameters: Tensor, window: Window, bend: Tensor, prior: Prior, beside: Beside | None, patches: Tensor
-) -> Tensor:
+def _with_gradient(parameters: Tensor, inputs: _FitInputs, levels: Tensor) -> Tensor:
     """The center as a function of the gray levels: at the minimum g(p, levels) = 0, so dp = -(∂g/∂p)⁻¹ ∂g."""
-    if beside is None:
-        nowhere = torch.full((len(parameters), 2, 2, 1), _NOWHERE, dtype=torch.float64, device=parameters.device)
-        beside = Beside(nowhere, torch.zeros_like(nowhere))
+    window, prior, lines = inputs.window, inputs.prior, inputs.lines
+    if lines is None:
+        far = torch.full((len(parameters), 2, 2, 1), FAR, dtype=torch.float64, device=parameters.device)
+        lines = LineDistances(far, torch.zeros_like(far))
 
     def gradient(
         parameters: Tensor,
@@ -258,17 +265,16 @@ def _with_gradient(
         distance: Tensor,
         turn: Tensor,
         prior: Tensor,
-        miss: Tensor,
+        mean: Tensor,
         weight: Tensor,
         values: Tensor,
     ) -> Tensor:
-        levels, jacobian = crossing(parameters, window.where, bend, Beside(distance, turn))
-        return jacobian @ (weight * (levels - values)) + prior * (parameters - miss)
+        levels, jacobian = crossing(parameters, window.where, bend, LineDistances(distance, turn))
+        return jacobian @ (weight * (levels - values)) + prior * (parameters - mean)
 
-    inputs = parameters, bend, *beside, prior.diagonal(), prior.value(), window.weight
-
-    hessian = torch.func.vmap(torch.func.jacfwd(gradient))(*inputs, window.levels)
+    arguments = parameters, inputs.bend, *lines, prior.diagonal(), prior.value(), window.weight
+    hessian = torch.func.vmap(torch.func.jacfwd(gradient))(*arguments, window.levels)
     inverse, _ = torch.linalg.inv_ex(hessian)
-    residual = torch.func.vmap(gradient)(*inputs, patches)
+    residual = torch.func.vmap(gradient)(*arguments, levels)
     change = -(inverse.detach() @ (residual - residual.detach())[..., None])[..., 0]
     return parameters[:, :2] + torch.nan_to_num(change[:, :2])

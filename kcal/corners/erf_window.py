@@ -1,4 +1,4 @@
-"""The pixels round corners that an erf fit explains."""
+"""Cut out the pixels around corners that an erf fit explains."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torch import Tensor
 from kcal.corners.saddle import cut_patches
 
 
-class Window:
-    """The pixels round each of M corners, and how much each counts: 1 inside the radius, falling to 0 within a pixel.
+class CornerWindow:
+    """The pixels around each of M corners and their weights: 1 inside the radius, falling to 0 within a pixel.
 
     Args:
         levels: (M, K) gray levels of the pixels on a disc.
         offset: (M, 2) starts relative to the patch's middle.
         radius: (M,) pixels.
-        places: (K,) which of a patch's pixels these are, row by row.
+        places: (K,) indices of these pixels in a patch, row by row.
         size: pixels on a side of the patch.
     """
 
@@ -31,22 +31,22 @@ class Window:
         distance = torch.linalg.vector_norm(self.where - offset[:, None], dim=-1)
         self.weight = (radius[:, None] + 0.5 - distance).clamp(0.0, 1.0)
 
-    def of(self, some: Tensor) -> Window:
+    def of(self, some: Tensor) -> CornerWindow:
         """The window of some of the corners."""
-        return Window(self.levels[some], self.offset[some], self.radius[some], self.places, self.size)
+        return CornerWindow(self.levels[some], self.offset[some], self.radius[some], self.places, self.size)
 
     def patches(self, values: Tensor) -> Tensor:
-        """Values of the pixels (..., K) as (..., P, P), 0 beside the disc."""
+        """Values of the pixels (..., K) as (..., P, P), 0 outside the disc."""
         whole = values.new_zeros(*values.shape[:-1], self.size * self.size)
         return whole.index_copy(-1, self.places, values).unflatten(-1, (self.size, self.size))
 
 
-def look(image: Tensor, base: Tensor, offset: Tensor, radius: Tensor) -> tuple[Window, Tensor]:
-    """The windows, and their gray levels with gradients."""
-    most = float(radius.max()) if radius.numel() else 1.0
+def cut_windows(image: Tensor, base: Tensor, offset: Tensor, radius: Tensor) -> tuple[CornerWindow, Tensor]:
+    """The windows around `base` + `offset`, and their gray levels (M, K) with gradients."""
+    most = float(radius.max())
     half = math.ceil(most + 1.0)
     axis = torch.arange(-half, half + 1, device=radius.device)
-    # A start lies at most half a pixel from the middle each way.
+    # A start lies at most half a pixel from the middle along each axis.
     places = (torch.hypot(axis[:, None].double(), axis[None].double()) < most + 1.21).flatten().nonzero()[:, 0]
     levels = cut_patches(image, base, half).flatten(-2)[:, places]
-    return Window(levels.detach(), offset, radius, places, len(axis)), levels
+    return CornerWindow(levels.detach(), offset, radius, places, len(axis)), levels

@@ -1,4 +1,4 @@
-"""What a detected grid of corners must look like: sizes of its squares, their colors, and whether it is a board."""
+"""Check that a detected grid of corners is the board, and measure its squares, lines and neighbors."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 
-MAX_BEND = 0.25  # of a square: how far a corner may lie from its neighbors' homography; a wrong grid is off by 1
-MAX_RATIO = 1.7  # of one square's side to the next along a row: perspective needs a board 3 squares away for this
-MIN_ALTERNATING = 0.9  # share of neighboring squares that differ as they must; glare may spoil a few
-GOES_ON = 0.75  # of the contrast across a corner: an outer corner of the board's edge has half, one more row all
+MAX_BEND = 0.25  # of a square: distance of a corner from its neighbors' homography; a wrong grid is off by 1
+MAX_RATIO = 1.7  # of one square's side to the next along a row; perspective reaches it only 3 squares from the board
+MIN_ALTERNATING = 0.9  # share of neighboring squares that must alternate; glare may spoil a few
+GOES_ON = 0.75  # of the contrast across a corner: the board's outer edge has half of it, another row all
 MIN_SHARPNESS = 0.58  # see `sharpness`: a blur of 0.22 of the square's side
-MIN_SIDE = 5.0  # pixels: below this, blur decides where the corner seems to be
+MIN_SQUARE = 5.0  # pixels: below, blur decides where the corner seems to be
 
 
 def as_grid(pixels: Tensor, columns: int, rows: int) -> Tensor:
@@ -35,10 +35,10 @@ def as_grid(pixels: Tensor, columns: int, rows: int) -> Tensor:
 
 
 def local_side(pixels: Tensor, columns: int, rows: int) -> Tensor:
-    """The distance in pixels from each corner to the nearest of its neighbors in the grid, (rows * columns,).
+    """The distance in pixels from each corner to its nearest neighbor in the grid, (rows * columns,).
 
-    This is what a refinement window must be measured by: a fixed one swallows the next corner of a distant board.
-    Neighbors that were not seen (NaN) do not count; a corner that has none gets infinity.
+    Refinement windows are proportional to it, because a fixed one would contain the next corner of a distant board.
+    Neighbors that were not seen (NaN) do not count; a corner without any gets infinity.
 
     Example:
         >>> corners = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [3.0, 4.0]])
@@ -59,7 +59,7 @@ def local_side(pixels: Tensor, columns: int, rows: int) -> Tensor:
 def cell_levels(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> Tensor:
     """Mean gray level in the middle of each square between four corners, (rows - 1, columns - 1) float64.
 
-    Sampled at 25 points over the middle half of the square, so that corners off by a few pixels change nothing.
+    Sampled at 25 points over the middle half of the square, so that corners may be off by a few pixels.
     """
     grid = as_grid(pixels, columns, rows)
     share = torch.linspace(0.25, 0.75, 5, dtype=torch.float64)
@@ -81,11 +81,11 @@ def first_square_dark(image: npt.NDArray[np.generic], pixels: Tensor, columns: i
 
 
 def sharpness(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> float:
-    """How square the squares still are: 1 if their color reaches their edges, 0.5 if blur has made them waves.
+    """Contrast near the corners of the squares over that in their middle: 1 if sharp, 0.5 if blurred to waves.
 
-    The median over the squares between the corners of the contrast a quarter of a square inside their corners, over
-    that in their middle. A Gaussian blur of 0.2 of the square's side gives 0.64, one of 0.25 gives 0.54; from there on
-    a corner leans towards whatever lies beyond its own four squares, by tenths of a pixel at the board's border.
+    The median over the squares, near meaning a quarter of a square inside. A Gaussian blur of 0.2 of the square's side
+    gives 0.64, one of 0.25 gives 0.54. With more blur a corner is shifted by what lies beyond its four squares, by
+    tenths of a pixel at the board's border.
     """
     grid = as_grid(pixels, columns, rows)
     p, q, r, s = grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
@@ -103,16 +103,17 @@ def sharpness(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows
 def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> str | None:
     """Why a detected grid cannot be the board, or None.
 
-    Every square must turn the same way, every block of up to 3 x 3 corners must fit a homography (by least squares;
-    one homography for the whole board would refuse wide lenses), sides must change slowly along rows and columns (a
-    homography would explain a skipped row), dark and light must alternate, and must not go on outside.
+    * Every square must have the same orientation.
+    * Every block of up to 3 x 3 corners must fit a homography; a single one for the board would refuse wide lenses.
+    * Sides must change slowly along rows and columns; a homography alone would accept a skipped row.
+    * Dark and light squares must alternate, and must not go on outside.
     """
     grid = as_grid(pixels, columns, rows)
     if not bool(torch.isfinite(grid).all()):
         return "a corner is not finite"
     side = local_side(pixels, columns, rows)
-    if float(side.min()) < MIN_SIDE:
-        return f"the smallest square is only {float(side.min()):.1f} px wide; come closer or use larger squares"
+    if float(side.min()) < MIN_SQUARE:
+        return f"the smallest square is only {float(side.min()):.1f} px wide; move closer or use larger squares"
     areas = _corner_areas(grid)
     if not (bool((areas > 0).all()) or bool((areas < 0).all())):
         return "the grid found is folded: not the board"
@@ -126,11 +127,11 @@ def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, r
 
 
 def goes_on(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> bool:
-    """Whether the checkerboard continues beyond the grid, so that the grid is only a part of a larger board.
+    """Whether the grid is only a part of a larger board.
 
     Detectors do return parts: asked for 8x6, OpenCV finds such a part on most views of a 9x6 board, and not the same
-    part for each camera. One step beyond each side, four squares meet again only if there is another row of corners;
-    on the board's own edge three of the four places have one color.
+    part for each camera. One step beyond each side, four squares meet only if there is another row of corners; on the
+    board's outer edge three of the four places have one color.
     """
     grid = as_grid(pixels, columns, rows)
     sides = (grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0))
@@ -138,7 +139,10 @@ def goes_on(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: 
 
 
 def _alternating(levels: Tensor) -> Tensor:
-    """How much lighter light squares are than dark neighbors, if the first is dark: uneven light hardly matters."""
+    """How much lighter each square is than its neighbors, with the sign for a dark first square.
+
+    Comparing neighbors makes the result nearly independent of uneven light.
+    """
     rows, columns = levels.shape
     i, j = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
     sign = 1.0 - 2.0 * ((i + j) % 2)
@@ -149,7 +153,7 @@ def _alternating(levels: Tensor) -> Tensor:
 
 def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
     along = torch.gradient(grid, dim=1)[0]
-    # Second-order steps outwards, so that perspective does not move the place by a good part of a square.
+    # Extrapolated quadratically, because perspective would shift a linear step by a good part of a square.
     beyond = 3 * grid[0] - 3 * grid[1] + grid[2]
     places = torch.stack([beyond, grid[0]])[:, :, None]
     out = torch.stack([beyond - grid[0], (grid[0] - grid[1] + beyond - grid[0]) / 2])[:, :, None]
@@ -224,11 +228,11 @@ def _bend(grid: Tensor) -> Tensor:
 
 
 def line_bend(pixels: Tensor, columns: int, rows: int) -> Tensor:
-    """How a distorting lens bends the board's lines at each corner: curvature vectors, (corners, 2, 2) in 1 / pixels.
+    """Curvature vectors of the board's lines at each corner, (corners, 2, 2) in 1 / pixels: row first, then column.
 
-    From the circle through three successive corners (K. Menger's curvature), of the row first, then of the column.
-    Three corners know it badly, and it changes smoothly: a quadratic over the board is fitted to what they say. 0 where
-    no three corners on a line were seen. Perspective bends no line and changes nothing.
+    Only a distorting lens bends lines; perspective does not. Each curvature is that of the circle through three
+    successive corners (K. Menger). Three corners determine it badly and it changes smoothly, so a quadratic over the
+    board is fitted to all of them. 0 where no three corners on a line were seen.
 
     Example:
         >>> angle = torch.tensor([-0.1, 0.0, 0.1], dtype=torch.float64)
@@ -244,7 +248,7 @@ def line_bend(pixels: Tensor, columns: int, rows: int) -> Tensor:
 
 
 def _smooth(values: Tensor) -> Tensor:
-    """A quadratic in both directions of a grid (L, N, 2) instead of its values, of which NaN are not known."""
+    """The quadratic in both directions that fits the values of a grid (L, N, 2) best; NaN values are ignored."""
     axes = (torch.linspace(-1.0, 1.0, size, dtype=torch.float64, device=values.device) for size in values.shape[:2])
     i, j = (axis.reshape(-1) for axis in torch.meshgrid(*axes, indexing="ij"))
     design = torch.stack([i**m * j**n for m in range(3) for n in range(3 - m)], -1)
@@ -252,19 +256,20 @@ def _smooth(values: Tensor) -> Tensor:
     known = torch.isfinite(flat).all(-1)
     if not bool(known.any()):
         return torch.zeros_like(values)
-    # Too few corners leave the smallest coefficients that explain them.
+    # If there are too few corners, this gives the smallest coefficients that explain them.
     solution = torch.linalg.lstsq(design[known], flat[known], driver="gelsd").solution
     return (design @ solution).reshape(values.shape)
 
 
 class Neighbors(NamedTuple):
-    """Where the next corners are: left, right, up and down in the board's order.
+    """Steps to the neighboring corners: left, right, up and down in the board's order.
 
     Args:
-        step: (..., N, 4, 2) pixels from each corner to its neighbor. At the board's border it leads to where the outer
-            square ends; there and where none was seen it follows from the two corners on the other side, NaN without.
-        change: (..., N, 4, 2) by how much that step differs from one corner to the next along the other line: along
-            rows for the steps up and down.
+        step: (..., N, 4, 2) pixels from each corner to its neighbor, at the board's border to the end of the outer
+            square. There, and where the neighbor was not seen, it is extrapolated from the two corners on the other
+            side; NaN without them.
+        change: (..., N, 4, 2) difference of that step between successive corners along the other line: along rows for
+            the steps up and down.
         outer: (..., N, 4) whether the board ends there.
     """
 
@@ -302,15 +307,15 @@ def _steps(lines: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     )
     outer = torch.zeros(step.shape[:-1], dtype=torch.bool, device=lines.device)
     outer[:, 0, 0] = outer[:, -1, 1] = True
-    return step, torch.nan_to_num(_slope(step)), outer
+    return step, torch.nan_to_num(_change(step)), outer
 
 
 def _beyond(step: Tensor, following: Tensor) -> Tensor:
-    """The step to the other side, from the two steps that go on from a corner; perspective changes them by its law.
+    """Extrapolate the step to the other side of a corner from the two steps on this side, allowing for perspective.
 
-    Along a line of even marks, perspective puts mark t at b t / (1 + c t); steps 0 to 1 and 1 to 2 give c. What the
-    lens bends them sideways goes on as it was. c is the median over all lines: one alone amplifies the corners' noise.
-    Without a second step the first one's mirror image remains.
+    Along a line of evenly spaced marks, perspective puts mark t at b t / (1 + c t); steps 0 to 1 and 1 to 2 give c.
+    c is the median over all lines, because a single line amplifies the corners' noise. The sideways bend by the lens
+    continues. Without a second step, the result is the mirror image of the first.
     """
     square = step.square().sum(-1, keepdim=True)
     ratio = (following * step).sum(-1, keepdim=True) / square
@@ -319,7 +324,7 @@ def _beyond(step: Tensor, following: Tensor) -> Tensor:
     return sideways - step * (1.0 + c) / (1.0 - c)
 
 
-def _slope(values: Tensor) -> Tensor:
+def _change(values: Tensor) -> Tensor:
     """Change from one to the next along dim 0, central where both neighbors are known, else one-sided."""
     after = torch.full_like(values, float("nan"))
     before = after.clone()

@@ -1,7 +1,7 @@
-"""Image files to gray pixels, or a reason why not; and which files the user meant.
+"""Read image files as gray pixels, and list the files that folders and wildcards stand for.
 
-Pixels are always in the order in which the sensor wrote them: an EXIF orientation tag is ignored, because a phone that
-was turned between two shots would otherwise swap width and height, and the lens does not turn with the tag.
+Pixels are always in the order in which the sensor wrote them. An EXIF orientation tag is ignored: a phone that was
+turned between two shots would otherwise swap width and height, and the lens does not turn with the tag.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from kcal.errors import FileError, InputError
 
 Gray = npt.NDArray[np.uint8 | np.uint16]
 
-SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm", ".jp2"})
-MIN_SIDE = 16
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm", ".jp2"})
+MIN_IMAGE_SIDE = 16
 
 _decoding = threading.Lock()
-# libjpeg paints what it could not decode in gray and only mutters. Spare bytes before the end mark (0xd9) are harmless
-# and usual in frames of web cameras.
+# libjpeg fills what it could not decode with gray and only prints a warning. Spare bytes before the end mark (0xd9) are
+# harmless and usual in frames of web cameras.
 _BROKEN_JPEG = re.compile(
     rb"(Corrupt JPEG data: (?!\d+ extraneous bytes before marker 0xd9)[^\r\n]*|Premature end of JPEG[^\r\n]*)"
 )
@@ -53,12 +53,11 @@ def read_bytes(path: str | Path) -> bytes:
 def decode_gray(data: bytes, source: str | Path) -> Gray:
     """Decode an image file's bytes to gray levels, (H, W) uint8 or uint16 as stored; `source` names it in errors.
 
-    Colors become gray by OpenCV's weights (ITU-R BT.601). The EXIF orientation is ignored: row 0 is the row the
-    sensor read first.
+    Colors become gray by OpenCV's weights (ITU-R BT.601). The EXIF orientation is ignored.
 
     Raises:
         FileError: not an image, truncated or corrupt (also where the decoder would fill the rest with gray), pixels
-            other than 8 or 16 bit unsigned, smaller than 16 pixels, or one flat gray.
+            other than 8 or 16 bit unsigned, smaller than 16 pixels, or of one gray level.
     """
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image, complaints = _imdecode(data, flags)
@@ -72,8 +71,8 @@ def decode_gray(data: bytes, source: str | Path) -> Gray:
     if image.dtype not in (np.uint8, np.uint16):
         raise FileError(f"{source}: pixels are {image.dtype}; store the image with 8 or 16 bits unsigned")
     height, width = image.shape
-    if min(height, width) < MIN_SIDE:
-        raise FileError(f"{source}: {width}x{height} pixels are too few; {MIN_SIDE} each way are needed")
+    if min(height, width) < MIN_IMAGE_SIDE:
+        raise FileError(f"{source}: {width}x{height} pixels are too few; {MIN_IMAGE_SIDE} in each direction are needed")
     if image.min() == image.max():
         raise FileError(f"{source}: every pixel has the same gray level; the image shows nothing")
     return image
@@ -83,7 +82,7 @@ def read_gray(path: str | Path) -> Gray:
     """Read an image file to gray levels, (H, W) uint8 or uint16 as stored; see `decode_gray`.
 
     Raises:
-        FileError: missing, empty, not an image, corrupt, or of no use.
+        FileError: missing, empty, or refused by `decode_gray`.
 
     Example:
         >>> import cv2, numpy as np, tempfile
@@ -97,10 +96,10 @@ def read_gray(path: str | Path) -> Gray:
 
 
 def to_8bit(image: Gray) -> npt.NDArray[np.uint8]:
-    """Eight bits a pixel for detectors; refinement should use the full depth.
+    """Convert an image to 8 bits per pixel for detectors; refinement should use the full depth.
 
-    uint8 is returned as it is. uint16 is stretched linearly so that its 0.1 % darkest pixels become 0 and its 0.1 %
-    brightest 255: cameras store 10, 12 or 14 bits in 16, and a few hot pixels must not make the board black.
+    uint8 is returned unchanged. uint16 is stretched linearly so that its 0.1 % darkest pixels become 0 and its 0.1 %
+    brightest 255, because cameras store 10, 12 or 14 bits in 16, and a few hot pixels must not make the board black.
 
     Example:
         >>> to_8bit(np.array([[0, 2048, 4095]], dtype=np.uint16))
@@ -116,10 +115,10 @@ def to_8bit(image: Gray) -> npt.NDArray[np.uint8]:
 
 
 def expand_images(inputs: Sequence[str | Path]) -> list[Path]:
-    """The image files that files, folders and wildcards stand for, each file once.
+    """List the image files that files, folders and wildcards stand for, each file once.
 
-    A folder stands for the images directly inside it (known by their suffix), a wildcard for the files it matches;
-    both in natural order (`2.jpg` before `10.jpg`).
+    A folder stands for the images directly inside it (by suffix), a wildcard for the files it matches; both in natural
+    order (`2.jpg` before `10.jpg`).
 
     Raises:
         InputError: no input at all.
@@ -142,7 +141,7 @@ def expand_images(inputs: Sequence[str | Path]) -> list[Path]:
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:
-    """A short unique name for each file: its file name, with as many folders before it as are needed.
+    """A short unique name for each file: its file name, preceded by as many folders as needed.
 
     Example:
         >>> unique_names([Path("a/1/x.jpg"), Path("b/1/x.jpg"), Path("y.jpg")])
@@ -161,10 +160,10 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
 
 def _expand_one(path: Path) -> list[Path]:
     if path.is_dir():
-        inside = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
+        inside = [file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file()]
         images = _natural(file for file in inside if not file.name.startswith("."))
         if not images:
-            raise FileError(f"{path}: no image in this folder (looked for {', '.join(sorted(SUFFIXES))})")
+            raise FileError(f"{path}: no image in this folder (looked for {', '.join(sorted(IMAGE_SUFFIXES))})")
         return images
     if path.exists():
         return [path]
@@ -185,10 +184,7 @@ def _natural(paths: Iterable[Path]) -> list[Path]:
 
 
 def _imdecode(data: bytes, flags: int) -> tuple[npt.NDArray[Any] | None, bytes]:
-    """`cv2.imdecode`, with what the decoders print to the error stream as the second value.
-
-    The C libraries report damage nowhere else, so the stream itself is caught for the milliseconds of one decode.
-    """
+    """`cv2.imdecode`, and what the decoders print to the error stream: the C libraries report damage nowhere else."""
     with _decoding, tempfile.TemporaryFile() as caught:
         try:
             saved = os.dup(2)

@@ -1,4 +1,4 @@
-"""Calls that may take only so long, although they are in a C++ library that hears no signal."""
+"""Limit the time of calls into C++ libraries that cannot be interrupted by a signal."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ T = TypeVar("T")
 
 
 class TookTooLongError(KcalError):
-    """A call was given up after its time limit, or its process died."""
+    """A call exceeded its time limit, or its process died."""
 
 
 class Limited:
     """Make calls one after the other, each with a time limit.
 
-    The first calls are made in a thread of this process, which costs nothing. When one exceeds the limit its thread is
-    left behind (it cannot be stopped) and all later calls are made in a process of their own, which can be killed: at
-    most one call goes on in vain until this process ends.
+    The first calls run in a thread of this process, at no cost. A thread that exceeds the limit cannot be stopped. It
+    is left behind, and all later calls run in a separate process, which can be killed. So at most one call goes on
+    until this process ends.
 
     Args:
-        seconds: the limit of each call; None for none.
+        seconds: the limit of each call; None for no limit.
 
     Raises:
         InputError: a limit that is not positive.
@@ -51,7 +51,7 @@ class Limited:
         self.close()
 
     def __call__(self, function: Callable[..., T], *arguments: Any) -> T:
-        """The function's result; it and the arguments must be such that they can be sent to a process.
+        """The function's result. The function and its arguments must be picklable.
 
         Raises:
             TookTooLongError: the limit was exceeded, or the process died.
@@ -76,7 +76,7 @@ class Limited:
 
     def _in_thread(self, function: Callable[..., T], arguments: tuple[Any, ...]) -> Any:
         outcome: list[Any] = []
-        thread = threading.Thread(target=lambda: outcome.append(_outcome(function, arguments)), daemon=True)
+        thread = threading.Thread(target=lambda: outcome.append(_result_or_error(function, arguments)), daemon=True)
         thread.start()
         thread.join(self.seconds)
         if outcome:
@@ -86,7 +86,7 @@ class Limited:
 
     def _in_process(self, function: Callable[..., T], arguments: tuple[Any, ...]) -> Any:
         if self._pipe is None:
-            # Not forked: threads of OpenCV and torch would be copied half.
+            # Spawned: a fork would copy the threads of OpenCV and torch in an undefined state.
             context = multiprocessing.get_context("spawn")
             self._pipe, theirs = context.Pipe()
             self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
@@ -99,13 +99,15 @@ class Limited:
                 return self._pipe.recv()
         except (EOFError, OSError):
             self.close()
-            return TookTooLongError("the process that searched this image died: out of memory, or a crash")
+            return TookTooLongError(
+                "the process that searched this image died (out of memory, or a crash); leave it out"
+            )
         self.close()
         return self._too_long()
 
     def _too_long(self) -> TookTooLongError:
         return TookTooLongError(
-            f"given up after the time limit of {self.seconds:g} s (--time-limit); leave the image out, or give more"
+            f"stopped at the time limit of {self.seconds:g} s (--time-limit); leave the image out, or allow more time"
         )
 
 
@@ -116,10 +118,10 @@ def _serve(pipe: Connection) -> None:
         except EOFError:
             return
         pipe.send(None)
-        pipe.send(_outcome(function, arguments))
+        pipe.send(_result_or_error(function, arguments))
 
 
-def _outcome(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+def _result_or_error(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
     try:
         return function(*arguments)
     except Exception as error:

@@ -1,4 +1,4 @@
-"""What was seen: the corners of one camera's views, in memory and in a file."""
+"""Store the observed corners of one camera's views, in memory and in a file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kcal.errors import InputError
 from kcal.files import NativeFile
 
 Pixel = tuple[float, float]
-Covariance = tuple[float, float, float]
+PackedCovariance = tuple[float, float, float]
 
 
 class View(pydantic.BaseModel):
@@ -21,18 +21,18 @@ class View(pydantic.BaseModel):
 
     Args:
         name: unique name in the file, usually the image's file name; views of two cameras are paired by it.
-        pixels: one (u, v) a board corner in the board's order, or None where a corner was not seen. Integer
+        pixels: (u, v) of each board corner in the board's order, or None where a corner was not seen. Integer
             coordinates are centers of pixels.
-        covariance: one (uu, uv, vv) in px² a board corner, None where not seen; or None where it is not known.
-        image: where the image was read from, relative or absolute.
-        sha256: of the image file's bytes, so that a changed image is noticed.
+        covariance: (uu, uv, vv) in px² of each board corner, None where not seen; or None if unknown for all.
+        image: path from which the image was read, relative or absolute.
+        sha256: of the image file's bytes, to notice a changed image.
     """
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     name: str = pydantic.Field(min_length=1)
     pixels: tuple[Pixel | None, ...]
-    covariance: tuple[Covariance | None, ...] | None = None
+    covariance: tuple[PackedCovariance | None, ...] | None = None
     image: str | None = None
     sha256: str | None = None
 
@@ -52,7 +52,7 @@ class Observations(NativeFile):
     Args:
         board: the board that was shown.
         image_size: (width, height) in pixels, the same for all views.
-        refinement: how corners were made sub-pixel.
+        refinement: method of `kcal.corners.refine.refine_corners`.
         views: the views in which the board was found.
         failures: the images that gave none.
 
@@ -81,18 +81,13 @@ class Observations(NativeFile):
         for view in self.views:
             if len(view.pixels) != self.board.corners:
                 raise ValueError(f"view {view.name!r} has {len(view.pixels)} corners, the board {self.board.corners}")
-        return self
-
-    @pydantic.model_validator(mode="after")
-    def _covariances(self) -> Observations:
-        for view in self.views:
             if view.covariance is None:
                 continue
             if len(view.covariance) != len(view.pixels):
                 raise ValueError(f"view {view.name!r} has {len(view.covariance)} covariances for its corners")
             for pixel, spread in zip(view.pixels, view.covariance, strict=True):
                 if (pixel is None) != (spread is None):
-                    raise ValueError(f"view {view.name!r}: seen corners, and only these, have a covariance")
+                    raise ValueError(f"view {view.name!r}: seen corners, and only these, must have a covariance")
                 if spread is not None and not (spread[0] > 0 and spread[0] * spread[2] > spread[1] ** 2):
                     raise ValueError(f"view {view.name!r}: the covariance {spread} is not positive definite")
         return self

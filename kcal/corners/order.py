@@ -1,4 +1,4 @@
-"""One order of corners for one board, however it was held."""
+"""Put detected corners into the board's order, however the board was held."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from kcal.corners.grid import as_grid, first_square_dark
 def canonical_order(image: npt.NDArray[np.generic], pixels: Tensor, board: Board) -> Tensor:
     """Put a board's detected corners into the board's order.
 
-    The order never is a mirror image: seen from the front, x along a row to y down a column is a clockwise quarter
-    turn in the image. Among the orders that remain, those whose square diagonally outside corner 0 is dark (decided
-    from the image, by majority of neighboring squares) go first. For boards with an odd sum of columns and rows this
-    leaves one. Other boards look the same turned by 180°, and then the order nearest to upright in the image is taken:
-    it may differ between two cameras, so such boards cannot be trusted for stereo (`Board.unambiguous`).
+    The order is never mirrored: seen from the front, x along a row to y down a column is a clockwise quarter turn in
+    the image. The square diagonally outside corner 0 must be dark, by majority of neighboring squares. For boards with
+    an odd sum of columns and rows this leaves one order. Other boards look the same after a turn by 180°; the order
+    nearest to upright in the image is taken. It may differ between two cameras, so do not use such boards for stereo
+    (`Board.unambiguous`).
 
     Args:
         image: (H, W) gray levels in which the corners were found.

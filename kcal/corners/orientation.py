@@ -1,58 +1,37 @@
-"""The EXIF orientation of a JPEG file: kcal ignores it, and says so."""
+"""Read the EXIF orientation of JPEG files. kcal ignores it, and says so."""
 
 from __future__ import annotations
 
-import struct
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
+from PIL import ExifTags
+from PIL.JpegImagePlugin import JpegImageFile
+
 from kcal.errors import FileError
 
-UPRIGHT = 1
-_TAG = 0x0112
-_HEAD = 1 << 17  # bytes: the EXIF block is among the first 64 KiB, another may lie before it
+_HEAD = 1 << 17  # bytes: the EXIF block is among the first 64 KiB, another block may precede it
 
 
 def exif_orientation(data: bytes) -> int:
-    """The orientation (1 to 8) that a JPEG's EXIF block asks viewers for; 1, upright, where there is none.
+    """The orientation (1 to 8) that a JPEG's EXIF block asks viewers for; 1 (as stored) where there is none.
 
-    1 is as stored, 3 turned by 180°, 6 and 8 by 90°; the others are mirrored as well. Pixels in kcal are always as
-    stored. Source: JEITA CP-3451 (Exif 2.3), tag 0x0112.
+    3 is turned by 180°, 6 and 8 by 90°; 2, 4, 5 and 7 are mirrored as well. Pixels in kcal are always as stored.
+    Source: JEITA CP-3451 (Exif 2.3), tag 0x0112.
 
     Args:
-        data: the file's bytes.
+        data: the file's bytes, or the first of them.
 
     Example:
         >>> exif_orientation(b"no JPEG")
         1
     """
-    place = 2
-    if data[:2] != b"\xff\xd8":
-        return UPRIGHT
-    while data[place : place + 1] == b"\xff" and place + 4 <= len(data):
-        marker, length = data[place + 1], int.from_bytes(data[place + 2 : place + 4], "big")
-        if marker == 0xE1 and data[place + 4 : place + 10] == b"Exif\0\0":
-            return _from_tiff(data[place + 10 : place + 2 + length])
-        if marker == 0xDA or length < 2:  # the picture itself begins, or damage
-            break
-        place += 2 + length
-    return UPRIGHT
-
-
-def _from_tiff(block: bytes) -> int:
-    order = {b"II": "<", b"MM": ">"}.get(block[:2])
-    if order is None:
-        return UPRIGHT
     try:
-        (first,) = struct.unpack_from(f"{order}I", block, 4)
-        (count,) = struct.unpack_from(f"{order}H", block, first)
-        for i in range(count):
-            tag, kind, _, value = struct.unpack_from(f"{order}HHIH", block, first + 2 + 12 * i)
-            if tag == _TAG and kind == 3 and 1 <= value <= 8:
-                return int(value)
-    except struct.error:
-        pass
-    return UPRIGHT
+        orientation = JpegImageFile(io.BytesIO(data)).getexif().get(ExifTags.Base.Orientation, 1)
+    except (SyntaxError, OSError, ValueError):  # no JPEG, or a damaged one: `decode_gray` reports it
+        return 1
+    return int(orientation) if orientation in range(1, 9) else 1
 
 
 def turned_images(paths: Sequence[str | Path]) -> list[Path]:
@@ -68,6 +47,6 @@ def turned_images(paths: Sequence[str | Path]) -> list[Path]:
                 head = file.read(_HEAD)
         except OSError as error:
             raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
-        if exif_orientation(head) != UPRIGHT:
+        if exif_orientation(head) != 1:
             found.append(path)
     return found

@@ -1,4 +1,4 @@
-"""Checkerboards to print at true scale."""
+"""Lay out checkerboards on pages, to print at true scale."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ PAGES: dict[str, tuple[float, float]] = {
 }
 EDGE = 5.0  # mm at each edge that printers leave white
 RULER = 100.0  # mm
-_THIN = 0.2  # mm
-_GAP = 4.0  # mm between ruler and caption
-_LINE = 3.6  # mm from one line of text to the next
-_TEXT = 2.5  # mm, height of the caption's letters
-_LETTER = 0.6  # mean width of a letter in text heights
+_STROKE = 0.2  # mm
+_CAPTION_GAP = 4.0  # mm between ruler and caption
+_LINE_SPACING = 3.6  # mm from one line of text to the next
+_TEXT_HEIGHT = 2.5  # mm, height of the caption's letters
+_LETTER_WIDTH = 0.6  # mean width of a letter in text heights
 
 
 class Sheet(NamedTuple):
-    """A board on a page: the `drawing`, the page's name, and the white round the board in squares (narrowest side)."""
+    """A board on a page: the `drawing`, the page's name, and the narrowest white margin of the board in squares."""
 
     drawing: Drawing
     page: str
@@ -40,18 +40,17 @@ class Sheet(NamedTuple):
 
 
 def board_sheet(board: Board, page: str = "auto") -> Sheet:
-    """Lay a board out on a page, in the board's own order: corner 0 at the top left, its outer square black.
+    """Lay a board out on a page, in the board's order: corner 0 at the top left, its outer square black.
 
-    Below the board are a ruler of 100 mm, to measure after printing, and a caption with the board's size. The board is
-    centered above them; the page lies upright or across, whichever leaves more white. One square of white all
-    round is what detectors like best.
+    Below the board are a ruler of 100 mm, to measure after printing, and a caption with the board's size. The page is
+    upright or across, whichever leaves a wider margin. Detectors work best with a margin of one square.
 
     Args:
         board: the board.
-        page: a name in `PAGES` in any case, or `auto` for a page just large enough for one square of white all round.
+        page: a name in `PAGES`, in upper or lower case, or `auto` for the smallest page with a margin of one square.
 
     Raises:
-        InputError: an unknown page, or one that is too small; the message names the smallest that would do.
+        InputError: an unknown page, or one that is too small; the message names the smallest that is large enough.
 
     Example:
         >>> sheet = board_sheet(Board(columns=9, rows=6, square=0.025), "A4")
@@ -106,9 +105,9 @@ def _page(board: Board, page: str, wide: float, high: float) -> tuple[str, tuple
     if page.lower() not in names:
         raise InputError(f"page {page!r}: choose one of auto, {', '.join(PAGES)}")
     name = names[page.lower()]
-    size = _turned(board, PAGES[name])
+    size = _better_way(board, PAGES[name])
     if size is None:
-        fitting = [other for other, paper in PAGES.items() if _turned(board, paper) is not None]
+        fitting = [other for other, paper in PAGES.items() if _better_way(board, paper) is not None]
         smallest = min(fitting, key=lambda other: PAGES[other][0] * PAGES[other][1], default=None)
         advice = f"{smallest} would do" if smallest else "use auto or smaller squares"
         width, height = PAGES[name]
@@ -126,7 +125,7 @@ def _margins(board: Board, page_wide: float, page_high: float) -> tuple[float, f
     return left, (page_high - _foot_height(board, page_wide) - (board.rows + 1) * square) / 2
 
 
-def _turned(board: Board, paper: tuple[float, float]) -> tuple[float, float] | None:
+def _better_way(board: Board, paper: tuple[float, float]) -> tuple[float, float] | None:
     """The page upright or across, whichever leaves more white, or None where the board fits neither way."""
     ways = [(min(_margins(board, *size)), size) for size in (paper, paper[::-1]) if size[0] >= RULER + 2 * EDGE]
     best, size = max(ways)
@@ -142,28 +141,28 @@ def _captions(board: Board) -> tuple[str, str]:
     return "Print at 100 %; the ruler is 100 mm long.", f"kcal board {size}{turned}"
 
 
-def _beside(board: Board, page_wide: float) -> bool:
+def _caption_beside_ruler(board: Board, page_wide: float) -> bool:
     """Whether the caption fits to the right of the ruler."""
-    longest = max(len(text) for text in _captions(board)) * _TEXT * _LETTER
-    return 2 * EDGE + RULER + _GAP + longest <= page_wide
+    longest = max(len(text) for text in _captions(board)) * _TEXT_HEIGHT * _LETTER_WIDTH
+    return 2 * EDGE + RULER + _CAPTION_GAP + longest <= page_wide
 
 
 def _foot_height(board: Board, page_wide: float) -> float:
-    return EDGE + (2 if _beside(board, page_wide) else 4) * _LINE
+    return EDGE + (2 if _caption_beside_ruler(board, page_wide) else 4) * _LINE_SPACING
 
 
 def _foot(board: Board, page_wide: float, page_high: float) -> tuple[tuple[Rectangle, ...], tuple[Text, ...]]:
     """The ruler with its ticks, and to its right, or above it on a narrow page, the caption."""
     base = page_high - EDGE
     ticks = [
-        Rectangle(x=EDGE + along - _THIN / 2, y=base - height, width=_THIN, height=height)
+        Rectangle(x=EDGE + along - _STROKE / 2, y=base - height, width=_STROKE, height=height)
         for along in range(0, int(RULER) + 1, 10)
         for height in (3.0 if along % 50 == 0 else 1.8,)
     ]
-    line = Rectangle(x=EDGE, y=base - _THIN, width=RULER, height=_THIN)
-    x, lowest = (EDGE + RULER + _GAP, 0) if _beside(board, page_wide) else (EDGE, 1)
+    line = Rectangle(x=EDGE, y=base - _STROKE, width=RULER, height=_STROKE)
+    x, lowest = (EDGE + RULER + _CAPTION_GAP, 0) if _caption_beside_ruler(board, page_wide) else (EDGE, 1)
     texts = tuple(
-        Text(x=x, y=base - (lowest + row) * _LINE - (0.6 if lowest else 0), size=_TEXT, text=text)
+        Text(x=x, y=base - (lowest + row) * _LINE_SPACING - (0.6 if lowest else 0), size=_TEXT_HEIGHT, text=text)
         for row, text in zip((1, 0), _captions(board), strict=True)
     )
     return (line, *ticks), texts

@@ -1,4 +1,4 @@
-"""Frames of a video or a live stream that are worth calibrating with: sharp ones with the board in a new place."""
+"""Detect the board in the frames of a video or a live stream that are sharp and show it in a new place."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 import numpy.typing as npt
-import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
@@ -23,15 +22,13 @@ from kcal.corners.refine import Refinement
 from kcal.errors import FileError, InputError
 from kcal.files import write_atomic
 
-SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"})
 MOST_VIEWS = 40
-# How long a live stream is watched, seconds, unless told otherwise.
-DURATION = 120.0
-# How long to wait for a stream to open, and for its next frame, milliseconds.
-_PATIENCE = 10_000
+DURATION = 120.0  # seconds: how long a live stream is read by default
+_STREAM_TIMEOUT_MS = 10_000  # for opening, and for each frame
 _STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|srt)://|camera:\d+$", re.IGNORECASE)
-_NOVELTY = 0.04  # of the image's width: how far the board's corners must have moved, root mean square
-_PEAK = 3  # frames on each side than which a frame must not be less sharp
+_MIN_RMS_MOVE = 0.04  # of the image's width: how far the board's corners must have moved from every earlier view
+_GROUP = 7  # frames, of which only the sharpest is searched
 
 
 class Frame(NamedTuple):
@@ -52,7 +49,7 @@ def is_stream(source: str | Path) -> bool:
 
 
 def source_name(source: str | Path) -> str:
-    """What views of a source are called: the file's name, the device, or the stream's host without any password.
+    """The name of a source in its views: the file's name, the device, or the stream's host without any password.
 
     Example:
         >>> source_name("rtsp://user:secret@10.0.0.7:554/main?token=1"), source_name("camera:0")
@@ -65,11 +62,11 @@ def source_name(source: str | Path) -> str:
 
 
 def read_frames(source: str | Path, duration: float | None = None) -> Iterator[Frame]:
-    """The frames of a video file or a live stream, gray, turned as the sensor wrote them.
+    """The gray frames of a video file or a live stream, in the orientation in which the sensor wrote them.
 
     Args:
         source: a video file, or a live source as in `is_stream`.
-        duration: seconds after which a live source ends.
+        duration: seconds after which a live source is closed.
 
     Raises:
         FileError: the file is missing or no video, the stream does not answer, or no frame can be decoded.
@@ -102,15 +99,15 @@ def read_frames(source: str | Path, duration: float | None = None) -> Iterator[F
 def _open(stream: str) -> cv2.VideoCapture:
     if stream.lower().startswith("camera:"):
         return cv2.VideoCapture(int(stream.split(":")[1]))
-    waits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _PATIENCE, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _PATIENCE]
+    waits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _STREAM_TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _STREAM_TIMEOUT_MS]
     return cv2.VideoCapture(stream, cv2.CAP_FFMPEG, waits)
 
 
 def sharpest(frames: Iterator[Frame]) -> Iterator[Frame]:
-    """Of every seven frames in a row at most the sharpest: while the board or the camera moves, all are blurred.
+    """The sharpest of every seven consecutive frames, because frames are blurred while the board or the camera moves.
 
-    Sharpness is the mean squared difference of neighboring pixels, which also grows with noise: it compares frames of
-    one moment with each other, nothing else.
+    Sharpness is the mean squared difference of neighboring pixels. It also grows with noise, so it only compares frames
+    of the same moment.
 
     Example:
         >>> frames = [Frame(i, np.full((4, 4), i, np.uint8)) for i in range(7)]
@@ -121,7 +118,7 @@ def sharpest(frames: Iterator[Frame]) -> Iterator[Frame]:
     held: list[tuple[float, Frame]] = []
     for frame in frames:
         held.append((_sharpness(frame.image), frame))
-        if len(held) == 2 * _PEAK + 1:
+        if len(held) == _GROUP:
             yield max(held, key=lambda item: item[0])[1]
             held.clear()
     if held:
@@ -141,26 +138,26 @@ def detect_video(
 ) -> Observations:
     """Find the board in the frames of a video or a live stream of one camera.
 
-    Of every seven frames the sharpest is searched, and kept where the board's corners are, root mean square, at least
-    4 % of the image's width away from those of every frame kept before. Views are named `video.mp4#000123` by the
-    frame's number from 0; those of a stream by its host.
+    The sharpest of every seven frames is searched. It becomes a view if the board's corners are at least 4 % of the
+    image's width (root mean square) from those of every earlier view. Views are named `video.mp4#000123` by the frame's
+    number from 0; those of a stream by its host.
 
     Args:
         source: a video file, `rtsp://...` or another address, or `camera:0` for a device of this machine.
         board: the board.
         refine: see `kcal.corners.refine.refine_corners`.
-        most: views after which the search ends.
+        most: number of views after which the search ends.
         progress: called with each searched frame's name.
-        time_limit: seconds after which a frame is given up; none by default.
-        duration: seconds after which a live stream is left; 120 by default.
-        keep: folder for the frames that became views, as PNG: a stream cannot be read again.
+        time_limit: seconds after which the search of a frame is stopped; no limit by default.
+        duration: seconds after which a live stream is closed; 120 by default.
+        keep: folder for the frames that became views, as PNG, because a stream cannot be read again.
 
     Raises:
         FileError: the file is missing or no video, a stream does not answer, or a frame cannot be kept.
         InputError: no board in any frame.
     """
     if most < 1:
-        raise InputError("most: at least one view is needed")
+        raise InputError(f"most={most}: at least one view is needed")
     kept: list[Tensor] = []
     views: list[View] = []
     size = (1, 1)
@@ -176,11 +173,12 @@ def detect_video(
                 found = Detection(None, str(error))
                 failures.append(Failure(name=name, reason=found.reason))
             reason = found.reason or reason
-            if found.pixels is not None and _novel(found, kept, _NOVELTY * size[0]):
+            if found.pixels is not None and _is_new(found.pixels, kept, _MIN_RMS_MOVE * size[0]):
                 kept.append(found.pixels)
                 image = None if is_stream(source) else str(source)
                 if keep is not None:
-                    image = str(_keep(frame, Path(keep), name))
+                    path = Path(keep) / (re.sub(r"[^\w.-]+", "_", name) + ".png")
+                    image = str(write_atomic(path, cv2.imencode(".png", frame.image)[1].tobytes()))
                 views.append(view_of(found, name, image=image))
             if progress is not None:
                 progress(name)
@@ -191,21 +189,10 @@ def detect_video(
     return Observations(board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures))
 
 
-def _keep(frame: Frame, folder: Path, name: str) -> Path:
-    path = folder / (re.sub(r"[^\w.-]+", "_", name) + ".png")
-    return write_atomic(path, cv2.imencode(".png", frame.image)[1].tobytes())
-
-
-def _novel(found: Detection, kept: list[Tensor], least: float) -> bool:
-    assert found.pixels is not None
-    for before in kept:
-        both = torch.isfinite(found.pixels - before).all(-1)
-        if not bool(both.any()):
-            continue  # other parts of a ChArUco board
-        moved = (found.pixels - before)[both].square().sum(-1).mean().sqrt()
-        if float(moved) < least:
-            return False
-    return True
+def _is_new(pixels: Tensor, kept: list[Tensor], least: float) -> bool:
+    # NaN, which is never less, where two views share no corner: other parts of a ChArUco board.
+    moves = [float((pixels - before).square().sum(-1).nanmean().sqrt()) for before in kept]
+    return not any(moved < least for moved in moves)
 
 
 def _sharpness(image: npt.NDArray[np.uint8]) -> float:

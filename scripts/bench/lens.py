@@ -27,6 +27,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort
 from kcal.lens.modules import Unproject
 from scripts.bench import undistort
+from scripts.shared.page import CONCLUSIONS
 from scripts.shared.timing import ratios, row, show, spread, times
 
 SIZE = (1920, 1080)
@@ -184,6 +185,8 @@ def main() -> None:
     lines = show(
         [
             "# The lens, measured",
+            "",
+            CONCLUSIONS["lens.md"],
             "",
             f"Made by `scripts/bench/lens.py` with kcal {kcal.__version__}, torch {torch.__version__}, kornia "
             f"{kornia.__version__}, OpenCV {cv2.__version__} on {platform.processor() or platform.machine()}; "

@@ -34,6 +34,7 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.stereo import Status
 from kcal.locate.triangulate import triangulate_linear
 from scripts.shared.long_range import ORIGIN, RANGES, rig
+from scripts.shared.page import CONCLUSIONS
 from scripts.shared.timing import ratios, row, show, spread, times
 
 COUNTS = (100, 10_000, 1_000_000)
@@ -281,6 +282,8 @@ def main() -> None:
     lines = show(
         [
             "# From pixels to positions, measured",
+            "",
+            CONCLUSIONS["locate.md"],
             "",
             f"Made by `scripts/bench/locate.py` with kcal {kcal.__version__}, torch {torch.__version__}, kornia "
             f"{kornia.__version__}, OpenCV {cv2.__version__}, PROJ {pyproj.proj_version_str} on "

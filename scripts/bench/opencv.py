@@ -32,6 +32,7 @@ from kcal.corners.detect import detect_images
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from kcal.locate.check import triangulated_sides
+from scripts.shared.page import CONCLUSIONS
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 CRITERIA = (3, 300, 1e-12)
@@ -57,6 +58,8 @@ def main() -> None:
     seen = {side: _observe(Path(folder, "opencv_stereo"), side) for side in ("left", "right")}
     text = [
         "# kcal beside OpenCV",
+        "",
+        CONCLUSIONS["opencv.md"],
         "",
         f"Made by `scripts/bench/opencv.py` with kcal {kcal.__version__}, torch {torch.__version__}, OpenCV "
         f"{cv2.__version__}, one thread. 13 pairs of OpenCV's sample images, 640x480, 9x6 corners, squares of 25 mm; "

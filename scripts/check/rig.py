@@ -30,7 +30,7 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import drift_effect
 from kcal.report.rig import save_rig_picture
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import DOCS
+from scripts.shared.page import CONCLUSIONS, DOCS
 from scripts.shared.timing import row, show
 
 HEADING = 35.0
@@ -301,6 +301,8 @@ def main() -> None:
     lines = show(
         [
             "# Rigs from a survey, measured",
+            "",
+            CONCLUSIONS["rig.md"],
             "",
             f"Made by `scripts/check/rig.py` with kcal {kcal.__version__} and torch {torch.__version__}. Two cameras "
             f"{BASELINE:.1f} m apart, f 1600 px, distorting lenses that are known; 12 landmarks 100 m to 2.6 km away, "

@@ -16,7 +16,7 @@ from scripts.paper.range import choice, distance, edges
 from scripts.paper.site import LOOKS, MARK_SIGMA, QUALITY, SURVEY_SIGMA
 from scripts.paper.solve import HYBRID
 from scripts.paper.tables import table_1, table_2, table_3
-from scripts.shared.page import read_section, table
+from scripts.shared.page import CONCLUSIONS, read_section, table
 
 Demo = list[tuple[str, float]]
 
@@ -47,6 +47,8 @@ def _head(results: Results, views: int) -> list[str]:
     seeds = max(len(runs) for runs in results.values())
     return [
         "# The paper's experiment, simulated",
+        "",
+        CONCLUSIONS["paper.md"],
         "",
         "The paper (Pandat et al., Long-Range depth estimation using learning based Hybrid Distortion Model for CCTV "
         "cameras) calibrates two surveillance cameras 10 m apart and locates seven points from 100 m to 5 km. Its "

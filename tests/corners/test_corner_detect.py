@@ -189,7 +189,7 @@ def test_two_sizes_name_the_images(pictures, tmp_path):
 
 def test_squares_counted_instead_of_corners(pictures):
     folder, _, _ = pictures
-    with pytest.raises(InputError, match=r"no board in any of 1 images .*a board of 6x5 is there: count inner corners"):
+    with pytest.raises(InputError, match=r"no board in any of 1 images .*a board of 6x5 was found: count inner"):
         detect_images([folder / "a.png"], Board(columns=7, rows=6, square=0.02))
 
 

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.board import Board
-from kcal.corners.crossing import NAMES, Beside, crossing
+from kcal.corners.crossing import NAMES, LineDistances, crossing
 from kcal.corners.detect import detect_images
-from kcal.corners.erf import ErfRefine, erf_saddle
+from kcal.corners.erf import erf_saddle
 from kcal.corners.grid import line_bend, local_side, neighbors
 from kcal.corners.refine import refine_corners
-from kcal.corners.saddle import Status
+from kcal.corners.saddle import CornerStatus
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.sim.board import BoardSize, project_board
@@ -63,7 +63,7 @@ class TestCrossing:
         by_autograd = torch.func.jacfwd(lambda p: crossing(p, where, bend)[0])(parameters).T
         torch.testing.assert_close(crossing(parameters, where, bend)[1], by_autograd, rtol=1e-12, atol=1e-11)
         distance = 4 + 4 * torch.rand(2, 2, 50, generator=generator, dtype=torch.float64)
-        beside = Beside(distance, torch.tensor([[1.0, 0.5], [0.0, 1.0]]).double()[..., None])
+        beside = LineDistances(distance, torch.tensor([[1.0, 0.5], [0.0, 1.0]]).double()[..., None])
         by_autograd = torch.func.jacfwd(lambda p: crossing(p, where, bend, beside)[0])(parameters).T
         torch.testing.assert_close(crossing(parameters, where, bend, beside)[1], by_autograd, rtol=1e-12, atol=1e-11)
 
@@ -101,7 +101,7 @@ class TestCrossing:
         parameters = torch.tensor([0, 0, math.pi / 2, 0.0, math.log(2.0), 0, -1, 0, 0, 0]).double()
         turn = torch.tensor([[0.0, 1.0], [0.5, 0.0]]).double()[..., None]
         distance = torch.tensor([[1e6, 4.0], [5.0, 1e6]]).double()[..., None]
-        levels, _ = crossing(parameters, where, torch.zeros(2, dtype=torch.float64), Beside(distance, turn))
+        levels, _ = crossing(parameters, where, torch.zeros(2, dtype=torch.float64), LineDistances(distance, turn))
         # The margin begins beyond the last square, whose tail there is left out: 2 % at the last place, which is 1 px
         # from both lines.
         torch.testing.assert_close(levels[:4], torch.stack(wanted)[:4], rtol=0, atol=6e-3)
@@ -116,14 +116,14 @@ class TestFit:
         # The last step is below 1e-5 px, and of what was left before it a damping of 1e-4 remains.
         torch.testing.assert_close(found.pixels, torch.tensor([[20.31, 19.78]], dtype=torch.float64), rtol=0, atol=1e-8)
         assert float(found.blur[0]) == pytest.approx(1.1, abs=1e-8)
-        assert found.status.tolist() == [Status.GOOD]
+        assert found.status.tolist() == [CornerStatus.GOOD]
 
     def test_twenty_pixel_squares_are_found_to_seven_thousandths(self):
         errors = []
         for seed in range(4):
             image, truth, start, side = scene(20, seed=seed)
             found = erf_saddle(torch.from_numpy(image).double(), start, side)
-            assert bool((found.status == Status.GOOD).all())
+            assert bool((found.status == CornerStatus.GOOD).all())
             errors.append(found.pixels - truth)
         errors = torch.cat(errors)
         # 0.0065 over many boards; 0.008 leaves room for the chance of 80 corners. The saddle alone has 0.009.
@@ -136,7 +136,7 @@ class TestFit:
         for seed in range(6):
             image, truth, start, side = scene(square, blur, 3.0, seed, supersample=4)
             found = erf_saddle(torch.from_numpy(image).double(), start, side)
-            keep = found.status == Status.GOOD
+            keep = found.status == CornerStatus.GOOD
             errors.append((found.pixels - truth)[keep])
             predicted.append(found.covariance[keep])
         errors, predicted = torch.cat(errors), torch.cat(predicted)
@@ -183,11 +183,11 @@ class TestFit:
         for seed in range(4):
             image, truth, start, side = scene(10, 2.0, 1.0, seed, tilt=(0.15, -0.1))
             found = refine_corners(image, start, side, "erf", (5, 4))
-            assert int((found.status == Status.GOOD).sum()) >= 18
-            errors.append((found.pixels - truth)[found.status == Status.GOOD])
-            predicted.append(found.covariance[found.status == Status.GOOD])
+            assert int((found.status == CornerStatus.GOOD).sum()) >= 18
+            errors.append((found.pixels - truth)[found.status == CornerStatus.GOOD])
+            predicted.append(found.covariance[found.status == CornerStatus.GOOD])
             single = refine_corners(image, start, side, "erf")
-            alone.append((single.pixels - truth)[single.status == Status.GOOD])
+            alone.append((single.pixels - truth)[single.status == CornerStatus.GOOD])
         errors, alone, predicted = torch.cat(errors), torch.cat(alone), torch.cat(predicted)
         assert float(errors.square().mean().sqrt()) < 0.6 * float(alone.square().mean().sqrt())
         ratio = predicted.diagonal(dim1=-2, dim2=-1).mean().sqrt() / errors.square().mean().sqrt()
@@ -197,7 +197,7 @@ class TestFit:
         image, truth, start, side = scene(20, noise=0, supersample=8, dtype=np.float64)
         curved = 255 * (torch.from_numpy(image) / 255) ** 0.45
         found = erf_saddle(curved, start, side)
-        assert bool((found.status == Status.GOOD).all())
+        assert bool((found.status == CornerStatus.GOOD).all())
         # 0.001 without the curve: the renderer's sampling.
         assert float((found.pixels - truth).square().mean().sqrt()) < 0.002
 
@@ -222,7 +222,7 @@ class TestFit:
         scenes = [scene(16, seed=seed) for seed in range(3)]
         images = torch.stack([torch.from_numpy(s[0]).double() for s in scenes])
         starts, sides = torch.stack([s[2] for s in scenes]), torch.stack([s[3] for s in scenes])
-        together = ErfRefine()(images, starts, sides)
+        together = erf_saddle(images, starts, sides)
         for k, (image, start, side) in enumerate(zip(images, starts, sides, strict=True)):
             one = erf_saddle(image, start, side)
             # The batch goes on until its last corner stands still.
@@ -257,12 +257,12 @@ class TestRejection:
         start = start.clone()
         start[0], start[1] = math.nan, torch.tensor([4.0, 60.0])
         found = erf_saddle(torch.from_numpy(image), start, side)
-        assert found.status[:2].tolist() == [Status.MISSING, Status.OUTSIDE]
+        assert found.status[:2].tolist() == [CornerStatus.MISSING, CornerStatus.OUTSIDE]
         for value in (found.pixels, found.covariance.flatten(-2), found.blur[:, None]):
             assert bool(torch.isnan(value[:2]).all())
             assert bool(torch.isfinite(value[2:]).all())
         flat = erf_saddle(torch.full((50, 50), 128.0), torch.tensor([[25.0, 25.0]]), 20.0)
-        assert flat.status.tolist() == [Status.NO_SADDLE]
+        assert flat.status.tolist() == [CornerStatus.NO_SADDLE]
 
     def test_covered_corner(self):
         image, truth, _, side = scene(30, noise=1)
@@ -270,35 +270,35 @@ class TestRejection:
         column, row = truth[7].tolist()
         image[np.hypot(x - column - 9, y - row - 5) < 8] = 130
         found = refine_corners(image, truth, side, "erf", (5, 4))
-        assert int(found.status[7]) in (Status.OCCLUDED, Status.NO_SADDLE)
-        assert int((found.status == Status.GOOD).sum()) == 19
+        assert int(found.status[7]) in (CornerStatus.OCCLUDED, CornerStatus.NO_SADDLE)
+        assert int((found.status == CornerStatus.GOOD).sum()) == 19
 
     def test_saturated_corners(self):
         image, truth, start, side = scene(24)
         glaring = np.clip(image.astype(float) * 8, 0, 255).astype(np.uint8)
         found = refine_corners(glaring, start, side, "erf", (5, 4))
         assert bool(torch.isnan(found.pixels).all())
-        assert int((found.status == Status.SATURATED).sum()) > 10
+        assert int((found.status == CornerStatus.SATURATED).sum()) > 10
         # White paper at the end of the scale alone is no harm.
         white = np.clip(image.astype(float) * 1.25, 0, 255).astype(np.uint8)
         found = refine_corners(white, start, side, "erf", (5, 4))
-        assert bool((found.status == Status.GOOD).all())
+        assert bool((found.status == CornerStatus.GOOD).all())
         assert float((found.pixels - truth).square().mean().sqrt()) < 0.01
 
     def test_blurred_corners(self):
         image, _, start, side = scene(12, blur=5.0, noise=0.2)
         found = erf_saddle(torch.from_numpy(image).double(), start, side)
-        assert int((found.status == Status.BLURRED).sum()) >= 18
+        assert int((found.status == CornerStatus.BLURRED).sum()) >= 18
 
     def test_sixteen_bits_of_a_twelve_bit_camera(self):
         image, _, start, side = scene(20)
         found = refine_corners(image.astype(np.uint16) * 16, start, side, "erf", (5, 4))
-        assert bool((found.status == Status.GOOD).all())
+        assert bool((found.status == CornerStatus.GOOD).all())
 
     def test_noisy_images_are_judged_by_their_own_noise(self):
         image, _, start, side = scene(24, noise=22)
         found = erf_saddle(torch.from_numpy(image).double(), start, side)
-        assert int((found.status == Status.GOOD).sum()) >= 19
+        assert int((found.status == CornerStatus.GOOD).sum()) >= 19
 
     def test_bad_arguments(self):
         image, pixels = torch.zeros(40, 40), torch.zeros(3, 2)
@@ -347,7 +347,7 @@ class TestNoise:
             if kind == "jpeg":
                 image = cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])[1], 0)
             found = refine_corners(image, start, side, "erf", (5, 4))
-            keep = found.status == Status.GOOD
+            keep = found.status == CornerStatus.GOOD
             errors.append((found.pixels - truth)[keep])
             predicted.append(found.covariance[keep])
         errors, predicted = torch.cat(errors), torch.cat(predicted)

@@ -75,6 +75,14 @@ class TestRefinePoint:
             refine_point(corner_image(5, 5), torch.tensor([3.0, 20.0]))
         with pytest.raises(InputError, match="away"):
             refine_point(corner_image(30.0, 30.0), torch.tensor([36.0, 36.0]))
+        with pytest.raises(InputError, match=r"\(H, W\)"):
+            refine_point(torch.zeros(3, 40, 40), torch.tensor([20.0, 20.0]))
+        with pytest.raises(InputError, match="ndarray"):
+            refine_point(np.zeros((40, 40)), torch.tensor([20.0, 20.0]))
+        dead = corner_image(30.0, 30.0)
+        dead[25, 25] = math.nan
+        with pytest.raises(InputError, match="image: 1 of 3600 values are not finite"):
+            refine_point(dead, torch.tensor([30.0, 30.0]))
 
 
 def texture(seed, points):
@@ -198,5 +206,8 @@ class TestMatch:
             match_points(rig, left[:100], right, PIXELS)
         with pytest.raises(InputError, match=r"\(N, 2\)"):
             match_points(rig, left, right, PIXELS[0])
+        left[3, 4] = math.nan  # one dead pixel would hide every match whose line it touches
+        with pytest.raises(InputError, match="left image: 1 of"):
+            match_points(rig, left, right, PIXELS)
         with pytest.raises(InputError, match="half"):
             MatchOptions(half=0)

@@ -166,7 +166,7 @@ def test_wrong_grids_are_refused_with_a_reason():
     swapped[2, 2], swapped[2, 3] = grid[2, 3], grid[2, 2]
     assert "folded" in trouble(swapped)
     assert "dark and light" in trouble(grid, np.random.default_rng(0).integers(0, 255, image.shape, dtype=np.uint8))
-    assert "come closer" in trouble(grid / 5)
+    assert "move closer" in trouble(grid / 5)
     assert "finite" in trouble(grid * float("nan"))
 
 

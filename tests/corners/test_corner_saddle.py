@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from kcal.corners.board import Board
 from kcal.corners.grid import local_side
 from kcal.corners.refine import refine_corners
-from kcal.corners.saddle import SaddleRefine, Status, saddle
+from kcal.corners.saddle import CornerStatus, saddle
 from kcal.errors import InputError
 
 BOARD = Board(columns=5, rows=4, square=0.02)
@@ -36,7 +36,7 @@ def test_twenty_pixel_squares_are_found_to_a_hundredth_of_a_pixel():
     for seed in range(4):
         image, truth, start, side = scene(20, seed=seed)
         found = saddle(torch.from_numpy(image).double(), start, side)
-        assert bool((found.status == Status.GOOD).all())
+        assert bool((found.status == CornerStatus.GOOD).all())
         errors.append(found.pixels - truth)
     errors = torch.cat(errors)
     # 0.009 over many boards at this noise and blur; 0.012 leaves room for the chance of 80 corners.
@@ -52,7 +52,7 @@ def test_window_follows_the_square(square, method):
     # and reaches 0.063; from 14 px on both are below 0.03.
     image, truth, start, side = scene(square, roll=0.3, tilt=(0.2, 0.1), supersample=4)
     found = refine_corners(image, start, side, method)
-    assert bool((found.status == Status.GOOD).all())
+    assert bool((found.status == CornerStatus.GOOD).all())
     assert rms(found.pixels, truth) < (0.02 if method == "saddle" else 0.08)
 
 
@@ -70,7 +70,7 @@ def test_methods_agree():
     ours = refine_corners(image, start, side, "saddle").pixels
     for method in ("opencv", "skimage"):
         other = refine_corners(image, start, side, method)
-        assert int((other.status == Status.GOOD).sum()) >= 19
+        assert int((other.status == CornerStatus.GOOD).sum()) >= 19
         # Each method is good to 0.01 to 0.03 px a corner at this noise.
         assert float((other.pixels - ours).abs().nan_to_num().max()) < 0.08
 
@@ -94,7 +94,7 @@ def test_result_does_not_depend_on_the_start():
     image = torch.from_numpy(image).double()
     one = saddle(image, truth + torch.tensor([0.7, -0.4]), side)
     two = saddle(image, truth - torch.tensor([0.5, -0.8]), side)
-    assert bool((one.status == Status.GOOD).all())
+    assert bool((one.status == CornerStatus.GOOD).all())
     # Both stop at the same stationary point, to what is left after six repeats of the bilinear fit.
     torch.testing.assert_close(one.pixels, two.pixels, rtol=0, atol=1e-4)
 
@@ -121,7 +121,7 @@ def test_batch_equals_one_by_one():
     scenes = [scene(16, seed=seed) for seed in range(3)]
     images = torch.stack([torch.from_numpy(s[0]).double() for s in scenes])
     starts, sides = torch.stack([s[2] for s in scenes]), torch.stack([s[3] for s in scenes])
-    together = SaddleRefine()(images, starts, sides)
+    together = saddle(images, starts, sides)
     for k, (image, start, side) in enumerate(zip(images, starts, sides, strict=True)):
         one = saddle(image, start, side)
         torch.testing.assert_close(together.pixels[k], one.pixels, rtol=0, atol=1e-12)
@@ -156,14 +156,21 @@ def test_statuses():
     corner = torch.tanh((x - 60) / 2) * torch.tanh((y - 30) / 2) * (x > 40)
     far = torch.tensor([[20.3, 30.2], [60.4, 29.8], [62.0, 31.5], [math.nan, 0], [2.0, 2.0], [-40.0, 1e7]])
     found = saddle(hill + corner, far.double(), torch.tensor([20.0, 20.0, 6.0, 20.0, 20.0, 20.0]))
-    expected = [Status.NO_SADDLE, Status.GOOD, Status.MOVED, Status.MISSING, Status.OUTSIDE, Status.OUTSIDE]
+    expected = [
+        CornerStatus.NO_SADDLE,
+        CornerStatus.GOOD,
+        CornerStatus.MOVED,
+        CornerStatus.MISSING,
+        CornerStatus.OUTSIDE,
+        CornerStatus.OUTSIDE,
+    ]
     assert found.status.tolist() == expected
-    assert torch.isfinite(found.pixels).all(-1).tolist() == [status == Status.GOOD for status in expected]
+    assert torch.isfinite(found.pixels).all(-1).tolist() == [status == CornerStatus.GOOD for status in expected]
 
 
 def test_flat_image_gives_no_number():
     found = saddle(torch.full((50, 50), 128.0), torch.tensor([[25.0, 25.0]]), 20.0)
-    assert int(found.status[0]) == Status.NO_SADDLE
+    assert int(found.status[0]) == CornerStatus.NO_SADDLE
     assert bool(found.pixels.isnan().all())
 
 
@@ -174,9 +181,9 @@ def test_other_methods_flag_what_they_cannot_do(method):
     start[0] = math.nan
     start[1] = torch.tensor([-5.0, 3.0])
     found = refine_corners(image, start, side, method)
-    assert found.status[:2].tolist() == [Status.MISSING, Status.OUTSIDE]
+    assert found.status[:2].tolist() == [CornerStatus.MISSING, CornerStatus.OUTSIDE]
     assert bool(found.pixels[:2].isnan().all())
-    assert int((found.status[2:] == Status.GOOD).sum()) >= 17
+    assert int((found.status[2:] == CornerStatus.GOOD).sum()) >= 17
     if method == "none":
         assert bool((found.pixels[2:] == truth[2:]).all())
 

@@ -22,7 +22,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
 from kcal.corners.images import decode_gray, expand_images, read_bytes, unique_names
-from kcal.corners.observations import Covariance, Failure, Observations, Pixel, View
+from kcal.corners.observations import Failure, Observations, PackedCovariance, Pixel, View
 from kcal.corners.refine import Refinement
 from kcal.errors import FileError, InputError, KcalError
 from kcal.files import NativeFile
@@ -65,7 +65,7 @@ class Detected(NativeFile):
 
     size: tuple[int, int] | None = None
     pixels: tuple[Pixel | None, ...] | None = None
-    covariance: tuple[Covariance | None, ...] | None = None
+    covariance: tuple[PackedCovariance | None, ...] | None = None
     reason: str = ""
 
 
