@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kcal.errors import InputError
 
@@ -44,3 +45,33 @@ def keep_float64(fn: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
         return tensor.to(result.device) if tensor.dtype == torch.float64 else result
 
     return moved
+
+
+def as_covariance(name: str, matrix: Tensor | None, size: int) -> Tensor:
+    """Return `matrix` as float64 (size, size) after checking that it is a covariance; zeros for None.
+
+    Raises:
+        InputError: not a tensor, another shape, not finite, not symmetric, or with a negative eigenvalue.
+    """
+    if matrix is None:
+        return torch.zeros(size, size, dtype=torch.float64)
+    if not isinstance(matrix, Tensor) or tuple(matrix.shape) != (size, size):
+        shape = tuple(matrix.shape) if isinstance(matrix, Tensor) else type(matrix).__name__
+        raise InputError(f"{name}: a covariance of shape ({size}, {size}) is needed, got {shape}")
+    matrix = matrix.detach().to(torch.float64)
+    require_finite(name, matrix)
+    # Entries have different units: compare them as correlations.
+    scale = matrix.diagonal().clamp_min(0.0).sqrt()
+    scale = torch.where(scale > 0, scale, 1.0)
+    unit = matrix / scale[:, None] / scale
+    # Rounding stays below 1e-9 per row.
+    if not torch.allclose(unit, unit.T, atol=1e-9) or (size and float(torch.linalg.eigvalsh(unit)[0]) < -1e-9 * size):
+        raise InputError(f"{name}: not a covariance; it must be symmetric and have no negative eigenvalue")
+    return 0.5 * (matrix + matrix.T)
+
+
+class Float64Module(nn.Module):
+    """A module whose float64 tensors keep their precision under `.half()`, `.float()` and `.to(dtype)`."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
+        return super()._apply(keep_float64(fn), recurse)

@@ -115,7 +115,7 @@ def _write_survey(scene: DemoScene, path: Path) -> None:
 def _write_summary(output: Path, scene: DemoScene, table: list[list[str]], command: str, located: Located) -> None:
     from kcal.corners.observations import Observations
     from kcal.io.rig_file import RigFile
-    from kcal.locate.truth import misses
+    from kcal.locate.truth import position_errors
     from kcal.report.summary import Part, save_summary
 
     found = sum(len(Observations.load(output / f"{side}.near.obs.json").views) for side in SIDES)
@@ -125,7 +125,7 @@ def _write_summary(output: Path, scene: DemoScene, table: list[list[str]], comma
     cameras = zip(SIDES, (rig.left.calibration, rig.right.calibration), strict=True)
     rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
     pairs = 0 if rig.calibration is None else rig.calibration.pairs
-    inside = sum(miss is not None and miss[2] for miss in misses(located, scene.targets.enu))
+    inside = sum(miss is not None and miss[2] for miss in position_errors(located, scene.targets.enu))
     parts = [
         Part(
             heading="What came out",

@@ -116,7 +116,7 @@ def locate_command(
     from kcal.locate.export import check_format, write_positions
     from kcal.locate.geodesy import Origin
     from kcal.locate.marks import read_marks
-    from kcal.locate.truth import misses, read_truth
+    from kcal.locate.truth import position_errors, read_truth
     from kcal.report.figures import check_picture
     from kcal.report.map_page import check_map_format, save_map
     from kcal.report.positions import save_positions_picture
@@ -164,7 +164,7 @@ def locate_command(
         if web_map is not None:
             save_map(web_map, located, true, tiles=tiles, image=image, online=online)
             advance(web_map.name)
-    rows = position_rows(located, None if true is None else misses(located, true))
+    rows = position_rows(located, None if true is None else position_errors(located, true))
     print_table(rows, left=(0, len(rows[0]) - 1))
     for position in located.positions:
         if position.reason:
@@ -197,46 +197,41 @@ def locate_marks(
 
     import torch
 
-    from kcal.io.rig_file import RigFile
-    from kcal.locate.covariances import RigCovariance, mounting_covariance
+    from kcal.io.rig_file import load_rig
+    from kcal.lens.rig import RigCovariance
     from kcal.locate.datum import find_geoid, true_from_grid
-    from kcal.locate.geodesy import Origin
-    from kcal.locate.positions import locate
+    from kcal.locate.mounting import mounting_covariance
+    from kcal.locate.positions import locate_points
 
-    file = RigFile.load(rig)
-    solved = file.rig()
-    calibration = file.joint_covariance()
+    solved = load_rig(rig)
+    calibration, link = solved.covariance, None
     if yaw_sigma:
         yaw = torch.zeros(6, 6, dtype=torch.float64)
         yaw[1, 1] = math.radians(yaw_sigma) ** 2
-        more = RigCovariance.of(solved, pose=yaw).matrix
-        calibration = more if calibration is None else calibration + more
-    link = None
+        more = RigCovariance.of(solved, pose=yaw)
+        calibration = more if calibration is None else RigCovariance(matrix=calibration.matrix + more.matrix)
     standing = mounting_covariance(origin_m=[origin_sigma] * 3, attitude_deg=(0.0, 0.0, heading_sigma))
     if origin is None or heading is None:
-        stored = file.mounting
+        stored = solved.mounting
         if stored is None:
             raise InputError(f"{rig}: the file has no position of the rig; give --origin and --heading")
-        origin = Origin(lat=stored.lat, lon=stored.lon, height=stored.height)
-        heading, pitch, roll = stored.heading_deg, stored.pitch_deg, stored.roll_deg
-        if stored.covariance is not None:
-            standing = standing + torch.tensor(stored.covariance, dtype=torch.float64)
-        if stored.link is not None:
-            link = torch.tensor(stored.link, dtype=torch.float64)
-    heights = find_geoid(geoid)
-    return locate(
+        standing = standing if stored.covariance is None else standing + stored.covariance
+        link = stored.link
+    elif grid is not None:
+        heading = true_from_grid(heading, origin, grid)
+    return locate_points(
         solved,
         marks.left,
         marks.right,
         origin=origin,
-        heading_deg=heading if grid is None else true_from_grid(heading, origin, grid),
+        heading_deg=heading,
         pitch_deg=pitch,
         roll_deg=roll,
         pixel_sigma=pixel_sigma,
         names=marks.names,
-        calibration=None if calibration is None else RigCovariance.of(solved, joint=calibration),
+        calibration=calibration,
         mounting=standing if bool(standing.any()) else None,
         link=link,
         refraction=refraction,
-        geoid=heights,
+        geoid=find_geoid(geoid),
     )

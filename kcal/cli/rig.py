@@ -224,8 +224,9 @@ def _from_boards(
 
 def rig_record(result: RigCalibrationResult, cameras: tuple[CameraFile, CameraFile] | None) -> RigFile:
     """The rig file of a result; `cameras` are kept whole where they were not solved again."""
-    from kcal.io.camera_file import Exclusion, provenance
-    from kcal.io.rig_file import RigCalibration, rig_to_file
+    from kcal.io.camera_file import provenance
+    from kcal.io.rig_file import rig_to_file
+    from kcal.lens.calibration import Exclusion, RigCalibration
 
     return rig_to_file(
         result.rig,

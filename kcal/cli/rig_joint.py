@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from kcal.calibrate.rig.sources import Baseline, Boards, MeasuredPosition, RigData
     from kcal.io.camera_file import CameraFile
     from kcal.io.rig_file import RigFile
+    from kcal.lens.mounting import Mounting
     from kcal.locate.geodesy import Origin
-    from kcal.locate.mounting import Mounting
 
 CAMERAS = ("left", "right")
 
@@ -159,8 +159,9 @@ def record(
     solution: RigSolution, cameras: tuple[CameraFile, CameraFile], there: Mounting | None, *, fixed: bool
 ) -> RigFile:
     """The rig file of a solution; camera files are kept whole where the cameras were not solved again."""
-    from kcal.io.camera_file import Exclusion, provenance
-    from kcal.io.rig_file import RigCalibration, RigMounting, RigSource, rig_to_file
+    from kcal.io.camera_file import provenance
+    from kcal.io.rig_file import RigMounting, rig_to_file
+    from kcal.lens.calibration import Exclusion, RigCalibration, RigSource
 
     rig = solution.stereo()
     known = [rms for rms in solution.rms_px if not math.isnan(rms)]
@@ -169,24 +170,12 @@ def record(
         for item in solution.items
         if item.source == "boards" and item.used
     }
-    mount = None
-    if there is not None:
-        mount = RigMounting(
-            lat=there.origin.lat,
-            lon=there.origin.lon,
-            height=there.origin.height,
-            heading_deg=there.heading_deg,
-            pitch_deg=there.pitch_deg,
-            roll_deg=there.roll_deg,
-            covariance=tuple(map(tuple, there.covariance.tolist())),
-            link=tuple(map(tuple, there.link.tolist())),
-        )
     return rig_to_file(
         rig,
         left=cameras[0] if fixed else None,
         right=cameras[1] if fixed else None,
         covariance=solution.joint_covariance(),
-        mounting=mount,
+        mounting=None if there is None else RigMounting.of(there),
         calibration=RigCalibration(
             rms=math.sqrt(sum(rms**2 for rms in known) / max(1, len(known))),
             rms_left=0.0 if math.isnan(solution.rms_px[0]) else solution.rms_px[0],
@@ -232,7 +221,7 @@ def show(solution: RigSolution, there: Mounting | None) -> None:
         f"baseline [bold]{float(rig.baseline):.6f} m[/] ± {_along(solution):.6f}; "
         f"σ of yaw {yaw:.5f}°, pitch {pitch:.5f}°, roll {roll:.5f}°; {solution.status.message}"
     )
-    if there is not None:
+    if there is not None and there.covariance is not None:
         spread = there.covariance.diagonal().sqrt().tolist()
         out.print(
             f"left camera at {there.origin.lat:.7f}, {there.origin.lon:.7f}, {there.origin.height:.3f} m above the "

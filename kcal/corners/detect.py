@@ -44,7 +44,7 @@ _STATUS_TEXTS = {
 
 
 class Detection(NamedTuple):
-    """A board in an image.
+    """What was found of a board in an image.
 
     Args:
         pixels: (corners, 2) float64 in the board's order, NaN where not seen; None if no board was found.

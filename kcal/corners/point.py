@@ -60,7 +60,7 @@ class Enlarged:
 
 @dataclass(frozen=True, kw_only=True)
 class RefinedPoint:
-    """A refined point.
+    """A point refined to a fraction of a pixel.
 
     Args:
         pixel: (2,) float64.

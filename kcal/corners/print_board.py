@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 from typing import NamedTuple
 
 from kcal.corners.board import Board
 from kcal.corners.charuco import marker_cells
-from kcal.corners.drawing import Drawing, Rectangle, Text
+from kcal.corners.drawing import Drawing, Rectangle, Text, to_pdf, to_svg
 from kcal.errors import InputError
+from kcal.files import write_atomic
 
 # Millimeters, upright; ISO 216 and the North American sizes.
 PAGES: dict[str, tuple[float, float]] = {
@@ -166,3 +168,23 @@ def _foot(board: Board, page_wide: float, page_high: float) -> tuple[tuple[Recta
         for row, text in zip((1, 0), _captions(board), strict=True)
     )
     return (line, *ticks), texts
+
+
+def save_board(path: str | Path, board: Board, page: str = "auto") -> Path:
+    """Write a board to print, as a .svg or .pdf file; see `board_sheet` for the page.
+
+    Raises:
+        InputError: another suffix, or a page as for `board_sheet`.
+        FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_board(Path(folder, "board.pdf"), Board(columns=9, rows=6, square=0.025), "A4").read_bytes()[:4]
+        b'%PDF'
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".svg", ".pdf"):
+        raise InputError(f"{path}: give a file name that ends in .svg or .pdf")
+    drawing = board_sheet(board, page).drawing
+    return write_atomic(path, to_svg(drawing) if suffix == ".svg" else to_pdf(drawing))

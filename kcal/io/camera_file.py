@@ -18,6 +18,7 @@ import kcal
 from kcal.errors import InputError
 from kcal.files import NativeFile
 from kcal.io.record import CovarianceRecord, Record
+from kcal.lens.calibration import CalibrationRecord, CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.model import LensModel
@@ -77,7 +78,7 @@ class FieldScaleRecord(Record):
         return FieldScale(width=self.width, left=self.left, top=self.top, columns=self.columns, rows=self.rows)
 
 
-class Intrinsics(Record):
+class IntrinsicsRecord(Record):
     """Focal lengths, principal point and skew (γ of Eq. 3), pixels."""
 
     fx: pydantic.PositiveFloat
@@ -87,17 +88,10 @@ class Intrinsics(Record):
     skew: float
 
 
-class Exclusion(Record):
-    """A view, a corner of one, or a pair that was left out, and why."""
-
-    name: str
-    reason: str
-
-
 class ValidRegion(Record):
     """Where the lens is a lens: before it folds back or meets a pole.
 
-    Derived from the camera when the file is written, for readers that cannot compute it; kcal itself measures anew.
+    Derived from the camera when the file is written, for readers that cannot compute it; kcal itself measures it again.
 
     Args:
         radius: of the disc about the optical axis that is valid: on the plane z = 1; for a fisheye, radians off axis.
@@ -107,52 +101,6 @@ class ValidRegion(Record):
 
     radius: pydantic.NonNegativeFloat
     polygon: tuple[tuple[float, float], ...]
-
-
-class BoardRecord(Record):
-    """The board as plain fields: inner corners, and the side of a square in meters."""
-
-    columns: pydantic.PositiveInt
-    rows: pydantic.PositiveInt
-    square: pydantic.PositiveFloat
-
-
-class CameraCalibration(Record):
-    """How a camera was calibrated.
-
-    Args:
-        rms: sqrt(mean ‖r‖²) over the points that were used, pixels.
-        views: how many views were used.
-        points: how many corners were used.
-        per_view_rms: view name -> RMS in pixels, for the views used.
-        excluded: views, and corners of the views used, that were left out, with the reason.
-        board: the board that was shown.
-        board_warp: height of the board's bend in x and y, meters; None if it was not estimated.
-        stop_reason: why the solver stopped.
-        iterations: of the solver.
-        observations: name of the observations file, if there was one.
-        kcal_version: the version that calibrated; see `provenance`.
-        created: when, with its time zone.
-    """
-
-    rms: pydantic.NonNegativeFloat
-    views: pydantic.PositiveInt
-    points: pydantic.PositiveInt
-    per_view_rms: dict[str, pydantic.NonNegativeFloat]
-    excluded: tuple[Exclusion, ...] = ()
-    board: BoardRecord
-    board_warp: tuple[float, float] | None = None
-    stop_reason: str
-    iterations: pydantic.NonNegativeInt
-    observations: str | None = None
-    kcal_version: str
-    created: pydantic.AwareDatetime
-
-    @pydantic.model_validator(mode="after")
-    def _counted(self) -> CameraCalibration:
-        if self.views != len(self.per_view_rms):
-            raise ValueError(f"views is {self.views}, but per_view_rms has {len(self.per_view_rms)}")
-        return self
 
 
 class CameraFile(NativeFile):
@@ -192,13 +140,13 @@ class CameraFile(NativeFile):
     name: str
     image_size: tuple[pydantic.PositiveInt, pydantic.PositiveInt]
     model: LensOrders
-    intrinsics: Intrinsics
+    intrinsics: IntrinsicsRecord
     coefficients: dict[str, float]
     standard_deviations: dict[str, pydantic.NonNegativeFloat | None] | None = None
     covariance: CovarianceRecord | None = None
     residual: tuple[FieldScaleRecord, ...] | None = None
     valid_region: ValidRegion | None = None
-    calibration: CameraCalibration | None = None
+    calibration: CalibrationRecord | None = None
 
     @pydantic.field_validator("coefficients", "standard_deviations")
     @classmethod
@@ -232,7 +180,18 @@ class CameraFile(NativeFile):
         return self.covariance.expand((*INTRINSICS, *self.coefficients))
 
     def camera(self) -> Camera:
-        """The camera, equal to the stored one to the last bit."""
+        """The camera, equal to the stored one to the last bit, with its `calibration` if the file has one."""
+        camera = self._plain_camera()
+        if self.name or self.standard_deviations or self.covariance or self.calibration:
+            camera.calibration = CameraCalibration(
+                name=self.name,
+                sigma=self.standard_deviations,
+                covariance=self.covariance_matrix(),
+                record=self.calibration,
+            )
+        return camera
+
+    def _plain_camera(self) -> Camera:
         values = [*(getattr(self.intrinsics, name) for name in INTRINSICS), *self.coefficients.values()]
         parameters, model = torch.tensor(values, dtype=torch.float64), self.model.model()
         if self.residual is None:
@@ -254,7 +213,7 @@ class CameraFile(NativeFile):
     def _invertible(self) -> CameraFile:
         if self.residual is not None:
             try:
-                self.camera()
+                self._plain_camera()
             except InputError as error:
                 raise ValueError(str(error)) from error
         return self
@@ -294,15 +253,15 @@ def provenance() -> dict[str, Any]:
 def camera_to_file(
     camera: Camera,
     *,
-    name: str = "",
+    name: str | None = None,
     standard_deviations: Mapping[str, float | None] | None = None,
     covariance: torch.Tensor | None = None,
-    calibration: CameraCalibration | None = None,
+    calibration: CalibrationRecord | None = None,
 ) -> CameraFile:
     """Put a camera in the form in which it is stored.
 
     Args:
-        camera: a single camera, not a batch.
+        camera: a single camera, not a batch. What is not given below is taken from its `calibration`.
         name: free text that tells cameras apart.
         standard_deviations: parameter name -> one sigma; names left out, and None, stand for parameters held fixed.
         covariance: (5 + P, 5 + P) in the order of `Camera.names`; parameters whose variance is zero are held fixed.
@@ -319,7 +278,10 @@ def camera_to_file(
     """
     values = camera.params.detach()
     if values.ndim != 1:
-        raise InputError(f"a camera file holds one camera, got a batch of shape {tuple(values.shape[:-1])}")
+        raise InputError(f"a camera file contains one camera, got a batch of shape {tuple(values.shape[:-1])}")
+    known = camera.calibration or CameraCalibration()
+    standard_deviations = known.sigma if standard_deviations is None else standard_deviations
+    covariance = known.covariance if covariance is None else covariance
     if standard_deviations is not None:
         unknown = [key for key in standard_deviations if key not in camera.names]
         if unknown:
@@ -333,7 +295,7 @@ def camera_to_file(
     model = camera.model
     try:
         return CameraFile(
-            name=name,
+            name=known.name if name is None else name,
             image_size=camera.size,
             model=LensOrders(
                 numerator=model.numerator,
@@ -343,7 +305,7 @@ def camera_to_file(
                 tilt=model.tilt,
                 fisheye=model.fisheye,
             ),
-            intrinsics=Intrinsics(**{key: stored[key] for key in INTRINSICS}),
+            intrinsics=IntrinsicsRecord(**{key: stored[key] for key in INTRINSICS}),
             coefficients={key: stored[key] for key in model.names},
             standard_deviations=standard_deviations,
             covariance=None if covariance is None else CovarianceRecord.of(covariance.detach(), camera.names),
@@ -352,7 +314,7 @@ def camera_to_file(
                 radius=float(camera.valid_radius),
                 polygon=tuple((round(u, 3), round(v, 3)) for u, v in camera.valid_polygon().tolist()),
             ),
-            calibration=calibration,
+            calibration=known.record if calibration is None else calibration,
         )
     except pydantic.ValidationError as error:
         first = error.errors()[0]
@@ -360,8 +322,8 @@ def camera_to_file(
         raise InputError(f"this camera cannot be stored: {where}: {first['msg']}") from error
 
 
-def save_camera(camera: Camera, path: str | Path, *, name: str = "") -> Path:
-    """Write a camera without its calibration record; `camera_to_file(...).save(path)` writes one with it.
+def save_camera(camera: Camera, path: str | Path, *, name: str | None = None) -> Path:
+    """Write a camera with its error bars and history (`camera.calibration`); `name` replaces the name it has.
 
     Raises:
         InputError: see `camera_to_file`.
@@ -378,7 +340,7 @@ def save_camera(camera: Camera, path: str | Path, *, name: str = "") -> Path:
 
 
 def load_camera(path: str | Path) -> Camera:
-    """Read the camera of a kcal camera file.
+    """Read the camera of a kcal camera file; its `calibration` has what else the file contains.
 
     Raises:
         FileError: missing, not JSON, another kind of file (a rig, say), or a field that is wrong; it names the path.

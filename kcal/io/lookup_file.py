@@ -1,6 +1,6 @@
 """Lookup cameras as .npz files, for consumers that know no lens formulas, no nets and no torch.
 
-What a file holds (numpy arrays, read with `np.load(path, allow_pickle=False)`):
+What a file contains (numpy arrays, read with `np.load(path, allow_pickle=False)`):
 
 | name | shape, type | meaning |
 |---|---|---|

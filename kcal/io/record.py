@@ -5,8 +5,7 @@ from __future__ import annotations
 import pydantic
 import torch
 
-# Of the eigenvalues of a matrix of correlations.
-_ROUNDING = 1e-9
+from kcal.checks import as_covariance
 
 
 class Record(pydantic.BaseModel):
@@ -16,7 +15,7 @@ class Record(pydantic.BaseModel):
 
 
 class CovarianceRecord(Record):
-    """How the parameters of a camera scatter together: what one sigma of each does not tell.
+    """The joint covariance of a camera's parameters.
 
     Args:
         names: of the parameters that were estimated, in the order of the camera's; all others are exact.
@@ -34,14 +33,7 @@ class CovarianceRecord(Record):
             raise ValueError("covariance: a name occurs twice")
         if len(self.matrix) != count or any(len(row) != count for row in self.matrix):
             raise ValueError(f"covariance: {count} names need {count} rows of {count} numbers")
-        values = torch.tensor(self.matrix, dtype=torch.float64).reshape(count, count)
-        scale = values.diagonal().clamp_min(0.0).sqrt()
-        # Entries have different units: compare them as correlations.
-        unit = values / torch.where(scale > 0, scale, 1.0)[:, None] / torch.where(scale > 0, scale, 1.0)
-        if not torch.allclose(unit, unit.T, rtol=0, atol=1e-9):
-            raise ValueError("covariance: the matrix is not symmetric")
-        if count and float(torch.linalg.eigvalsh(unit)[0]) < -_ROUNDING * count:
-            raise ValueError("covariance: the matrix has a negative eigenvalue")
+        as_covariance("covariance", torch.tensor(self.matrix, dtype=torch.float64).reshape(count, count), count)
         return self
 
     @classmethod

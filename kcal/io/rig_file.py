@@ -6,20 +6,25 @@ so a rig must never be combined with cameras that were solved again after it.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import pydantic
 import torch
 from torch import Tensor
 
+from kcal.checks import as_covariance
 from kcal.errors import InputError
 from kcal.files import NativeFile
-from kcal.io.camera_file import CameraFile, Exclusion, camera_to_file
+from kcal.io.camera_file import CameraFile, camera_to_file
 from kcal.io.record import Record
+from kcal.lens.calibration import RigCalibration
+from kcal.lens.camera import Camera
+from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.projection import INTRINSICS
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import RigCovariance, StereoRig
 
 Triple = tuple[float, float, float]
 
@@ -33,7 +38,7 @@ class RigPose(Record):
     @pydantic.model_validator(mode="after")
     def _rigid(self) -> RigPose:
         rotation = self.matrix()
-        # As StereoRig asks for; told here so that the error names the file.
+        # As in StereoRig; checked here so that the error names the file.
         error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
         if not float(error) <= 1e-6 or float(torch.linalg.det(rotation)) < 0:
             raise ValueError("rotation is no rotation matrix (R Rᵀ must be 1 and det R = +1)")
@@ -47,15 +52,18 @@ class RigPose(Record):
 Matrix = tuple[tuple[float, ...], ...]
 
 
-def _matrix(value: Matrix, size: int, what: str) -> Tensor:
-    if len(value) != size or any(len(row) != size for row in value):
-        raise ValueError(f"{what} must be {size} x {size}")
-    matrix = torch.tensor(value, dtype=torch.float64)
-    scale = matrix.diagonal().clamp_min(0.0).sqrt()
-    unit = matrix / torch.where(scale > 0, scale, 1.0)[:, None] / torch.where(scale > 0, scale, 1.0)
-    if not torch.allclose(unit, unit.T, atol=1e-9) or float(torch.linalg.eigvalsh(unit)[0]) < -1e-9 * size:
-        raise ValueError(f"{what} is no covariance: it must be symmetric without negative eigenvalues")
-    return matrix
+def _tensor(value: Matrix, rows: int, columns: int, what: str) -> Tensor:
+    if len(value) != rows or any(len(row) != columns for row in value):
+        raise ValueError(f"{what} must be {rows} x {columns}")
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def _stored(matrix: Tensor | None) -> Matrix | None:
+    return None if matrix is None else tuple(map(tuple, matrix.tolist()))
+
+
+def _loaded(matrix: Matrix | None) -> Tensor | None:
+    return None if matrix is None else torch.tensor(matrix, dtype=torch.float64)
 
 
 class RigMounting(Record):
@@ -84,59 +92,33 @@ class RigMounting(Record):
     @pydantic.model_validator(mode="after")
     def _square(self) -> RigMounting:
         if self.covariance is not None:
-            _matrix(self.covariance, 6, "the mounting's covariance")
+            as_covariance("the mounting's covariance", _tensor(self.covariance, 6, 6, "the mounting's covariance"), 6)
+        self.mounting()
         return self
 
+    @classmethod
+    def of(cls, mounting: Mounting) -> RigMounting:
+        """In the form in which it is stored."""
+        return cls(
+            **dataclasses.asdict(mounting.origin),
+            heading_deg=mounting.heading_deg,
+            pitch_deg=mounting.pitch_deg,
+            roll_deg=mounting.roll_deg,
+            covariance=_stored(mounting.covariance),
+            link=_stored(mounting.link),
+        )
 
-class RigSource(Record):
-    """One kind of data that a rig was solved from; see `kcal.calibrate.rig.result.SourceResidual`."""
-
-    name: str
-    used: pydantic.NonNegativeInt
-    left_out: pydantic.NonNegativeInt
-    rms_px: pydantic.NonNegativeFloat | None = None
-    rms_m: pydantic.NonNegativeFloat | None = None
-    sigmas: pydantic.NonNegativeFloat | None = None
-
-
-class RigCalibration(Record):
-    """How a rig was solved.
-
-    Args:
-        rms: sqrt(mean ‖r‖²) over the points of both cameras, pixels.
-        rms_left: of the left camera alone.
-        rms_right: of the right camera alone.
-        pairs: how many pairs of views were used.
-        per_pair_rms: pair name -> RMS in pixels, for the pairs used.
-        flipped: pairs in which one camera's corner order had to be turned by 180°.
-        excluded: pairs, landmarks and matches left out, with the reason.
-        sources: what the rig was solved from, where that is more than boards.
-        relocked: when only the cameras' attitudes were solved again, and from what.
-        baseline_m: distance between the cameras' centers, meters; must be the length of the translation.
-        frame: what the rig's frame is.
-        kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
-        created: when, with its time zone.
-    """
-
-    rms: pydantic.NonNegativeFloat
-    rms_left: pydantic.NonNegativeFloat
-    rms_right: pydantic.NonNegativeFloat
-    pairs: pydantic.NonNegativeInt
-    per_pair_rms: dict[str, pydantic.NonNegativeFloat]
-    flipped: tuple[str, ...] = ()
-    excluded: tuple[Exclusion, ...] = ()
-    sources: tuple[RigSource, ...] = ()
-    relocked: str | None = None
-    baseline_m: pydantic.PositiveFloat
-    frame: Literal["left camera"] = "left camera"
-    kcal_version: str
-    created: pydantic.AwareDatetime
-
-    @pydantic.model_validator(mode="after")
-    def _counted(self) -> RigCalibration:
-        if self.pairs != len(self.per_pair_rms):
-            raise ValueError(f"pairs is {self.pairs}, but per_pair_rms has {len(self.per_pair_rms)}")
-        return self
+    def mounting(self) -> Mounting:
+        """As `StereoRig.mounting`."""
+        covariance, link = map(_loaded, (self.covariance, self.link))
+        return Mounting(
+            origin=Origin(lat=self.lat, lon=self.lon, height=self.height),
+            heading_deg=self.heading_deg,
+            pitch_deg=self.pitch_deg,
+            roll_deg=self.roll_deg,
+            covariance=covariance,
+            link=link,
+        )
 
 
 class RigFile(NativeFile):
@@ -147,7 +129,7 @@ class RigFile(NativeFile):
         right: the second camera, whole.
         right_from_left: where the right camera stands.
         covariance: of both cameras' parameters and the relative pose together, in the order of
-            `kcal.locate.covariances.RigCovariance`; what was held has zeros.
+            `RigCovariance`; what was held has zeros.
         mounting: where the rig stands on the Earth, if that was solved.
         calibration: how the rig was solved, if it was.
 
@@ -171,18 +153,17 @@ class RigFile(NativeFile):
 
     @pydantic.model_validator(mode="after")
     def _measured(self) -> RigFile:
+        link = None if self.mounting is None else self.mounting.link
         if self.covariance is not None:
-            counts = (len(self.left.coefficients), len(self.right.coefficients))
-            matrix = _matrix(self.covariance, sum(counts) + 2 * len(INTRINSICS) + 6, "the rig's covariance")
-            if self.mounting is not None and self.mounting.link is not None:
-                link, stands = self.mounting.link, self.mounting.covariance
-                if stands is None or len(link) != len(matrix) or any(len(row) != 6 for row in link):
-                    raise ValueError(f"the mounting's link must be {len(matrix)} x 6, beside a covariance")
-                cross = torch.tensor(link, dtype=torch.float64)
-                below = torch.cat([cross.T, torch.tensor(stands, dtype=torch.float64)], 1)
-                whole = torch.cat([torch.cat([matrix, cross], 1), below])
-                _matrix(tuple(map(tuple, whole.tolist())), len(whole), "rig and mounting together")
-        elif self.mounting is not None and self.mounting.link is not None:
+            size = len(self.left.coefficients) + len(self.right.coefficients) + 2 * len(INTRINSICS) + 6
+            matrix = _tensor(self.covariance, size, size, "the rig's covariance")
+            as_covariance("the rig's covariance", matrix, size)
+            if link is not None:
+                if self.mounting is None or self.mounting.covariance is None:
+                    raise ValueError("the mounting's link needs the mounting's covariance")
+                mounted = torch.tensor(self.mounting.covariance, dtype=torch.float64)
+                RigCovariance(matrix=matrix).checked_link(mounted, _tensor(link, size, 6, "the mounting's link"))
+        elif link is not None:
             raise ValueError("the mounting's link needs the rig's covariance")
         length = math.hypot(*self.right_from_left.translation)
         # A thousandth of a millimeter in a meter: more is not rounding but another rig.
@@ -192,13 +173,17 @@ class RigFile(NativeFile):
 
     def joint_covariance(self) -> Tensor | None:
         """The stored covariance, float64."""
-        return None if self.covariance is None else torch.tensor(self.covariance, dtype=torch.float64)
+        return _loaded(self.covariance)
 
     def rig(self) -> StereoRig:
-        """The rig, equal to the stored one to the last bit."""
-        pose = self.right_from_left
+        """The rig, equal to the stored one to the last bit, with its covariance, mounting and calibration."""
+        pose, joint = self.right_from_left, self.joint_covariance()
         translation = torch.tensor(pose.translation, dtype=torch.float64)
-        return StereoRig(self.left.camera(), self.right.camera(), pose.matrix(), translation)
+        rig = StereoRig(self.left.camera(), self.right.camera(), pose.matrix(), translation)
+        rig.covariance = None if joint is None else RigCovariance(matrix=joint)
+        rig.mounting = None if self.mounting is None else self.mounting.mounting()
+        rig.calibration = self.calibration
+        return rig
 
 
 def rig_to_file(
@@ -213,15 +198,15 @@ def rig_to_file(
     """Put a rig in the form in which it is stored.
 
     Args:
-        rig: the rig.
-        left: the left camera's file, to keep its name, error bars and record; it must hold the same camera.
+        rig: the rig. What is not given below is taken from it and from its cameras.
+        left: the left camera's file, to keep its name, error bars and record; it must contain the same camera.
         right: likewise for the right camera.
         covariance: see `RigFile`.
         mounting: see `RigFile`.
         calibration: how the rig was solved.
 
     Raises:
-        InputError: a camera file that holds another camera than the rig, or values that do not fit together.
+        InputError: a camera file that contains another camera than the rig, or values that do not fit together.
 
     Example:
         >>> from kcal.lens.camera import Camera
@@ -232,28 +217,37 @@ def rig_to_file(
     """
     for name, file, camera in (("left", left, rig.left), ("right", right, rig.right)):
         if file is not None and file.camera().fingerprint != camera.fingerprint:
-            raise InputError(f"the {name} camera file holds another camera than the rig; pass the file it came from")
+            raise InputError(f"the {name} camera file contains another camera than the rig; pass the file it came from")
+    if covariance is None and rig.covariance is not None:
+        covariance = rig.covariance.matrix
     try:
+        if mounting is None and rig.mounting is not None:
+            mounting = RigMounting.of(rig.mounting)
         return RigFile(
-            left=left or camera_to_file(rig.left, name="left"),
-            right=right or camera_to_file(rig.right, name="right"),
+            left=left or _camera_to_file(rig.left, "left"),
+            right=right or _camera_to_file(rig.right, "right"),
             right_from_left=RigPose.model_validate(
                 {
                     "rotation": rig.right_from_left_rotation.tolist(),
                     "translation": rig.right_from_left_translation.tolist(),
                 }
             ),
-            covariance=None if covariance is None else tuple(map(tuple, covariance.tolist())),
+            covariance=_stored(covariance),
             mounting=mounting,
-            calibration=calibration,
+            calibration=calibration or rig.calibration,
         )
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"this rig cannot be stored: {first['msg']}") from error
 
 
+def _camera_to_file(camera: Camera, name: str) -> CameraFile:
+    known = camera.calibration
+    return camera_to_file(camera, name=known.name if known is not None and known.name else name)
+
+
 def save_rig(rig: StereoRig, path: str | Path) -> Path:
-    """Write a rig without its calibration record; `rig_to_file(...).save(path)` writes one with it.
+    """Write a rig with both cameras and all that is known of them: covariances, mounting and how they were calibrated.
 
     Raises:
         InputError: see `rig_to_file`.
@@ -272,7 +266,7 @@ def save_rig(rig: StereoRig, path: str | Path) -> Path:
 
 
 def load_rig(path: str | Path) -> StereoRig:
-    """Read the rig of a kcal rig file.
+    """Read the rig of a kcal rig file, with its covariance, mounting and calibration, and those of its cameras.
 
     Raises:
         FileError: missing, not JSON, another kind of file (a camera, say), or a field that is wrong; it names the path.

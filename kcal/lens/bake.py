@@ -1,4 +1,4 @@
-"""Any camera to tables with a measured error bound."""
+"""Tabulate a camera, with a measured error bound."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from kcal.lens.camera import Camera
 from kcal.lens.lookup import LookupCamera, chart_from_points, rays_from_chart
 from kcal.lens.spline import RINGS, Spline, evaluate_spline, extend_nodes, filter_nodes
 
-# Errors are measured on a lattice this many times finer than the cells, corners and middles of cells included; in
-# between they may be larger by no more than the safety factor.
+# Errors are measured on a lattice this many times finer than the cells; in between they may be larger by no more than
+# the safety factor.
 _FINER, _SAFETY = 4, 1.25
-# Cells along the longer side: at first, and at the most (8 MB a table).
+# Cells along the longer side: at first, and at most (8 MB per table).
 _FEWEST, _MOST = 12, 700
-# Of the image whose pixels have a ray: what tables must answer for at least, and where refining them ends.
-_LEAST, _ENOUGH = 0.9, 0.97
+# Share of the image's pixels with a ray: tables must cover the first, and are not refined beyond the second.
+_REQUIRED, _ENOUGH = 0.9, 0.97
 
-# Positions (N, 2) of a table's plane to exact values (N, 2), whether they exist, and whether they are asked for.
+# Maps positions (N, 2) of a table's plane to exact values (N, 2), their validity, and whether they are in the image.
 _Exact = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
-# Positions (N, 2) and values from the table (N, 2) to errors in pixels (N,); infinite where there is no telling.
+# Maps positions, values from the table and exact values (N, 2) to errors in pixels (N,); infinite where unknown.
 _Errors = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
@@ -41,23 +41,23 @@ class _Table(NamedTuple):
 
 @torch.no_grad()
 def bake(camera: Camera, tolerance: float = 1e-3) -> LookupCamera:
-    """Tabulate a camera so that both directions are right within a tolerance, by the coarsest tables that are.
+    """Tabulate both directions of a camera, with the coarsest tables that keep a tolerance.
 
-    Convention: errors are distances in pixels. Of `project`, between the table's pixel and the camera's; of
-    `unproject`, between a pixel and where the camera sees the table's ray. They are measured on a lattice four times
-    finer than the cells; `LookupCamera.bound` is the largest of them times 1.25. Cells that do not keep the tolerance,
-    or in which some point has no exact value, are marked and never used: what is lost is told by `coverage`, and along
-    a fold that crosses the image it is a strip of one cell.
+    Reading a table takes the same time for every lens and needs no lens formula, which helps most for a `HybridCamera`.
+    `kcal.io.lookup_file` stores tables for programs without torch.
 
-    Any camera can be baked, a `HybridCamera` above all: reading a table needs no lens formula and no net, and takes the
-    same time for every lens. `kcal.io.lookup_file` stores tables for readers that have no torch.
+    Errors are distances in pixels: for `project`, between the table's pixel and the camera's; for `unproject`, between
+    a pixel and the projection of the table's ray. They are measured on a lattice four times finer than the cells, and
+    `LookupCamera.bound` is the largest of them times 1.25. Cells that exceed the tolerance, or in which a point has no
+    exact value, are never used. Along a fold that crosses the image, that is a strip of one cell; `coverage` tells how
+    much is left.
 
     Args:
         camera: a single camera.
-        tolerance: in pixels; below 1e-8 the tables' own rounding counts.
+        tolerance: largest error in pixels, at least 1e-8.
 
     Raises:
-        InputError: a batch of cameras, or a tolerance that is not positive or not reached by tables of 700 cells.
+        InputError: a batch of cameras, a tolerance below 1e-8, or one that tables of 700 cells do not reach.
         DegenerateError: no pixel of the image has a ray.
 
     Example:
@@ -67,7 +67,7 @@ def bake(camera: Camera, tolerance: float = 1e-3) -> LookupCamera:
         (True, (1.0, 1.0))
     """
     if camera.params.ndim != 1:
-        raise InputError(f"bake: a single camera is needed, got a batch of {tuple(camera.params.shape[:-1])}")
+        raise InputError(f"bake: a single camera is needed, not a batch of {tuple(camera.params.shape[:-1])}")
     if not (math.isfinite(tolerance) and tolerance >= 1e-8):
         raise InputError(f"bake: the tolerance must be at least 1e-8 px, got {tolerance}")
     width, height = camera.size
@@ -79,7 +79,7 @@ def bake(camera: Camera, tolerance: float = 1e-3) -> LookupCamera:
         valid = valid & usable
         return torch.stack([p, q], -1), valid, valid & camera.inside(pixels)
 
-    def back_in_pixels(pixels: Tensor, chart: Tensor, _: Tensor) -> Tensor:
+    def reprojection_errors(pixels: Tensor, chart: Tensor, _: Tensor) -> Tensor:
         again, seen = camera.project(rays_from_chart(chart))
         return torch.where(seen, torch.linalg.vector_norm(again - pixels, dim=-1), torch.inf)
 
@@ -87,12 +87,12 @@ def bake(camera: Camera, tolerance: float = 1e-3) -> LookupCamera:
         pixels, valid = camera.project(rays_from_chart(chart))
         return pixels, valid, valid & camera.inside(pixels)
 
-    def in_pixels(_: Tensor, pixels: Tensor, exact: Tensor) -> Tensor:
+    def pixel_errors(_: Tensor, pixels: Tensor, exact: Tensor) -> Tensor:
         return torch.linalg.vector_norm(pixels - exact, dim=-1)
 
     seen = _chart_box(to_chart, image, camera.params)
-    inverse = _fit("unproject", to_chart, back_in_pixels, image, tolerance, camera.params)
-    forward = _fit("project", to_pixels, in_pixels, seen, tolerance, camera.params)
+    inverse = _fit_table("unproject", to_chart, reprojection_errors, image, tolerance, camera.params)
+    forward = _fit_table("project", to_pixels, pixel_errors, seen, tolerance, camera.params)
     return LookupCamera(
         size=camera.size,
         pixels_from_chart=forward.spline,
@@ -112,44 +112,45 @@ def _lattice(low: Tensor, step: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def _chart_box(to_chart: _Exact, image: _Box, like: Tensor) -> _Box:
-    """The rectangle of the chart where the image's pixels are seen, a little larger."""
+    """The rectangle of the chart that contains the rays of the image, with a margin of 1 %."""
     low, high = like.new_tensor(image.low), like.new_tensor(image.high)
     chart, valid, _ = to_chart(_lattice(low, (high - low) / 128, 129, 129).reshape(-1, 2))
     if not bool(valid.any()):
-        raise DegenerateError("bake: no pixel of the image has a ray")
+        raise DegenerateError("bake: no pixel of the image has a ray; check the camera")
     least, most = chart[valid].amin(0), chart[valid].amax(0)
     margin = 0.01 * (most - least)
     (left, top), (right, bottom) = (least - margin).tolist(), (most + margin).tolist()
     return _Box((left, top), (right, bottom))
 
 
-def _fit(name: str, exact: _Exact, errors: _Errors, box: _Box, tolerance: float, like: Tensor) -> _Table:
-    """Refine a table until it covers enough; the last one if it covers what it must."""
+def _fit_table(name: str, exact: _Exact, errors: _Errors, box: _Box, tolerance: float, like: Tensor) -> _Table:
+    """Refine a table until it keeps the tolerance on enough of the image."""
     low, high = like.new_tensor(box.low), like.new_tensor(box.high)
     cells = _FEWEST
     while True:
-        table, worst = _measured(exact, errors, low, high, cells, tolerance)
-        # Where a fold crosses the image (worst is infinite), a strip along it is lost however fine the table is.
+        table, worst = _build_table(exact, errors, low, high, cells, tolerance)
+        # Where a fold crosses the image (worst is infinite), a strip along it is lost, however fine the table is.
         if worst <= tolerance or (math.isinf(worst) and table.coverage >= _ENOUGH):
             return table
         if cells == _MOST:
             break
-        # Errors fall with the fourth power of the step; what a fold takes, a little faster than the step.
+        # Errors fall with the fourth power of the step; the share lost along a fold falls a little faster than the
+        # step.
         lost = (1.0 - table.coverage) / (1.0 - _ENOUGH)
         grown = 1.05 * (worst / tolerance) ** 0.25 if math.isfinite(worst) else lost**0.85
         cells = min(_MOST, math.ceil(cells * min(max(grown, 1.25), 4.0)))
-    if table.coverage < _LEAST:
+    if table.coverage < _REQUIRED:
         raise InputError(
-            f"bake: a table of {_MOST} cells keeps {tolerance:g} px of {name} on {table.coverage:.1%} of the image; "
-            "allow a larger tolerance"
+            f"bake: a table of {_MOST} cells keeps {tolerance:g} px in `{name}` on only {table.coverage:.1%} of "
+            "the image; allow a larger tolerance"
         )
     return table
 
 
-def _measured(
+def _build_table(
     exact: _Exact, errors: _Errors, low: Tensor, high: Tensor, cells: int, tolerance: float
 ) -> tuple[_Table, float]:
-    """A table of so many cells along the longer side, and the worst error of the cells where the image is seen."""
+    """A table of so many cells along the longer side, and its largest error inside the image."""
     extent = high - low
     columns, rows = (max(4, math.ceil(cells * float(side / extent.amax()))) for side in extent)
     step = extent / extent.new_tensor([columns, rows])
@@ -164,13 +165,13 @@ def _measured(
     found, _ = evaluate_spline(spline, fine[..., 0].flatten(), fine[..., 1].flatten())
     wrong = _SAFETY * torch.where(valid, errors(fine.flatten(0, 1), found.T, truth), torch.inf)
     wrong, asked = wrong.unflatten(0, fine.shape[:2]), asked.unflatten(0, fine.shape[:2])
-    # The worst of each cell, its edges included. Cells at which the image does not look are of no use.
+    # The largest error of each cell, its edges included. Cells outside the image are not used.
     worst, seen = (
         torch.nn.functional.max_pool2d(part[None, None], _FINER + 1, _FINER)[0, 0] for part in (wrong, asked.double())
     )
     filled = torch.nn.functional.max_pool2d((~known).double()[None, None], 2 * RINGS + 2, 1)[0, 0] == 0
     usable = (worst <= tolerance) & (seen > 0) & filled
-    # Middles of cells stand for their quarters.
+    # Coverage is counted in quarters of cells.
     spread = usable.repeat_interleave(_FINER, 0).repeat_interleave(_FINER, 1)
     here = asked[:-1, :-1] & asked[1:, 1:] & asked[:-1, 1:] & asked[1:, :-1]
     coverage = float((spread & here).sum() / here.sum().clamp(min=1))

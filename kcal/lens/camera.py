@@ -10,35 +10,44 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, keep_float64, require_finite
+from kcal.checks import Float64Module, as_points, require_finite
 from kcal.errors import InputError
+from kcal.lens.calibration import CameraCalibration, UntilChanged
 from kcal.lens.distortion import distort_components
-from kcal.lens.inverse import Inverse, InverseStart, prepare_inverse, undistort_components
+from kcal.lens.inverse import InverseStart, PreparedInverse, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
-from kcal.lens.outline import area, image_outline
+from kcal.lens.outline import image_outline, polygon_area
 from kcal.lens.plane import plane_from_points, rays_from_plane
 from kcal.lens.projection import INTRINSICS, from_pixels, parameter_names, to_pixels
 from kcal.lens.region import Region, in_region, surely_in_region
 from kcal.lens.residual import Field
-from kcal.lens.tracing import finite_or, in_chunks, is_differentiated, known_true, separate
+from kcal.lens.tracing import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
 
 
-class Camera(nn.Module):
-    """A camera that maps points to pixels (`project`) and pixels to rays (`unproject`).
+class Camera(Float64Module):
+    """Project points to pixels (`project`) and unproject pixels to rays (`unproject`), both with a validity mask.
 
-    Convention: camera frame x right, y down, z forward; pixel (0, 0) is the center of the first pixel; meters.
-    Geometry is float64 whatever `.half()`, `.float()` or the inputs are: lower precision is promoted. Parameters do
-    not require gradients until asked (`camera.free("fx", "k1")`), so that training a network around a camera leaves its
-    calibration alone. Where the lens is valid is measured when the camera is made and when a state is loaded; after
-    changing parameters in any other way, call `update_valid_region()`.
+    Make one from plain numbers with `Camera.build`, or load one with `kcal.load_camera`.
+
+    Convention: camera frame x right, y down, z forward; pixel (0, 0) is the center of the first pixel; meters. All
+    geometry is float64: inputs of lower precision are promoted, and `.half()` or `.float()` do not round the camera.
+
+    The parameters do not require gradients until asked (`camera.free("fx", "k1")`), so that training a network around a
+    camera does not change its calibration. The region where the lens is valid is computed when the camera is made and
+    when a state is loaded. After changing parameters in any other way, call `update_valid_region()`.
+
+    The attribute `calibration` (a `CameraCalibration`) has the name, the error bars and the history of a camera that
+    was calibrated or loaded; `kcal.save_camera` stores it, and projection does not use it. It is None until it is set,
+    and again once a parameter has changed.
 
     Args:
         parameters: (..., 5 + P): fx, fy, cx, cy, skew, then the lens coefficients in the order of `model.names`.
-        size: (width, height) in pixels.
-        model: a `LensModel` or a preset's name, for example `"opencv5"`.
+            Leading dimensions make a batch of cameras.
+        size: (width, height) of the image in pixels.
+        model: a `LensModel` or the name of one, for example `"opencv5"`.
 
     Raises:
-        InputError: wrong shapes, values that are not finite, a focal length or size that is not positive.
+        InputError: a wrong shape, a value that is not finite, or a focal length or size that is not positive.
 
     Example:
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080),
@@ -56,6 +65,7 @@ class Camera(nn.Module):
     valid_radius: Tensor
     valid_edge: Tensor
     inverse_start: Tensor
+    calibration = UntilChanged[CameraCalibration](lambda camera, value: value.check(len(camera.names)))
 
     def __init__(self, parameters: Tensor, *, size: tuple[int, int], model: LensModel | str = "opencv5") -> None:
         super().__init__()
@@ -64,14 +74,14 @@ class Camera(nn.Module):
         parameters = as_points("camera parameters", parameters, 5 + self.model.size)
         require_finite("camera parameters", parameters)
         if not bool((parameters[..., :2] > 0).all()):
-            raise InputError("focal lengths must be positive pixels")
+            raise InputError("camera parameters: focal lengths must be positive, in pixels")
         if min(self.size) < 1:
             raise InputError(f"image size {self.size}: width and height must be positive")
         self.params = nn.Parameter(parameters.detach().clone(), requires_grad=False)
         everything = torch.ones(5 + self.model.size, dtype=torch.bool, device=parameters.device)
         self.register_buffer("free_mask", everything)
-        # Follow from the parameters, so they are no part of the state that is saved.
-        for name, value in self._measure().items():
+        # They follow from the parameters, so they are not part of the saved state.
+        for name, value in self._measured_region().items():
             self.register_buffer(name, value, persistent=False)
 
     @classmethod
@@ -85,23 +95,23 @@ class Camera(nn.Module):
         model: LensModel | str = "opencv5",
         skew: float = 0.0,
     ) -> Self:
-        """A single camera from plain numbers; missing trailing coefficients are zero."""
+        """Make a single camera from plain numbers; coefficients left out at the end are zero."""
         model = LensModel.named(model)
         lens = [float(value) for value in coefficients]
         if len(lens) > model.size:
-            raise InputError(f"{len(lens)} coefficients given, {model} has {model.size}")
+            raise InputError(f"{len(lens)} coefficients given, {model} has {model.size}; choose a model with more")
         lens += [0.0] * (model.size - len(lens))
         values = [*map(float, focal), *map(float, center), float(skew), *lens]
         return cls(torch.tensor(values, dtype=torch.float64), size=size, model=model)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters in storage order."""
+        """Names of the parameters in storage order: fx, fy, cx, cy, skew, then the lens coefficients."""
         return parameter_names(self.model)
 
     @property
     def values(self) -> Tensor:
-        """(..., 5 + P) the parameters, with gradients only to those that are free."""
+        """(..., 5 + P) the parameters; gradients reach only the free ones."""
         if not self.params.requires_grad:
             return self.params
         return torch.where(self.free_mask, self.params, self.params.detach())
@@ -114,13 +124,13 @@ class Camera(nn.Module):
         return tuple(name for name, free in zip(self.names, self.free_mask.tolist(), strict=True) if free)
 
     def free(self, *names: str) -> Self:
-        """Let gradients reach these parameters and no others; without names, all but skew.
+        """Let gradients reach these parameters only; without names, all but skew. Return the camera itself.
 
-        The choice is part of the state (`free_mask`). The frozen parameters get a gradient of exactly zero; weight
-        decay in an optimizer would still move them. `requires_grad_(False)` freezes the camera again.
+        The choice is part of the state (`free_mask`). Frozen parameters get a gradient of exactly zero, but weight
+        decay in an optimizer would still move them. `requires_grad_(False)` freezes the whole camera again.
 
         Raises:
-            InputError: a name that the camera does not have.
+            InputError: an unknown parameter name.
 
         Example:
             >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480)).free("fx", "k1")
@@ -130,7 +140,7 @@ class Camera(nn.Module):
         """
         unknown = [name for name in names if name not in self.names]
         if unknown:
-            raise InputError(f"parameter {unknown[0]!r}: the camera has {', '.join(self.names)}")
+            raise InputError(f"unknown parameter {unknown[0]!r}: the camera has {', '.join(self.names)}")
         chosen = names or tuple(name for name in self.names if name != "skew")
         with torch.no_grad():
             self.free_mask.copy_(torch.tensor([name in chosen for name in self.names]))
@@ -166,32 +176,35 @@ class Camera(nn.Module):
 
     @property
     def field(self) -> Field | None:
-        """What corrects the lens before the intrinsics; None, unless the camera is a `HybridCamera`."""
+        """The residual field between lens and intrinsics of a `HybridCamera`; None for other cameras."""
         return None
 
     def with_parameters(self, parameters: Tensor) -> Camera:
-        """A camera of the same kind, size and model with other parameters; nothing is shared."""
+        """Make a camera of the same kind, size and model with other parameters; no memory is shared."""
         return Camera(parameters, size=self.size, model=self.model)
 
     @property
     def valid_region(self) -> Region:
-        """Where the lens is valid, on the plane z = 1 (for a fisheye, on the plane of angles)."""
+        """The region where the lens is valid, on the plane z = 1 (for a fisheye, on the plane of angles)."""
         return Region(self.valid_radius, self.valid_edge)
 
     def valid_polygon(self) -> Tensor:
-        """The part of the image whose pixels have a ray, as a polygon (V, 2) of pixels; clockwise as one sees it.
+        """The part of the image whose pixels have a ray, as a polygon (V, 2) in pixels, clockwise as seen in the image.
 
-        The whole image of an ordinary camera: its four corners, half a pixel beyond the outermost pixel centers.
-        Where the lens folds inside the image, the fold's outline at 256 directions; empty if no pixel has a ray.
+        For most cameras this is the whole image: four corners, half a pixel beyond the outermost pixel centers. Where
+        the lens folds inside the image, the polygon follows the fold at 256 directions. It is empty if no pixel has a
+        ray.
 
         Raises:
             InputError: a batch of cameras.
         """
         if self.params.ndim != 1:
-            raise InputError(f"one camera has one polygon, this is a batch of {tuple(self.valid_radius.shape)}")
+            raise InputError(
+                f"valid_polygon: a single camera is needed, not a batch of {tuple(self.valid_radius.shape)}"
+            )
         return image_outline(self._to_sensor, self.params.detach(), self.model, self.valid_region, self.size)
 
-    def _measure(self) -> dict[str, Tensor]:
+    def _measured_region(self) -> dict[str, Tensor]:
         with torch.no_grad():
             values = self.params.detach()
             width, height = self.size
@@ -201,8 +214,8 @@ class Camera(nn.Module):
         return {"valid_radius": ready.region.radius, "valid_edge": ready.region.edge, "inverse_start": ready.start}
 
     def update_valid_region(self) -> None:
-        """Measure the valid region again; call it after changing parameters in place."""
-        for name, value in self._measure().items():
+        """Compute the valid region again; call this after changing parameters in place."""
+        for name, value in self._measured_region().items():
             setattr(self, name, value)
 
     def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
@@ -212,9 +225,12 @@ class Camera(nn.Module):
             points_cam: (..., N, 3) in the camera frame.
 
         Returns:
-            pixels (..., N, 2) and valid (..., N): in front of the camera (for a fisheye: within its monotone angle),
-            finite, and before the lens model folds. Whether the pixel lies inside the image is another question
-            (`inside`). Pixels that are not valid hold the principal point.
+            pixels (..., N, 2) and valid (..., N). Valid points are finite, in front of the camera (for a fisheye:
+            within its monotone angle), and not beyond a fold of the lens model. They need not lie inside the image;
+            `inside` tells that. Pixels that are not valid are set to the principal point.
+
+        Raises:
+            InputError: a wrong shape or an integer dtype.
         """
         points = as_points("points_cam", points_cam, 3)
         values = self.values
@@ -223,13 +239,13 @@ class Camera(nn.Module):
         differentiated = is_differentiated(points, values)
 
         def one(points: Tensor) -> tuple[Tensor, Tensor]:
-            X, Y, Z = separate(points)
+            X, Y, Z = split_coordinates(points)
             x, y = plane_from_points(X, Y, Z, self.model)
             with torch.no_grad():
-                valid, settled = self._may_see(x, y, Z)
+                valid, settled = self._possibly_valid(x, y, Z)
                 all_valid = known_true(valid)
             if not all_valid:
-                # The axis is a harmless stand-in: no NaN in values or gradients.
+                # The axis as a stand-in keeps NaN out of values and gradients.
                 X, Y, Z = torch.where(valid, X, 0.0), torch.where(valid, Y, 0.0), torch.where(valid, Z, 1.0)
                 x, y = plane_from_points(X, Y, Z, self.model)
             lens = distort_components(x, y, coefficients, self.model, slopes=not (settled or differentiated))
@@ -242,9 +258,9 @@ class Camera(nn.Module):
 
         return self._in_chunks(one, points)
 
-    def _may_see(self, x: Tensor, y: Tensor, Z: Tensor) -> tuple[Tensor, bool]:
-        """Where points are usable and within the outline of the valid region, and whether that settles it."""
-        # A point infinitely far ahead would land on the axis.
+    def _possibly_valid(self, x: Tensor, y: Tensor, Z: Tensor) -> tuple[Tensor, bool]:
+        """Points that are usable and within the outline of the valid region; whether that settles their validity."""
+        # A point infinitely far ahead would be projected to the axis.
         usable = Z.abs() < torch.inf
         if not self.model.fisheye:
             usable = usable & (Z > 0)
@@ -256,11 +272,11 @@ class Camera(nn.Module):
         return usable & self.valid_region.encloses(x, y), False
 
     def _to_sensor(self, x: Tensor, y: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Distorted coordinates (..., N) to pixels; a camera that corrects its lens does so here."""
+        """Map distorted coordinates (..., N) to pixels; a hybrid camera applies its field here."""
         return to_pixels(x, y, values)
 
     def _from_sensor(self, u: Tensor, v: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """The inverse, and (..., N) whether it was found; None: always."""
+        """The inverse of `_to_sensor`, and a mask (..., N) of where it was found; None: everywhere."""
         return *from_pixels(u, v, values), None
 
     def _in_chunks(self, function: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor) -> tuple[Tensor, Tensor]:
@@ -268,21 +284,24 @@ class Camera(nn.Module):
         return in_chunks(function, points, self.valid_radius.numel(), differentiated=differentiated)
 
     def _to_plane(self, pixels: Tensor, start: InverseStart | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Pixels (..., N, 2) to x, y on the plane of the lens, and valid; every one is (..., N)."""
+        """Map pixels (..., N, 2) to x, y on the plane of the lens, and valid; each is (..., N)."""
         values = self.values
         cx, cy = values[..., 2, None], values[..., 3, None]
-        u, v = separate(pixels)
+        u, v = split_coordinates(pixels)
         u, v, finite = finite_or(u, v, cx, cy)
         x, y, settled = self._from_sensor(u, v, values)
         usable = finite if settled is None else finite & settled
-        ready = Inverse(self.valid_region, self.inverse_start, start)
+        ready = PreparedInverse(self.valid_region, self.inverse_start, start)
         return undistort_components(x, y, usable, values[..., 5:], self.model, ready)
 
     def normalize(self, pixels: Tensor, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
-        """Map pixels to undistorted coordinates on the plane z = 1: (normalized (..., N, 2), valid (..., N)).
+        """Map pixels (..., N, 2) to undistorted coordinates (..., N, 2) on the plane z = 1, and valid (..., N).
 
-        Pixels of a fisheye that look 89° or more off axis have no such coordinates and are not valid. `start` as in
-        `unproject`.
+        Pixels of a fisheye that look 89° or more off axis have no such coordinates and are not valid. `start` is that
+        of `unproject`.
+
+        Raises:
+            InputError: a wrong shape or an integer dtype.
         """
         pixels = as_points("pixels", pixels, 2)
 
@@ -301,13 +320,16 @@ class Camera(nn.Module):
 
         Args:
             pixels: (..., N, 2); any real position, also outside the image.
-            start: where Newton's method begins, instead of the start in closed form (`InverseNet.guess`). It decides
-                about time only, never about rays and mask.
+            start: initial guess of Newton's method in place of the closed form, for example `InverseNet.guess`. It
+                affects run time only, not the result.
 
         Returns:
-            rays (..., N, 3) of length one, and valid (..., N). A pixel that the lens model cannot have produced, or
-            that is not finite, is not valid, and its ray is the optical axis. Gradients by pixels and parameters
-            follow the implicit function theorem.
+            rays (..., N, 3) of length one, and valid (..., N). A pixel that is not finite or that the lens model cannot
+            produce is not valid, and its ray is the optical axis. Gradients by pixels and parameters follow the
+            implicit function theorem.
+
+        Raises:
+            InputError: a wrong shape or an integer dtype.
         """
         pixels = as_points("pixels", pixels, 2)
 
@@ -318,14 +340,14 @@ class Camera(nn.Module):
         return self._in_chunks(one, pixels)
 
     def inside(self, pixels: Tensor) -> Tensor:
-        """Whether pixels (..., N, 2) lie on the image, whose edges are half a pixel beyond the outer centers."""
+        """Whether pixels (..., N, 2) lie in the image, whose edges are half a pixel beyond the outer pixel centers."""
         pixels = as_points("pixels", pixels, 2)
         width, height = self.size
         u, v = pixels.unbind(-1)
         return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
 
     def grid(self, columns: int, rows: int) -> Tensor:
-        """Pixels (rows, columns, 2) spread evenly over the image, its outermost pixels included."""
+        """Pixels (rows, columns, 2) spread evenly over the image, including its outermost pixels."""
         width, height = self.size
         kind, place = torch.float64, self.params.device
         u = torch.linspace(0, width - 1, columns, dtype=kind, device=place)
@@ -333,7 +355,7 @@ class Camera(nn.Module):
         return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
 
     def covers_image(self) -> Tensor:
-        """(...) whether every pixel of the image has a ray, judged along its border."""
+        """Whether every pixel of the image has a ray, (...); checked along the border of the image."""
         grid = self.grid(17, 13)
         border = torch.cat([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
         _, valid = self.unproject(border)
@@ -348,12 +370,9 @@ class Camera(nn.Module):
         text = f"model={self.model}, size={self.size}, focal={self.focal.tolist()}"
         if self.params.ndim > 1:
             return text
-        share = area(self.valid_polygon()) / (self.size[0] * self.size[1])
+        share = polygon_area(self.valid_polygon()) / (self.size[0] * self.size[1])
         return f"{text}, valid={'whole image' if share > 1 - 1e-9 else f'{share:.1%} of the image'}"
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
         self.update_valid_region()
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
-        return super()._apply(keep_float64(fn), recurse)

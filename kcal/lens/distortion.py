@@ -1,4 +1,4 @@
-"""The distortion of Eq. 4 and Eq. 10 with its closed-form derivatives, for any orders.
+"""Compute the distortion of Eq. 4 and Eq. 10, for any orders, with closed-form derivatives.
 
 Convention: `normalized` points are (x, y) on the plane z = 1 of the camera, y down. The terms apply in this order:
 
@@ -10,10 +10,9 @@ Convention: `normalized` points are (x, y) on the plane z = 1 of the camera, y d
 
 The last two lines are OpenCV's tilted-sensor homography multiplied out. Sources: the paper's Eq. 4 and 10; OpenCV's
 camera-calibration documentation for the tilt. A fisheye uses g alone, on points whose distance from the origin is the
-angle from the axis (`kcal.lens.plane`); that is the model of Kannala and Brandt (2006) as `cv2.fisheye` writes it.
+angle from the axis (`kcal.lens.plane`): the model of Kannala and Brandt (2006) in the form of `cv2.fisheye`.
 
-Inside, coordinates are separate tensors (..., N): these loops are bound by memory, and this layout touches each number
-once.
+Coordinates are separate tensors (..., N), because these loops are bound by memory and so touch each number once.
 """
 
 from __future__ import annotations
@@ -28,39 +27,37 @@ from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.model import LensModel
 
-Pair = tuple[Tensor, Tensor]
-
 
 class Distorted(NamedTuple):
     """Distorted coordinates with what validity and derivatives need; every tensor is (..., N).
 
-    `point` holds ∂x/∂x, ∂x/∂y, ∂y/∂x, ∂y/∂y, or nothing if they were not asked for; `positive` is true where both
-    the radial denominator and the tilt's w are positive, that is, before any pole.
+    `point` is the Jacobian ∂x/∂x, ∂x/∂y, ∂y/∂x, ∂y/∂y, or () if it was not asked for. `positive` is true before any
+    pole: where both the radial denominator and the tilt's w are positive.
     """
 
     x: Tensor
     y: Tensor
     point: tuple[Tensor, ...]
-    coefficients: list[Pair]
+    coefficients: list[tuple[Tensor, Tensor]]
     positive: Tensor
 
     @property
     def determinant(self) -> Tensor:
-        """Of the derivative by the point: positive before the lens folds."""
+        """Determinant of the Jacobian: positive before the lens folds."""
         a, b, d, e = self.point
         return torch.addcmul(a * e, b, d, value=-1.0)
 
 
 def unbind_last(values: Tensor) -> tuple[Tensor, ...]:
-    """The last dimension of (..., P) as P tensors that broadcast against (..., N).
+    """Split the last dimension of (..., P) into P tensors that broadcast against (..., N).
 
-    A single vector gives scalars without a dimension, which elementwise kernels take as constants.
+    A single vector gives scalars without dimensions, which elementwise kernels take as constants.
     """
     return (values if values.ndim == 1 else values.unsqueeze(-2)).unbind(-1)
 
 
 def polynomial(s: Tensor, coefficients: Sequence[Tensor], constant: float, slopes: bool) -> tuple[Tensor, Tensor]:
-    """Horner: constant + c1 s + c2 s² + ... and its derivative by s, which is zero if it is not asked for."""
+    """Evaluate constant + c1 s + c2 s² + ... by Horner's rule; its derivative by s is zero unless asked for."""
     if not coefficients:
         return torch.full_like(s, constant), torch.zeros_like(s)
     value, *rest = reversed(coefficients)
@@ -73,13 +70,6 @@ def polynomial(s: Tensor, coefficients: Sequence[Tensor], constant: float, slope
     return constant + value * s, torch.addcmul(value, slope, s) if slopes else slope
 
 
-def _powers(s: Tensor, count: int) -> list[Tensor]:
-    powers = [s]
-    while len(powers) < count:
-        powers.append(powers[-1] * s)
-    return powers
-
-
 def distort_components(
     x: Tensor,
     y: Tensor,
@@ -89,15 +79,15 @@ def distort_components(
     *,
     slopes: bool = True,
 ) -> Distorted:
-    """Distort separate coordinates x, y (..., N); `wanted` lists the coefficients whose derivatives are needed.
+    """Distort separate coordinates x, y (..., N), with the derivatives that are asked for.
 
     Args:
         x: (..., N) coordinates on the plane z = 1; for a fisheye, on the plane of angles.
-        y: likewise.
+        y: (..., N).
         coefficients: (..., P) in the order of `model.names`, broadcast against the leading shape of x.
-        model: which terms there are.
-        wanted: indices into the P coefficients, for `Distorted.coefficients`, in that order.
-        slopes: whether `Distorted.point` is needed; without it a third of the work is saved.
+        model: the lens model.
+        wanted: indices of the coefficients by which `Distorted.coefficients` are derivatives, in that order.
+        slopes: whether `Distorted.point` is needed; leaving it out saves a third of the work.
     """
     c = unbind_last(coefficients)
     xx, xy, yy = x * x, x * y, y * y
@@ -138,7 +128,7 @@ def distort_components(
             a, e = torch.add(a + shear, p2x, alpha=4.0), torch.add(e + shear, p1y, alpha=4.0)
             point = (a, b + turn, d + turn, e)
 
-    columns = _columns(x, y, s, xx, xy, yy, g, inverse, model, wanted)
+    columns = _coefficient_columns(x, y, s, xx, xy, yy, g, inverse, model, wanted)
     if not model.tilt:
         return Distorted(u, v, point, [pair for pair in columns if pair is not None], positive)
 
@@ -173,7 +163,7 @@ def distort_components(
     return Distorted(x_tilted, y_tilted, point, tilted, positive & (w > 0))
 
 
-def _columns(
+def _coefficient_columns(
     x: Tensor,
     y: Tensor,
     s: Tensor,
@@ -184,14 +174,16 @@ def _columns(
     inverse: Tensor,
     model: LensModel,
     wanted: Sequence[int],
-) -> list[Pair | None]:
-    """Derivatives before the tilt by the wanted coefficients; None stands for a tilt angle."""
+) -> list[tuple[Tensor, Tensor] | None]:
+    """Derivatives by the wanted coefficients, before the tilt; None stands for a tilt angle."""
     if not wanted:
         return []
-    powers = _powers(s, max(model.numerator, model.denominator, model.prism))
+    powers = [s]
+    while len(powers) < max(model.numerator, model.denominator, model.prism):
+        powers.append(powers[-1] * s)
     zero = torch.zeros_like(s)
     x_radial, y_radial = x * inverse, y * inverse
-    table: dict[int, Pair] = {}
+    table: dict[int, tuple[Tensor, Tensor]] = {}
     for j, i in enumerate(model.numerator_index):
         if i in wanted:
             table[i] = (x_radial * powers[j], y_radial * powers[j])
@@ -210,7 +202,7 @@ def _columns(
 
 
 def check_coefficients(coefficients: Tensor, model: LensModel) -> Tensor:
-    """Return the coefficients as float64 (..., P) after checking that P fits the model."""
+    """Return the coefficients as float64 (..., P), after checking that P fits the model."""
     coefficients = torch.as_tensor(coefficients)
     if coefficients.ndim < 1 or coefficients.shape[-1] != model.size:
         raise InputError(
@@ -225,14 +217,14 @@ def distort(normalized: Tensor, coefficients: Tensor, model: LensModel | str) ->
     Args:
         normalized: (..., N, 2) undistorted coordinates; for a fisheye, angles from the axis along x and y.
         coefficients: (..., P) in the order of `model.names`.
-        model: a `LensModel` or a preset's name.
+        model: a `LensModel` or the name of one.
 
     Returns:
-        (..., N, 2) distorted coordinates, float64. Beyond a pole or fold the numbers mean nothing;
-        `Camera.project` flags such points.
+        (..., N, 2) distorted coordinates, float64. They are meaningless beyond a pole or fold; `Camera.project` flags
+        such points.
 
     Raises:
-        InputError: wrong shapes or an integer dtype.
+        InputError: a wrong shape or an integer dtype.
 
     Example:
         >>> point = torch.tensor([[0.5, 0.0]], dtype=torch.float64)
@@ -246,27 +238,3 @@ def distort(normalized: Tensor, coefficients: Tensor, model: LensModel | str) ->
         normalized[..., 0], normalized[..., 1], check_coefficients(coefficients, model), model, slopes=False
     )
     return torch.stack([lens.x, lens.y], -1)
-
-
-def distort_with_jacobian(
-    normalized: Tensor, coefficients: Tensor, model: LensModel | str
-) -> tuple[Tensor, Tensor, Tensor]:
-    """As `distort`, with its Jacobians in closed form.
-
-    Returns:
-        distorted (..., N, 2); its derivative by the point (..., N, 2, 2); by the coefficients (..., N, 2, P).
-    """
-    model = LensModel.named(model)
-    normalized = as_points("normalized", normalized, 2)
-    coefficients = check_coefficients(coefficients, model)
-    result = distort_components(normalized[..., 0], normalized[..., 1], coefficients, model, range(model.size))
-    a, b, d, e = result.point
-    by_point = torch.stack([torch.stack([a, b], -1), torch.stack([d, e], -1)], -2)
-    if result.coefficients:
-        shape = result.x.shape
-        by_coefficients = torch.stack(
-            [torch.stack([u.expand(shape), v.expand(shape)], -1) for u, v in result.coefficients], -1
-        )
-    else:
-        by_coefficients = result.x.new_zeros((*result.x.shape, 2, 0))
-    return torch.stack([result.x, result.y], -1), by_point, by_coefficients

@@ -1,4 +1,4 @@
-"""`HybridCamera`: a parametric camera whose lens is corrected by a small learned field."""
+"""`HybridCamera`: a parametric camera whose lens is corrected by a small smooth field."""
 
 from __future__ import annotations
 
@@ -15,29 +15,28 @@ from kcal.lens.model import LensModel
 from kcal.lens.projection import from_pixels, to_pixels
 from kcal.lens.residual import Field, FieldGrid, FieldResidual, correct_components, undo_components
 
-# The name by which `HybridCamera.free` knows the field's weights.
+# The name of the field's weights in `HybridCamera.free`.
 WEIGHTS = "weights"
 
 
 class HybridCamera(Camera):
     """A camera with a residual field between its lens and its intrinsics (`kcal.lens.residual`).
 
-    It goes wherever a `Camera` goes, with the same contract: `project` and `unproject` with validity, exact round
-    trips, and gradients by the implicit function theorem to pixels, parameters and weights alike. The inverse has two
-    stages, first the field's (always possible), then the lens's; so the valid region is that of the lens. One camera,
-    no batch of them; `vmap` maps over several.
+    It can be used wherever a `Camera` can: `project` and `unproject` have the same masks and exact round trips, and
+    gradients also reach the field's weights. The field can be undone everywhere, so the valid region is that of the
+    lens. It is a single camera; use `vmap` for several.
 
-    Its parameters mean nothing without its field: `params` alone is not the camera. Formats that know no
-    field refuse it.
+    `params` alone do not describe this camera, because they were fitted together with the field. Writing it to a format
+    without fields is therefore an error.
 
     Args:
         parameters: (5 + P,) as for `Camera`.
-        size: (width, height) in pixels.
-        model: a `LensModel` or a preset's name.
-        residual: the field; none: nothing is corrected.
+        size: (width, height) of the image in pixels.
+        model: a `LensModel` or the name of one.
+        residual: the field; not given: an empty one, which corrects nothing.
 
     Raises:
-        InputError: as `Camera`; a batch of cameras; a field that is no small correction.
+        InputError: as for `Camera`; a batch of cameras; a field whose slope is too steep.
 
     Example:
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.1])
@@ -63,26 +62,28 @@ class HybridCamera(Camera):
     ) -> None:
         super().__init__(parameters, size=size, model=model)
         if self.params.ndim != 1:
-            raise InputError(f"HybridCamera: one camera, not a batch of {tuple(self.valid_radius.shape)}")
+            raise InputError(
+                f"HybridCamera: a single camera is needed, not a batch of {tuple(self.valid_radius.shape)}"
+            )
         self.residual = residual or FieldResidual(FieldGrid())
 
     @classmethod
     def of(cls, camera: Camera, residual: FieldResidual) -> Self:
-        """A camera whose lens is followed by a field."""
+        """Add a field to a camera."""
         return cls(camera.params, size=camera.size, model=camera.model, residual=residual)
 
     @property
     def parametric(self) -> Camera:
-        """The camera without its field. It is another camera: nothing was fitted with these parameters alone."""
+        """The camera without its field. It fits no data: the parameters were fitted together with the field."""
         return Camera(self.params, size=self.size, model=self.model)
 
     @property
     def field(self) -> Field | None:
-        """Units and weights, for the functions of `kcal.lens.projection`."""
+        """The residual field, as `kcal.lens.projection.project_components` takes it."""
         return self.residual.field
 
     def with_parameters(self, parameters: Tensor) -> HybridCamera:
-        """The same field behind a lens with other parameters; nothing is shared."""
+        """Make a camera with the same field and other parameters; no memory is shared."""
         residual = FieldResidual(self.residual.grid, self.residual.weights)
         return HybridCamera(parameters, size=self.size, model=self.model, residual=residual)
 
@@ -95,7 +96,7 @@ class HybridCamera(Camera):
 
     @property
     def free_names(self) -> tuple[str, ...]:
-        """As `Camera.free_names`; the field's weights together are called "weights"."""
+        """As `Camera.free_names`; "weights" stands for all weights of the field."""
         return super().free_names + (WEIGHTS,) * self.residual.weights.requires_grad
 
     def free(self, *names: str) -> Self:
@@ -108,12 +109,12 @@ class HybridCamera(Camera):
         return self
 
     def update_valid_region(self) -> None:
-        """Measure the valid region again, and check the field; call it after changing parameters or weights."""
+        """Compute the valid region again and check the field; call this after changing parameters or weights."""
         super().update_valid_region()
         self.residual.check()
 
     def correction(self, pixels: Tensor) -> Tensor:
-        """By how many pixels (..., N, 2) the field moves what is seen at pixels (..., N, 2)."""
+        """Displacement (..., N, 2) in pixels that the field causes at pixels (..., N, 2)."""
         values = self.params.detach()
         u, v = as_points("pixels", pixels, 2).unbind(-1)
         x, y, _ = self._from_sensor(u, v, values)

@@ -1,9 +1,9 @@
-"""Images without distortion: where each new pixel looks in the source image, and a module that resamples.
+"""Undistort images: compute the source position of each new pixel, and resample.
 
-A pixel of the new image is a direction, and the lens says where that direction was imaged: only the forward model is
-needed. Positions are computed in float64. Sampling runs in the image's own precision, for which normalized positions
-are rounded once: in float32 that moves a sample by less than W * 1.2e-7 px (0.0003 px at 1920 columns), in float64 not
-at all. float16 and bfloat16 images are sampled in float32, because their 8 to 11 bits cannot hold a position.
+Each pixel of the new image is a ray, and the source camera projects it. Positions are computed in float64. Sampling
+runs in the image's own precision, to which positions are rounded once: in float32 that moves a sample by less than
+W * 1.2e-7 px (0.0003 px at 1920 columns). float16 and bfloat16 images are sampled in float32, because 8 to 11 bits are
+too few for a position.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-# Where positions without a source are sent: far outside, so that the sampler's border value (black) is taken, never
-# a plausible pixel.
+# Position of pixels without a source: far outside, so that the sampler returns its border value (black) and never a
+# plausible pixel.
 NOWHERE = -1e4
-# Pixels a band: the lens's temporary values stay small, whatever the image.
+# Pixels computed at a time, so that temporary values stay small for any image.
 _BAND = 1 << 18
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _INTEGERS = (torch.uint8, torch.uint16)
 
 
 class UndistortMaps(NamedTuple):
-    """Source positions for `cv2.remap` (float32) and where they mean something; each (H, W) of the new image."""
+    """Source positions for `cv2.remap` (float32), and a mask of the pixels that have one; each (H, W)."""
 
     map_x: NDArray[np.float32]
     map_y: NDArray[np.float32]
@@ -42,20 +42,21 @@ class UndistortMaps(NamedTuple):
 
 
 def undistort_maps(camera: Camera, new_camera: Camera | None = None) -> UndistortMaps:
-    """Maps for `cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR)`.
+    """Compute maps for `cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR)`.
 
     Convention: new pixel (column x, row y) takes the source's value at (map_x[y, x], map_y[y, x]); whole numbers are
-    centers of pixels. The mask is False, and both maps are -10000, where the source shows nothing: outside the centers
-    of its outer pixels, or beyond the fold of the lens. With OpenCV's default border those pixels become black.
+    pixel centers. Where the source shows nothing, the mask is False and both maps are -10000, so that OpenCV's default
+    border makes the pixel black. That is outside the centers of the source's outer pixels, and beyond a fold of its
+    lens.
 
     Args:
-        camera: the camera that took the image, a single one.
-        new_camera: the camera of the new image; `new_pinhole(camera)` if not given. Any camera serves: with a lens of
-            its own, the new image is distorted as that lens would.
+        camera: the single camera that took the image.
+        new_camera: the camera of the new image, by default `new_pinhole(camera)`. If it has a lens, the new image is
+            distorted by that lens.
 
     Returns:
-        map_x, map_y (float32) and mask (bool) as numpy arrays (H, W) of the new image's size. float32 holds positions
-        to 1e-4 px at 1920 columns.
+        map_x, map_y (float32) and mask (bool) as NumPy arrays (H, W) of the new image's size. Rounding to float32
+        moves positions by up to 1e-4 px at 1920 columns.
 
     Raises:
         InputError: a batch of cameras, or an image less than two pixels wide or high.
@@ -70,7 +71,7 @@ def undistort_maps(camera: Camera, new_camera: Camera | None = None) -> Undistor
     with torch.no_grad():
         pixels, mask = _source_positions(camera, new_camera or new_pinhole(camera))
     if mask.ndim != 2:
-        raise InputError(f"undistort_maps: a single camera is needed, got a batch of shape {tuple(mask.shape[:-2])}")
+        raise InputError(f"undistort_maps: a single camera is needed, not a batch of {tuple(mask.shape[:-2])}")
     map_x, map_y = pixels.to("cpu", torch.float32).unbind(-1)
     return UndistortMaps(map_x.contiguous().numpy(), map_y.contiguous().numpy(), mask.cpu().numpy())
 
@@ -78,20 +79,20 @@ def undistort_maps(camera: Camera, new_camera: Camera | None = None) -> Undistor
 class Undistort(nn.Module):
     """Resample images as another camera, usually a pinhole, would have taken them.
 
-    Bilinear, by kornia's `remap` with `align_corners=True`: integer coordinates are centers of pixels, and nothing is
-    stretched. Where the source shows nothing the image is 0 and the mask False (see `undistort_maps`).
+    Sampling is bilinear, by kornia's `remap` with `align_corners=True`: integer coordinates are pixel centers. Where
+    the source shows nothing, the image is 0 and the mask False (see `undistort_maps`).
 
-    The maps are computed once and kept, for one precision at a time; they follow when a camera's parameters are
-    changed or loaded. While a camera requires gradients, they are computed anew at each call, and
-    gradients flow to its parameters too. The new camera stays as it is when the old one changes.
+    The maps are computed once and kept, for one precision at a time. They are updated when the parameters of a camera
+    change. While a camera requires gradients, they are computed at each call, and gradients also reach its parameters.
+    The new camera does not change with the old one.
 
     Args:
         camera: the camera that took the images, or a batch of cameras.
-        new_camera: the camera of the new images, single or a batch; `new_pinhole(camera)` if not given, so that every
+        new_camera: the camera of the new images, single or a batch. By default `new_pinhole(camera)`, for which every
             new pixel is valid.
 
     Raises:
-        InputError: an image less than two pixels wide or high, or batches that do not fit.
+        InputError: an image less than two pixels wide or high, or batches of cameras that do not broadcast.
         DegenerateError: see `new_pinhole`.
 
     Example:
@@ -105,7 +106,7 @@ class Undistort(nn.Module):
     grid_x: Tensor
     grid_y: Tensor
     mask: Tensor
-    _made_for: Tensor
+    _made_from: Tensor
 
     def __init__(self, camera: Camera, new_camera: Camera | None = None) -> None:
         super().__init__()
@@ -113,21 +114,21 @@ class Undistort(nn.Module):
         self.new_camera = new_pinhole(camera) if new_camera is None else new_camera
         for name, value in zip(("grid_x", "grid_y", "mask"), self._grid(torch.float32), strict=True):
             self.register_buffer(name, value.detach(), persistent=False)
-        self.register_buffer("_made_for", self._state(), persistent=False)
+        self.register_buffer("_made_from", self._camera_values(), persistent=False)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Undistort images.
 
         Args:
-            image: (..., C, H, W) of the camera's size. Floating point of any precision, or uint8 or uint16, which are
-                sampled in float32 and rounded to the nearest level. Leading dimensions are broadcast against those of
-                a batch of cameras.
+            image: (..., C, H, W) of the camera's size: floating point of any precision, or uint8 or uint16, which are
+                sampled in float32 and rounded to the nearest level. Leading dimensions broadcast against those of a
+                batch of cameras.
 
         Returns:
-            image (..., C, H', W') with the dtype of the input, and mask (..., H', W').
+            image (..., C, H', W') of the same dtype, and mask (..., H', W').
 
         Raises:
-            InputError: no tensor, another dtype, size or device, or leading dimensions that do not fit the cameras'.
+            InputError: not a tensor, a wrong dtype, size or device, or leading dimensions that do not fit the cameras.
         """
         self._check(image)
         precision = image.dtype if image.dtype in (torch.float32, torch.float64) else torch.float32
@@ -160,8 +161,8 @@ class Undistort(nn.Module):
         if image.device != self.mask.device:
             raise InputError(f"image is on {image.device}, the module on {self.mask.device}; move one with .to()")
 
-    def _state(self) -> Tensor:
-        """All that the maps depend on, to notice when it changes."""
+    def _camera_values(self) -> Tensor:
+        """All values that the maps depend on, to notice when they change."""
         parts = [
             part for camera in (self.camera, self.new_camera) for part in (*camera.parameters(), *camera.buffers())
         ]
@@ -173,15 +174,17 @@ class Undistort(nn.Module):
         compiling = torch.compiler.is_compiling()
         if live or (compiling and self.grid_x.dtype != precision):
             return self._grid(precision)
-        # What is compiled or exported is a snapshot: a comparison of values would break its graph. Here it costs some
-        # microseconds, and a stale map would be a wrong image.
-        if not compiling and (self.grid_x.dtype != precision or not torch.equal(self._made_for, self._state())):
+        # Compiled and exported graphs keep their maps, because comparing values would break the graph. In an eager call
+        # the comparison takes some microseconds, and a stale map would give a wrong image.
+        if not compiling and (
+            self.grid_x.dtype != precision or not torch.equal(self._made_from, self._camera_values())
+        ):
             self.grid_x, self.grid_y, self.mask = self._grid(precision)
-            self._made_for = self._state()
+            self._made_from = self._camera_values()
         return self.grid_x, self.grid_y, self.mask
 
     def _grid(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions as `grid_sample` wants them, -1 and 1 at the centers of the outer pixels, rounded once."""
+        """Positions for `grid_sample`, -1 and 1 at the centers of the outer pixels, rounded once."""
         pixels, mask = _source_positions(self.camera, self.new_camera)
         last = torch.tensor(self.camera.size, dtype=pixels.dtype, device=pixels.device) - 1
         x, y = (2 * pixels / last - 1).to(precision).unbind(-1)
@@ -189,7 +192,7 @@ class Undistort(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         def moved(tensor: Tensor) -> Tensor:
-            """Buffers change their device, never their precision: `.half()` would move samples by half a pixel."""
+            """Buffers keep their precision: `.half()` would move samples by half a pixel."""
             result = fn(tensor)
             return tensor.to(result.device) if result.dtype != tensor.dtype else result
 

@@ -1,9 +1,9 @@
-"""Where Newton's method starts: the radial part of a lens undone by a short polynomial.
+"""Give Newton's method a start: undo the radial part of a lens by a short polynomial, and the tilt in closed form.
 
-For a lens with radial terms only, the undistorted radius is a function of the distorted one. Its ratio is fitted, once
-a lens, as a polynomial in √(1 - r_D² / D²), where D is the largest distorted radius: at a fold the inverse behaves as a
-square root, so that this variable makes it smooth there too. Within the image the polynomial is good to 1e-5 or better
-for ordinary lenses; what tangential and prism terms add is left to Newton, and the tilt is undone in closed form.
+For a lens with radial terms only, the undistorted radius is a function of the distorted one. Their ratio is fitted
+once per lens by a polynomial in √(1 - r_D² / D²), where D is the largest distorted radius. In this variable the inverse
+is smooth also at a fold, where it behaves as a square root. Within the image the polynomial is accurate to 1e-5 or
+better for ordinary lenses. Newton's method does the rest, tangential and prism terms included.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from torch import Tensor
 
 from kcal.lens.distortion import distort_components, polynomial, unbind_last
 from kcal.lens.model import LensModel
-from kcal.lens.region import first_limits
+from kcal.lens.region import direction_limits
 
-DEGREE = 11
+_DEGREE = 11
 _NODES = 96
-# Distorted radii that the polynomial is made for, unless a camera knows its own: 56° through a pinhole.
-DEFAULT_REACH = 1.5
+# Largest distorted radius for a lens without a camera: 56° through a pinhole.
+_DEFAULT_REACH = 1.5
 
 
 @torch.no_grad()
-def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = DEFAULT_REACH) -> Tensor:
-    """The polynomial of `start_from`.
+def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = _DEFAULT_REACH) -> Tensor:
+    """Fit the polynomial of `start_from`.
 
     Args:
         coefficients: (..., P).
         model: the lens model.
-        reach: (...) or a number: the largest distorted radius that will be asked for.
+        reach: (...) the largest distorted radius that will be asked for.
 
     Returns:
         (..., 1 + 12): D², then the coefficients by rising powers of 2 √(1 - r_D² / D²) - 1.
@@ -36,7 +36,7 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = DE
     radial = LensModel(numerator=model.numerator, denominator=model.denominator, fisheye=model.fisheye)
     chosen = [model.names.index(name) for name in radial.names]
     own = coefficients[..., chosen]
-    limit = first_limits(own, radial, 1)
+    limit = direction_limits(own, radial, 1)
 
     def distorted(radius: Tensor) -> Tensor:
         return distort_components(radius, torch.zeros_like(radius), own, radial, slopes=False).x
@@ -48,16 +48,16 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = DE
         middle = 0.5 * (low + high)
         beyond = distorted(middle) > 1.1 * wanted
         low, high = torch.where(beyond, low, middle), torch.where(beyond, middle, high)
-    # Evenly in angle: of a wide lens, equal steps on the plane would nearly all lie at its rim.
+    # Evenly in angle: for a wide lens, equal steps on the plane would nearly all lie at its edge.
     steps = torch.linspace(1.0 / _NODES, 1.0, _NODES, dtype=torch.float64, device=own.device)
     radius = high * steps if model.fisheye else torch.tan(torch.atan(high) * steps)
     values = distorted(radius)
     largest = values[..., -1:] ** 2
     variable = 2.0 * torch.sqrt(torch.clamp(1.0 - values * values / largest, min=0.0)) - 1.0
-    powers = variable[..., None] ** torch.arange(DEGREE + 1, device=own.device)
-    # A lens without any valid disc gives no equations; the ratio one starts as well as any.
+    powers = variable[..., None] ** torch.arange(_DEGREE + 1, device=own.device)
+    # A lens without any valid disc gives no equations; any ratio will do.
     usable = torch.isfinite(powers).all(-1).all(-1) & (largest[..., 0] > 0)
-    plain = torch.zeros(DEGREE + 1, dtype=torch.float64, device=own.device)
+    plain = torch.zeros(_DEGREE + 1, dtype=torch.float64, device=own.device)
     plain[0] = 1.0
     powers = torch.where(usable[..., None, None], powers, 0.0)
     ratio = torch.where(usable[..., None], radius / values, 0.0)
@@ -67,7 +67,7 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = DE
 
 
 def start_from(x: Tensor, y: Tensor, model: LensModel, start: Tensor) -> tuple[Tensor, Tensor]:
-    """A first guess of the undistorted coordinates for distorted ones (..., N) whose tilt is undone."""
+    """Guess the undistorted coordinates for distorted ones (..., N) whose tilt is undone."""
     if not (model.numerator or model.denominator):
         return x, y
     largest, constant, *rest = unbind_last(start)
@@ -78,9 +78,7 @@ def start_from(x: Tensor, y: Tensor, model: LensModel, start: Tensor) -> tuple[T
     return x * ratio, y * ratio
 
 
-def without_tilt(
-    x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel
-) -> tuple[Tensor, Tensor, Tensor, LensModel]:
+def undo_tilt(x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel) -> tuple[Tensor, Tensor, Tensor, LensModel]:
     """Undo the tilt of distorted coordinates (..., N) in closed form: x, y, and the lens that remains."""
     if not model.tilt:
         return x, y, coefficients, model

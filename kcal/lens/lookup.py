@@ -1,14 +1,11 @@
-"""`LookupCamera`: a camera that has become two tables, for consumers that know no lens formulas and no nets."""
+"""`LookupCamera`: a camera as two tables, for programs that know neither lens formulas nor networks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcal.checks import as_points, keep_float64
+from kcal.checks import Float64Module, as_points
 from kcal.errors import InputError
 from kcal.lens.spline import Spline, evaluate_spline
 from kcal.lens.tracing import finite_or, in_chunks, is_differentiated
@@ -16,26 +13,25 @@ from kcal.lens.tracing import finite_or, in_chunks, is_differentiated
 _PARTS = Spline._fields
 
 
-class LookupCamera(nn.Module):
-    """A camera as bicubic tables of both directions; made by `kcal.lens.bake.bake`.
+class LookupCamera(Float64Module):
+    """A camera as bicubic tables of both directions, made by `bake`.
 
-    Convention: as `Camera` (x right, y down, z forward; pixel (0, 0) is a center). Directions are tabulated on the
-    stereographic chart, where (X, Y, Z) with R = √(X² + Y² + Z²) lies at p = 2 X / (R + Z), q = 2 Y / (R + Z): one step
-    on it is about one step in the image for every lens, and 90° off axis is no special place. Back, with
-    s = (p² + q²) / 4, the direction is (p, q, 1 - s) / (1 + s). Float64 like every camera; the tables are part of the
-    state, and no parameters.
+    A valid answer lies in the image, is also valid for the camera that was baked, and is off by at most `bound` pixels.
+    Tables end where the image ends. They leave out a strip along a fold of the lens, so that `coverage` may be less
+    than one.
 
-    A `Camera` answers for every point; tables end. What is valid here lies in the image, is valid for the camera that
-    was baked, and its error is at most `bound` (see `bake`); some of what is valid there is not here, along the fold of
-    a lens (`coverage`).
+    Convention: as `Camera`: x right, y down, z forward; pixel (0, 0) is the center of the first pixel. Directions are
+    tabulated on the stereographic chart, where (X, Y, Z) with R = √(X² + Y² + Z²) lies at p = 2 X / (R + Z),
+    q = 2 Y / (R + Z). Equal steps on it are about equal steps in the image for every lens, also beyond 90° off axis.
+    With s = (p² + q²) / 4, the direction is (p, q, 1 - s) / (1 + s). The tables are float64 buffers of the state.
 
     Args:
-        size: (width, height) in pixels.
-        pixels_from_chart: table of pixels (u, v) on the chart.
-        chart_from_pixels: table of chart positions (p, q) on the image.
-        center: (2,) principal point, which pixels that are not valid hold.
-        bound: largest error in pixels of `project` and of `unproject`.
-        coverage: the share of the image whose pixels have a ray that each direction answers for.
+        size: (width, height) of the image in pixels.
+        pixels_from_chart: table of pixels (u, v) over the chart.
+        chart_from_pixels: table of chart positions (p, q) over the image.
+        center: (2,) principal point, the value of pixels that are not valid.
+        bound: largest errors in pixels of `project` and of `unproject`.
+        coverage: share of the pixels with a ray for which `project` and `unproject` are valid.
         source: fingerprint of the camera that was baked.
 
     Raises:
@@ -89,12 +85,12 @@ class LookupCamera(nn.Module):
         return Spline(*(getattr(self, f"chart_from_pixels_{part}") for part in _PARTS))
 
     def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
-        """Map points (..., N, 3) to pixels (..., N, 2) and valid (..., N): seen in the image, and in a usable cell.
+        """Map points (..., N, 3) to pixels (..., N, 2) and valid (..., N): in the image, and in a usable cell.
 
-        Pixels that are not valid hold the principal point. Gradients are those of the table.
+        Pixels that are not valid are set to the principal point. Gradients are those of the table.
 
         Raises:
-            InputError: wrong shapes or an integer dtype.
+            InputError: a wrong shape or an integer dtype.
         """
         points = as_points("points_cam", points_cam, 3)
         table = self.pixels_from_chart
@@ -111,10 +107,10 @@ class LookupCamera(nn.Module):
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Map pixels (..., N, 2) of the image to rays (..., N, 3) of length one and valid (..., N).
 
-        A ray that is not valid is the optical axis. Gradients are those of the table.
+        Rays that are not valid are set to the optical axis. Gradients are those of the table.
 
         Raises:
-            InputError: wrong shapes or an integer dtype.
+            InputError: a wrong shape or an integer dtype.
         """
         pixels = as_points("pixels", pixels, 2)
         table = self.chart_from_pixels
@@ -128,7 +124,7 @@ class LookupCamera(nn.Module):
         return in_chunks(one, pixels, 1, differentiated=is_differentiated(pixels))
 
     def inside(self, pixels: Tensor) -> Tensor:
-        """Whether pixels (..., N, 2) lie on the image, whose edges are half a pixel beyond the outer centers."""
+        """Whether pixels (..., N, 2) lie in the image, whose edges are half a pixel beyond the outer pixel centers."""
         u, v = as_points("pixels", pixels, 2).unbind(-1)
         width, height = self.size
         return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
@@ -138,18 +134,15 @@ class LookupCamera(nn.Module):
         return self.project(points_cam)
 
     def extra_repr(self) -> str:
-        """Size, tables and errors for `repr`."""
+        """Size, tables and errors, for `repr`."""
         cells = [f"{t.cells.shape[1]}x{t.cells.shape[0]}" for t in (self.pixels_from_chart, self.chart_from_pixels)]
         return f"size={self.size}, cells={' and '.join(cells)}, error at most {max(self.bound):.2g} px"
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
-        return super()._apply(keep_float64(fn), recurse)
-
 
 def chart_from_points(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Points (..., N, 3) to the stereographic chart: p, q (..., N), and (..., N) whether they have a place there.
+    """Map points (..., N, 3) to the stereographic chart: p, q (..., N), and a mask (..., N) of those on it.
 
-    The axis stands in for what has none: no number, infinite, the origin, or the axis behind the camera.
+    The origin, points straight behind the camera, and points that are not finite have no place; they get the axis's.
     """
     length = torch.linalg.vector_norm(points.detach(), dim=-1)
     behind = length + points[..., 2].detach() <= 1e-12 * length
@@ -161,7 +154,7 @@ def chart_from_points(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def rays_from_chart(chart: Tensor) -> Tensor:
-    """Positions (..., N, 2) on the chart to rays (..., N, 3) of length one.
+    """Map positions (..., N, 2) on the chart to rays (..., N, 3) of length one.
 
     Example:
         >>> rays_from_chart(torch.tensor([[2.0, 0.0], [0.0, 0.0]], dtype=torch.float64)).tolist()

@@ -1,4 +1,4 @@
-"""Which distortion terms a lens model has, and the public names and order of its coefficients."""
+"""Which distortion terms a lens model has, and the names and order of its coefficients."""
 
 from __future__ import annotations
 
@@ -6,49 +6,46 @@ import dataclasses
 
 from kcal.errors import InputError
 
-# OpenCV's order. A name keeps its meaning in every model; what a model lacks is left out.
-_OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
-# Orders above OpenCV's, named as in Eq. 10 of the paper and continued alike: numerator, denominator.
-_RADIAL = {
-    **{f"k{i}": ("numerator", i) for i in (1, 2, 3)},
-    **{f"k{i + 3}": ("denominator", i) for i in (1, 2, 3)},
-    **{f"k{i}": ("numerator", j) for i, j in ((7, 4), (8, 5), (11, 6), (13, 7))},
-    **{f"k{i}": ("denominator", j) for i, j in ((9, 4), (10, 5), (12, 6), (14, 7))},
-}
-_PRISM = {
-    "s1": (0, 1),
-    "s2": (0, 2),
-    "s3": (1, 1),
-    "s4": (1, 2),
-    "s5": (0, 3),
-    "s6": (1, 3),
-    "s7": (0, 4),
-    "s8": (1, 4),
-}
-_ORDER = (*_OPENCV, "k7", "k8", "k9", "k10", "s5", "s6", "k11", "k12", "k13", "k14", "s7", "s8")
+# The term and the order of every coefficient, in storage order: OpenCV's 14 first, so that its models are prefixes,
+# then the higher orders of Eq. 10 of the paper and their continuation. A name means the same in every model.
+_COEFFICIENTS = {
+    "k1": ("numerator", 1), "k2": ("numerator", 2), "p1": ("tangential", 1), "p2": ("tangential", 1),
+    "k3": ("numerator", 3), "k4": ("denominator", 1), "k5": ("denominator", 2), "k6": ("denominator", 3),
+    "s1": ("prism_x", 1), "s2": ("prism_x", 2), "s3": ("prism_y", 1), "s4": ("prism_y", 2),
+    "tau_x": ("tilt", 1), "tau_y": ("tilt", 1),
+    "k7": ("numerator", 4), "k8": ("numerator", 5), "k9": ("denominator", 4), "k10": ("denominator", 5),
+    "s5": ("prism_x", 3), "s6": ("prism_y", 3),
+    "k11": ("numerator", 6), "k12": ("denominator", 6), "k13": ("numerator", 7), "k14": ("denominator", 7),
+    "s7": ("prism_x", 4), "s8": ("prism_y", 4),
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LensModel:
-    """The orders of each distortion term (Eq. 4 and Eq. 10 of the paper).
+    """A lens model: the order of each distortion term (Eq. 4 and Eq. 10 of the paper).
+
+    Most models have a name: `LensModel.named("opencv5")`. Functions that take a model also take its name.
 
     Args:
         numerator: highest power of r² in the radial numerator, 0 to 7.
         denominator: highest power of r² in the radial denominator, 0 to 7.
-        tangential: whether p1, p2 are present.
-        prism: highest power of r² in the thin-prism terms, 0 to 4, for x and y each.
-        tilt: whether the tilted-sensor angles are present.
-        fisheye: whether the numerator's series acts on the angle from the axis instead of its tangent
-            (Kannala-Brandt): r_D = θ (1 + k1 θ² + k2 θ⁴ + ...). It has no other terms, and its coefficients are
+        tangential: whether the tangential terms p1, p2 are present.
+        prism: highest power of r² in the thin-prism terms, 0 to 4, the same for x and y.
+        tilt: whether the angles τx, τy of a tilted sensor are present.
+        fisheye: whether the numerator's series acts on the angle θ from the axis instead of its tangent
+            (Kannala-Brandt): r_D = θ (1 + k1 θ² + k2 θ⁴ + ...). A fisheye has no other terms, and its coefficients are
             called k1, k2, k3, ... in this order, as in `cv2.fisheye`.
 
     Attributes:
-        names: coefficient names in storage order: OpenCV's 14 first, higher orders after them.
-        numerator_index: where the numerator's coefficients of r², r⁴, ... are stored.
-        denominator_index: likewise for the denominator.
-        prism_index: likewise for the prism terms, for x and for y.
+        names: names of the coefficients in storage order: OpenCV's 14 first, then higher orders.
+        numerator_index: indices of the numerator's coefficients of r², r⁴, ...
+        denominator_index: indices of the denominator's coefficients of r², r⁴, ...
+        prism_index: indices of the prism coefficients of r², r⁴, ..., for x and for y.
         without_tilt: the same model without its tilt; None if it has none.
-        untilted_index: where the coefficients of `untilted` are stored.
+        untilted_index: indices of the coefficients of `untilted`.
+
+    Raises:
+        InputError: an order out of range, or a fisheye with other terms.
 
     Example:
         >>> LensModel(numerator=3, tangential=True).names
@@ -64,7 +61,7 @@ class LensModel:
     tilt: bool = False
     fisheye: bool = False
 
-    # What follows from the orders. Ordinary attributes, because compilers trace no lazily computed ones.
+    # Computed once: compilers cannot trace lazily computed attributes.
     names: tuple[str, ...] = dataclasses.field(init=False, repr=False, compare=False)
     numerator_index: tuple[int, ...] = dataclasses.field(init=False, repr=False, compare=False)
     denominator_index: tuple[int, ...] = dataclasses.field(init=False, repr=False, compare=False)
@@ -78,39 +75,31 @@ class LensModel:
             if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= limit:
                 raise InputError(f"lens model: {name} must be a whole number from 0 to {limit}, got {value!r}")
         if self.fisheye and (self.denominator or self.tangential or self.prism or self.tilt):
-            raise InputError("lens model: a fisheye has a numerator only")
-        names = self._names()
-        radial = {term: self._radial_names(term) for term in ("numerator", "denominator")}
-        prism = {order: names.index(name) for name, order in _PRISM.items() if name in names}
-        rest = dataclasses.replace(self, tilt=False) if self.tilt else None
+            raise InputError("lens model: a fisheye has a numerator only; leave out the other terms")
+        highest = {
+            "numerator": self.numerator, "denominator": self.denominator, "tangential": self.tangential,
+            "prism_x": self.prism, "prism_y": self.prism, "tilt": self.tilt,
+        }  # fmt: skip
+        table = {f"k{i}": ("numerator", i) for i in range(1, 8)} if self.fisheye else _COEFFICIENTS
+        terms = {name: term for name, (term, order) in table.items() if order <= highest[term]}
+
+        def index(*chosen: str) -> tuple[int, ...]:
+            return tuple(i for i, term in enumerate(terms.values()) if term in chosen)
+
         derived = {
-            "names": names,
-            "numerator_index": tuple(names.index(name) for name in radial["numerator"]),
-            "denominator_index": tuple(names.index(name) for name in radial["denominator"]),
-            "prism_index": tuple(tuple(prism[k, j] for j in range(1, self.prism + 1)) for k in (0, 1)),
-            "without_tilt": rest,
-            "untilted_index": tuple(names.index(name) for name in (rest.names if rest else names)),
+            "names": tuple(terms),
+            "numerator_index": index("numerator"),
+            "denominator_index": index("denominator"),
+            "prism_index": (index("prism_x"), index("prism_y")),
+            "without_tilt": dataclasses.replace(self, tilt=False) if self.tilt else None,
+            "untilted_index": index(*(term for term in highest if term != "tilt")),
         }
         for name, value in derived.items():
             object.__setattr__(self, name, value)
 
-    def _names(self) -> tuple[str, ...]:
-        if self.fisheye:
-            return tuple(f"k{order}" for order in range(1, self.numerator + 1))
-        present = {name for name, (term, order) in _RADIAL.items() if order <= getattr(self, term)}
-        present |= {name for name, (_, order) in _PRISM.items() if order <= self.prism}
-        present |= {"p1", "p2"} if self.tangential else set()
-        present |= {"tau_x", "tau_y"} if self.tilt else set()
-        return tuple(name for name in _ORDER if name in present)
-
-    def _radial_names(self, term: str) -> tuple[str, ...]:
-        place = {order: name for name, (kind, order) in _RADIAL.items() if kind == term}
-        orders = range(1, getattr(self, term) + 1)
-        return tuple(f"k{order}" if self.fisheye else place[order] for order in orders)
-
     @classmethod
     def named(cls, name: str | LensModel) -> LensModel:
-        """The model behind a preset name such as `"opencv5"` (or the model itself).
+        """Return the model with a preset name such as `"opencv5"`; a model is returned as it is.
 
         Raises:
             InputError: an unknown name; the message lists the known ones.
@@ -123,17 +112,17 @@ class LensModel:
 
     @property
     def size(self) -> int:
-        """How many coefficients the model has."""
+        """Number of coefficients."""
         return len(self.names)
 
     @property
     def radial(self) -> bool:
-        """Whether the lens is symmetric about its axis, so that whatever limits it is a circle."""
+        """Whether the lens is symmetric about its axis."""
         return not (self.tangential or self.prism or self.tilt)
 
     @property
     def untilted(self) -> LensModel:
-        """The same model without the tilt."""
+        """The same model without its tilt."""
         return self if self.without_tilt is None else self.without_tilt
 
     def contains(self, other: LensModel) -> bool:

@@ -1,7 +1,4 @@
-"""`Unproject`: a camera's inverse as a module of its own, for pipelines, `torch.export` and ONNX.
-
-`Camera` itself is the module of the other direction: its `forward` is `project`.
-"""
+"""`Unproject`: `Camera.unproject` as the `forward` of a module, for pipelines, `torch.export` and ONNX."""
 
 from __future__ import annotations
 
@@ -13,24 +10,25 @@ from kcal.lens.camera import Camera
 
 
 class LearnedStart(Protocol):
-    """A learned start for the inverse, such as `kcal.nets.inverse.InverseNet`; an `nn.Module`."""
+    """A module that guesses the inverse of a lens, such as `kcal.nets.inverse.InverseNet`."""
 
     def guess(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Roughly the undistorted coordinates of distorted ones (..., N)."""
+        """Return roughly undistorted coordinates for distorted ones (..., N)."""
         ...
 
 
 class Unproject(nn.Module):
-    """Pixels to rays, as `Camera.unproject`.
+    """Map pixels to rays: `Camera.unproject` as a module.
 
-    Compiled and exported graphs take a fixed number of Newton steps for every point: what has not arrived by
-    then, beside a fold, is flagged as not valid. An eager call goes on until it knows.
+    The module of the other direction is `Camera` itself. Compiled and exported graphs take a fixed number of Newton
+    steps for every point. The few pixels next to a fold that have not converged by then are not valid there, although
+    an eager call may find their rays.
 
-    `kcal.io.onnx_file.save_onnx` writes it, and every other module of points, as ONNX.
+    `kcal.io.onnx_file.save_onnx` writes the module as ONNX.
 
     Args:
         camera: the camera, kept as a submodule.
-        start: a trained inverse net whose guess Newton's method starts from; it never changes the answer.
+        start: a trained `InverseNet`; its guess is where Newton's method starts. It affects run time only.
 
     Example:
         >>> import torch
@@ -46,5 +44,5 @@ class Unproject(nn.Module):
         self.start = start
 
     def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (..., N, 2) -> rays (..., N, 3) of length one, valid (..., N)."""
+        """Map pixels (..., N, 2) to rays (..., N, 3) of length one, and valid (..., N)."""
         return self.camera.unproject(pixels, start=None if self.start is None else self.start.guess)

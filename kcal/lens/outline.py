@@ -12,10 +12,6 @@ from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.region import Region
 
-_COUNT = 256
-# A little inside the edge: at a pole the edge itself is mapped to infinity.
-_INSIDE = 1.0 - 1e-6
-
 
 def image_outline(
     to_sensor: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
@@ -24,25 +20,26 @@ def image_outline(
     region: Region,
     size: tuple[int, int],
 ) -> Tensor:
-    """The part of the image (width, height) that the region is mapped to: a polygon (V, 2) of pixels.
+    """Map the valid region to the image (width, height): a polygon (V, 2) in pixels.
 
     Args:
-        to_sensor: distorted coordinates x, y (N,) and the parameters to pixels u, v.
-        parameters: (5 + P,) of one camera.
+        to_sensor: maps distorted coordinates x, y (N,) and the parameters to pixels u, v.
+        parameters: (5 + P,) of a single camera.
         model: its lens model.
-        region: where its lens is valid.
-        size: of the image.
+        region: its valid region.
+        size: (width, height) of the image.
     """
-    x, y = (region.outline(_COUNT) * _INSIDE).unbind(-1)
+    # A little inside the edge: at a pole the edge itself is mapped to infinity.
+    x, y = (region.outline(256) * (1.0 - 1e-6)).unbind(-1)
     lens = distort_components(x, y, parameters[len(INTRINSICS) :], model, slopes=False)
     polygon = torch.stack(to_sensor(lens.x, lens.y, parameters), -1)
     return clip_to_image(polygon, size) if bool(region.radius > 0) else polygon[:0]
 
 
 def clip_to_image(polygon: Tensor, size: tuple[int, int]) -> Tensor:
-    """Cut a polygon (V, 2) to the image, whose edges lie half a pixel beyond the outer centers.
+    """Clip a polygon (V, 2) to the image, whose edges lie half a pixel beyond the outer pixel centers.
 
-    One edge of the image after the other, as Sutherland and Hodgman (1974) do.
+    Source: Sutherland and Hodgman (1974), one edge of the image after the other.
 
     Example:
         >>> triangle = torch.tensor([[-0.5, -0.5], [9.5, -0.5], [-0.5, 9.5]], dtype=torch.float64)
@@ -57,13 +54,13 @@ def clip_to_image(polygon: Tensor, size: tuple[int, int]) -> Tensor:
         crossing = polygon + weight * (following - polygon)
         crossing[:, axis] = edge
         keep = torch.stack([height_over >= 0, (height_over > 0) != (height_after > 0)], -1)
-        # A corner on the edge is kept as itself; its crossing would be the same point again.
+        # A corner on the edge is kept as such; its crossing would repeat it.
         keep[:, 1] &= (height_over != 0) & (height_after != 0)
         polygon = torch.stack([polygon, crossing], 1)[keep]
     return polygon
 
 
-def area(polygon: Tensor) -> float:
-    """Area of a polygon (V, 2) whose corners run clockwise as one sees them (x right, y down)."""
+def polygon_area(polygon: Tensor) -> float:
+    """Area of a polygon (V, 2) whose corners run clockwise as seen in the image (x right, y down)."""
     (x, y), (next_x, next_y) = polygon.T, polygon.roll(-1, 0).T
     return float(0.5 * (x * next_y - y * next_x).sum())

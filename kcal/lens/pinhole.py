@@ -1,7 +1,7 @@
-"""Which pinhole camera shows an undistorted image: OpenCV's alpha, where only the lens's valid region counts.
+"""Choose a pinhole camera for undistorted images: OpenCV's alpha, restricted to the valid region of the lens.
 
-A rectangle on the plane z = 1 that is stretched over the new image is a pinhole camera. The inner rectangle (alpha 0)
-holds no point without a source pixel; the outer one (alpha 1) holds every source pixel that has a ray.
+A pinhole camera stretches a rectangle of the plane z = 1 over its image. Every point of the inner rectangle (alpha 0)
+has a source pixel; the outer rectangle (alpha 1) contains every source pixel that has a ray.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from torch import Tensor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 
-# Source positions this far outside the outer pixel centers still count, in pixels: an undistorted pixel that should
-# lie exactly on the image's edge must not be lost to rounding.
-SLACK = 1e-6
-_SAMPLES = 129
-_RIM = 1440
-# Rays farther from the axis count for neither rectangle: a pinhole's plane has no place for them.
+# Source positions this far outside the outer pixel centers still count, in pixels, so that rounding does not lose an
+# undistorted pixel that lies exactly on the image's edge.
+_SLACK = 1e-6
+# Points per side of the image in the search for its extremes.
+_SIDE_SAMPLES = 129
+# Rays farther from the axis count for neither rectangle: on a pinhole's plane they lie too far out.
 _WIDEST = math.radians(89.0)
 
 
 def source_pixels(camera: Camera, points_cam: Tensor) -> tuple[Tensor, Tensor]:
-    """Where a lens put points, and whether the image has a value there.
+    """Project points to pixels, and say whether the image has a value there.
 
     Args:
         camera: the camera that took the image.
         points_cam: (..., N, 3), rays for example.
 
     Returns:
-        pixels (..., N, 2) and seen (..., N): before the lens folds, and between the centers of the outer pixels, so
-        that bilinear interpolation has all its neighbors. Pixels within 1e-6 px of that are moved onto it.
+        pixels (..., N, 2) and seen (..., N): valid for the lens, and between the centers of the outer pixels, so that
+        bilinear interpolation has all its neighbors. Pixels up to 1e-6 px outside are moved onto the edge.
 
     Example:
         >>> camera = Camera.build(focal=(100, 100), center=(50, 40), size=(101, 81), model="pinhole")
@@ -42,36 +42,38 @@ def source_pixels(camera: Camera, points_cam: Tensor) -> tuple[Tensor, Tensor]:
     """
     pixels, valid = camera.project(points_cam)
     last = torch.tensor(camera.size, dtype=pixels.dtype, device=pixels.device) - 1
-    near = ((pixels >= -SLACK) & (pixels <= last + SLACK)).all(-1)
-    # On the bounds themselves clamp passes the gradient on.
+    near = ((pixels >= -_SLACK) & (pixels <= last + _SLACK)).all(-1)
+    # On the bounds themselves, clamp still passes gradients.
     return torch.clamp(pixels, torch.zeros_like(last), last), valid & near
 
 
 @torch.no_grad()
 def new_pinhole(camera: Camera, alpha: float = 0.0, size: tuple[int, int] | None = None) -> Camera:
-    """The pinhole camera for undistorted images, chosen as OpenCV's `getOptimalNewCameraMatrix` does.
+    """Choose the pinhole camera for undistorted images, like OpenCV's `getOptimalNewCameraMatrix`.
 
-    Convention: the centers of the outer pixels lie on the rectangle's sides. Between 0 and 1, focal lengths and
-    principal point are interpolated linearly. As with OpenCV, fx and fy differ even where the source's are equal,
-    because the rectangle need not have the image's shape. OpenCV looks at 9 x 9 points; here the extremes along the
-    image's border are narrowed down, and alpha 0 is checked at every border pixel of the new image.
+    Convention: the centers of the outer pixels lie on the sides of the rectangle that the new image shows.
 
-    A part of the image where the lens model folds, or has no preimage, counts for neither rectangle. With a very wide
-    lens the outer one is huge, and the middle of an image with alpha 1 small: a pinhole cannot show 180°. For such a
-    lens, a fisheye above all, choose the new focal length yourself: `Camera.build(..., model="pinhole")`.
+    With alpha 0 every pixel of the new image is valid; with alpha 1 every source pixel is kept that has a ray less than
+    89° from the axis. In between, focal lengths and principal point are interpolated linearly. As with OpenCV, fx and
+    fy differ even if those of the source are equal, because the new image shows a rectangle of another shape. OpenCV
+    looks at 9 x 9 points; this function searches for the extremes along the image's border, and with alpha 0 checks
+    every border pixel of the new image.
+
+    Parts of the image where the lens model folds or has no preimage do not count. A pinhole cannot show 180°: with a
+    very wide lens and alpha 1, the middle of the image becomes small. For such a lens, above all a fisheye, choose the
+    new focal length yourself: `Camera.build(..., model="pinhole")`.
 
     Args:
-        camera: one camera or a batch.
-        alpha: 0: every pixel of the new image is valid; 1: every pixel of the source that has a ray, less than 89°
-            from the axis, is kept.
-        size: (width, height) of the new image, the camera's own if not given.
+        camera: a camera or a batch of cameras.
+        alpha: 0 (only valid pixels) to 1 (all source pixels).
+        size: (width, height) of the new image; by default that of `camera`.
 
     Returns:
         A camera with the model `"pinhole"` and the batch shape of `camera`.
 
     Raises:
-        InputError: alpha not from 0 to 1, or an image less than two pixels wide or high.
-        DegenerateError: the ray of the image's center is not valid, or nothing round it is.
+        InputError: alpha outside 0 to 1, or an image less than two pixels wide or high.
+        DegenerateError: the pixel at the image's center or those around it have no valid ray.
 
     Example:
         >>> camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.2])
@@ -88,23 +90,23 @@ def new_pinhole(camera: Camera, alpha: float = 0.0, size: tuple[int, int] | None
 
     values = torch.zeros_like(camera.params[..., :5])
     if alpha < 1:
-        values = values + (1 - alpha) * _pinhole(*_inner(camera, (width, height)), (width, height))
+        values = values + (1 - alpha) * _pinhole_parameters(*_inner_rectangle(camera, (width, height)), (width, height))
     if alpha > 0:
-        values = values + alpha * _pinhole(*_outer(camera), (width, height))
+        values = values + alpha * _pinhole_parameters(*_outer_rectangle(camera), (width, height))
     return Camera(values, size=(width, height), model="pinhole")
 
 
-def _pinhole(low: Tensor, high: Tensor, size: tuple[int, int]) -> Tensor:
-    """The rectangle from low (..., 2) to high (..., 2) over an image: (..., 5) fx, fy, cx, cy and no skew."""
+def _pinhole_parameters(low: Tensor, high: Tensor, size: tuple[int, int]) -> Tensor:
+    """Stretch the rectangle from low (..., 2) to high (..., 2) over an image: (..., 5) fx, fy, cx, cy and no skew."""
     if not bool((high > low).all()):
-        raise DegenerateError("no valid pixels round the image's center; check the camera's coefficients")
+        raise DegenerateError("new_pinhole: no valid pixels around the image's center; check the coefficients")
     last = torch.tensor(size, dtype=low.dtype, device=low.device) - 1
     focal = last / (high - low)
     return torch.cat([focal, -focal * low, torch.zeros_like(focal[..., :1])], -1)
 
 
-def _border(low: Tensor, high: Tensor, along: Tensor) -> Tensor:
-    """Points on the left, right, top and bottom side of a rectangle, (..., 4, N, 2); `along` (..., 4, N) is 0 to 1."""
+def _points_on_sides(low: Tensor, high: Tensor, along: Tensor) -> Tensor:
+    """Points (..., 4, N, 2) on the left, right, top and bottom side of a rectangle; `along` (..., 4, N) is 0 to 1."""
     x, y = (low[..., i, None, None] + (high - low)[..., i, None, None] * along for i in (0, 1))
     side = torch.tensor([0.0, 1.0], dtype=along.dtype, device=along.device)[:, None]
     x_side, y_side = (low[..., i, None, None] + (high - low)[..., i, None, None] * side for i in (0, 1))
@@ -117,42 +119,42 @@ def _border(low: Tensor, high: Tensor, along: Tensor) -> Tensor:
     )
 
 
-def _extremes(camera: Camera, outermost: bool) -> Tensor:
-    """Where the image's four sides reach farthest in (or out): (..., 4) x left, x right, y top, y bottom.
+def _side_extremes(camera: Camera, outermost: bool) -> Tensor:
+    """Innermost (or outermost) x of the left and right side and y of the top and bottom side of the image, (..., 4).
 
-    A side none of whose pixels has a ray is infinite.
+    Infinite for a side on which no pixel has a ray.
     """
     vector = camera.params
     last = torch.tensor(camera.size, dtype=vector.dtype, device=vector.device) - 1
-    step = torch.linspace(0, 1, _SAMPLES, dtype=vector.dtype, device=vector.device)
+    step = torch.linspace(0, 1, _SIDE_SAMPLES, dtype=vector.dtype, device=vector.device)
     # Inward is +x on the left and -x on the right.
     inward = torch.tensor([1.0, -1.0, 1.0, -1.0], dtype=vector.dtype, device=vector.device)
     sign = -inward if outermost else inward
     start, end = torch.zeros_like(sign), torch.ones_like(sign)
     value = torch.zeros_like(sign)
-    # 129 samples of a side, then twice the two steps round the best one: the rest is below 1e-9 px.
+    # 129 samples per side, then twice the two steps around the best one: the remaining error is below 1e-9 px.
     for _ in range(3):
         along = start[..., None] + (end - start)[..., None] * step
-        pixels = _border(torch.zeros_like(last), last, along)
+        pixels = _points_on_sides(torch.zeros_like(last), last, along)
         rays, valid = camera.unproject(pixels.flatten(-3, -2))
-        rays, valid = rays.unflatten(-2, (4, _SAMPLES)), valid.unflatten(-1, (4, _SAMPLES))
+        rays, valid = rays.unflatten(-2, (4, _SIDE_SAMPLES)), valid.unflatten(-1, (4, _SIDE_SAMPLES))
         valid = valid & (rays[..., 2] > math.cos(_WIDEST))
         reach = torch.cat([rays[..., :2, :, 0], rays[..., 2:, :, 1]], -2) / rays[..., 2] * sign[:, None]
         best, index = torch.where(valid, reach, -math.inf).max(-1)
         value = best * sign
         along = along.expand(reach.shape)
         start = torch.gather(along, -1, (index - 1).clamp(min=0)[..., None])[..., 0]
-        end = torch.gather(along, -1, (index + 1).clamp(max=_SAMPLES - 1)[..., None])[..., 0]
+        end = torch.gather(along, -1, (index + 1).clamp(max=_SIDE_SAMPLES - 1)[..., None])[..., 0]
     return value
 
 
-def _inner(camera: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """The rectangle of which every pixel of a new image of this size has a source."""
+def _inner_rectangle(camera: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """The rectangle in which every pixel of a new image of this size has a source."""
     vector = camera.params
     shape = torch.tensor(size, dtype=vector.dtype, device=vector.device) - 1
-    # A side without rays lies beyond the fold: there the rectangle of the image's shape in the valid disc ends it.
-    disc = torch.linalg.vector_norm(_rim(camera), dim=-1).amin(-1, keepdim=True) * shape / shape.norm()
-    sides = _extremes(camera, outermost=False)
+    # A side without rays lies beyond the fold. There the limit is the rectangle of the image's shape in the valid disc.
+    disc = torch.linalg.vector_norm(_valid_rim(camera), dim=-1).amin(-1, keepdim=True) * shape / shape.norm()
+    sides = _side_extremes(camera, outermost=False)
     low = torch.where(sides[..., 0::2].isfinite(), sides[..., 0::2], -disc)
     high = torch.where(sides[..., 1::2].isfinite(), sides[..., 1::2], disc)
 
@@ -161,58 +163,60 @@ def _inner(camera: Camera, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     ray, valid = rays[..., 0, :], valid[..., 0]
     center = ray[..., :2] / ray[..., 2:]
     if not bool((valid & (ray[..., 2] > 0) & (center > low).all(-1) & (center < high).all(-1)).all()):
-        raise DegenerateError("the image's center has no valid ray; check the camera, or build the new one by hand")
+        raise DegenerateError(
+            "new_pinhole: the image's center has no valid ray; check the camera, or make the new one by `Camera.build`"
+        )
 
     columns, rows = (torch.linspace(0, 1, n, dtype=vector.dtype, device=vector.device) for n in size)
     longest = max(size)
     along = torch.stack([torch.nn.functional.pad(t, (0, longest - t.numel())) for t in (rows, rows, columns, columns)])
 
-    def clear(scale: Tensor) -> Tensor:
-        """Whether all pixels along the border have a source when the rectangle shrinks towards the center."""
-        border = _border(*_towards(center, low, high, scale), along)
-        return source_pixels(camera, _points(border.flatten(-3, -2)))[1].all(-1)
+    def all_seen(scale: Tensor) -> Tensor:
+        """Whether all pixels along the border have a source, after the rectangle is shrunk towards the center."""
+        border = _points_on_sides(*_shrunk(center, low, high, scale), along)
+        return source_pixels(camera, _on_plane(border.flatten(-3, -2)))[1].all(-1)
 
     good, bad = torch.zeros_like(center[..., 0]), torch.ones_like(center[..., 0])
-    good = torch.where(clear(bad), bad, good)
+    good = torch.where(all_seen(bad), bad, good)
     while bool((bad - good > 1e-9).any()):
         trial = (good + bad) / 2
-        passed = clear(trial) | (good == bad)
+        passed = all_seen(trial) | (good == bad)
         good, bad = torch.where(passed, trial, good), torch.where(passed, bad, trial)
-    return _towards(center, low, high, good)
+    return _shrunk(center, low, high, good)
 
 
-def _towards(center: Tensor, low: Tensor, high: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-    """The rectangle shrunk towards a point: scale 1 leaves it, 0 is the point."""
+def _shrunk(center: Tensor, low: Tensor, high: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Shrink a rectangle towards a point: scale 1 leaves it as it is, 0 gives the point."""
     scale = scale[..., None]
     return center + scale * (low - center), center + scale * (high - center)
 
 
-def _outer(camera: Camera) -> tuple[Tensor, Tensor]:
-    """The rectangle round every source pixel that has a ray."""
-    sides = _extremes(camera, outermost=True)
+def _outer_rectangle(camera: Camera) -> tuple[Tensor, Tensor]:
+    """The rectangle around every source pixel that has a ray."""
+    sides = _side_extremes(camera, outermost=True)
     low, high = sides[..., 0::2], sides[..., 1::2]
-    # Where the fold crosses the image, the valid region ends on its rim instead of on the image's border.
-    rim = _rim(camera)
-    _, seen = source_pixels(camera, _points(rim))
+    # Where the fold crosses the image, the valid region ends there and not at the image's border.
+    rim = _valid_rim(camera)
+    _, seen = source_pixels(camera, _on_plane(rim))
     low = torch.minimum(low, torch.where(seen[..., None], rim, math.inf).amin(-2))
     high = torch.maximum(high, torch.where(seen[..., None], rim, -math.inf).amax(-2))
     return low, high
 
 
-def _rim(camera: Camera) -> Tensor:
-    """The last valid points of the plane z = 1 along 1440 directions from the axis, (..., 1440, 2)."""
+def _valid_rim(camera: Camera) -> Tensor:
+    """Last valid points (..., 1440, 2) of the plane z = 1 along as many directions from the axis."""
     vector = camera.params
-    turn = torch.arange(_RIM, dtype=vector.dtype, device=vector.device) * (2 * math.pi / _RIM)
+    turn = torch.arange(1440, dtype=vector.dtype, device=vector.device) * (2 * math.pi / 1440)
     circle = torch.stack([torch.cos(turn), torch.sin(turn)], -1)
     low, high = torch.zeros_like(turn), torch.full_like(turn, _WIDEST)
-    # Halved until neither angle can be told from the other.
+    # Bisection to rounding.
     for _ in range(52):
         middle = (low + high) / 2
-        _, valid = camera.project(_points(circle * torch.tan(middle)[..., None]))
+        _, valid = camera.project(_on_plane(circle * torch.tan(middle)[..., None]))
         low, high = torch.where(valid, middle, low), torch.where(valid, high, middle)
     return circle * torch.tan(low)[..., None]
 
 
-def _points(normalized: Tensor) -> Tensor:
-    """Points (..., 3) on the plane z = 1."""
+def _on_plane(normalized: Tensor) -> Tensor:
+    """Points (..., 3) on the plane z = 1 from their x, y (..., 2)."""
     return torch.cat([normalized, torch.ones_like(normalized[..., :1])], -1)

@@ -1,13 +1,13 @@
-"""The first stage of a camera: points to the plane on which the lens terms act, and back to rays.
+"""Map points to the plane on which the lens terms act, the first stage of a camera, and back to rays.
 
 A perspective lens works on x = X / Z, y = Y / Z, the plane z = 1. A fisheye works on the plane of angles: a point at
 angle θ from the optical axis lies at distance θ from the origin, in the same direction as (X, Y),
 
     (x, y) = θ / ρ · (X, Y),  ρ = √(X² + Y²),  θ = atan2(ρ, Z)
 
-so that points beside the camera and behind it have a place too (Kannala and Brandt, 2006). θ / ρ comes from halving the
-angle four times, tan(θ/2) = ρ / (R + Z) and tan(φ/2) = tan φ / (1 + √(1 + tan² φ)), and a series for what is left:
-exact to rounding, smooth on the axis, and made of operations that every runtime has in float64.
+so that points beside and behind the camera have a place too (Kannala and Brandt, 2006). For θ / ρ, the angle is halved
+four times, tan(θ/2) = ρ / (R + Z) and tan(φ/2) = tan φ / (1 + √(1 + tan² φ)), and a series does the rest. This is
+exact to rounding, smooth on the axis, and uses only operations that every runtime has in float64.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from torch import Tensor
 from kcal.lens.model import LensModel
 
 _HALVINGS = 4
-# arctan t / t by powers of t², for t up to tan(180° / 16) = 0.199.
+# Series of arctan t / t in t², for t up to tan(180° / 16) = 0.199.
 _ARCTAN = [(-1.0) ** n / (2 * n + 1) for n in range(12)]
-# Where t = ρ² / Z² or θ² is below this, few terms of a series are exact to rounding.
-_NEAR = 0.01
-# 2 d/dt of arctan's series: the derivative of θ / ρ by ρ, near the axis.
+# Where ρ² / Z² or θ² is below this, the series below are exact to rounding.
+_SERIES_LIMIT = 0.01
+# 2 d/dt of the series of arctan: the derivative of θ / ρ by ρ, near the axis.
 _ARCTAN_SLOPE = [(-1.0) ** n * 2 * n / (2 * n + 1) for n in range(1, 10)]
 _SINC = [(-1.0) ** n / math.factorial(2 * n + 1) for n in range(7)]
 _COS = [(-1.0) ** n / math.factorial(2 * n) for n in range(7)]
 
 
 def largest_radius(model: LensModel) -> float:
-    """How far from the origin of the plane any point may lie: tan 89°, for a fisheye 179° in radians."""
+    """Largest distance of a point from the origin of the plane: tan 89°, or 179° in radians for a fisheye."""
     return math.radians(179.0) if model.fisheye else math.tan(math.radians(89.0))
 
 
@@ -54,9 +54,9 @@ def _angle_over_distance(X: Tensor, Y: Tensor, Z: Tensor) -> Tensor:
 
 
 def plane_from_points(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:
-    """Points of the camera frame to (x, y) on the plane of `model`; every tensor is (..., N).
+    """Map points of the camera frame to (x, y) on the plane of `model`; every tensor is (..., N).
 
-    Perspective points must lie in front of the camera, fisheye points anywhere but on the axis behind it.
+    Perspective points must lie in front of the camera; fisheye points must not lie on the axis behind it.
 
     Example:
         >>> X, Y, Z = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 2.0]], dtype=torch.float64).T
@@ -79,8 +79,8 @@ def plane_with_slopes(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
     ratio = _angle_over_distance(X, Y, Z)
     square = X * X + Y * Y
     by_distance = (square + Z * Z).reciprocal()
-    # h is the derivative of θ / ρ by ρ, over ρ; near the axis its difference would cancel.
-    near = (square < _NEAR * Z * Z) & (Z > 0)
+    # h is the derivative of θ / ρ by ρ, divided by ρ; near the axis the difference would cancel.
+    near = (square < _SERIES_LIMIT * Z * Z) & (Z > 0)
     depth = torch.where(near, Z, 1.0)
     series = _series(_ARCTAN_SLOPE, torch.where(near, square / (depth * depth), 0.0)) / (depth * depth * depth)
     h = torch.where(near, series, (Z * by_distance - ratio) / torch.where(near, 1.0, square))
@@ -91,7 +91,7 @@ def plane_with_slopes(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
 
 
 def rays_from_plane(x: Tensor, y: Tensor, model: LensModel) -> tuple[Tensor, Tensor, Tensor]:
-    """Points (x, y) of the plane to the three components of a ray of length one; every tensor is (..., N).
+    """Map points (x, y) of the plane to the three components of a ray of length one; every tensor is (..., N).
 
     Example:
         >>> x, y = torch.tensor([[0.75, 0.0]], dtype=torch.float64).T
@@ -102,7 +102,7 @@ def rays_from_plane(x: Tensor, y: Tensor, model: LensModel) -> tuple[Tensor, Ten
     if not model.fisheye:
         z = torch.sqrt(1.0 + square).reciprocal()
         return x * z, y * z, z
-    near = square < _NEAR
+    near = square < _SERIES_LIMIT
     t = torch.where(near, square, 0.0)
     angle = torch.sqrt(torch.where(near, 1.0, square))
     sinc = torch.where(near, _series(_SINC, t), torch.sin(angle) / angle)

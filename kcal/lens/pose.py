@@ -1,4 +1,4 @@
-"""Rigid motions as a rotation matrix and a translation, moved by small steps from the left.
+"""Convert and move rigid motions, given by a rotation matrix and a translation.
 
 A step is six numbers: a rotation vector ω (radians) and a translation v (meters), R ← exp([ω]×) R, t ← t + v.
 """
@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def rotation_from_vector(vector: Tensor) -> Tensor:
-    """Rotation vectors (..., 3) in radians to matrices (..., 3, 3), exact and differentiable at zero too.
+    """Convert rotation vectors (..., 3) in radians to matrices (..., 3, 3), differentiable also at zero.
 
     Example:
         >>> rotation_from_vector(torch.zeros(3)).diagonal().tolist()
@@ -22,7 +22,7 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
 
 
 def vector_from_rotation(rotation: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) to rotation vectors (..., 3) of length at most π.
+    """Convert rotation matrices (..., 3, 3) to rotation vectors (..., 3) of length at most π.
 
     Example:
         >>> vector_from_rotation(torch.eye(3)).tolist()
@@ -33,7 +33,7 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def nearest_rotation(matrix: Tensor) -> Tensor:
-    """The rotation closest to matrices (..., 3, 3) in the Frobenius norm (orthogonal Procrustes).
+    """Return the rotations closest to matrices (..., 3, 3) in the Frobenius norm (orthogonal Procrustes).
 
     Example:
         >>> nearest_rotation(2 * torch.eye(3)).diagonal().tolist()
@@ -62,7 +62,7 @@ def step_rows(by_point: Tensor, rotated: Tensor) -> Tensor:
 
 
 def side_axes(rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Two directions that make an orthonormal frame with unit rays (..., N, 3), smooth but for a ray turning back.
+    """Two directions that form an orthonormal frame with unit rays (..., N, 3); smooth except where z changes sign.
 
     Source: Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017).
     """

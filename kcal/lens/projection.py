@@ -1,4 +1,4 @@
-"""Points in front of the camera to pixels: the chain pinhole, lens, intrinsics, and its closed-form Jacobian.
+"""Project points to pixels by the chain pinhole, lens, intrinsics, with its closed-form Jacobian.
 
 Camera parameters are one vector (..., 5 + P): fx, fy, cx, cy, skew, then the lens coefficients:
 
@@ -30,13 +30,13 @@ def parameter_names(model: LensModel) -> tuple[str, ...]:
 
 
 class Projection(NamedTuple):
-    """Pixels and their derivatives, each as tensors whose last two dimensions are (2, N): all u, then all v.
+    """Pixels and their derivatives; the last two dimensions of each are (2, N): all u, then all v.
 
     Attributes:
         pixels: (..., 2, N).
         by_point: (..., 3, 2, N), by X, Y, Z of the point in the camera frame.
         by_camera: (..., C, 2, N), by the wanted camera parameters.
-        regular: (..., N), in front of the camera (of a fisheye: anywhere), before any pole, and not folded over
+        regular: (..., N), in front of the camera (for a fisheye: anywhere), before any pole, and not folded
             (det J > 0).
     """
 
@@ -47,7 +47,7 @@ class Projection(NamedTuple):
 
 
 def to_pixels(x: Tensor, y: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
-    """Distorted coordinates (..., N) to pixels: the last stage."""
+    """Map distorted coordinates (..., N) to pixels: the last stage."""
     fx, fy, cx, cy, skew = unbind_last(parameters[..., : len(INTRINSICS)])
     return torch.addcmul(torch.addcmul(cx, skew, y), fx, x), torch.addcmul(cy, fy, y)
 
@@ -72,9 +72,9 @@ def project_components(
         points: (..., 3, N) in the camera frame, meters.
         parameters: (..., 5 + P), broadcast against the leading shape of `points`.
         model: the lens model.
-        wanted: indices of camera parameters for `by_camera`; None: no derivative at all is formed, and `by_point`
-            and `by_camera` are empty.
-        field: what corrects the lens, or None.
+        wanted: indices of the camera parameters of `by_camera`; None: no derivatives, `by_point` and `by_camera` are
+            empty.
+        field: a residual field after the lens, or None.
     """
     X, Y, Z = points[..., 0, :], points[..., 1, :], points[..., 2, :]
     x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(X, Y, Z, model)
@@ -84,8 +84,8 @@ def project_components(
     fx, fy, _, _, skew = unbind_last(parameters[..., :offset])
     regular = lens.positive & (lens.determinant > 0)
     if field is not None:
-        # One-to-one by itself, so that it neither folds nor mends what is folded.
-        lens = _corrected(lens, field)
+        # The field is one-to-one, so it neither makes nor removes folds.
+        lens = _with_field(lens, field)
     pixels = torch.stack(to_pixels(lens.x, lens.y, parameters), -2)
     if not model.fisheye:
         regular = regular & (Z > 0)
@@ -122,8 +122,8 @@ def project_components(
     return Projection(pixels, by_point, by_camera, regular)
 
 
-def _corrected(lens: Distorted, field: Field) -> Distorted:
-    """The lens followed by the residual: positions, and derivatives by the chain rule."""
+def _with_field(lens: Distorted, field: Field) -> Distorted:
+    """The lens followed by the field: positions, and derivatives by the chain rule."""
     moved = correct_components(lens.x, lens.y, field)
     p, q, r, t = moved.point
     a, b, d, e = lens.point

@@ -1,9 +1,9 @@
-"""The chain of `kcal.lens.projection` with all its derivatives, written for calibration on the CPU.
+"""Compute the chain of `kcal.lens.projection` with all derivatives in NumPy, for calibration on the CPU.
 
-Calibration evaluates this chain some thousand times on a few thousand corners, where beginning an operation of torch
-costs more than carrying it out. NumPy begins one several times faster, and every derivative can be written to its place
-in the rows of the normal equations at once, each column of a polynomial from the one before. Tests hold it to
-`project_components` to rounding. Where gradients or another device are wanted, that one is used.
+Calibration evaluates this chain some thousand times on a few thousand corners, where starting an operation of torch
+takes longer than the operation itself. NumPy starts one several times faster. Derivatives are written straight into the
+rows of the normal equations, each column of a polynomial from the one before. Tests hold the values to those of
+`project_components`, which is used where gradients or another device are needed.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ def fill_rows(
         points: (..., 3, N) in the camera frame.
         parameters: (5 + P,), or broadcast against the leading shape of `points` with one more dimension of length one.
         model: the lens model; not a fisheye.
-        wanted: parameter -> its row in `by_camera`.
-        by_point: (..., 3, 2, N), written.
-        by_camera: (..., C, 2, N), written.
+        wanted: maps each wanted parameter to its row in `by_camera`.
+        by_point: (..., 3, 2, N), receives the derivatives by the point.
+        by_camera: (..., C, 2, N), receives the derivatives by the camera parameters.
 
     Returns:
-        u, v (..., N), and whether each point is in front of the camera, before any pole and not folded.
+        u, v (..., N), and a mask (..., N) as `Projection.regular`.
     """
     X, Y, Z = points[..., 0, :], points[..., 1, :], points[..., 2, :]
     inverse_depth = 1.0 / Z
@@ -99,7 +99,7 @@ def fill_rows(
     np.negative(ux * x + uy * y, out=by_point[..., 2, 0, :])
     np.negative(vx * x + vy * y, out=by_point[..., 2, 1, :])
 
-    _lens_rows(rows, model, (x, y, s), (m00, m01, m10, m11), g, inverse)
+    _write_lens_rows(rows, model, (x, y, s), (m00, m01, m10, m11), g, inverse)
     intrinsic = ((x_out, 0.0), (0.0, y_out), (1.0, 0.0), (0.0, 1.0), (y_out, 0.0))
     for i, (du, dv) in enumerate(intrinsic):
         if i in wanted:
@@ -122,7 +122,7 @@ def _polynomial(s: Array, coefficients: list[Value], constant: float) -> tuple[V
 def _tilt(
     u: Array, v: Array, c: list[Value], model: LensModel, intrinsics: tuple[Value, Value, Value], rows: dict[int, Array]
 ) -> tuple[Array, Array, tuple[Array, Array, Array, Array], npt.NDArray[np.bool_]]:
-    """The tilted sensor: coordinates, the pixel's derivatives by those before the tilt, what lies before the pole.
+    """Apply the tilt: coordinates, derivatives of the pixel by those before the tilt, mask of those before a pole.
 
     Derivatives by both angles are written to `rows`.
     """
@@ -134,24 +134,26 @@ def _tilt(
     x, y = cos_x * u * scale, (cos_y * v - (sin_x * sin_y) * u) * scale
     if i in rows:
         w_rate = -cos_y * (cos_x * v + sin_x)
-        _pixel_rate(rows[i], (-sin_x * u - x * w_rate) * scale, (-cos_x * sin_y * u - y * w_rate) * scale, intrinsics)
+        _write_pixel_rate(
+            rows[i], (-sin_x * u - x * w_rate) * scale, (-cos_x * sin_y * u - y * w_rate) * scale, intrinsics
+        )
     if j in rows:
         w_rate = cos_y * u + sin_y * (sin_x * v - cos_x)
         y_rate = -sin_x * cos_y * u - sin_y * v
-        _pixel_rate(rows[j], -x * w_rate * scale, (y_rate - y * w_rate) * scale, intrinsics)
+        _write_pixel_rate(rows[j], -x * w_rate * scale, (y_rate - y * w_rate) * scale, intrinsics)
     m10, m11 = -sin_y * (sin_x + y) * scale, cos_y * (1.0 + sin_x * y) * scale
     m00 = fx * ((cos_x - sin_y * x) * scale) + skew * m10
     m01 = fx * ((cos_y * sin_x) * x * scale) + skew * m11
     return x, y, (m00, m01, fy * m10, fy * m11), w > 0
 
 
-def _pixel_rate(row: Array, x_rate: Array, y_rate: Array, intrinsics: tuple[Value, Value, Value]) -> None:
+def _write_pixel_rate(row: Array, x_rate: Array, y_rate: Array, intrinsics: tuple[Value, Value, Value]) -> None:
     fx, fy, skew = intrinsics
     row[..., 0, :] = fx * x_rate + skew * y_rate
     np.multiply(fy, y_rate, out=row[..., 1, :])
 
 
-def _lens_rows(
+def _write_lens_rows(
     rows: dict[int, Array],
     model: LensModel,
     place: tuple[Array, Array, Array],
@@ -159,10 +161,10 @@ def _lens_rows(
     g: Array,
     inverse: Value,
 ) -> None:
-    """Derivatives by all coefficients but the tilt's."""
+    """Write the derivatives by all coefficients except the tilt's."""
     x, y, s = place
     m00, m01, m10, m11 = outer
-    # What a change of the ratio of the polynomials does to the pixel.
+    # Derivatives of the pixel by the ratio of the polynomials.
     u_radial, v_radial = m00 * x + m01 * y, m10 * x + m11 * y
     if model.tangential:
         double_x, double_y = 2.0 * x, 2.0 * y
@@ -172,16 +174,16 @@ def _lens_rows(
                 rows[index][..., 0, :] = du * s + rate * u_radial
                 rows[index][..., 1, :] = dv * s + rate * v_radial
     u_start, v_start = u_radial * inverse * s, v_radial * inverse * s
-    _powers(rows, model.numerator_index, (u_start, v_start), s)
+    _write_powers(rows, model.numerator_index, (u_start, v_start), s)
     if model.denominator:
-        _powers(rows, model.denominator_index, (-g * u_start, -g * v_start), s)
+        _write_powers(rows, model.denominator_index, (-g * u_start, -g * v_start), s)
     if model.prism:
         for members, du, dv in zip(model.prism_index, (m00, m01), (m10, m11), strict=True):
-            _powers(rows, members, (du * s, dv * s), s)
+            _write_powers(rows, members, (du * s, dv * s), s)
 
 
-def _powers(rows: dict[int, Array], members: tuple[int, ...], start: tuple[Array, Array], s: Array) -> None:
-    """Columns of a polynomial in s, each the one before times s."""
+def _write_powers(rows: dict[int, Array], members: tuple[int, ...], start: tuple[Array, Array], s: Array) -> None:
+    """Write the columns of a polynomial in s, each the one before times s."""
     if not all(i in rows for i in members):
         for order, i in enumerate(members):
             if i in rows:
@@ -192,8 +194,5 @@ def _powers(rows: dict[int, Array], members: tuple[int, ...], start: tuple[Array
         before: Array = start[k]
         for order, i in enumerate(members):
             row = rows[i][..., k, :]
-            if order == 0:
-                row[...] = before
-            else:
-                np.multiply(before, s, out=row)
+            np.multiply(before, s if order else 1.0, out=row)
             before = row

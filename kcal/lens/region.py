@@ -1,14 +1,14 @@
-"""Where a lens model is a lens: the part around the optical axis before it folds back or meets a pole.
+"""Find the region where a lens model is valid: the part around the optical axis before it folds or meets a pole.
 
-The distortion of Eq. 4 is no bijection of the plane. Seen from the axis along any direction there is a first place
-where the Jacobian's determinant, the radial denominator or the tilt's w is no longer positive, and what lies beyond it
-is not the lens. `valid_region` walks outward along 64 directions to that place. A map without folds that takes the
-edge of a region once around the origin is one-to-one inside; where the edge does not (two folds can meet in a cusp,
-inside which a pixel has several preimages), the region is pulled in until it does.
+The distortion of Eq. 4 is no bijection of the plane. Along every direction from the axis there is a first place where
+the Jacobian's determinant, the radial denominator or the tilt's w is no longer positive. Beyond it the formula does not
+describe the lens. `valid_region` walks outward along 64 directions to that place. A map without folds that takes the
+edge of a region once around the origin is one-to-one inside. Where the edge does not (two folds can meet in a cusp,
+inside which a pixel has several preimages), the region is shrunk until it does.
 
-For a lens without tangential, prism and tilt terms the region is a disc. For others it is the union of the largest
-disc about the axis and the regular part of what a short Fourier series encloses: the reciprocal of the limit as a
-function of the direction, rounded up so that it stays inside the 64 places.
+For a lens without tangential, prism and tilt terms the region is a disc. For others it is the union of the largest disc
+about the axis and the regular part of what a short Fourier series encloses. The series describes the reciprocal of the
+limit as a function of the direction, rounded up so that it stays inside the 64 places.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from kcal.lens.tracing import known_true
 
 DIRECTIONS = 64
 _HARMONICS = 6
-# How far beyond the smallest disc the region may reach, or how far inside it must stay, until it is one-to-one.
+# Largest reach of the region, relative to the largest disc; tried in this order until the lens is one-to-one inside.
 _CAPS = (math.inf, 8.0, 4.0, 2.5, 1.7, 1.3, 1.15, 1.05, 1.0, 0.8, 0.6, 0.4, 0.2)
-# The limit is smooth along the directions: within this fraction of the smallest one no fold hides between two of them.
+# The limit is smooth along the directions: within this fraction of the smallest limit, no fold lies between two.
 _SURE = 0.95
 
 
 class Region(NamedTuple):
-    """The valid region on the plane z = 1 (for a fisheye, on the plane of angles).
+    """The valid region of a lens on the plane z = 1 (for a fisheye, on the plane of angles).
 
     Attributes:
-        radius: (...) of the largest disc about the axis inside the region.
-        edge: (..., 13) Fourier series of the reciprocal distance of the edge: constant, then cosine and sine of the
-            direction's first, second, ... multiple.
+        radius: (...) radius of the largest disc about the axis inside the region.
+        edge: (..., 13) Fourier series of the reciprocal distance of the edge: the constant, then cosine and sine of
+            once, twice, ... the direction.
     """
 
     radius: Tensor
@@ -50,25 +50,25 @@ class Region(NamedTuple):
         return torch.addcmul(x * x, y, y) < radius * radius
 
     def fraction(self, x: Tensor, y: Tensor) -> Tensor:
-        """How far out points (..., N) lie, as a fraction of the way to the edge that the series describes."""
+        """Distance of points (..., N) from the axis, as a fraction of that to the edge that the series describes."""
         distance = torch.sqrt(torch.addcmul(x * x, y, y))
         scale = torch.clamp(distance, min=1e-300).reciprocal()
-        return distance * _fourier(self.edge, x * scale, y * scale)
+        return distance * _evaluate_series(self.edge, x * scale, y * scale)
 
     def encloses(self, x: Tensor, y: Tensor) -> Tensor:
-        """Whether points (..., N) lie within the outline, where all of the valid region is."""
+        """Whether points (..., N) lie within the outline, which encloses the whole valid region."""
         return self.covers(x, y) | (self.fraction(x, y) < 1.0)
 
     def outline(self, count: int) -> Tensor:
         """Points (..., count, 2) on the edge of the region, clockwise as seen in the image, the first on the x axis."""
         unit_x, unit_y = directions(count, self.edge)
-        reciprocal = _fourier(self.edge, unit_x, unit_y)
+        reciprocal = _evaluate_series(self.edge, unit_x, unit_y)
         reach = torch.maximum(self.radius[..., None], reciprocal.reciprocal())
         return torch.stack([reach * unit_x, reach * unit_y], -1)
 
 
-def _fourier(edge: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
-    """The series at directions given by their cosine and sine."""
+def _evaluate_series(edge: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+    """Evaluate the series at directions given by their cosine and sine."""
     constant, *rest = unbind_last(edge)
     double = 2.0 * cosine
     value = torch.addcmul(torch.addcmul(constant, rest[0], cosine), rest[1], sine)
@@ -79,14 +79,14 @@ def _fourier(edge: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
     return value
 
 
-def _fit_edge(limits: Tensor) -> Tensor:
-    """The series (..., 13) that stays within limits (..., 64) at every one of the directions."""
+def _fit_series(limits: Tensor) -> Tensor:
+    """Fit a series (..., 13) that stays within limits (..., 64) at each of the directions."""
     angle = torch.arange(DIRECTIONS, dtype=torch.float64, device=limits.device) * (2 * math.pi / DIRECTIONS)
     waves = [f(k * angle) for k in range(1, _HARMONICS + 1) for f in (torch.cos, torch.sin)]
     basis = torch.stack([torch.ones_like(angle), *waves], -1)
     weights = basis * (2.0 / DIRECTIONS)
     weights[:, 0] *= 0.5
-    # A lens that is irregular on the axis reaches nowhere; 1e100 stands for the reciprocal of zero.
+    # A lens that is irregular on the axis has a limit of zero; 1e100 stands for its reciprocal.
     wanted = limits.clamp(min=1e-100).reciprocal()
     series = wanted @ weights
     raise_by = (wanted - series @ basis.T).amax(-1).clamp(min=0.0)
@@ -94,32 +94,32 @@ def _fit_edge(limits: Tensor) -> Tensor:
 
 
 def directions(count: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine (count,) of directions spread evenly, beginning on the x axis."""
+    """Cosine and sine (count,) of evenly spread directions, the first on the x axis."""
     angle = torch.arange(count, dtype=torch.float64, device=like.device) * (2 * math.pi / count)
     return torch.cos(angle), torch.sin(angle)
 
 
 @torch.no_grad()
-def first_limits(coefficients: Tensor, model: LensModel, count: int) -> Tensor:
-    """How far the lens reaches along each of `count` directions, (..., count); see the module's first lines."""
+def direction_limits(coefficients: Tensor, model: LensModel, count: int) -> Tensor:
+    """Distance (..., count) of the first place along each of `count` directions where the lens is not regular."""
     unit_x, unit_y = directions(count, coefficients)
 
-    def good(radius: Tensor) -> Tensor:
-        """Radii (..., K, count), one column a direction -> how many from the first on are regular, (..., count)."""
+    def count_regular(radius: Tensor) -> Tensor:
+        """For radii (..., K, count), one column per direction: number (..., count) of leading regular ones."""
         x, y = (radius * unit_x).flatten(-2), (radius * unit_y).flatten(-2)
         lens = distort_components(x, y, coefficients, model)
         regular = (lens.positive & (lens.determinant > 0)).unflatten(-1, (-1, count))
         return regular.to(torch.int64).cumprod(-2).sum(-2)
 
-    # From the axis out, 1/6° or so a step; then each interval is split in 32 again until it is as narrow as rounding.
+    # Outward in steps of 1/6°; then the interval is split in 32 again and again, until it is as narrow as rounding.
     top = largest_radius(model)
     steps = torch.linspace(0, top if model.fisheye else math.atan(top), 535, dtype=torch.float64)
     radii = (steps if model.fisheye else torch.tan(steps)).to(coefficients.device)[:, None].expand(-1, count)
     fractions = torch.linspace(0, 1, 33, dtype=torch.float64, device=coefficients.device)[:, None]
     for _ in range(11):
-        regular = good(radii)
+        regular = count_regular(radii)
         radii = radii.expand(*regular.shape[:-1], -1, -1)
-        # A lens that is irregular on the axis itself (a tilt beyond 90°, say) reaches nowhere: radius zero.
+        # A lens that is irregular on the axis itself, for example with a tilt beyond 90°, has a limit of zero.
         low = torch.gather(radii, -2, (regular - 1).clamp(min=0)[..., None, :])
         high = torch.gather(radii, -2, regular.clamp(max=radii.shape[-2] - 1)[..., None, :])
         radii = low + (high - low) * fractions
@@ -127,7 +127,7 @@ def first_limits(coefficients: Tensor, model: LensModel, count: int) -> Tensor:
 
 
 def _winds_once(x: Tensor, y: Tensor) -> Tensor:
-    """Whether closed curves (..., M) run around the origin exactly once, never backwards: (...)."""
+    """Whether closed curves (..., M) run around the origin exactly once and never backwards, (...)."""
     scale = torch.sqrt(x * x + y * y).clamp(min=1e-300)
     x, y = x / scale, y / scale
     next_x, next_y = x.roll(-1, -1), y.roll(-1, -1)
@@ -138,11 +138,11 @@ def _winds_once(x: Tensor, y: Tensor) -> Tensor:
 
 @torch.no_grad()
 def valid_region(coefficients: Tensor, model: LensModel | str) -> Region:
-    """Measure where a lens is valid.
+    """Find where a lens is valid.
 
     Args:
         coefficients: (..., P).
-        model: a `LensModel` or a preset's name.
+        model: a `LensModel` or the name of one.
 
     Raises:
         InputError: the wrong number of coefficients.
@@ -156,18 +156,18 @@ def valid_region(coefficients: Tensor, model: LensModel | str) -> Region:
     model = LensModel.named(model)
     coefficients = check_coefficients(coefficients, model)
     if model.radial:
-        limits = first_limits(coefficients, model, 1)
-        return Region(limits[..., 0], _fit_edge(limits.expand(*limits.shape[:-1], DIRECTIONS)))
-    limits = first_limits(coefficients, model, DIRECTIONS)
+        limits = direction_limits(coefficients, model, 1)
+        return Region(limits[..., 0], _fit_series(limits.expand(*limits.shape[:-1], DIRECTIONS)))
+    limits = direction_limits(coefficients, model, DIRECTIONS)
     smallest = limits.amin(-1, keepdim=True)
     caps = torch.tensor(_CAPS, dtype=torch.float64, device=limits.device)[:, None]
-    # No limit times a radius of zero would be NaN.
+    # An infinite cap times a limit of zero would be NaN.
     capped = torch.minimum(limits[..., None, :], torch.nan_to_num(caps * smallest[..., None, :], nan=0.0, posinf=1e9))
-    candidates = Region(capped.amin(-1), _fit_edge(capped))
+    candidates = Region(capped.amin(-1), _fit_series(capped))
     outline = candidates.outline(DIRECTIONS).flatten(-3, -2)
     lens = distort_components(outline[..., 0], outline[..., 1], coefficients, model, slopes=False)
     fits = _winds_once(lens.x.unflatten(-1, (-1, DIRECTIONS)), lens.y.unflatten(-1, (-1, DIRECTIONS)))
-    # The first cap that fits; close to the axis every regular lens is linear, so the last one stands for it.
+    # The first cap that fits, or the last one: close to the axis every regular lens is linear.
     first = (fits.to(torch.int64).cumsum(-1) == 0).sum(-1).clamp(max=len(_CAPS) - 1)[..., None]
     radius = torch.gather(candidates.radius, -1, first)[..., 0]
     edge = torch.gather(candidates.edge, -2, first[..., None].expand(*first.shape, candidates.edge.shape[-1]))
@@ -184,16 +184,16 @@ def in_region(
 ) -> Tensor:
     """Whether points (..., N) of the plane lie in the valid region.
 
-    Near the edge of a lens that is not symmetric the Jacobian itself is asked, so that a fold in between two of the
-    64 directions does not go unseen.
+    Near the edge of a lens that is not symmetric, the Jacobian itself is checked, because a fold may lie between two of
+    the 64 directions.
 
     Args:
         x: (..., N).
-        y: likewise.
+        y: (..., N).
         coefficients: (..., P).
         model: the lens model.
         region: of the lens.
-        lens: the lens evaluated there with its slopes, if that is at hand.
+        lens: the lens at these points with its Jacobian, if already known.
     """
     if model.radial:
         return region.covers(x, y)
@@ -206,15 +206,5 @@ def in_region(
 
 
 def surely_in_region(x: Tensor, y: Tensor, region: Region) -> Tensor:
-    """Whether points (..., N) lie so far inside that nothing else need be asked."""
+    """Whether points (..., N) lie so far inside that no further check is needed."""
     return region.covers(x, y, _SURE)
-
-
-def valid_radius(coefficients: Tensor, model: LensModel | str) -> Tensor:
-    """Radius (...) of the disc about the axis inside which the lens is valid; see `valid_region`.
-
-    Example:
-        >>> round(float(valid_radius(torch.tensor([-0.75, 0.0, 0.0, 0.0], dtype=torch.float64), "opencv4")), 12)
-        0.666666666667
-    """
-    return valid_region(coefficients, model).radius

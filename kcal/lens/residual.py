@@ -1,56 +1,54 @@
 """A small smooth correction of the distorted plane: what a real lens does beside its formula.
 
-After the lens terms (tilt included) a point of the plane is at d. The residual moves it on, d → d + r(d), and the
-intrinsics follow. r is a network of Gaussian units on regular grids, one grid a width l (Broomhead and Lowe 1988):
+After the lens terms, tilt included, a point of the plane is at d. The residual field moves it, d → d + r(d), and the
+intrinsics follow. r is a network of Gaussian units on regular grids, one grid per width l (Broomhead and Lowe 1988):
 
     r(d) = Σ_ij w_ij e(x; x_i, l) e(y; y_j, l),   e(x; c, l) = exp(-(x - c)² / 2 l²)
 
-so it is smooth to any order, zero for zero weights, and dies out within a few widths of the last unit that was given a
-weight. A Gaussian of two variables is a product: the units of a grid of n x m cost n + m exponentials a point and one
-matrix product. It is linear in the weights, so that fits with Gaussian priors on these are least squares.
+It is smooth to any order, zero for zero weights, and vanishes within a few widths of the outermost unit. Because a
+Gaussian of two variables is a product, a grid of n x m units costs n + m exponentials per point and one matrix product.
+r is linear in the weights, so a fit with Gaussian priors on them is linear least squares.
 
-It must be a small correction: its slope is bounded everywhere by less than `LARGEST_SLOPE` (checked, not hoped for), so
-that d + r(d) is one-to-one on the whole plane (Banach), the parametric lens keeps its valid region, and the inverse
-always exists.
+The slope of r must stay below `LARGEST_SLOPE` everywhere, which is checked. Then d + r(d) is one-to-one on the whole
+plane (Banach), the parametric lens keeps its valid region, and the inverse always exists.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, keep_float64, require_finite
+from kcal.checks import Float64Module, as_points, require_finite
 from kcal.errors import InputError
+from kcal.lens.newton import Jacobian, inverse_jacobian, is_solved, newton_step
 from kcal.lens.tracing import is_differentiated, known_true, may_branch
 
-# Distance of the units of a grid, in widths. A denser grid says nothing that this one cannot.
+# Distance between the units of a grid, in widths. Denser units are nearly redundant.
 SPACING = 0.8
-# Of r, everywhere: above 1 the inverse might not be unique, and close to it hard to find.
+# Of r, everywhere: above 1 the inverse might not be unique, and close to 1 it is hard to find.
 LARGEST_SLOPE = 0.5
-# Residual of the inverse on the plane, as for the lens terms.
-_TOLERANCE = 1e-13
-_FIXED, _CHORD, _MOST, _CONTRACTIONS = 4, 4, 12, 60
-# Nodes in each width where the slope is looked at; beyond this many widths of the outermost unit there is nothing left.
-_NODES, _REACH = 8, 6.0
-# The most that Σ_i |e|, Σ_i |e'| and Σ_i |e''| can be anywhere on an endless grid of width one.
+# Steps of the inverse: in compiled graphs; with the first Jacobian; of Newton's method at most; of the contraction,
+# which halves the error at least, at most.
+_FIXED, _CHORD, _NEWTON, _CONTRACTIONS = 4, 4, 12, 60
+# The largest values of Σ_i |e|, Σ_i |e'| and Σ_i |e''| anywhere on an endless grid of width one.
 _SUMS = (3.14, 2.58, 3.11)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FieldScale:
-    """A grid of Gaussian units of one width, in units of the distorted plane (focal lengths).
+    """A grid of Gaussian units of one width; lengths are on the distorted plane, in focal lengths.
 
     Args:
-        width: l of the units.
+        width: l of each unit.
         left: x of the first column of units.
         top: y of the first row.
-        columns: how many.
-        rows: likewise.
+        columns: number of columns.
+        rows: number of rows.
     """
 
     width: float
@@ -63,22 +61,22 @@ class FieldScale:
         if not (0 < self.width < math.inf and math.isfinite(self.left) and math.isfinite(self.top)):
             raise InputError(f"field scale: width must be positive and all numbers finite, got {self}")
         if min(self.columns, self.rows) < 1:
-            raise InputError(f"field scale: {self.columns} x {self.rows} units; at least one each way is needed")
+            raise InputError(f"field scale: {self.columns} x {self.rows} units; at least one each is needed")
 
     @property
     def count(self) -> int:
-        """How many units there are."""
+        """Number of units."""
         return self.columns * self.rows
 
     def places(self) -> tuple[list[float], list[float]]:
-        """X of the columns and y of the rows."""
+        """Coordinates x of the columns and y of the rows."""
         step = SPACING * self.width
         return [self.left + i * step for i in range(self.columns)], [self.top + j * step for j in range(self.rows)]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FieldGrid:
-    """The units of a residual field: some grids, each of its own width.
+    """The units of a residual field: grids, each of its own width.
 
     Example:
         >>> grid = FieldGrid.covering((-1.0, -0.6), (1.0, 0.6), widths=[0.5, 0.25])
@@ -90,7 +88,7 @@ class FieldGrid:
 
     @classmethod
     def covering(cls, low: Sequence[float], high: Sequence[float], widths: Sequence[float]) -> FieldGrid:
-        """Grids over the rectangle from `low` to `high` (x, y), centered on it, no side left uncovered."""
+        """Grids that cover the rectangle from `low` to `high` (x, y) and are centered on it."""
         scales = []
         for width in widths:
             step = SPACING * width
@@ -101,32 +99,32 @@ class FieldGrid:
 
     @property
     def count(self) -> int:
-        """How many units there are, of all widths."""
+        """Number of units of all widths."""
         return sum(scale.count for scale in self.scales)
 
     def scale_weights(self, weights: Tensor) -> list[Tensor]:
-        """Weights (2, K) as one (2, columns, rows) a scale."""
+        """Split weights (2, K) into one tensor (2, columns, rows) per scale."""
         parts = weights.split([scale.count for scale in self.scales], -1)
         return [part.unflatten(-1, (s.columns, s.rows)) for s, part in zip(self.scales, parts, strict=True)]
 
 
 class Field(NamedTuple):
-    """A residual field as its functions take it: the units, and their weights (2, K) along x and y."""
+    """A residual field for the functions below: the units, and their weights (2, K) along x and y."""
 
     grid: FieldGrid
     weights: Tensor
 
 
 class Corrected(NamedTuple):
-    """The plane after the residual: d + r(d) as x, y (..., N), and ∂x/∂x, ∂x/∂y, ∂y/∂x, ∂y/∂y if asked for."""
+    """Corrected points d + r(d) as x, y (..., N), and their Jacobian by d, or () if it was not asked for."""
 
     x: Tensor
     y: Tensor
-    point: tuple[Tensor, ...]
+    point: Jacobian
 
 
-def _units(z: Tensor, places: Sequence[float], width: float) -> tuple[Tensor, Tensor]:
-    """E along one axis at z (..., N) for units at `places`, (..., M, N), and what -e is multiplied by for e'."""
+def _gaussians(z: Tensor, places: Sequence[float], width: float) -> tuple[Tensor, Tensor]:
+    """e(z; c, l) along one axis at z (..., N) for units at `places`, (..., M, N), and -e' / e."""
     # As tensors: ONNX would write plain numbers as float32.
     inverse = torch.tensor(1.0 / width, dtype=z.dtype, device=z.device)
     scaled = torch.tensor([place / width for place in places], dtype=z.dtype, device=z.device)
@@ -139,30 +137,29 @@ def correct_components(x: Tensor, y: Tensor, field: Field, *, slopes: bool = Tru
 
     Args:
         x: (..., N).
-        y: likewise.
-        field: one field (weights without batch dimensions).
+        y: (..., N).
+        field: one field; its weights have no batch dimensions.
         slopes: whether `Corrected.point` is needed.
     """
-    moved: Tensor | None = None
-    rates: list[Tensor] = []
+    if not field.grid.scales:
+        one, zero = torch.ones_like(x), torch.zeros_like(x)
+        return Corrected(x, y, (one, zero, zero, one) if slopes else ())
+    parts = []
     for scale, weights in zip(field.grid.scales, field.grid.scale_weights(field.weights), strict=True):
         columns, rows = scale.places()
-        across, across_rate = _units(x, columns, scale.width)
-        down, down_rate = _units(y, rows, scale.width)
+        across, across_rate = _gaussians(x, columns, scale.width)
+        down, down_rate = _gaussians(y, rows, scale.width)
         matrix = weights.transpose(-1, -2).flatten(0, 1)
         # One product for both components: (2 rows, columns) times (..., columns, N).
         along = (matrix @ across).unflatten(-2, (2, scale.rows))
-        step = (along * down[..., None, :, :]).sum(-2)
-        moved = step if moved is None else moved + step
+        part = [(along * down[..., None, :, :]).sum(-2)]
         if slopes:
             turned = (matrix @ (across * across_rate)).unflatten(-2, (2, scale.rows))
-            by_x = -(turned * down[..., None, :, :]).sum(-2)
-            by_y = -(along * (down * down_rate)[..., None, :, :]).sum(-2)
-            rates = [by_x, by_y] if not rates else [rates[0] + by_x, rates[1] + by_y]
-    if moved is None:
-        one, zero = torch.ones_like(x), torch.zeros_like(x)
-        return Corrected(x, y, (one, zero, zero, one) if slopes else ())
-    point: tuple[Tensor, ...] = ()
+            part.append(-(turned * down[..., None, :, :]).sum(-2))
+            part.append(-(along * (down * down_rate)[..., None, :, :]).sum(-2))
+        parts.append(part)
+    moved, *rates = (sum(terms[1:], terms[0]) for terms in zip(*parts, strict=True))
+    point: Jacobian = ()
     if slopes:
         (a, d), (b, e) = rates[0].unbind(-2), rates[1].unbind(-2)
         point = (1.0 + a, b, d, 1.0 + e)
@@ -170,33 +167,34 @@ def correct_components(x: Tensor, y: Tensor, field: Field, *, slopes: bool = Tru
 
 
 def field_basis(x: Tensor, y: Tensor, grid: FieldGrid) -> Tensor:
-    """Values (..., K, N) of all units at points (..., N): the derivative of r by the weights, the same for x and y."""
+    """Values (..., K, N) of all units at points (..., N): the derivatives of r by the weights, the same for x and y."""
     out = []
     for scale in grid.scales:
         columns, rows = scale.places()
-        across, _ = _units(x, columns, scale.width)
-        down, _ = _units(y, rows, scale.width)
+        across, _ = _gaussians(x, columns, scale.width)
+        down, _ = _gaussians(y, rows, scale.width)
         out.append((across[..., :, None, :] * down[..., None, :, :]).flatten(-3, -2))
     return torch.cat(out, -2) if out else x.new_zeros((*x.shape[:-1], 0, x.shape[-1]))
 
 
 @torch.no_grad()
 def field_bounds(field: Field) -> tuple[float, float]:
-    """The most that a field moves a point, and its steepest slope (Frobenius), on the whole plane.
+    """Upper bounds of a field's displacement and of its slope (Frobenius norm) on the whole plane.
 
-    Rigorous upper bounds, some percent above the largest values: the field is looked at on nodes an eighth of a width
-    apart, scale by scale, and what it can do in between is bounded by its second derivatives.
+    The bounds are rigorous and some percent above the largest values: each scale is evaluated on nodes an eighth of a
+    width apart, and its second derivatives bound the change in between.
     """
     largest = steepest = 0.0
     flat, bent, sharp = _SUMS
     for scale, weights in zip(field.grid.scales, field.grid.scale_weights(field.weights.detach()), strict=True):
-        step = scale.width / _NODES
+        step = scale.width / 8
         axes = []
         for places in scale.places():
-            margin = _REACH * scale.width
+            # Six widths beyond the outermost unit, Gaussians are zero to 1e-8.
+            margin = 6.0 * scale.width
             count = math.ceil((places[-1] - places[0] + 2.0 * margin) / step) + 1
             nodes = places[0] - margin + step * torch.arange(count, dtype=weights.dtype, device=weights.device)
-            axes.append(_units(nodes, places, scale.width))
+            axes.append(_gaussians(nodes, places, scale.width))
         (across, across_rate), (down, down_rate) = axes
         value, by_x, by_y = (
             torch.einsum("aij,im,jn->amn", weights, a, b)
@@ -204,7 +202,7 @@ def field_bounds(field: Field) -> tuple[float, float]:
         )
         heaviest = weights.abs().amax((-1, -2))
         curve = float((heaviest * math.sqrt(2.0 * (sharp * flat) ** 2 + 2.0 * bent**4)).norm()) / scale.width**2
-        # Half a diagonal to the nearest node; beyond the outermost ones the field is below all it is within.
+        # Half a diagonal to the nearest node; beyond the outermost nodes the field only decreases.
         away = step / math.sqrt(2.0)
         slope = float((by_x.square() + by_y.square()).sum(0).max().sqrt()) + away * curve
         largest += float(value.square().sum(0).max().sqrt()) + away * slope
@@ -215,96 +213,74 @@ def field_bounds(field: Field) -> tuple[float, float]:
 def undo_components(x: Tensor, y: Tensor, field: Field) -> tuple[Tensor, Tensor, Tensor]:
     """Solve d + r(d) = (x, y) for d.
 
-    Newton's method with the Jacobian kept for some steps; where it should stray, the contraction d = target - r(d),
-    which cannot. Compiled and exported graphs take a fixed number of full Newton steps. The last two steps stay in the
-    autograd graph, as in `kcal.lens.inverse.undistort`.
+    Newton's method, with the first Jacobian kept for some steps; where it strays, the contraction d = goal - r(d),
+    which always converges. Compiled and exported graphs take a fixed number of full Newton steps. The last two steps
+    stay in the autograd graph, as in `kcal.lens.inverse.undistort`.
 
     Args:
         x: (..., N) finite.
-        y: likewise.
-        field: the field, of a slope below `LARGEST_SLOPE`.
+        y: (..., N) finite.
+        field: a field whose slope stays below `LARGEST_SLOPE`.
 
     Returns:
-        x and y of d, and (..., N) whether they solve the equation to rounding; for such a field they always do,
+        x and y of d, and (..., N) whether they solve the equation to rounding, which is always true for such a field
         except in a graph of fixed steps.
     """
     if not field.grid.scales:
         return x, y, torch.ones_like(x, dtype=torch.bool)
     with torch.no_grad():
         solve = _undo_eagerly if may_branch(x, y, field.weights) else _undo_in_fixed_steps
-        found_x, found_y, settled = solve(x, y, field)
+        found_x, found_y, solved = solve(x, y, field)
     if is_differentiated(x, y, field.weights):
         for _ in range(2):
-            found_x, found_y = _newton_step(found_x, found_y, x, y, field)
-    return found_x, found_y, settled
+            found_x, found_y = _full_step(found_x, found_y, x, y, field)
+    return found_x, found_y, solved
 
 
-def _newton_step(x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, field: Field) -> tuple[Tensor, Tensor]:
+def _full_step(x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, field: Field) -> tuple[Tensor, Tensor]:
     here = correct_components(x, y, field)
-    return _step(x, y, here.x - goal_x, here.y - goal_y, _inverse(here))
-
-
-def _inverse(here: Corrected) -> tuple[Tensor, ...]:
-    a, b, d, e = here.point
-    scale = (a * e - b * d).reciprocal()
-    return e * scale, b * scale, d * scale, a * scale
-
-
-def _step(x: Tensor, y: Tensor, error_x: Tensor, error_y: Tensor, inverse: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    e, b, d, a = inverse
-    return x - (e * error_x - b * error_y), y - (a * error_y - d * error_x)
-
-
-def _settled(error_x: Tensor, error_y: Tensor, goal_x: Tensor, goal_y: Tensor) -> Tensor:
-    enough = (1.0 + goal_x * goal_x + goal_y * goal_y) * _TOLERANCE**2
-    return error_x * error_x + error_y * error_y <= enough
+    return newton_step(x, y, here.x - goal_x, here.y - goal_y, inverse_jacobian(here.point))
 
 
 def _undo_eagerly(goal_x: Tensor, goal_y: Tensor, field: Field) -> tuple[Tensor, Tensor, Tensor]:
     x, y = goal_x, goal_y
-    settled = torch.zeros_like(goal_x, dtype=torch.bool)
-    inverse: tuple[Tensor, ...] = ()
-    for trial in range(_MOST):
-        fresh = trial == 0 or trial >= _CHORD
+    solved = torch.zeros_like(goal_x, dtype=torch.bool)
+    inverse: Jacobian = ()
+    for trial in range(_NEWTON + _CONTRACTIONS):
+        if trial == _NEWTON:
+            x, y = torch.where(solved, x, goal_x), torch.where(solved, y, goal_y)
+        fresh = trial == 0 or _CHORD <= trial < _NEWTON
         here = correct_components(x, y, field, slopes=fresh)
         error_x, error_y = here.x - goal_x, here.y - goal_y
-        settled = _settled(error_x, error_y, goal_x, goal_y)
-        if known_true(settled):
-            return x, y, settled
-        inverse = _inverse(here) if fresh else inverse
-        x, y = _step(x, y, error_x, error_y, inverse)
-    x, y = torch.where(settled, x, goal_x), torch.where(settled, y, goal_y)
-    for _ in range(_CONTRACTIONS):
-        here = correct_components(x, y, field, slopes=False)
-        error_x, error_y = here.x - goal_x, here.y - goal_y
-        settled = _settled(error_x, error_y, goal_x, goal_y)
-        if known_true(settled):
+        solved = is_solved(error_x, error_y, goal_x, goal_y)
+        if known_true(solved):
             break
-        x, y = x - error_x, y - error_y
-    return x, y, settled
+        inverse = inverse_jacobian(here.point) if fresh else inverse
+        x, y = newton_step(x, y, error_x, error_y, inverse) if trial < _NEWTON else (x - error_x, y - error_y)
+    return x, y, solved
 
 
 def _undo_in_fixed_steps(goal_x: Tensor, goal_y: Tensor, field: Field) -> tuple[Tensor, Tensor, Tensor]:
     x, y = goal_x, goal_y
     for _ in range(_FIXED):
-        x, y = _newton_step(x, y, goal_x, goal_y, field)
+        x, y = _full_step(x, y, goal_x, goal_y, field)
     here = correct_components(x, y, field, slopes=False)
-    return x, y, _settled(here.x - goal_x, here.y - goal_y, goal_x, goal_y)
+    return x, y, is_solved(here.x - goal_x, here.y - goal_y, goal_x, goal_y)
 
 
-class FieldResidual(nn.Module):
+class FieldResidual(Float64Module):
     """A residual field as a module: a network of Gaussian units on the distorted plane.
 
-    Convention: coordinates and corrections on the plane after the lens terms, in units of the focal length, y down;
-    float64 whatever the module is cast to. Weights do not require gradients until asked. Zero weights: the identity.
+    Convention: coordinates and corrections lie on the plane after the lens terms, in focal lengths, y down. Float64,
+    whatever the module is cast to. The weights do not require gradients until asked. Zero weights are the identity.
 
     Args:
         grid: the units.
-        weights: (2, K) corrections along x and y; zero if not given.
+        weights: (2, K) of the units, along x and y; zero if not given.
 
     Raises:
-        InputError: weights of another shape or not finite, or a field whose slope somewhere exceeds 0.5: no small
-            correction, and perhaps not invertible.
+        InputError: weights of another shape or not finite, or a field whose slope exceeds 0.5 somewhere and that
+            might not be invertible.
 
     Example:
         >>> grid = FieldGrid.covering((-1.0, -0.6), (1.0, 0.6), widths=[0.5])
@@ -315,8 +291,6 @@ class FieldResidual(nn.Module):
         >>> moved = field(point)
         >>> bool((moved[0, 0] > 0.1) & (moved[0, 0] < 0.11)), moved[1].tolist()
         (True, [30.0, 0.0])
-        >>> bool(torch.allclose(field.undo(moved)[0], point, rtol=0, atol=1e-13))
-        True
     """
 
     weights: Tensor
@@ -335,42 +309,33 @@ class FieldResidual(nn.Module):
 
     @property
     def field(self) -> Field:
-        """Units and weights as the functions take them."""
+        """Units and weights, for the functions of this module."""
         return Field(self.grid, self.weights)
 
     def bounds(self) -> tuple[float, float]:
-        """The most that a point is moved, in focal lengths, and the steepest slope; see `field_bounds`."""
+        """Upper bounds of the displacement, in focal lengths, and of the slope; see `field_bounds`."""
         return field_bounds(self.field)
 
     def check(self) -> None:
-        """Raise `InputError` unless the field is a small correction everywhere; for weights changed in place."""
+        """Raise `InputError` if the slope exceeds 0.5 somewhere; call it after changing the weights in place."""
         _, steepest = self.bounds()
         if not steepest <= LARGEST_SLOPE:
             raise InputError(
-                f"residual field: its slope reaches {steepest:.3g}, at most {LARGEST_SLOPE} makes a correction that "
-                "can be undone; use smaller weights or wider units"
+                f"residual field: its slope reaches {steepest:.3g}, and above {LARGEST_SLOPE} it might not be "
+                "invertible; use smaller weights or wider units"
             )
 
     def forward(self, distorted: Tensor) -> Tensor:
-        """Points d (..., N, 2) of the distorted plane to d + r(d)."""
+        """Move points d (..., N, 2) of the distorted plane to d + r(d)."""
         distorted = as_points("distorted", distorted, 2)
         moved = correct_components(distorted[..., 0], distorted[..., 1], self.field, slopes=False)
         return torch.stack([moved.x, moved.y], -1)
 
-    def undo(self, corrected: Tensor) -> tuple[Tensor, Tensor]:
-        """The inverse of `forward`: d (..., N, 2) and (..., N) whether it is one, see `undo_components`."""
-        corrected = as_points("corrected", corrected, 2)
-        x, y, settled = undo_components(corrected[..., 0], corrected[..., 1], self.field)
-        return torch.stack([x, y], -1), settled
-
     def extra_repr(self) -> str:
-        """Units of each width, and how far points are moved."""
+        """Units of each width and the largest displacement, for `repr`."""
         grids = ", ".join(f"{s.columns}x{s.rows} of {s.width:.3g}" for s in self.grid.scales)
         return f"units {grids or 'none'}, moves at most {self.bounds()[0]:.3g}"
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
         self.check()
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
-        return super()._apply(keep_float64(fn), recurse)

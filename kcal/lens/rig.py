@@ -1,16 +1,20 @@
-"""`StereoRig`: two cameras and where one stands from the other."""
+"""`StereoRig`: two cameras and where one stands from the other; `RigCovariance`: how well that is known."""
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, keep_float64, require_finite
+from kcal.checks import as_covariance, as_points, keep_float64, require_finite
 from kcal.errors import InputError
+from kcal.lens.calibration import RigCalibration, UntilChanged
 from kcal.lens.camera import Camera
+from kcal.lens.mounting import Mounting
 
 
 class StereoRig(nn.Module):
@@ -18,6 +22,10 @@ class StereoRig(nn.Module):
 
     Convention: the rig frame is the left camera's frame, and `points_right = rotation @ points_left + translation`
     (meters). "Left" is only the first camera's name.
+
+    What else is known of the rig travels with it, is stored by `kcal.save_rig` and used by `StereoLocalizer`, but takes
+    no part in projection: the attributes `covariance` (a `RigCovariance`), `mounting` (a `Mounting`) and `calibration`
+    (a `RigCalibration`). Each is None until it is set, and again once a camera or the relative pose has changed.
 
     Args:
         left: the first camera.
@@ -37,6 +45,9 @@ class StereoRig(nn.Module):
 
     right_from_left_rotation: Tensor
     right_from_left_translation: Tensor
+    covariance = UntilChanged["RigCovariance"](lambda rig, value: RigCovariance.of(rig, joint=value.matrix))
+    mounting = UntilChanged[Mounting]()
+    calibration = UntilChanged[RigCalibration]()
 
     def __init__(
         self, left: Camera, right: Camera, right_from_left_rotation: Tensor, right_from_left_translation: Tensor
@@ -64,6 +75,12 @@ class StereoRig(nn.Module):
         """Distance between the cameras' centers, meters."""
         return torch.linalg.vector_norm(self.right_from_left_translation)
 
+    @property
+    def fingerprint(self) -> str:
+        """Twelve hex digits that change with either camera and with the relative pose."""
+        pose = self.right_from_left_rotation.tolist(), self.right_from_left_translation.tolist()
+        return hashlib.sha256(repr((self.left.fingerprint, self.right.fingerprint, pose)).encode()).hexdigest()[:12]
+
     def right_from_left(self, points_left: Tensor) -> Tensor:
         """Move points (..., N, 3) from the left camera's frame into the right camera's."""
         points = as_points("points_left", points_left, 3)
@@ -77,3 +94,78 @@ class StereoRig(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         return super()._apply(keep_float64(fn), recurse)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RigCovariance:
+    """How well a rig is known: one joint covariance, so that what is correlated stays so.
+
+    The order is: the parameters of the left camera as in `Camera.names`, those of the right one, the rotation of
+    right_from_left (3 radians: a rotation vector about the right camera's axes, `exp([ω]x) R`), its translation
+    (3 meters), as in `kcal.lens.pose`.
+
+    Args:
+        matrix: (P, P) float64, P = the two cameras' parameters + 6.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+        >>> sigma = torch.tensor([0, 1e-4, 0, 0, 0, 0], dtype=torch.float64)  # relative yaw
+        >>> known = RigCovariance.of(rig, pose=torch.diag(sigma**2))
+        >>> tuple(known.matrix.shape)
+        (16, 16)
+    """
+
+    matrix: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        rig: StereoRig,
+        *,
+        left: Tensor | None = None,
+        right: Tensor | None = None,
+        pose: Tensor | None = None,
+        joint: Tensor | None = None,
+    ) -> RigCovariance:
+        """Put parts together, each independent of the others and exact where left out; or check a `joint` matrix.
+
+        Args:
+            rig: the rig that they belong to.
+            left: of the left camera's parameters, (5 + P, 5 + P).
+            right: of the right camera's.
+            pose: (6, 6) of the relative pose.
+            joint: all of it, in place of the parts.
+
+        Raises:
+            InputError: a wrong shape, a matrix that is no covariance, or parts and a joint matrix together.
+        """
+        sizes = (rig.left.values.shape[-1], rig.right.values.shape[-1], 6)
+        if joint is not None:
+            if not (left is None and right is None and pose is None):
+                raise InputError("rig covariance: give the joint matrix or its parts, not both")
+            return cls(matrix=as_covariance("joint covariance", joint, sum(sizes)))
+        names = ("left camera's covariance", "right camera's covariance", "pose covariance")
+        parts = [as_covariance(*item) for item in zip(names, (left, right, pose), sizes, strict=True)]
+        return cls(matrix=torch.block_diag(*parts))
+
+    def factor(self) -> Tensor:
+        """(P, K) with factor @ factor.T = matrix, K being its rank."""
+        scale = self.matrix.diagonal().sqrt()
+        safe = torch.where(scale > 0, scale, 1.0)
+        values, vectors = torch.linalg.eigh(self.matrix / safe[:, None] / safe[None, :])
+        kept = values > 1e-14 * values[-1].clamp_min(1e-300)
+        return scale[:, None] * vectors[:, kept] * values[kept].sqrt()
+
+    def checked_link(self, mounting: Tensor, link: Tensor) -> Tensor:
+        """`link` (P, 6) as float64, after checking that it fits this covariance and that of the mounting (6, 6).
+
+        Raises:
+            InputError: a wrong shape, or the three together are no covariance.
+        """
+        size = len(self.matrix)
+        if not isinstance(link, Tensor) or tuple(link.shape) != (size, 6):
+            raise InputError(f"link: a covariance of the calibration with the mounting, ({size}, 6), is needed")
+        link, mounting = link.to(self.matrix), mounting.to(self.matrix)
+        whole = torch.cat([torch.cat([self.matrix, link], 1), torch.cat([link.T, mounting], 1)])
+        return as_covariance("covariance of calibration and mounting", whole, size + 6)[:size, size:]

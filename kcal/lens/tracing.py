@@ -1,4 +1,4 @@
-"""What only an ordinary, eager call may do: look at values, and work through points a cache-sized piece at a time.
+"""Find out whether a call is ordinary and eager, so that it may branch on values and work in cache-sized pieces.
 
 Under `torch.compile`, `torch.export` and `vmap` no branch may depend on values, and the compiler does its own blocking.
 """
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-# Points a piece: large enough to outweigh the cost of a call, small enough for the caches of one core.
+# Points per piece: large enough to outweigh the cost of a call, small enough for the caches of one core.
 CHUNK = 16384
 
 
@@ -21,12 +21,12 @@ def is_traced() -> bool:
 
 
 def known_true(mask: Tensor) -> bool:
-    """Whether a mask is true everywhere; False also where that may not be asked (compile, export, vmap)."""
+    """Whether a mask is true everywhere; also False where values must not be read (compile, export, vmap)."""
     if is_traced():
         return False
     try:
         return bool(mask.all())
-    except RuntimeError:  # vmap refuses to turn tensors into branches
+    except RuntimeError:  # vmap cannot branch on tensors
         return False
 
 
@@ -35,11 +35,11 @@ def may_branch(*tensors: Tensor) -> bool:
     return all(known_true(tensor.reshape(-1)[:0] == 0) for tensor in tensors)
 
 
-def separate(points: Tensor) -> tuple[Tensor, ...]:
-    """Points (..., K) as K tensors (...).
+def split_coordinates(points: Tensor) -> tuple[Tensor, ...]:
+    """Split points (..., K) into K tensors (...).
 
-    Compiled kernels get each coordinate in memory of its own, because loops over interleaved ones are not vectorized:
-    that is worth a factor of two to three. `as_strided` is what the compiler does not fuse away.
+    Compiled kernels get each coordinate in its own memory, because loops over interleaved ones are not vectorized; this
+    makes them two to three times faster. The compiler fuses away other copies than `as_strided`.
     """
     if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
         planes = points.movedim(-1, 0).contiguous()
@@ -48,9 +48,9 @@ def separate(points: Tensor) -> tuple[Tensor, ...]:
 
 
 def finite_or(x: Tensor, y: Tensor, other_x: Tensor, other_y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Coordinates (..., N) with others in place of what is not finite, and the mask of what was.
+    """Replace coordinates (..., N) that are not finite by others; also return the mask of finite ones.
 
-    To be called before any arithmetic: 0 * NaN in the backward pass would spoil the gradients of parameters.
+    Call this before any arithmetic: 0 * NaN in the backward pass would spoil the gradients of parameters.
     """
     finite = torch.isfinite(x + y)
     if known_true(finite):
@@ -66,11 +66,11 @@ def is_differentiated(*tensors: Tensor) -> bool:
 
 
 def plain_on_host(*tensors: Tensor) -> bool:
-    """Whether NumPy may do the work: on the CPU, where nothing is differentiated, traced or mapped."""
+    """Whether NumPy may do the work: on the CPU, with nothing differentiated, traced or mapped."""
     if torch.is_grad_enabled() or is_traced() or any(tensor.device.type != "cpu" for tensor in tensors):
         return False
     try:
-        # What `torch.func` wraps has no memory of its own.
+        # Tensors that `torch.func` wraps have no memory of their own.
         return not is_differentiated(*tensors) and all(tensor.data_ptr() >= 0 for tensor in tensors)
     except RuntimeError:
         return False
@@ -82,10 +82,10 @@ def in_chunks(
     """Call `function`, which maps points (..., N, K) to values (..., N, L) and a mask (..., N), piece by piece.
 
     Args:
-        function: what to call; each point must stand for itself.
+        function: what to call; it must treat each point on its own.
         points: (..., N, K).
-        batch: how many cameras each point is computed for.
-        differentiated: then everything is done in one piece, because the graph would keep all pieces anyway.
+        batch: number of cameras for each point.
+        differentiated: work in one piece, because the autograd graph would keep all pieces anyway.
     """
     count = points.shape[-2]
     size = max(1, CHUNK // max(1, batch * points[..., 0, 0].numel() if count else 1))

@@ -22,9 +22,9 @@ from kcal.lens.pose import side_axes
 from kcal.lens.tracing import CHUNK, is_differentiated, is_traced, known_true
 
 # Sine of the angle between a ray and the baseline: below, both rays meet everywhere on the line through the cameras.
-_EPIPOLE = 1e-9
+EPIPOLE = 1e-9
 # Points farther than this many baselines are at infinity for float64.
-_HORIZON = 1e12
+HORIZON = 1e12
 # Beyond this cosine (84°) the directions of the two rays around the baseline have no common plane worth the name.
 _SAME_SIDE = 0.1
 
@@ -65,13 +65,15 @@ def triangulate_pairs(rays_left: Tensor, rays_right: Tensor, right_from_left: tu
     axes_right = rotation @ axes
     whole = is_traced() or is_differentiated(rays_left, rays_right, rotation, translation)
     if whole or rays_left.shape[-2] <= CHUNK:
-        return _pairs(rays_left, rays_right, axes, axes_right, length)
+        return _meeting_points(rays_left, rays_right, axes, axes_right, length)
     pieces = zip(rays_left.split(CHUNK, -2), rays_right.split(CHUNK, -2), strict=True)
-    points, valid = zip(*(_pairs(left, right, axes, axes_right, length) for left, right in pieces), strict=True)
+    points, valid = zip(
+        *(_meeting_points(left, right, axes, axes_right, length) for left, right in pieces), strict=True
+    )
     return Found(torch.cat(points, -2), torch.cat(valid, -1))
 
 
-def _pairs(rays_left: Tensor, rays_right: Tensor, axes: Tensor, axes_right: Tensor, length: Tensor) -> Found:
+def _meeting_points(rays_left: Tensor, rays_right: Tensor, axes: Tensor, axes_right: Tensor, length: Tensor) -> Found:
     # Along the baseline, and two components around it.
     x0, p0, q0 = (rays_left @ axes).unbind(-1)
     x1, p1, q1 = (rays_right @ axes_right).unbind(-1)
@@ -79,7 +81,7 @@ def _pairs(rays_left: Tensor, rays_right: Tensor, axes: Tensor, axes_right: Tens
     norm0, norm1 = torch.addcmul(squared0, x0, x0), torch.addcmul(squared1, x1, x1)
     with torch.no_grad():
         # Not so for rays of length zero, along the baseline, or not finite.
-        usable = (squared0 > _EPIPOLE**2 * norm0) & (squared1 > _EPIPOLE**2 * norm1) & (norm0 + norm1 < torch.inf)
+        usable = (squared0 > EPIPOLE**2 * norm0) & (squared1 > EPIPOLE**2 * norm1) & (norm0 + norm1 < torch.inf)
         every = known_true(usable)
     if not every:
         x0, p0, q0 = torch.where(usable, x0, 0.0), torch.where(usable, p0, 1.0), torch.where(usable, q0, 0.0)
@@ -98,7 +100,7 @@ def _pairs(rays_left: Tensor, rays_right: Tensor, axes: Tensor, axes_right: Tens
     # The sine of the parallax, times the rays' lengths.
     sine = torch.addcmul(x0 * y1, x1, y0, value=-1.0)
     with torch.no_grad():
-        valid = usable & sided & (sine * _HORIZON > torch.sqrt(norm0 * norm1))
+        valid = usable & sided & (sine * HORIZON > torch.sqrt(norm0 * norm1))
     along = length * y1 / torch.where(valid, sine, torch.inf)
     across = along * y0
     points = torch.stack([along * x0, across * p, across * q], -1) @ axes.mT
@@ -178,25 +180,25 @@ def _several(world: list[Tensor], shifts: Tensor) -> tuple[Tensor, Tensor]:
     e1, e2 = side_axes(ray)
     weights: list[Tensor | None] = [None] * len(world)
     for _ in range(2):
-        rows = [_rows(w, (e1, e2, shifts[..., c, :], -ray), weights[c]) for c, w in enumerate(world)]
+        rows = [_across_ray(w, (e1, e2, shifts[..., c, :], -ray), weights[c]) for c, w in enumerate(world)]
         p, q, u, r, v, s, f, g, h = (torch.stack(terms).sum(0) for terms in zip(*rows, strict=True))
         # The upper 2x2 block is never worse than the identity, from the first camera.
         scale = (p * r - q * q).reciprocal()
         first, second = (r * u - q * v) * scale, (p * v - q * u) * scale
         left = s - first * u - second * v
-        determined = left > _EPIPOLE**2
+        determined = left > EPIPOLE**2
         inverse = (h - first * f - second * g) / torch.where(determined, left, 1.0)
         a = (r * f - q * g) * scale - first * inverse
         b = (p * g - q * f) * scale - second * inverse
         direction = ray + a[..., None] * e1 + b[..., None] * e2
         seen = [direction + inverse[..., None] * shifts[..., c, :] for c in range(len(world))]
-        weights = [(point * point).sum(-1).clamp_min(_EPIPOLE**2).reciprocal() for point in seen]
+        weights = [(point * point).sum(-1).clamp_min(EPIPOLE**2).reciprocal() for point in seen]
     ahead = torch.stack([(point * w).sum(-1) > 0 for point, w in zip(seen, world, strict=True)]).all(0)
-    valid = determined & (inverse * _HORIZON > 1.0) & ahead
+    valid = determined & (inverse * HORIZON > 1.0) & ahead
     return spread[..., None] * direction / torch.where(valid, inverse, torch.inf)[..., None], valid
 
 
-def _rows(w: Tensor, columns: tuple[Tensor, Tensor, Tensor, Tensor], weight: Tensor | None) -> list[Tensor]:
+def _across_ray(w: Tensor, columns: tuple[Tensor, Tensor, Tensor, Tensor], weight: Tensor | None) -> list[Tensor]:
     """(x · y) - (w · x)(w · y) of the columns across the ray w: six of the matrix, three of the right side."""
     on = [(w * column).sum(-1) for column in columns]
     found = []

@@ -20,7 +20,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.locate.stereo import Status, sight_lines
+from kcal.locate.stereo import PositionStatus, sight_lines
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,7 +115,7 @@ def range_errors(
         along = _epipolar_direction(rig, points)
         moved = {
             "disparity": lambda s: (rig, right + s * errors.disparity_px * along),
-            "yaw": lambda s: (_turned(rig, s * math.radians(errors.yaw_deg)), right),
+            "yaw": lambda s: (_yawed(rig, s * math.radians(errors.yaw_deg)), right),
             "baseline": lambda s: (_stretched(rig, s * errors.baseline_m), right),
             "timing": lambda s: (rig, rig(points + s * _crossing(rig, ray) * errors.timing_s * errors.speed_mps)[1]),
         }
@@ -138,7 +138,7 @@ def _range(rig: StereoRig, left: Tensor, right: Tensor) -> Tensor:
     """Range from the left camera; infinite where the rays do not meet ahead."""
     lines = sight_lines(rig, left, right)
     distance = torch.linalg.vector_norm(lines.points, dim=-1)
-    return torch.where(lines.status == int(Status.OK), distance, math.inf)
+    return torch.where(lines.status == int(PositionStatus.OK), distance, math.inf)
 
 
 def _direction(rig: StereoRig, pixel: Sequence[float] | None) -> Tensor:
@@ -169,7 +169,7 @@ def _epipolar_direction(rig: StereoRig, points: Tensor) -> Tensor:
     return step / torch.linalg.vector_norm(step, dim=-1, keepdim=True)
 
 
-def _turned(rig: StereoRig, yaw: float) -> StereoRig:
+def _yawed(rig: StereoRig, yaw: float) -> StereoRig:
     turn = rotation_from_vector(torch.tensor([0.0, yaw, 0.0], dtype=torch.float64))
     # About its own center: the center stays where it is.
     return StereoRig(rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation)

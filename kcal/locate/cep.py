@@ -16,13 +16,13 @@ from kcal.checks import as_points
 from kcal.errors import InputError
 
 # A quasi-random set of this size knows the radius to some 0.1 %.
-_SAMPLES = 8192
+_DRAWS = 8192
 # Points at once, so that memory stays below 200 MB.
 _AT_ONCE = 256
 
 
 def circular_error(enu: Tensor, covariance: Tensor, shares: tuple[float, ...] = (0.5, 0.95)) -> Tensor:
-    """Radii of the horizontal circles about an estimate that hold the true position with the given probabilities.
+    """Radii of the horizontal circles about an estimate that contain the true position with the given probabilities.
 
     Args:
         enu: (..., 3) estimates, meters from the camera that ranges are measured from.
@@ -66,19 +66,19 @@ def _radii(enu: Tensor, covariance: Tensor, shares: tuple[float, ...]) -> Tensor
     values, vectors = torch.linalg.eigh(slope @ covariance @ slope.mT)
     factor = vectors * values.clamp_min(0.0).sqrt()[:, None, :]
     inverted = enu / squared[:, None]
-    samples = inverted[:, None, :] + _normal(enu.device) @ factor.mT
+    samples = inverted[:, None, :] + _standard_normal(enu.device) @ factor.mT
     ahead = (samples * direction[:, None, :]).sum(-1) > 0
     points = samples / (samples * samples).sum(-1, keepdim=True).clamp_min(1e-300)
     distance = torch.linalg.vector_norm((points - enu[:, None, :])[..., :2], dim=-1)
     ordered = torch.where(ahead, distance, torch.inf).sort(-1).values
-    places = [min(_SAMPLES - 1, round(share * _SAMPLES)) for share in shares]
+    places = [min(_DRAWS - 1, round(share * _DRAWS)) for share in shares]
     return torch.where(known[:, None], ordered[:, places], torch.inf)
 
 
 @functools.lru_cache(maxsize=2)
-def _normal(device: torch.device) -> Tensor:
+def _standard_normal(device: torch.device) -> Tensor:
     """(S, 3) standard normal points, the same ones every time."""
-    uniform = torch.quasirandom.SobolEngine(3, scramble=True, seed=1).draw(_SAMPLES, dtype=torch.float64)
+    uniform = torch.quasirandom.SobolEngine(3, scramble=True, seed=1).draw(_DRAWS, dtype=torch.float64)
     # Never 0 or 1, where the inverse is infinite.
-    half = 0.5 / _SAMPLES
+    half = 0.5 / _DRAWS
     return torch.special.ndtri(uniform.clamp(half, 1.0 - half)).to(device)

@@ -10,7 +10,8 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.rig import StereoRig
-from kcal.locate.stereo import Status, Triangulate
+from kcal.locate.stereo import PositionStatus
+from kcal.locate.triangulate import Triangulate
 
 
 class Sides(NamedTuple):
@@ -49,7 +50,7 @@ def triangulated_sides(rig: StereoRig, columns: int, rows: int, pixels: Tensor) 
     if pixels.ndim != 4 or pixels.shape[1:3] != (2, columns * rows):
         raise InputError(f"pixels: shape (P, 2, {columns * rows}, 2) is needed, got {tuple(pixels.shape)}")
     located = Triangulate(rig)(pixels[:, 0], pixels[:, 1])
-    points = torch.where((located.status == Status.OK)[..., None], located.points, torch.nan)
+    points = torch.where((located.status == PositionStatus.OK)[..., None], located.points, torch.nan)
     grid = points.unflatten(1, (rows, columns))
     along_rows = (grid[:, :, 1:] - grid[:, :, :-1]).reshape(-1, 3)
     along_columns = (grid[:, 1:] - grid[:, :-1]).reshape(-1, 3)

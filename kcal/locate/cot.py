@@ -21,12 +21,12 @@ _HOW = "m-g"
 def to_cot(located: Located, *, time: datetime.datetime | None = None, stale_s: float = 300.0) -> str:
     """One event for each position, in an `events` element; send them one by one.
 
-    `hae` is the ellipsoidal height. `ce` is the radius of the horizontal circle that holds the true position with
+    `hae` is the ellipsoidal height. `ce` is the radius of the horizontal circle that contains the true position with
     95 %, `le` half the vertical 95 % interval, both in meters; the format's definition names no probability, so that
     the remark in each event states it. Pairs without a position are left out.
 
     Args:
-        located: from `kcal.locate.positions.locate`.
+        located: from `kcal.locate_points`.
         time: of the marks, with its time zone; now if left out.
         stale_s: seconds for which an event counts.
 
@@ -58,17 +58,17 @@ def _event(
     )  # fmt: skip
     vertical = None if position.covariance is None else 1.96 * math.sqrt(max(position.covariance[2][2], 0.0))
     ET.SubElement(
-        event, "point", lat=repr(position.lat), lon=repr(position.lon), hae=_number(position.height),
-        ce=_number(position.cep95_m), le=_number(vertical),
+        event, "point", lat=repr(position.lat), lon=repr(position.lon), hae=_meters_text(position.height),
+        ce=_meters_text(position.cep95_m), le=_meters_text(vertical),
     )  # fmt: skip
     detail = ET.SubElement(event, "detail")
     name = "".join(c for c in position.name if c >= " ")
     ET.SubElement(detail, "contact", callsign=name)
-    remark = f"kcal: ce and le hold 95 %; {located.interval_note}"
+    remark = f"kcal: ce and le contain 95 %; {located.interval_note}"
     ET.SubElement(detail, "remarks").text = f"{remark}. {position.reason}" if position.reason else remark
 
 
-def _number(value: float | None) -> str:
+def _meters_text(value: float | None) -> str:
     return _UNKNOWN if value is None or not math.isfinite(value) else f"{value:.3f}"
 
 

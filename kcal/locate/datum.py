@@ -12,7 +12,7 @@ import pyproj
 from pyproj.exceptions import ProjError
 
 from kcal.errors import FileError, InputError
-from kcal.locate.geodesy import Origin
+from kcal.lens.mounting import Origin
 
 # Global geoid grids by the names PROJ gives them, the finer first.
 _KNOWN_GRIDS = ("us_nga_egm08_25.tif", "egm08_25.gtx", "us_nga_egm96_15.tif", "egm96_15.gtx")

@@ -1,7 +1,7 @@
 """WGS84 in closed form: geodetic, Earth-centered (ECEF) and local east-north-up coordinates, in torch, differentiable.
 
-ECEF coordinates are millions of meters and hold 1e-9 m in float64; float32 would hold half a meter, so everything here
-is float64. Geodetic coordinates are latitude, longitude in degrees and meters above the ellipsoid, in this order.
+ECEF coordinates are millions of meters: float64 resolves 1e-9 m of them, float32 half a meter, so everything here is
+float64. Geodetic coordinates are latitude, longitude in degrees and meters above the ellipsoid, in this order.
 """
 
 from __future__ import annotations

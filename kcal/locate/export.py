@@ -20,12 +20,12 @@ def to_geojson(located: Located) -> dict[str, Any]:
     """A FeatureCollection after RFC 7946: coordinates are [longitude, latitude, ellipsoidal WGS84 height in meters].
 
     The cameras come first (`kind` is "camera"), then one feature for each pair of marks (`kind` is "point"), and last
-    a polygon for each position (`kind` is "region"): where it lies with 95 %, a long and slightly skewed ellipse. A
+    a polygon for each position (`kind` is "region"): its 95 % region, a long and slightly skewed ellipse. A
     pair without a position has a null geometry, its status and the reason. `range_high_m` is null where it is
-    infinite, because JSON has no infinity; `range_high_infinite` tells that from unknown.
+    infinite, because JSON has no infinity; `range_high_infinite` is then true.
 
     Example:
-        >>> from kcal.locate.geodesy import Origin
+        >>> from kcal.lens.mounting import Origin
         >>> from kcal.locate.positions import Viewpoint
         >>> left = Viewpoint(name="left", enu=(0, 0, 0), geodetic=(19.07, 72.87, 14.0), azimuths_deg=None)
         >>> located = Located(positions=(), cameras=(left, left), origin=Origin(lat=19.07, lon=72.87, height=14.0),
@@ -50,7 +50,7 @@ def to_geojson(located: Located) -> dict[str, Any]:
         place = None
         if position.lat is not None and position.lon is not None and position.height is not None:
             place = (position.lat, position.lon, position.height)
-        features.append(_feature(place, {"kind": "point", **_row(position)}))
+        features.append(_feature(place, {"kind": "point", **_fields(position)}))
     for position, ring in region_rings(located):
         # Section 3.1.6: closed, counterclockwise; section 3.1.9: a polygon across the antimeridian is cut in two.
         parts = [[[lon, lat] for lat, lon in part] for part in cut_at_antimeridian(ring)]
@@ -83,8 +83,8 @@ def _upper(position: Position) -> list[float | None]:
     return [None] * 6 if c is None else [c[0][0], c[0][1], c[0][2], c[1][1], c[1][2], c[2][2]]
 
 
-def _row(position: Position) -> dict[str, Any]:
-    """The values of a position by column name; None where there is none."""
+def _fields(position: Position) -> dict[str, Any]:
+    """The values of a position by column name; None where unknown."""
     east, north, up = position.enu or (None, None, None)
     left, right = position.reprojection_px or (None, None)
     return {
@@ -117,10 +117,10 @@ def to_csv(located: Located) -> str:
     """Comma-separated text, one line for each pair; unknown fields are empty and an infinite range is `inf`."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_row(located.positions[0]))
+    writer.writerow(_fields(located.positions[0]))
     for position in located.positions:
         # repr reads back to the same float64; csv would write it so too, but only by accident of str().
-        values = _row(position).values()
+        values = _fields(position).values()
         writer.writerow([repr(value) if isinstance(value, float) else value for value in values])
     return text.getvalue()
 
@@ -146,6 +146,18 @@ def write_positions(path: str | Path, located: Located) -> Path:
     Raises:
         InputError: another suffix.
         FileError: the file cannot be written; an old one is then untouched.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from kcal.lens.mounting import Origin
+        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.locate.positions import locate_points
+        >>> left, right, _ = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))
+        >>> located = locate_points(planned_rig(), left, right, origin=Origin(lat=19.07, lon=72.87, height=14.0),
+        ...                         heading_deg=0.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_positions(Path(folder, "positions.csv"), located).read_text().splitlines()[1][:4]
+        '1,ok'
     """
     check_format(path)
     return write_atomic(path, _FORMATS[Path(path).suffix.lower()](located))

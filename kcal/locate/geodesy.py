@@ -6,14 +6,13 @@ Conventions, all of them pinned by tests:
   ellipsoid has fallen 1.96 m below the tangent plane, and the conversion here accounts for it.
 * Heights are ellipsoidal (WGS84, what GNSS receivers call HAE), not above mean sea level; the two differ by up to
   100 m (`kcal.locate.datum` has the difference where a geoid grid is at hand).
-* Refraction of light is an option (`lower_by_refraction`): 0.26 m of height at 5 km in standard air.
+* Refraction of light is an option of `StereoLocalizer`: 0.26 m of height at 5 km in standard air.
 * Headings count clockwise from true north, not from magnetic or grid north (`kcal.locate.datum` converts the latter).
 * Order is latitude, longitude, height everywhere but in GeoJSON.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import torch
@@ -21,7 +20,8 @@ from torch import Tensor
 
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
-from kcal.locate.ellipsoid import ecef_from_enu_rotation, ecef_to_geodetic, geodetic_to_ecef, mean_radius
+from kcal.lens.mounting import Origin
+from kcal.locate.ellipsoid import ecef_from_enu_rotation, ecef_to_geodetic, geodetic_to_ecef
 
 
 def enu_from_cam(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Tensor:
@@ -72,61 +72,6 @@ def azimuth_elevation(enu: Tensor) -> Tensor:
     azimuth = torch.rad2deg(torch.atan2(enu[..., 0], enu[..., 1])) % 360.0
     elevation = torch.rad2deg(torch.atan2(enu[..., 2], torch.hypot(enu[..., 0], enu[..., 1])))
     return torch.stack([azimuth, elevation], -1)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Origin:
-    """Where ENU is anchored: for a rig the projection center of its left camera.
-
-    Args:
-        lat: geodetic latitude in degrees, -90 to 90.
-        lon: longitude in degrees, -180 to 180.
-        height: meters above the WGS84 ellipsoid, not above sea level.
-
-    Raises:
-        InputError: a value out of range; swapped latitude and longitude are named where they can be told.
-
-    Example:
-        >>> Origin.parse("-33.9, 151.2, 10")
-        Origin(lat=-33.9, lon=151.2, height=10.0)
-    """
-
-    lat: float
-    lon: float
-    height: float
-
-    def __post_init__(self) -> None:
-        if not all(math.isfinite(value) for value in (self.lat, self.lon, self.height)):
-            raise InputError(f"origin: latitude, longitude and height must be finite, got {self}")
-        if abs(self.lat) > 90:
-            hint = "; longitude came first? write LAT,LON,HEIGHT" if abs(self.lon) <= 90 else ""
-            raise InputError(f"origin: latitude {self.lat:g} is outside -90 to 90{hint}")
-        if abs(self.lon) > 180:
-            hint = f"; write {self.lon - 360:g}" if 180 < self.lon <= 360 else ""
-            raise InputError(f"origin: longitude {self.lon:g} is outside -180 to 180{hint}")
-        if not -1000 <= self.height <= 100_000:
-            raise InputError(f"origin: height {self.height:g} m is outside -1000 to 100000; meters are needed")
-
-    @classmethod
-    def parse(cls, text: str) -> Origin:
-        """Read `"LAT,LON,HEIGHT"`: degrees, degrees, meters above the WGS84 ellipsoid.
-
-        Raises:
-            InputError: not three numbers, or a value out of range.
-        """
-        fields = text.split(",")
-        try:
-            values = [float(field) for field in fields]
-        except ValueError:
-            values = []
-        if len(values) != 3:
-            raise InputError(f"origin {text!r}: write three numbers LAT,LON,HEIGHT, for example 19.07,72.87,14")
-        return cls(lat=values[0], lon=values[1], height=values[2])
-
-    @property
-    def geodetic(self) -> Tensor:
-        """(3,) float64: latitude, longitude, height."""
-        return torch.tensor([self.lat, self.lon, self.height], dtype=torch.float64)
 
 
 def enu_to_geodetic(enu: Tensor, origin: Origin) -> Tensor:
@@ -187,26 +132,3 @@ def geodetic_to_enu(geodetic: Tensor, origin: Origin) -> Tensor:
         raise InputError("geodetic: a latitude is outside -90 to 90; the order is latitude, longitude, height")
     rotation, translation = anchor(origin, checked.device)
     return (geodetic_to_ecef(checked) - translation) @ rotation
-
-
-# Share of the Earth's curvature by which light bends downward in standard air.
-STANDARD_REFRACTION = 0.13
-
-
-def lower_by_refraction(enu: Tensor, origin: Origin, coefficient: float = STANDARD_REFRACTION) -> Tensor:
-    """Take the bending of light out of points (..., 3) found along straight lines of sight from the origin.
-
-    Light that arrives level has come up a little: the target stands lower than it seems, by k d² / (2 R) with the
-    horizontal distance d and the Earth's radius R. The coefficient k is 0.13 in standard air; over hot ground or cold
-    water it may be anything from -1 to 1, so that this is a correction on average, not for the day.
-
-    Example:
-        >>> point = torch.tensor([5000.0, 0.0, 0.0], dtype=torch.float64)
-        >>> round(lower_by_refraction(point, Origin(lat=19.0, lon=73.0, height=0.0))[2].item(), 3)
-        -0.255
-    """
-    enu = as_points("enu", enu, 3)
-    if not -2.0 <= coefficient <= 2.0:
-        raise InputError(f"refraction {coefficient}: a coefficient such as 0.13 is needed, not beyond ±2")
-    drop = coefficient / (2.0 * mean_radius(origin.lat)) * (enu[..., 0] ** 2 + enu[..., 1] ** 2)
-    return torch.stack([enu[..., 0], enu[..., 1], enu[..., 2] - drop], -1)

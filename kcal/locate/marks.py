@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcal.errors import FileError
 from kcal.files import write_atomic
-from kcal.locate.tables import Row, read_rows
+from kcal.locate.tables import TableRow, read_rows
 
 PIXELS = ("left_u", "left_v", "right_u", "right_v")
 _HEADER = f"name,{','.join(PIXELS)}"
@@ -22,7 +22,7 @@ class Marks(NamedTuple):
     """The same things marked in both images.
 
     Attributes:
-        names: one a pair, unique; the row's number where the file has no names.
+        names: one for each pair, unique; the row's number where the file has no names.
         left: (N, 2) float64 pixels in the left image, integer coordinates at pixel centers.
         right: (N, 2) likewise in the right image.
     """
@@ -42,7 +42,7 @@ def read_marks(path: str | Path, *, single: bool = False) -> Marks:
 
     Columns may come in any order; `name` may be absent (rows are then numbered from 1) and a column `note` is allowed
     and not used. Blank lines are skipped, and a byte order mark at the beginning is accepted. Pixels may lie outside
-    the image: `locate` reports such a pair.
+    the image: `locate_points` reports such a pair.
 
     Args:
         path: of the file.
@@ -62,7 +62,7 @@ def read_marks(path: str | Path, *, single: bool = False) -> Marks:
         (('mast',), [[956.8, 540.5]])
     """
     rows = read_rows(path, _HEADER, ("name", *PIXELS, "note"), PIXELS)
-    table = torch.tensor([_pixels(row, single) for row in rows], dtype=torch.float64)
+    table = torch.tensor([_four_pixels(row, single) for row in rows], dtype=torch.float64)
     return Marks(names=tuple(row.name for row in rows), left=table[:, :2], right=table[:, 2:])
 
 
@@ -77,11 +77,11 @@ def write_marks(path: str | Path, marks: Marks) -> Path:
     return write_atomic(path, "\n".join(lines) + "\n")
 
 
-def _pixels(row: Row, single: bool) -> list[float]:
+def _four_pixels(row: TableRow, single: bool) -> list[float]:
     return [*pixel_of(row, "left", single), *pixel_of(row, "right", single)]
 
 
-def pixel_of(row: Row, side: str, optional: bool) -> tuple[float, float]:
+def pixel_of(row: TableRow, side: str, optional: bool) -> tuple[float, float]:
     """The pixel in the columns `side`_u and `side`_v; NaN where both are empty and may be."""
     columns = (f"{side}_u", f"{side}_v")
     if optional and not any(row.cells[column] for column in columns):

@@ -26,25 +26,25 @@ from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection, project_components
 from kcal.lens.tracing import known_true
 
-_STEPS = 5
+_MOST_STEPS = 5
 # The derivative of the optimum comes from this many steps with a fixed matrix; each leaves a share of about the
 # residual over the focal length, 1e-4, of the error.
 _CHORDS = 2
 # A step that moves no pixel by more than this, in units of the noise, is the last.
-_SETTLED = 1e-7
+_SMALLEST_STEP = 1e-7
 
 Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
-class Sight(NamedTuple):
-    """A camera and where it stands: points_cam = rotation @ points + translation, in the first camera's frame."""
+class RelativeCamera(NamedTuple):
+    """A camera and its pose from the first one: points_cam = rotation @ points + translation."""
 
     camera: Camera
     rotation: Tensor
     translation: Tensor
 
 
-class Fit(NamedTuple):
+class PointFit(NamedTuple):
     """Points at the optimum, in the first camera's frame; K = 3 unknowns a, b, ρ; M = 2 C pixel coordinates.
 
     Attributes:
@@ -68,7 +68,7 @@ class Fit(NamedTuple):
     turned: tuple[Tensor, ...]
 
 
-class _At(NamedTuple):
+class _Evaluated(NamedTuple):
     cost: Tensor
     jacobian: Tensor
     weighted: Tensor
@@ -78,10 +78,10 @@ class _At(NamedTuple):
     turned: tuple[Tensor, ...]
 
 
-class _Setting(NamedTuple):
+class _Fixed(NamedTuple):
     """What stays fixed while (a, b, ρ) moves."""
 
-    sights: Sequence[Sight]
+    cameras: Sequence[RelativeCamera]
     base: Tensor
     sides: Tensor
     shifts: list[Tensor]
@@ -91,8 +91,8 @@ class _Setting(NamedTuple):
     wanted: tuple[tuple[int, ...], ...]
 
 
-def refine(
-    sights: Sequence[Sight],
+def most_likely(
+    cameras: Sequence[RelativeCamera],
     scale: Tensor,
     start: tuple[Tensor, Tensor],
     pixels: Tensor,
@@ -101,11 +101,11 @@ def refine(
     *,
     by_camera: bool = False,
     differentiated: bool = False,
-) -> Fit:
+) -> PointFit:
     """Minimize the weighted squares of the reprojection errors, each point on its own.
 
     Args:
-        sights: C cameras; the first has the identity as its pose.
+        cameras: C cameras; the first has the identity as its pose.
         scale: meters, the size of the rig; sets the unit of ρ.
         start: unit directions (..., N, 3) in the first camera's frame, and ρ (..., N).
         pixels: (..., 2 C, N): u, v of the first camera, u, v of the second, ...
@@ -116,16 +116,15 @@ def refine(
     """
     base = start[0].detach().mT
     sides = torch.stack([side.mT for side in side_axes(start[0].detach())], -3)
-    wanted = tuple(tuple(range(s.camera.values.shape[-1])) if by_camera else () for s in sights)
-    setting = _Setting(
-        sights, base, sides, [s.translation / scale for s in sights], pixels, usable, weight, tuple(() for _ in sights)
-    )
+    wanted = tuple(tuple(range(s.camera.values.shape[-1])) if by_camera else () for s in cameras)
+    shifts = [camera.translation / scale for camera in cameras]
+    fixed = _Fixed(cameras, base, sides, shifts, pixels, usable, weight, tuple(() for _ in cameras))
     zero = torch.zeros_like(start[1])
     with torch.no_grad():
         theta = torch.stack([zero, zero, torch.where(usable, start[1], 0.0)], -2)
         best, step, cost, at = theta, torch.zeros_like(theta), torch.full_like(zero, torch.inf), None
-        for _ in range(_STEPS):
-            at = _evaluate(setting, theta)
+        for _ in range(_MOST_STEPS):
+            at = _evaluate(fixed, theta)
             better = at.cost <= cost
             every = known_true(better)
             newton = _newton(at, usable)
@@ -136,43 +135,43 @@ def refine(
                 best = torch.where(better[..., None, :], theta, best)
                 step = torch.where(better[..., None, :], newton, 0.25 * step)
                 cost = torch.where(better, at.cost, cost)
-            if every and known_true(moved <= _SETTLED * _noise(weight)):
+            if every and known_true(moved <= _SMALLEST_STEP * _least_noise(weight)):
                 break
             theta = best + step
         theta = best
     if not differentiated and not by_camera and every and at is not None:
-        return _finish(at, theta, setting, usable)
+        return _with_covariance(at, theta, fixed, usable)
     if differentiated:
-        inverse = _inverse(_matrix(_evaluate(setting, theta), usable))
+        inverse = _inverse_of_six(_normal_matrix(_evaluate(fixed, theta), usable))
         inverse = tuple(value.detach() for value in inverse)  # type: ignore[assignment]
         for _ in range(_CHORDS):
-            at = _evaluate(setting, theta)
-            theta = theta - torch.where(usable[..., None, :], _times(inverse, _gradient(at)), 0.0)
-    return _finish(_evaluate(setting._replace(wanted=wanted), theta), theta, setting, usable)
+            at = _evaluate(fixed, theta)
+            theta = theta - torch.where(usable[..., None, :], _product(inverse, _cost_slope(at)), 0.0)
+    return _with_covariance(_evaluate(fixed._replace(wanted=wanted), theta), theta, fixed, usable)
 
 
-def _noise(weight: Tensor | None) -> Tensor | float:
+def _least_noise(weight: Tensor | None) -> Tensor | float:
     """A lower bound of the pixels' noise."""
     return 1.0 if weight is None else weight.diagonal(dim1=-3, dim2=-2).amax(-1).clamp_min(1e-30).rsqrt()
 
 
-def _evaluate(setting: _Setting, theta: Tensor) -> _At:
+def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
     a, b, inverse = (value[..., None, :] for value in theta.unbind(-2))
-    e1, e2 = setting.sides[..., 0, :, :], setting.sides[..., 1, :, :]
-    direction = setting.base + a * e1 + b * e2
+    e1, e2 = fixed.sides[..., 0, :, :], fixed.sides[..., 1, :, :]
+    direction = fixed.base + a * e1 + b * e2
     rows, predicted, projections, turned = [], [], [], []
-    for number, (sight, shift) in enumerate(zip(setting.sights, setting.shifts, strict=True)):
+    for number, (camera, shift) in enumerate(zip(fixed.cameras, fixed.shifts, strict=True)):
         ahead, along, across = direction, e1, e2
         if number:
-            ahead, along, across = sight.rotation @ direction, sight.rotation @ e1, sight.rotation @ e2
+            ahead, along, across = camera.rotation @ direction, camera.rotation @ e1, camera.rotation @ e2
         seen = ahead + inverse * shift[:, None]
         with torch.no_grad():
-            good = setting.usable if sight.camera.model.fisheye else setting.usable & (seen[..., 2, :] > 1e-6)
+            good = fixed.usable if camera.camera.model.fisheye else fixed.usable & (seen[..., 2, :] > 1e-6)
         if not known_true(good):
             # The axis is a harmless stand-in: no NaN in values or gradients.
             seen = torch.where(good[..., None, :], seen, seen.new_tensor([[0.0], [0.0], [1.0]]))
         projection = project_components(
-            seen, sight.camera.values, sight.camera.model, setting.wanted[number], sight.camera.field
+            seen, camera.camera.values, camera.camera.model, fixed.wanted[number], camera.camera.field
         )
         columns = torch.stack([along, across, shift[:, None].expand_as(along)], -3)
         # (..., 3 unknowns, 3 of the point, 2, N) summed over the point.
@@ -181,17 +180,17 @@ def _evaluate(setting: _Setting, theta: Tensor) -> _At:
         projections.append(projection)
         turned.append(ahead)
     jacobian = torch.cat(rows, -2)
-    residual = torch.where(setting.usable[..., None, :], torch.cat(predicted, -2) - setting.pixels, 0.0)
+    residual = torch.where(fixed.usable[..., None, :], torch.cat(predicted, -2) - fixed.pixels, 0.0)
     weighted = jacobian
-    if setting.weight is None:
+    if fixed.weight is None:
         cost = (residual * residual).sum(-2)
     else:
-        weighted = (setting.weight[..., None, :, :, :] * jacobian[..., None, :, :]).sum(-2)
-        cost = (setting.weight * residual[..., None, :, :] * residual[..., None, :]).sum((-3, -2))
-    return _At(cost, jacobian, weighted, residual, direction, tuple(projections), tuple(turned))
+        weighted = (fixed.weight[..., None, :, :, :] * jacobian[..., None, :, :]).sum(-2)
+        cost = (fixed.weight * residual[..., None, :, :] * residual[..., None, :]).sum((-3, -2))
+    return _Evaluated(cost, jacobian, weighted, residual, direction, tuple(projections), tuple(turned))
 
 
-def _matrix(at: _At, usable: Tensor) -> Six:
+def _normal_matrix(at: _Evaluated, usable: Tensor) -> Six:
     """Jᵀ W J by its six entries 11, 12, 13, 22, 23, 33; the identity where a point is not usable."""
     j, w = at.jacobian.unbind(-3), at.weighted.unbind(-3)
     entries = []
@@ -200,15 +199,15 @@ def _matrix(at: _At, usable: Tensor) -> Six:
     return tuple(entries)  # type: ignore[return-value]
 
 
-def _gradient(at: _At) -> Tensor:
+def _cost_slope(at: _Evaluated) -> Tensor:
     return (at.weighted * at.residual[..., None, :, :]).sum(-2)
 
 
-def _newton(at: _At, usable: Tensor) -> Tensor:
-    return -_times(_inverse(_matrix(at, usable)), _gradient(at))
+def _newton(at: _Evaluated, usable: Tensor) -> Tensor:
+    return -_product(_inverse_of_six(_normal_matrix(at, usable)), _cost_slope(at))
 
 
-def _inverse(m: Six) -> Six:
+def _inverse_of_six(m: Six) -> Six:
     """Of symmetric positive 3x3 matrices, by their adjugate; zero where the determinant vanishes."""
     a, b, c, d, e, f = m
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
@@ -218,20 +217,22 @@ def _inverse(m: Six) -> Six:
     return A * scale, B * scale, C * scale, (a * f - c * c) * scale, (b * c - a * e) * scale, (a * d - b * b) * scale
 
 
-def _times(m: Six, v: Tensor) -> Tensor:
+def _product(m: Six, v: Tensor) -> Tensor:
     a, b, c, d, e, f = m
     x, y, z = v.unbind(-2)
     return torch.stack([a * x + b * y + c * z, b * x + d * y + e * z, c * x + e * y + f * z], -2)
 
 
-def _finish(at: _At, theta: Tensor, setting: _Setting, usable: Tensor) -> Fit:
-    covariance = _inverse(_matrix(at, usable))
+def _with_covariance(at: _Evaluated, theta: Tensor, fixed: _Fixed, usable: Tensor) -> PointFit:
+    covariance = _inverse_of_six(_normal_matrix(at, usable))
     weighted = at.weighted.movedim(-3, -2)  # (..., M, 3, N)
-    gain = torch.stack([_times(covariance, row) for row in weighted.unbind(-3)], -2)
-    return Fit(at.direction, theta[..., 2, :], setting.sides, covariance, gain, at.residual, at.projections, at.turned)
+    gain = torch.stack([_product(covariance, row) for row in weighted.unbind(-3)], -2)
+    return PointFit(
+        at.direction, theta[..., 2, :], fixed.sides, covariance, gain, at.residual, at.projections, at.turned
+    )
 
 
-def by_pose(fit: Fit, number: int) -> Tensor:
+def by_pose(fit: PointFit, number: int) -> Tensor:
     """Derivatives (..., 6, 2, N) of the predicted pixels of a camera by a step of its pose: rotation, translation.
 
     The step is that of `kcal.lens.pose`: a rotation vector (radians) from the left and an added translation
@@ -240,3 +241,49 @@ def by_pose(fit: Fit, number: int) -> Tensor:
     rows = step_rows(fit.projections[number].by_point, fit.turned[number])
     turn, shift = rows[..., :3, :, :], rows[..., 3:, :, :]
     return torch.cat([turn, shift * fit.inverse[..., None, None, :]], -3)
+
+
+def symmetric(six: Sequence[Tensor]) -> Tensor:
+    """Six entries (..., N) as symmetric matrices (..., N, 3, 3)."""
+    a, b, c, d, e, f = six
+    return torch.stack([a, b, c, b, d, e, c, e, f], -1).unflatten(-1, (3, 3))
+
+
+def position_slope(fit: PointFit, scale: Tensor, ok: Tensor) -> Tensor:
+    """(..., N, 3, 3) derivatives of points in the first camera's frame by a, b and ρ; finite where not `ok`."""
+    inverse = torch.where(ok, fit.inverse, 1.0)
+    ahead = torch.where(ok[..., None, :], fit.direction / inverse[..., None, :], 0.0)
+    columns = torch.stack([*fit.sides.unbind(-3), -ahead], -1)  # (..., 3, N, 3)
+    return ((scale / inverse)[..., None, :, None] * columns).movedim(-3, -2)
+
+
+def calibration_effect(fit: PointFit, scale: Tensor) -> Tensor:
+    """(..., N, 3, P) derivatives of a, b and ρ by the parameters in the order of `RigCovariance`; `fit` of two cameras.
+
+    A rise of a parameter that moves predicted pixels acts as a measurement that moved the other way.
+    """
+    left, right = (projection.by_camera for projection in fit.projections)
+    pose = by_pose(fit, 1)
+    pose = torch.cat([pose[..., :3, :, :], pose[..., 3:, :, :] / scale], -3)
+    gain_left, gain_right = fit.gain[..., :2, :], fit.gain[..., 2:, :]
+
+    def through(gain: Tensor, moved: Tensor) -> Tensor:
+        return -(gain[..., :, None, :, :] * moved[..., None, :, :, :]).sum(-2)
+
+    effect = torch.cat([through(gain_left, left), through(gain_right, right), through(gain_right, pose)], -2)
+    return effect.movedim(-1, -3)
+
+
+def inverse_covariances(cov: Tensor | None) -> tuple[Tensor | None, Tensor]:
+    """Inverses of covariances (..., N, M, M) as (..., M, M, N), and where they exist."""
+    if cov is None:
+        return None, torch.ones((), dtype=torch.bool)
+    with torch.no_grad():
+        mirrored = (cov - cov.mT).abs().amax((-2, -1)) <= 1e-6 * cov.abs().amax((-2, -1))
+        finite = torch.isfinite(cov).all(-1).all(-1) & mirrored
+        still = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
+        _, info = torch.linalg.cholesky_ex(torch.where(finite[..., None, None], cov, still))
+        sound = finite & (info == 0)
+    safe = torch.where(sound[..., None, None], 0.5 * (cov + cov.mT), still)
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(safe)[0])
+    return inverse.movedim(-3, -1), sound

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.locate.stereo import Status, sight_lines
+from kcal.locate.stereo import PositionStatus, sight_lines
 
 
 class DriftEffect(NamedTuple):
@@ -57,17 +57,17 @@ def drift_effect(
         points = far[:, None] * axis / torch.linalg.vector_norm(axis)
         left, right, seen = new(points)
         if not bool(seen.all()):
-            raise InputError("the cameras do not look the same way: the effect of a drift cannot be told")
+            raise InputError("the cameras do not look the same way: the effect of a drift cannot be computed")
         lines = sight_lines(old, left, right)
         found = torch.linalg.vector_norm(lines.points, dim=-1)
         # Turning the right camera by ω about its x, y, z moves a point's image; the range follows the disparity.
-        slope = [_slope(old, new, points, far, k) for k in range(3)]
+        slope = [_range_slope(old, new, points, far, k) for k in range(3)]
     rows = torch.stack(slope, -1)
     sigma = (rows @ turn_covariance * rows).sum(-1).clamp_min(0.0).sqrt()
-    return DriftEffect(far, torch.where(lines.status == int(Status.OK), found, math.inf), sigma)
+    return DriftEffect(far, torch.where(lines.status == int(PositionStatus.OK), found, math.inf), sigma)
 
 
-def _slope(old: StereoRig, new: StereoRig, points: Tensor, far: Tensor, axis: int) -> Tensor:
+def _range_slope(old: StereoRig, new: StereoRig, points: Tensor, far: Tensor, axis: int) -> Tensor:
     """Meters of range by a radian about one axis of the right camera."""
     ends = []
     for sign in (-1.0, 1.0):

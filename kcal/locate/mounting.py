@@ -3,33 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from kcal.calibrate.rig.result import RigSolution
+from kcal.errors import InputError
+from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.ellipsoid import ecef_from_enu_rotation
-from kcal.locate.geodesy import Origin, enu_to_geodetic
-
-
-class Mounting(NamedTuple):
-    """How a camera stands; angles as in `kcal.locate.geodesy.enu_from_cam`.
-
-    Attributes:
-        origin: of the camera's projection center.
-        heading_deg: clockwise from true north, 0 to 360.
-        pitch_deg: positive up.
-        roll_deg: clockwise as seen from behind.
-        covariance: (6, 6) of east, north, up (meters) and of turns about these axes (radians), all at the camera.
-        link: (P, 6) covariance of other quantities with these six.
-    """
-
-    origin: Origin
-    heading_deg: float
-    pitch_deg: float
-    roll_deg: float
-    covariance: Tensor
-    link: Tensor
+from kcal.locate.geodesy import enu_to_geodetic
 
 
 def attitude(enu_from_cam: Tensor) -> tuple[float, float, float]:
@@ -73,8 +57,71 @@ def mounting_of(
         (35.0, 14.0)
     """
     lat, lon, height = enu_to_geodetic(center, origin).tolist()
-    here = Origin(lat=lat, lon=lon, height=height)
     turn = ecef_from_enu_rotation(lat, lon).T @ ecef_from_enu_rotation(origin.lat, origin.lon)
     both = torch.block_diag(turn, turn)
-    link = torch.zeros(0, 6, dtype=torch.float64) if link is None else link
-    return Mounting(here, *attitude(turn @ cam_from_enu.T), both @ covariance @ both.T, link @ both.T)
+    heading, pitch, roll = attitude(turn @ cam_from_enu.T)
+    return Mounting(
+        origin=Origin(lat=lat, lon=lon, height=height),
+        heading_deg=heading,
+        pitch_deg=pitch,
+        roll_deg=roll,
+        covariance=both @ covariance @ both.T,
+        link=None if link is None else link @ both.T,
+    )
+
+
+def placed_rig(result: RigSolution, origin: Origin) -> StereoRig:
+    """The rig of a solution with its covariance, and with its mounting if the data determine it.
+
+    Args:
+        result: from `kcal.solve_rig`.
+        origin: of the frame in which landmarks and positions were given.
+
+    Example:
+        >>> from kcal.calibrate.rig.sources import Landmarks, RigData
+        >>> from kcal.calibrate.rig.solve import solve_rig
+        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.locate.geodesy import enu_from_cam
+        >>> rig, generator = planned_rig(), torch.Generator().manual_seed(0)
+        >>> points = torch.rand(12, 3, dtype=torch.float64, generator=generator) * 40 + torch.tensor([-20, -10, 60])
+        >>> landmarks = Landmarks(names=tuple("abcdefghijkl"), points=points @ enu_from_cam(0.0).T,
+        ...                       sigma=torch.full((12, 3), 0.01).double(), pixels=torch.stack(rig(points)[:2], 1))
+        >>> data = RigData(cameras=(rig.left, rig.right), names=("left", "right"), landmarks=landmarks)
+        >>> found = placed_rig(solve_rig(data), Origin(lat=19.07, lon=72.87, height=14.0))
+        >>> round(found.mounting.heading_deg, 6) % 360.0, found.covariance is None
+        (0.0, False)
+    """
+    rig = result.stereo()
+    rig.covariance = RigCovariance.of(rig, joint=result.joint_covariance())
+    covariance = result.mounting_covariance(0)
+    if result.absolute and bool(torch.isfinite(covariance).all()):
+        rig.mounting = mounting_of(result.rotation[0], result.center[0], covariance, origin, result.mounting_link())
+    return rig
+
+
+def mounting_covariance(
+    *, origin_m: Sequence[float] = (0.0, 0.0, 0.0), attitude_deg: Sequence[float] = (0.0, 0.0, 0.0)
+) -> Tensor:
+    """(6, 6) covariance of how a rig stands: east, north, up of its origin, and small turns about these axes.
+
+    Args:
+        origin_m: one sigma of the left camera's position, meters east, north, up.
+        attitude_deg: one sigma of turns about the east, north and up axes, degrees; the last is the heading's.
+
+    Example:
+        >>> mounting_covariance(origin_m=(0.02, 0.02, 0.04), attitude_deg=(0, 0, 0.1)).diagonal()[:3].tolist()
+        [0.0004, 0.0004, 0.0016]
+    """
+    values = torch.tensor([*origin_m, *attitude_deg], dtype=torch.float64)
+    if values.shape != (6,) or not bool((torch.isfinite(values) & (values >= 0)).all()):
+        raise InputError("mounting: three sigmas of the origin and three of the attitude are needed, none negative")
+    return torch.diag(torch.cat([values[:3], torch.deg2rad(values[3:])]) ** 2)
+
+
+def by_mounting(enu: Tensor) -> Tensor:
+    """(..., N, 3, 6) derivatives of ENU points by the origin and by small turns about the east, north and up axes."""
+    e, n, u = enu.unbind(-1)
+    zero = torch.zeros_like(e)
+    turns = torch.stack([zero, u, -n, -u, zero, e, n, -e, zero], -1).unflatten(-1, (3, 3))
+    still = torch.eye(3, dtype=enu.dtype, device=enu.device).expand(turns.shape)
+    return torch.cat([still, turns], -1)

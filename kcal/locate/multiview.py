@@ -13,9 +13,9 @@ from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.tracing import is_differentiated
 from kcal.locate.angular import triangulate_angular
-from kcal.locate.max_likelihood import Fit, Sight, refine
-from kcal.locate.stereo import Status
-from kcal.locate.triangulate import triangulate_linear
+from kcal.locate.linear import triangulate_linear
+from kcal.locate.max_likelihood import RelativeCamera, inverse_covariances, most_likely, position_slope, symmetric
+from kcal.locate.stereo import PositionStatus, with_status
 
 Method = Literal["linear", "angular", "likelihood"]
 
@@ -26,8 +26,8 @@ class ViewsResult(NamedTuple):
     Attributes:
         points: (..., N, 3) meters in the world frame; the first camera's center unless the status is OK.
         covariance: (..., N, 3, 3) from the pixels' noise, to first order; an infinite diagonal unless OK.
-        status: (..., N) int8, codes of `Status`; PARALLEL stands for all rays that do not meet in front of every
-            camera.
+        status: (..., N) int8, codes of `PositionStatus`; PARALLEL stands for all rays that do not meet in front of
+            every camera.
         reprojection: (..., N, C) distance in px between mark and reprojected point; zero unless OK.
     """
 
@@ -132,20 +132,20 @@ class TriangulateViews(nn.Module):
             rays.append(ray)
             seen.append(valid)
             inside.append(camera.inside(pixels[..., number, :]))
-        weight, sound = _weight(cov, pixels)
+        weight, sound = inverse_covariances(_joint_covariance(cov, pixels))
         turn, shift = self._from_first()
         solve = triangulate_linear if self.method == "linear" else triangulate_angular
         # The first camera's frame: a far world origin costs no digits.
         points, valid = solve(torch.cat([turn, shift[..., None]], -1), torch.stack(rays, -2))
         code = torch.zeros(points.shape[:-1], dtype=torch.int8, device=points.device)
         for condition, status in (
-            (~valid, Status.PARALLEL),
-            (~torch.stack(seen).all(0), Status.OUTSIDE_LENS),
-            (~torch.stack(inside).all(0), Status.OUTSIDE_IMAGE),
-            (~sound, Status.BAD_COVARIANCE),
-            (~finite, Status.NOT_FINITE),
+            (~valid, PositionStatus.PARALLEL),
+            (~torch.stack(seen).all(0), PositionStatus.OUTSIDE_LENS),
+            (~torch.stack(inside).all(0), PositionStatus.OUTSIDE_IMAGE),
+            (~sound, PositionStatus.BAD_COVARIANCE),
+            (~finite, PositionStatus.NOT_FINITE),
         ):
-            code = torch.where(condition, code.new_full((), int(status)), code)
+            code = with_status(code, condition, status)
         return self._refined(cameras, pixels, points, rays[0], code, weight)
 
     def _refined(
@@ -153,27 +153,30 @@ class TriangulateViews(nn.Module):
     ) -> ViewsResult:
         turn, shift = self._from_first()
         scale = torch.linalg.vector_norm(shift, dim=-1).amax()
-        ok = code == int(Status.OK)
+        ok = code == int(PositionStatus.OK)
         with torch.no_grad():
             distance = torch.where(ok, torch.linalg.vector_norm(points, dim=-1), 1.0)
             ahead = torch.where(ok[..., None], points / distance[..., None], ray)
-        sights = [Sight(*each) for each in zip(cameras, turn, shift, strict=True)]
-        learns = self.method == "likelihood" and is_differentiated(pixels, *self.parameters(), *_some(weight))
-        fit = refine(
-            sights, scale, (ahead, scale / distance), pixels.flatten(-2).mT, ok, weight, differentiated=learns,
+        posed = [RelativeCamera(*each) for each in zip(cameras, turn, shift, strict=True)]
+        learns = self.method == "likelihood" and is_differentiated(
+            pixels, *self.parameters(), *([] if weight is None else [weight])
+        )
+        fit = most_likely(
+            posed, scale, (ahead, scale / distance), pixels.flatten(-2).mT, ok, weight, differentiated=learns,
         )  # fmt: skip
         if self.method == "likelihood":
             ok = ok & (fit.inverse > 0)
-            code = torch.where((code == int(Status.OK)) & ~ok, code.new_full((), int(Status.PARALLEL)), code)
+            code = with_status(code, (code == int(PositionStatus.OK)) & ~ok, PositionStatus.PARALLEL)
             points = (scale / torch.where(ok, fit.inverse, 1.0))[..., None] * fit.direction.mT
         points = torch.where(ok[..., None], points, 0.0)
         rotation, translation = self.cam_from_world[0, :, :3], self.cam_from_world[0, :, 3]
         variance = self.pixel_sigma**2 if weight is None else 1.0
-        covariance = rotation.mT @ _covariance(fit, points, scale, ok) @ rotation * variance
+        slope = rotation.mT @ position_slope(fit, scale, ok)
+        covariance = variance * slope @ symmetric(fit.covariance) @ slope.mT
         misses = []
-        for number, sight in enumerate(sights):
-            again, _ = sight.camera.project(
-                torch.where(ok[..., None], points, ray) @ sight.rotation.mT + sight.translation
+        for number, camera in enumerate(posed):
+            again, _ = camera.camera.project(
+                torch.where(ok[..., None], points, ray) @ camera.rotation.mT + camera.translation
             )
             misses.append(torch.where(ok[..., None], again - pixels[..., number, :], 0.0))
         return ViewsResult(
@@ -189,35 +192,13 @@ class TriangulateViews(nn.Module):
         return super()._apply(keep_float64(fn), recurse)
 
 
-def _some(value: Tensor | None) -> list[Tensor]:
-    return [] if value is None else [value]
-
-
-def _weight(cov: Tensor | None, pixels: Tensor) -> tuple[Tensor | None, Tensor]:
-    """Inverse covariances as (..., 2 C, 2 C, N), blocks along the diagonal, and where they exist."""
+def _joint_covariance(cov: Tensor | None, pixels: Tensor) -> Tensor | None:
+    """Covariances (..., N, C, 2, 2) of each pixel as blocks along the diagonal of (..., N, 2 C, 2 C)."""
     if cov is None:
-        return None, torch.ones(pixels.shape[:-2], dtype=torch.bool, device=pixels.device)
+        return None
     cov = as_points("cov", cov, 2)
     if cov.ndim < 2 or cov.shape[-2] != 2:
         raise InputError(f"cov: shape (..., N, {pixels.shape[-2]}, 2, 2) is needed, got {tuple(cov.shape)}")
-    cov = cov.expand(*pixels.shape, 2)
-    a, b, c, d = cov.flatten(-2).unbind(-1)
-    determinant = a * d - b * c
-    good = torch.isfinite(cov).all(-1).all(-1) & (a > 0) & (determinant > 0) & ((b - c).abs() <= 1e-6 * (a + d))
-    safe = torch.where(good, determinant, 1.0)
-    entries = [torch.where(good, value, one) / safe for value, one in ((d, 1.0), (-b, 0.0), (-c, 0.0), (a, 1.0))]
-    blocks = torch.stack(entries, -1).unflatten(-1, (2, 2))  # (..., N, C, 2, 2)
-    count = blocks.shape[-3]
-    empty = torch.zeros_like(blocks[..., 0, :, :])
-    rows = [torch.cat([blocks[..., i, :, :] if i == j else empty for j in range(count)], -1) for i in range(count)]
-    return torch.cat(rows, -2).movedim(-3, -1), good.all(-1)
-
-
-def _covariance(fit: Fit, points: Tensor, scale: Tensor, ok: Tensor) -> Tensor:
-    """(..., N, 3, 3) of the points in the first camera's frame, for a pixel noise of one or as weighed."""
-    depth = scale / torch.where(ok, fit.inverse, 1.0)
-    columns = torch.cat([fit.sides.movedim(-3, -1), -(points / scale).mT[..., None]], -1)
-    slope = (depth[..., None, :, None] * columns).movedim(-3, -2)  # (..., N, 3, 3)
-    p, q, r, s, t, u = fit.covariance
-    inner = torch.stack([p, q, r, q, s, t, r, t, u], -1).unflatten(-1, (3, 3))
-    return slope @ inner @ slope.mT
+    still = torch.eye(pixels.shape[-2], dtype=cov.dtype, device=cov.device)
+    blocks = cov.expand(*pixels.shape, 2)[..., :, :, None, :] * still[:, None, :, None]  # (..., N, C, 2, C, 2)
+    return blocks.flatten(-2).flatten(-3, -2)

@@ -1,4 +1,4 @@
-"""Pixel pairs to positions on the Earth: the function `locate` and its result."""
+"""`locate_points`: pixel pairs to positions on the Earth, with everything that is told to a user."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
+from kcal.lens.mounting import Origin
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.cep import circular_error
-from kcal.locate.covariances import RigCovariance
 from kcal.locate.datum import Geoid, geoid_heights
-from kcal.locate.geodesy import Origin, azimuth_elevation, enu_from_cam, enu_to_geodetic
+from kcal.locate.geodesy import azimuth_elevation, enu_to_geodetic
 from kcal.locate.localizer import Localization, StereoLocalizer
-from kcal.locate.stereo import Status
+from kcal.locate.stereo import PositionStatus
 
 # A reprojection error of this many sigma is not noise: two different things were marked, or the rig has moved.
 _MISMATCH_SIGMAS = 10.0
 
-_REASONS = {
-    Status.OUTSIDE_LENS: "the lens model has no ray for a mark",
-    Status.BEHIND: "the lines of sight cross behind a camera: are the marks the same thing?",
-    Status.NOT_FINITE: "a pixel coordinate is not finite",
-    Status.OUTSIDE_IMAGE: "a mark lies outside its image",
-    Status.BAD_COVARIANCE: "the covariance of the marks is none",
+_STATUS_TEXTS = {
+    PositionStatus.OUTSIDE_LENS: "the lens model has no ray for a mark",
+    PositionStatus.BEHIND: "the lines of sight cross behind a camera: are the marks the same thing?",
+    PositionStatus.NOT_FINITE: "a pixel coordinate is not finite",
+    PositionStatus.OUTSIDE_IMAGE: "a mark lies outside its image",
+    PositionStatus.BAD_COVARIANCE: "the covariance of the marks is not positive definite",
 }
 
 
@@ -44,12 +44,12 @@ class Position:
 
     `height` is above the ellipsoid; `geoid_height` is that of the geoid, known only with a grid, and
     `height - geoid_height` is close to the height above the sea. `covariance` is of `enu`, to first order; `cep50_m`
-    and `cep95_m` are the radii of horizontal circles that hold the true position with 50 and 95 %, infinite where it
+    and `cep95_m` are the radii of horizontal circles that contain the true position with 50 and 95 %, infinite where it
     may lie at infinity. The sensitivities are slopes of the range by a pixel of a mark and by a degree of relative yaw.
     """
 
     name: str
-    status: Status
+    status: PositionStatus
     reason: str = ""
     lat: float | None = None
     lon: float | None = None
@@ -88,10 +88,10 @@ class Viewpoint:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Located:
-    """Result of `locate`: one position for each pair of marks, in order, and where the rig stood.
+    """Result of `locate_points`: one position for each pair of marks, in order, and where the rig stood.
 
-    `included` names the errors that the intervals and covariances hold; `geoid` the grid of the geoid heights, None if
-    there was none.
+    `included` names the errors that intervals and covariances cover; `geoid` is the grid of the geoid heights, None
+    without one.
     """
 
     positions: tuple[Position, ...]
@@ -106,17 +106,16 @@ class Located:
 
     @property
     def interval_note(self) -> str:
-        """What the intervals hold and what they do not, as a sentence without a full stop."""
+        """Which errors the intervals cover and which they do not, as a sentence without a full stop."""
         missing = [name for name in ("calibration", "mounting") if name not in self.included]
-        note = "95 % of the " + " and the ".join(
-            "marks' noise" if name == "marks" else f"{name}'s errors" for name in self.included
-        )
-        return note + (f"; {' and '.join(missing)} errors are not included" if missing else "")
+        known = [name for name in self.included if name != "marks"]
+        note = "95 % of the noise in the marks" + (f" and of the errors in {' and '.join(known)}" if known else "")
+        return note + (f"; errors in {' and '.join(missing)} are not included" if missing else "")
 
     @property
     def count(self) -> int:
         """How many pairs have a position."""
-        return sum(position.status == Status.OK for position in self.positions)
+        return sum(position.status == PositionStatus.OK for position in self.positions)
 
     @property
     def enu(self) -> Tensor:
@@ -126,13 +125,13 @@ class Located:
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, 3)
 
 
-def locate(
+def locate_points(
     rig: StereoRig,
     pixels_left: Tensor,
     pixels_right: Tensor,
     *,
-    origin: Origin,
-    heading_deg: float,
+    origin: Origin | None = None,
+    heading_deg: float | None = None,
     pitch_deg: float = 0.0,
     roll_deg: float = 0.0,
     pixel_sigma: float = 0.3,
@@ -147,7 +146,8 @@ def locate(
     """Positions on the Earth of things marked in both images of a stereo rig.
 
     Args:
-        rig: the calibrated rig.
+        rig: the calibrated rig; origin, attitude and covariances that are left out are the rig's own, as for
+            `StereoLocalizer`.
         pixels_left: (N, 2) marks in the left image, integer coordinates at pixel centers.
         pixels_right: (N, 2) the same things in the right image.
         origin: position of the left camera's projection center.
@@ -173,7 +173,7 @@ def locate(
     Example:
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> located = locate(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
+        >>> located = locate_points(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
         ...                  origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
         >>> position = located.positions[0]
         >>> round(position.range_m, 3), round(position.lat, 6), round(position.range_high_m, 1)
@@ -189,7 +189,6 @@ def locate(
     names = [str(i + 1) for i in range(len(pixels_left))] if names is None else list(names)
     if len(names) != len(pixels_left):
         raise InputError(f"names: {len(names)} for {len(pixels_left)} pairs of marks; one each is needed")
-    rotation = enu_from_cam(heading_deg, pitch_deg, roll_deg)
     with torch.no_grad():
         localize = StereoLocalizer(
             rig, origin=origin, heading_deg=heading_deg, pitch_deg=pitch_deg, roll_deg=roll_deg,
@@ -197,7 +196,8 @@ def locate(
         )  # fmt: skip
         slopes = [slope.tolist() for slope in localize.sensitivity(pixels_left, pixels_right)]
         result = Localization(*(tensor.cpu() for tensor in localize(pixels_left, pixels_right, cov)))
-        cameras = _viewpoints(rig, rotation, origin)
+        cameras = _viewpoints(rig, localize.enu_from_rig.cpu(), localize.origin)
+    heading, pitch, roll = localize.attitude_deg
     angles = azimuth_elevation(result.bearing).tolist()
     circles = circular_error(result.enu, result.covariance).tolist()
     sigmas = [pixel_sigma] * len(names) if cov is None else _marks_sigma(cov, len(names))
@@ -205,17 +205,17 @@ def locate(
 
     positions = []
     for i, name in enumerate(names):
-        status = Status(int(result.status[i]))
-        position = Position(name=name, status=status, reason=_reason(status, result, i, sigmas[i], baseline))
-        if status in (Status.OK, Status.BEARING_ONLY, Status.PARALLEL):
+        status = PositionStatus(int(result.status[i]))
+        position = Position(name=name, status=status, reason=_explanation(status, result, i, sigmas[i], baseline))
+        if status in (PositionStatus.OK, PositionStatus.BEARING_ONLY, PositionStatus.PARALLEL):
             position = dataclasses.replace(position, azimuth_deg=angles[i][0], elevation_deg=angles[i][1])
             low, high = float(result.range_low[i]), float(result.range_high[i])
             if math.isfinite(low):
                 position = dataclasses.replace(position, range_low_m=low, range_high_m=high)
-        if status in (Status.OK, Status.BEARING_ONLY):
+        if status in (PositionStatus.OK, PositionStatus.BEARING_ONLY):
             left, right = result.reprojection[i].tolist()
             position = dataclasses.replace(position, reprojection_px=(left, right))
-        if status == Status.OK:
+        if status == PositionStatus.OK:
             position = _placed(position, result, i)
             position = dataclasses.replace(
                 position, cep50_m=circles[i][0], cep95_m=circles[i][1], meters_per_pixel=slopes[0][i],
@@ -224,16 +224,15 @@ def locate(
         positions.append(position)
     if geoid is not None:
         positions = _with_geoid(positions, geoid)
-    errors = (("marks", True), ("calibration", calibration is not None), ("mounting", mounting is not None))
     return Located(
         positions=tuple(positions),
         cameras=cameras,
-        origin=origin,
-        heading_deg=heading_deg,
-        pitch_deg=pitch_deg,
-        roll_deg=roll_deg,
+        origin=localize.origin,
+        heading_deg=heading,
+        pitch_deg=pitch,
+        roll_deg=roll,
         pixel_sigma=pixel_sigma,
-        included=tuple(name for name, there in errors if there),
+        included=localize.included,
         geoid=None if geoid is None else geoid.name,
     )
 
@@ -257,21 +256,21 @@ def _with_geoid(positions: list[Position], geoid: Geoid) -> list[Position]:
 
 
 def _marks_sigma(cov: Tensor, count: int) -> list[float]:
-    """The largest standard deviation of each pair's coordinates; infinite where there is none."""
+    """The largest standard deviation of each pair's coordinates; infinite where it is not positive."""
     variance = cov.detach().cpu().double().diagonal(dim1=-2, dim2=-1).amax(-1).expand(count)
     return [math.sqrt(value) if value > 0 else math.inf for value in variance.tolist()]
 
 
-def _reason(status: Status, result: Localization, i: int, pixel_sigma: float, baseline: float) -> str:
-    if status in _REASONS:
-        return _REASONS[status]
+def _explanation(status: PositionStatus, result: Localization, i: int, pixel_sigma: float, baseline: float) -> str:
+    if status in _STATUS_TEXTS:
+        return _STATUS_TEXTS[status]
     low = float(result.range_low[i])
-    if status == Status.PARALLEL and math.isinf(low):
+    if status == PositionStatus.PARALLEL and math.isinf(low):
         angle = math.degrees(math.atan(-baseline * float(result.inverse_range[i])))
         return f"the lines of sight diverge by {angle:.3g}°, more than noise: not the same thing, or the rig has turned"
-    if status == Status.PARALLEL and low == 0:
+    if status == PositionStatus.PARALLEL and low == 0:
         return "a mark lies in the direction of the other camera: no range can be measured along that line"
-    if status in (Status.PARALLEL, Status.BEARING_ONLY):
+    if status in (PositionStatus.PARALLEL, PositionStatus.BEARING_ONLY):
         return f"the parallax is below three sigma: only the bearing is known, and a range of at least {low:.0f} m"
     worst = float(result.reprojection[i].max())
     if worst > _MISMATCH_SIGMAS * pixel_sigma:

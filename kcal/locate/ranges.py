@@ -1,11 +1,8 @@
-"""How far a point may be: the range interval that the noise of the marks leaves open.
+"""The 95 % interval of a range, from one over the range and its standard deviation.
 
-The interval covers the marks' noise only. An error of the calibration (0.01 degrees of relative yaw is 436 m at 5 km
-with a baseline of 10 m and 1600 px of focal length) comes on top and is not in it.
-
-A range is skewed: with parallax α the range is close to baseline / α, so that equal steps of α to either side reach
-much farther outward than inward, and the outer end is infinite once α may be zero. A standard deviation of the range
-hides both, hence an interval of α is carried over.
+A range is skewed: at 5 km with 3.2 px of disparity, half a pixel too many puts a point 0.7 km nearer and half a pixel
+too few 0.9 km farther, and the far end is infinite once the disparity may be zero. A standard deviation of the range
+hides both. One over the range has nearly Gaussian errors, so its interval is carried over.
 """
 
 from __future__ import annotations
@@ -28,61 +25,30 @@ class RangeInterval(NamedTuple):
     Attributes:
         low: nearest range; infinite if the rays diverge by more than the noise explains.
         high: farthest range; infinite if the point may be at infinity.
-        bearing_only: true where the parallax is below three of its standard deviations.
     """
 
     low: Tensor
     high: Tensor
-    bearing_only: Tensor
 
 
-def range_from_parallax(baseline: Tensor | float, bearing: Tensor, parallax: Tensor) -> Tensor:
-    """Range from the left camera by the law of sines; infinite where the rays do not meet in front.
-
-    Args:
-        baseline: distance of the cameras in meters.
-        bearing: (..., N) angle at the left camera between its ray and the direction to the right camera, radians.
-        parallax: (..., N) angle by which the right ray turns towards the left one, radians: the angle at the point.
-
-    Returns:
-        (..., N) meters, baseline * sin(bearing + parallax) / sin(parallax); the angle at the right camera is
-        what the other two leave of π. Gradients are finite everywhere.
-
-    Example:
-        >>> angle = torch.tensor([0.002, 0.0], dtype=torch.float64)
-        >>> range_from_parallax(10.0, torch.full_like(angle, math.pi / 2), angle).round(decimals=2).tolist()
-        [4999.99, inf]
-    """
-    meets = (parallax > 0) & (bearing + parallax < math.pi)
-    angle = torch.where(meets, parallax, 1.0)
-    distance = baseline * torch.sin(bearing + angle) / torch.sin(angle)
-    # With parallax π - bearing the right ray runs down the baseline and the point has come to the left camera.
-    return torch.where(meets, distance, torch.where(parallax > 0, 0.0, math.inf))
-
-
-def range_interval(
-    baseline: Tensor | float, bearing: Tensor, parallax: Tensor, parallax_sigma: Tensor
-) -> RangeInterval:
-    """The 95 % interval of the range, from the interval parallax ± 1.96 sigma. It covers the marks' noise only.
+def range_interval(inverse_range: Tensor, sigma: Tensor, known: Tensor | None = None) -> RangeInterval:
+    """The 95 % interval of the range, from the interval inverse_range ± 1.96 sigma.
 
     Args:
-        baseline: distance of the cameras in meters.
-        bearing: (..., N) angle at the left camera between its ray and the direction to the right camera, radians;
-            its own noise is neglected, as it moves the range by no more than the point moves sideways.
-        parallax: (..., N) radians, negative where the rays diverge.
-        parallax_sigma: (..., N) standard deviation of the parallax, radians: for a narrow rig that looks straight
-            ahead sqrt(2) * pixel_sigma / focal.
+        inverse_range: (..., N) one over meters, negative where the rays diverge.
+        sigma: (..., N) its standard deviation.
+        known: (..., N) bool; where it is False the interval is 0 to infinity.
 
     Example:
-        >>> f, disparity = 1600.0, torch.tensor([3.2], dtype=torch.float64)
-        >>> sigma = torch.tensor([0.5 / f], dtype=torch.float64)
-        >>> interval = range_interval(10.0, torch.tensor([math.pi / 2]).double(), disparity / f, sigma)
-        >>> round(interval.low.item(), 1), round(interval.high.item(), 1), interval.bearing_only.item()
-        (3827.8, 7207.1, False)
+        >>> f, baseline, disparity = 1600.0, 10.0, torch.tensor([3.2], dtype=torch.float64)
+        >>> sigma = torch.tensor([0.5 / (f * baseline)], dtype=torch.float64)
+        >>> interval = range_interval(disparity / (f * baseline), sigma)
+        >>> round(interval.low.item(), 1), round(interval.high.item(), 1)
+        (3827.8, 7207.1)
     """
-    reach = QUANTILE * parallax_sigma
-    return RangeInterval(
-        low=range_from_parallax(baseline, bearing, parallax + reach),
-        high=range_from_parallax(baseline, bearing, parallax - reach),
-        bearing_only=parallax < BEARING_SIGMAS * parallax_sigma,
-    )
+    ends = []
+    for inverse, unknown in ((inverse_range + QUANTILE * sigma, 0.0), (inverse_range - QUANTILE * sigma, math.inf)):
+        ahead = inverse > 0
+        reach = torch.where(ahead, 1.0 / torch.where(ahead, inverse, 1.0), math.inf)
+        ends.append(reach if known is None else torch.where(known, reach, unknown))
+    return RangeInterval(*ends)

@@ -1,4 +1,4 @@
-"""Where a position lies with 95 %, as a ring on the map: an ellipse in inverse range, skewed outward in meters."""
+"""The 95 % region of a position as a ring on the map: an ellipse in inverse range, skewed outward in meters."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.positions import Located, Position
 
 REGION_SHARE = 0.95
-_CORNERS = 72
+_RING_POINTS = 72
 # An ellipse that comes this close to the camera, in shares of the distance, has no inverse to speak of.
 _TOO_WIDE = 0.85
 
@@ -21,7 +21,7 @@ Ring = list[tuple[float, float]]
 
 
 def region_outline(enu: Tensor, covariance: Tensor, share: float = REGION_SHARE) -> Tensor:
-    """Outline of the horizontal region that holds the true position with a probability of `share`.
+    """Outline of the horizontal region that contains the true position with a probability of `share`.
 
     The ellipse is drawn where errors are Gaussian, in X / |X|² of the horizontal position, and carried back.
 
@@ -41,23 +41,23 @@ def region_outline(enu: Tensor, covariance: Tensor, share: float = REGION_SHARE)
     """
     place, spread = enu[:2].double(), covariance[:2, :2].double()
     reach = math.sqrt(-2.0 * math.log(1.0 - share))
-    angle = torch.linspace(0, 2 * math.pi, _CORNERS + 1, dtype=torch.float64)[:-1]
+    angle = torch.linspace(0, 2 * math.pi, _RING_POINTS + 1, dtype=torch.float64)[:-1]
     circle = reach * torch.stack([torch.cos(angle), torch.sin(angle)], -1)
     squared = float(place @ place)
     radial = math.sqrt(float(place @ spread @ place)) / squared if squared > 0 else math.inf
     if reach * radial > _TOO_WIDE:
-        ring = place + circle @ _root(spread).T
+        ring = place + circle @ _covariance_root(spread).T
     else:
         still = torch.eye(2, dtype=torch.float64)
         slope = (still - 2.0 * torch.outer(place, place) / squared) / squared
-        inverse = place / squared + circle @ _root(slope @ spread @ slope.T).T
+        inverse = place / squared + circle @ _covariance_root(slope @ spread @ slope.T).T
         ring = inverse / (inverse * inverse).sum(-1, keepdim=True)
     following = ring.roll(-1, 0)
     area = (ring[:, 0] * following[:, 1] - ring[:, 1] * following[:, 0]).sum()
     return ring if float(area) > 0 else ring.flip(0)
 
 
-def _root(matrix: Tensor) -> Tensor:
+def _covariance_root(matrix: Tensor) -> Tensor:
     values, vectors = torch.linalg.eigh(matrix)
     return vectors * values.clamp_min(0.0).sqrt()
 

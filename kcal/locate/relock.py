@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 from torch import Tensor
 
@@ -75,7 +77,7 @@ def relocked(file: RigFile, drift: Drift, note: str) -> RigFile:
     rig = drift.rig
     calibration = file.calibration
     if calibration is not None:
-        calibration = calibration.model_copy(update={"relocked": note, "baseline_m": float(rig.baseline)})
+        calibration = dataclasses.replace(calibration, relocked=note, baseline_m=float(rig.baseline))
     return RigFile(
         left=file.left,
         right=file.right,

@@ -1,30 +1,31 @@
-"""Pixel pairs of a stereo rig to points in meters, with a status for each: the module `Triangulate`."""
+"""Pixel pairs of a stereo rig to points with errors: statuses, the most likely point, the interval of its range.
+
+`Triangulate` and `StereoLocalizer` share what is here.
+"""
 
 from __future__ import annotations
 
 import enum
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
-from kcal.locate.angular import triangulate_pairs
-from kcal.locate.ranges import range_interval
+from kcal.lens.tracing import CHUNK, is_traced, known_true
+from kcal.locate.angular import EPIPOLE, triangulate_pairs
+from kcal.locate.max_likelihood import PointFit, RelativeCamera, inverse_covariances, most_likely
+from kcal.locate.ranges import BEARING_SIGMAS, RangeInterval, range_interval
 
 # Radians. A smaller parallax is parallel for any camera: the point would be a billion baselines away.
 _PARALLEL = 1e-9
-# A ray this close (sine) to the line through both cameras meets the other camera's rays everywhere on that line.
-_EPIPOLE = 1e-9
-# Radians of turn for the angular size of a pixel by central differences: truncation and rounding both near 1e-9.
-_TURN = 1e-5
 
 
-class Status(enum.IntEnum):
+class PositionStatus(enum.IntEnum):
     """What became of a pixel pair. Only `OK` comes with a point; `PARALLEL` still has a bearing and a nearest range."""
 
     OK = 0
@@ -38,143 +39,70 @@ class Status(enum.IntEnum):
     BAD_COVARIANCE = 8
 
 
-# Plain numbers: torch.compile cannot compare a tensor with an enum's member.
-_OK, _AT_INFINITY = int(Status.OK), int(Status.PARALLEL)
+def with_status(code: Tensor, condition: Tensor, status: PositionStatus) -> Tensor:
+    """`code` (int8) with `status` where the condition is true."""
+    return torch.where(condition, code.new_full((), int(status)), code)
 
 
-class Triangulation(NamedTuple):
-    """Result of `Triangulate`; no tensor holds NaN, whatever went in.
-
-    Attributes:
-        points: (..., N, 3) meters in the rig frame (the left camera's); zeros unless the status is OK.
-        status: (..., N) int8, codes of `Status` (never BEARING_ONLY: the geometry alone cannot tell; nor the last two,
-            which speak of what `StereoLocalizer` is given besides).
-        rays: (..., N, 3) unit rays of the left camera; its optical axis where the lens has none.
-        reprojection: (..., N, 2) distance in px between mark and reprojected point, left and right; zeros unless OK.
-        parallax: (..., N) radians by which the rays converge in the epipolar plane, negative where they diverge.
-        parallax_sigma: (..., N) its standard deviation from the marks' noise; carries no gradient.
-        range_low: (..., N) meters from the left camera, lower end of the 95 % interval of the marks' noise.
-        range_high: (..., N) its upper end, infinite where the point may be at infinity. The interval is 0 to infinity
-            unless the status is OK or PARALLEL.
-        bearing_only: (..., N) true where the parallax is below three sigma: trust the bearing, not the range.
-    """
-
-    points: Tensor
-    status: Tensor
-    rays: Tensor
-    reprojection: Tensor
-    parallax: Tensor
-    parallax_sigma: Tensor
-    range_low: Tensor
-    range_high: Tensor
-    bearing_only: Tensor
+def checked_rig(rig: StereoRig, pixel_sigma: float) -> float:
+    """The sigma of the marks as a float, after checking that it is positive and that the rig has a baseline."""
+    if not 0 < pixel_sigma < math.inf:
+        raise InputError(f"pixel_sigma: a positive number of pixels is needed, got {pixel_sigma}")
+    if not float(rig.baseline) > 0:
+        raise DegenerateError("the rig's cameras stand in the same place: no range can be measured")
+    return float(pixel_sigma)
 
 
-class Triangulate(nn.Module):
-    """Locate pixel pairs in the rig frame.
+def checked_pairs(pixels_left: Tensor, pixels_right: Tensor) -> tuple[Tensor, Tensor]:
+    """Both as float64 (..., N, 2), after checking types and shapes."""
+    left, right = as_points("pixels_left", pixels_left, 2), as_points("pixels_right", pixels_right, 2)
+    if left.shape != right.shape or left.ndim < 2:
+        raise InputError(
+            "pixels_left and pixels_right: the same shape (..., N, 2) is needed, "
+            f"got {tuple(left.shape)} and {tuple(right.shape)}"
+        )
+    return left, right
 
-    The status of a pair is decided from the two rays before anything is divided: `NOT_FINITE` (NaN or infinite
-    pixels), `OUTSIDE_IMAGE` (more than half a pixel outside), `OUTSIDE_LENS` (the lens model has no ray there),
-    `BEHIND` (the rays' lines cross behind exactly one camera), `PARALLEL` (parallel or diverging rays: at or beyond
-    infinity, or along the baseline), else `OK`. Points near infinity are `OK` with a wide range interval.
 
-    There is no branch on values, so that the module compiles and exports. Geometry runs in float64 whatever the
-    pixels' type; derivatives by the pixels are exact and finite, and zero for pairs that are not OK.
+Tensors = TypeVar("Tensors", bound=tuple)
+
+
+def piece_by_piece(
+    locate: Callable[..., Tensors], left: Tensor, right: Tensor, *others: Tensor | None, differentiated: bool
+) -> Tensors:
+    """Call `locate(left, right, *others)`, in pieces that fit the cache where nothing is traced or differentiated.
 
     Args:
-        rig: two cameras and their relative pose.
-        pixel_sigma: standard deviation of the marks, px along each axis, for the range interval. It stands for the
-            marks' noise only: calibration errors come on top.
-
-    Raises:
-        InputError: a `pixel_sigma` that is not positive.
-        DegenerateError: a rig without a baseline.
-
-    Example:
-        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> left = torch.tensor([[960.0, 540.0]], dtype=torch.float64)
-        >>> result = Triangulate(rig)(left, left - torch.tensor([3.2, 0.0], dtype=torch.float64))
-        >>> round(result.points[0, 2].item(), 3), Status(int(result.status[0])).name
-        (5000.0, 'OK')
+        locate: returns a named tuple of tensors whose axis of points is that of the pixels.
+        left: (..., N, 2).
+        right: (..., N, 2).
+        others: tensors (..., N, ...) with the same leading axes, or None.
+        differentiated: then everything is done in one piece, because the graph would keep all pieces anyway.
     """
-
-    def __init__(self, rig: StereoRig, pixel_sigma: float = 0.3) -> None:
-        super().__init__()
-        if not 0 < pixel_sigma < math.inf:
-            raise InputError(f"pixel_sigma: a positive number of pixels is needed, got {pixel_sigma}")
-        if not float(rig.baseline) > 0:
-            raise DegenerateError("the rig's cameras stand in the same place: no range can be measured")
-        self.rig = rig
-        self.pixel_sigma = float(pixel_sigma)
-
-    def forward(self, pixels_left: Tensor, pixels_right: Tensor) -> Triangulation:
-        """Triangulate matched pixels, both (..., N, 2), integer coordinates at pixel centers.
-
-        Raises:
-            InputError: not floating point, or shapes that are wrong or unlike.
-        """
-        pixels_left = as_points("pixels_left", pixels_left, 2)
-        pixels_right = as_points("pixels_right", pixels_right, 2)
-        if pixels_left.shape != pixels_right.shape or pixels_left.ndim < 2:
-            raise InputError(
-                "pixels_left and pixels_right: the same shape (..., N, 2) is needed, "
-                f"got {tuple(pixels_left.shape)} and {tuple(pixels_right.shape)}"
-            )
-        rotation, translation = self.rig.right_from_left_rotation, self.rig.right_from_left_translation
-        lines = sight_lines(self.rig, pixels_left, pixels_right)
-        rays_left, pair, code, points = lines.rays_left, lines.pair, lines.status, lines.points
-
-        ok = (code == _OK)[..., None]
-        points = torch.where(ok, points, rays_left)
-        reprojected_left, _ = self.rig.left.project(points)
-        reprojected_right, _ = self.rig.right.project(points @ rotation.T + translation)
-        misses = torch.stack([reprojected_left - pixels_left, reprojected_right - pixels_right], -2)
-        reprojection = torch.linalg.vector_norm(torch.where(ok[..., None], misses, 0.0), dim=-1)
-
-        known = ok[..., 0] | (code == _AT_INFINITY)
-        with torch.no_grad():
-            sizes = (
-                _pixel_angle(self.rig.left, rays_left, pair.turn_left, pair.normal_left),
-                _pixel_angle(
-                    self.rig.right, lines.rays_right, pair.turn_right @ rotation.T, pair.normal_right @ rotation.T
-                ),
-            )
-            sigma = self.pixel_sigma * torch.hypot(*sizes)
-            # One pixel of a camera never spans more than this; a broken lens model may say anything.
-            sigma = torch.where(known & torch.isfinite(sigma), sigma, math.pi)
-        parallax = torch.where(known, pair.parallax, 0.0)
-        low, high, bearing_only = range_interval(self.rig.baseline, pair.bearing, parallax, sigma)
-        open_low = ~known | pair.along_baseline
-        return Triangulation(
-            points=torch.where(ok, points, 0.0),
-            status=code,
-            rays=rays_left,
-            reprojection=reprojection,
-            parallax=parallax,
-            parallax_sigma=sigma,
-            range_low=torch.where(open_low, 0.0, low),
-            range_high=torch.where(open_low, math.inf, high),
-            bearing_only=bearing_only,
-        )
+    axis = left.ndim - 2
+    size = max(1, CHUNK // max(1, math.prod(left.shape[:-2])))
+    if is_traced() or differentiated or left.shape[-2] <= size:
+        return locate(left, right, *others)
+    cut = [None if value is None else value.split(size, axis) for value in (left, right, *others)]
+    count = math.ceil(left.shape[-2] / size)
+    pieces = [locate(*(None if value is None else value[i] for value in cut)) for i in range(count)]
+    return type(pieces[0])(*(torch.cat(values, axis) for values in zip(*pieces, strict=True)))
 
 
 class SightLines(NamedTuple):
-    """What the rays of pixel pairs say before any noise is thought of.
+    """What the rays of pixel pairs say before any noise is considered.
 
     Attributes:
         rays_left: (..., N, 3) unit rays in the left camera's frame.
-        rays_right: (..., N, 3) likewise in the right camera's.
         points: (..., N, 3) in the same frame, of `triangulate_pairs`; zeros where the rays do not meet ahead.
-        status: (..., N) int8, as in `Triangulation`.
-        pair: the angles of the two rays.
+        status: (..., N) int8, codes of `PositionStatus`.
+        along_baseline: (..., N) where a ray runs along the baseline, so that it meets the other everywhere on it.
     """
 
     rays_left: Tensor
-    rays_right: Tensor
     points: Tensor
     status: Tensor
-    pair: PairAngles
+    along_baseline: Tensor
 
 
 def sight_lines(rig: StereoRig, pixels_left: Tensor, pixels_right: Tensor) -> SightLines:
@@ -184,76 +112,158 @@ def sight_lines(rig: StereoRig, pixels_left: Tensor, pixels_right: Tensor) -> Si
     rays_right, seen_right = rig.right.unproject(pixels_right)
     inside = rig.left.inside(pixels_left) & rig.right.inside(pixels_right)
     finite = (torch.isfinite(pixels_left) & torch.isfinite(pixels_right)).all(-1)
-    pair = _epipolar(rays_left, rays_right @ rotation, -translation @ rotation)
+    parallax, opposite, along_baseline = _epipolar(rays_left, rays_right @ rotation, -translation @ rotation)
     points, solved = triangulate_pairs(rays_left, rays_right, (rotation, translation))
-    code = torch.full(rays_left.shape[:-1], _OK, dtype=torch.int8, device=rays_left.device)
+    code = torch.full(rays_left.shape[:-1], int(PositionStatus.OK), dtype=torch.int8, device=rays_left.device)
     for condition, status in (
-        ((pair.parallax <= _PARALLEL) | pair.along_baseline, Status.PARALLEL),
-        ((pair.opposite | (~solved & (pair.parallax > _PARALLEL))) & ~pair.along_baseline, Status.BEHIND),
-        (~(seen_left & seen_right), Status.OUTSIDE_LENS),
-        (~inside, Status.OUTSIDE_IMAGE),
-        (~finite, Status.NOT_FINITE),
+        ((parallax <= _PARALLEL) | along_baseline, PositionStatus.PARALLEL),
+        ((opposite | (~solved & (parallax > _PARALLEL))) & ~along_baseline, PositionStatus.BEHIND),
+        (~(seen_left & seen_right), PositionStatus.OUTSIDE_LENS),
+        (~inside, PositionStatus.OUTSIDE_IMAGE),
+        (~finite, PositionStatus.NOT_FINITE),
     ):
-        code = torch.where(condition, code.new_full((), int(status)), code)
-    return SightLines(rays_left, rays_right, points, code, pair)
+        code = with_status(code, condition, status)
+    return SightLines(rays_left, points, code, along_baseline)
 
 
-class PairAngles(NamedTuple):
-    """Two rays seen in the plane of the left ray and the baseline; vectors are in the rig frame."""
+@torch.no_grad()
+def _epipolar(left: Tensor, right: Tensor, baseline: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of unit rays (..., N, 3) in the rig frame, in the plane of the left one and the baseline (left to right camera).
 
-    bearing: Tensor
-    parallax: Tensor
-    opposite: Tensor
-    along_baseline: Tensor
-    turn_left: Tensor
-    normal_left: Tensor
-    turn_right: Tensor
-    normal_right: Tensor
-
-
-def _epipolar(left: Tensor, right: Tensor, baseline: Tensor) -> PairAngles:
-    """Angles of unit rays (..., N, 3), both in the rig frame; `baseline` points from the left camera to the right."""
+    Returns:
+        parallax (..., N), radians, negative where the rays diverge; whether the right ray points to the other side of
+        the baseline; and whether either runs along it.
+    """
     axis = (baseline / torch.linalg.vector_norm(baseline)).expand_as(left)
-    normal, sine, left_ok = _safe_unit(torch.linalg.cross(axis, left))
-    side = torch.linalg.cross(normal, axis)
+    normal = torch.linalg.cross(axis, left)
+    sine = torch.linalg.vector_norm(normal, dim=-1)
+    left_ok = sine > EPIPOLE
+    side = torch.linalg.cross(normal / torch.where(left_ok, sine, 1.0)[..., None], axis)
     cosine = (left * axis).sum(-1)
     along, across = (right * axis).sum(-1), (right * side).sum(-1)
-    normal_right, _, right_ok = _safe_unit(torch.linalg.cross(axis, right))
+    right_ok = torch.linalg.vector_norm(torch.linalg.cross(axis, right), dim=-1) > EPIPOLE
     # The right ray in the plane: the rest of it, the epipolar error, says nothing about the range.
-    in_plane = left_ok & right_ok & (torch.hypot(along, across) > _EPIPOLE)
-    return PairAngles(
-        bearing=torch.atan2(torch.where(left_ok, sine, 1.0), torch.where(left_ok, cosine, 0.0)),
-        parallax=torch.atan2(
-            torch.where(in_plane, cosine * across - sine * along, 0.0),
-            torch.where(in_plane, cosine * along + sine * across, 1.0),
-        ),
-        opposite=across <= 0,
-        along_baseline=~in_plane,
-        turn_left=torch.linalg.cross(normal, left),
-        normal_left=normal,
-        turn_right=torch.linalg.cross(normal_right, right),
-        normal_right=normal_right,
-    )
+    in_plane = left_ok & right_ok & (torch.hypot(along, across) > EPIPOLE)
+    parallax = torch.atan2(cosine * across - sine * along, cosine * along + sine * across)
+    return torch.where(in_plane, parallax, 0.0), across <= 0, ~in_plane
 
 
-def _safe_unit(vector: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit vector, length and whether it is long enough; a fixed vector stands in for a short one."""
-    squared = (vector * vector).sum(-1)
-    long = squared > _EPIPOLE**2
-    vector = torch.where(long[..., None], vector, vector.new_tensor([0.0, 1.0, 0.0]))
-    length = torch.linalg.vector_norm(vector, dim=-1)
-    return vector / length[..., None], torch.where(long, length, 0.0), long
+class PairFit(NamedTuple):
+    """The most likely points of pixel pairs.
 
-
-def _pixel_angle(camera: Camera, rays: Tensor, turn: Tensor, normal: Tensor) -> Tensor:
-    """Radians along `turn` per pixel of isotropic noise at each ray: the first row's norm of the inverse Jacobian.
-
-    The Jacobian of pixels by turns of the ray along `turn` and `normal` is taken by central differences.
+    Attributes:
+        fit: the optimum.
+        scale: meters, the unit of `fit.inverse`.
+        status: (..., N) int8, from `sight_lines` and what was given besides.
+        usable: (..., N) which pairs have an optimum.
     """
-    steps = torch.stack([turn, -turn, normal, -normal], -2) * _TURN
-    pixels, _ = camera.project((rays[..., None, :] + steps).flatten(-3, -2))
-    pixels = pixels.unflatten(-2, (rays.shape[-2], 4))
-    by_turn = (pixels[..., 0, :] - pixels[..., 1, :]) / (2 * _TURN)
-    by_normal = (pixels[..., 2, :] - pixels[..., 3, :]) / (2 * _TURN)
-    determinant = by_turn[..., 0] * by_normal[..., 1] - by_turn[..., 1] * by_normal[..., 0]
-    return torch.linalg.vector_norm(by_normal, dim=-1) / determinant.abs()
+
+    fit: PointFit
+    scale: Tensor
+    status: Tensor
+    usable: Tensor
+
+    @property
+    def length(self) -> Tensor:
+        """(..., N) of `fit.direction`."""
+        return torch.linalg.vector_norm(self.fit.direction, dim=-2)
+
+
+def fit_pairs(
+    rig: StereoRig,
+    left: Tensor,
+    right: Tensor,
+    cov: Tensor | None = None,
+    mask: Tensor | None = None,
+    *,
+    by_camera: bool = False,
+    differentiated: bool = False,
+) -> PairFit:
+    """The most likely point of each pixel pair: in closed form first, then by `most_likely`.
+
+    Args:
+        rig: two cameras and their relative pose.
+        left: (..., N, 2) float64 pixels.
+        right: (..., N, 2).
+        cov: (..., N, 4, 4) covariance of each pair's four coordinates; a variance of one if left out.
+        mask: (..., N) bool; what is False is neither read nor differentiated.
+        by_camera: see `most_likely`.
+        differentiated: see `most_likely`.
+    """
+    finite = torch.isfinite(left + right).all(-1)
+    wanted = finite if mask is None else finite & mask
+    if not known_true(wanted):
+        left = torch.where(wanted[..., None], left, rig.left.center.detach())
+        right = torch.where(wanted[..., None], right, rig.right.center.detach())
+    with torch.no_grad():
+        lines = sight_lines(rig, left, right)
+        weight, sound = inverse_covariances(cov)
+        code = with_status(lines.status, ~sound, PositionStatus.BAD_COVARIANCE)
+        code = with_status(code, ~finite, PositionStatus.NOT_FINITE)
+        if mask is not None:
+            code = with_status(code, ~mask, PositionStatus.MASKED)
+        met = code == int(PositionStatus.OK)
+        usable = met | ((code == int(PositionStatus.PARALLEL)) & ~lines.along_baseline)
+        scale = rig.baseline.detach()
+        distance = torch.where(met, torch.linalg.vector_norm(lines.points, dim=-1), 1.0)
+        ahead = torch.where(met[..., None], lines.points / distance[..., None], lines.rays_left)
+        start = torch.where(met, scale / distance, 0.0)
+    if differentiated and cov is not None:
+        weight, _ = inverse_covariances(cov)
+    rotation, translation = rig.right_from_left_rotation, rig.right_from_left_translation
+    still = torch.eye(3, dtype=torch.float64, device=rotation.device)
+    cameras = (
+        RelativeCamera(rig.left, still, torch.zeros_like(translation)),
+        RelativeCamera(rig.right, rotation, translation),
+    )
+    pixels = torch.cat([left, right], -1).mT
+    fit = most_likely(
+        cameras, scale, (ahead, start), pixels, usable, weight, by_camera=by_camera, differentiated=differentiated
+    )
+    return PairFit(fit, scale, code, usable)
+
+
+class InverseRange(NamedTuple):
+    """One over the range, whose errors are Gaussian at any distance, and what follows from it; each (..., N).
+
+    Attributes:
+        value: one over meters from the left camera; zero unless usable.
+        sigma: its standard deviation; zero where nothing is known.
+        interval: the 95 % interval of the range, meters.
+        weak: where the parallax is below three of its sigmas.
+        status: int8: PARALLEL where the value is not positive.
+    """
+
+    value: Tensor
+    sigma: Tensor
+    interval: RangeInterval
+    weak: Tensor
+    status: Tensor
+
+
+def inverse_range(found: PairFit, variance: Tensor, weak_status: PositionStatus) -> InverseRange:
+    """Range and status of fitted pairs, given the variance (..., N) of `fit.inverse`.
+
+    A pair that is `OK` and weak gets `weak_status`.
+    """
+    fit, scale, code, usable = found
+    value = torch.where(usable, fit.inverse / (scale * found.length), 0.0)
+    with torch.no_grad():
+        known = torch.isfinite(variance) & (variance > 0) & usable
+    sigma = torch.sqrt(torch.where(known, variance, 1.0)) / (scale * found.length)
+    sigma = torch.where(known, sigma, 0.0)
+    with torch.no_grad():
+        weak = usable & (~known | (value < BEARING_SIGMAS * sigma))
+        lost = usable & ~(value > 0)
+        code = with_status(code, weak & (code == int(PositionStatus.OK)), weak_status)
+        code = with_status(code, lost, PositionStatus.PARALLEL)
+        # What the closed form put at infinity may have come back in front of the rig.
+        code = with_status(code, usable & ~lost & ~weak, PositionStatus.OK)
+    return InverseRange(value, sigma, range_interval(value, sigma, known), weak, code)
+
+
+def reprojection_errors(residual: Tensor) -> Tensor:
+    """Residuals (..., 2 C, N) to distances in px (..., N, C), with a gradient of zero where there is no error."""
+    squared = residual.unflatten(-2, (-1, 2)).square().sum(-2)
+    some = squared > 0
+    return torch.where(some, torch.sqrt(torch.where(some, squared, 1.0)), 0.0).mT

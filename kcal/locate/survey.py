@@ -16,9 +16,10 @@ from torch import Tensor
 
 from kcal.calibrate.rig.sources import Features, Landmarks, MeasuredPosition, inverse_range_beyond
 from kcal.errors import FileError, InputError
-from kcal.locate.geodesy import Origin, geodetic_to_enu
+from kcal.lens.mounting import Origin
+from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.marks import PIXELS, Marks, pixel_of
-from kcal.locate.tables import Row, read_rows
+from kcal.locate.tables import TableRow, read_rows
 
 _EARTH, _LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
 _PLACES = ("name", *_EARTH, *_LOCAL, "sigma", "sigma_up", "note")
@@ -27,13 +28,13 @@ _INFINITY_SIGMA = 1e-12
 
 
 class Survey(NamedTuple):
-    """Named places.
+    """Named places with their uncertainty.
 
     Attributes:
         names: one each.
         points: (N, 3) meters east, north, up of `origin`.
         sigma: (N, 3) meters.
-        origin: where the frame is anchored; None if the file holds local meters and no origin was given.
+        origin: where the frame is anchored; None if the file contains local meters and no origin was given.
     """
 
     names: tuple[str, ...]
@@ -45,7 +46,7 @@ class Survey(NamedTuple):
 def read_survey(path: str | Path, origin: Origin | None = None, *, measured: bool = True) -> Survey:
     r"""Read surveyed places: `name,lat,lon,height,sigma` or `name,east,north,up,sigma`, and if need be `sigma_up`.
 
-    Degrees, meters above the WGS84 ellipsoid, meters; `sigma` holds along each axis, `sigma_up` upward where that
+    Degrees, meters above the WGS84 ellipsoid, meters; `sigma` is along each axis, `sigma_up` upward where that
     differs.
 
     Args:
@@ -66,7 +67,7 @@ def read_survey(path: str | Path, origin: Origin | None = None, *, measured: boo
         [1001.88, 0.0, 9.92]
     """
     rows = read_rows(path, "name,lat,lon,height,sigma", _PLACES, ("sigma",) if measured else ())
-    columns = _columns(rows[0], path)
+    columns = _coordinates(rows[0], path)
     values = torch.tensor([[row.number(column) for column in columns] for row in rows], dtype=torch.float64)
     if columns == _EARTH:
         for row, (lat, lon, height) in zip(rows, values.tolist(), strict=True):
@@ -77,11 +78,11 @@ def read_survey(path: str | Path, origin: Origin | None = None, *, measured: boo
             origin = origin or place
         assert origin is not None
         values = geodetic_to_enu(values, origin)
-    sigma = [_sigma(row) if measured or row.cells.get("sigma") else (0.0, 0.0, 0.0) for row in rows]
+    sigma = [_survey_sigma(row) if measured or row.cells.get("sigma") else (0.0, 0.0, 0.0) for row in rows]
     return Survey(tuple(row.name for row in rows), values, torch.tensor(sigma, dtype=torch.float64), origin)
 
 
-def _columns(row: Row, path: str | Path) -> tuple[str, str, str]:
+def _coordinates(row: TableRow, path: str | Path) -> tuple[str, str, str]:
     for columns in (_EARTH, _LOCAL):
         if all(column in row.cells for column in columns):
             other = _LOCAL if columns == _EARTH else _EARTH
@@ -91,7 +92,7 @@ def _columns(row: Row, path: str | Path) -> tuple[str, str, str]:
     raise FileError(f"{path}: the columns lat, lon, height or east, north, up are needed")
 
 
-def _sigma(row: Row) -> tuple[float, float, float]:
+def _survey_sigma(row: TableRow) -> tuple[float, float, float]:
     level = row.positive("sigma")
     if level is None or not math.isfinite(level):
         raise FileError(f"{row.where}: sigma is empty; write how well the place is known, meters")
@@ -112,6 +113,13 @@ def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float) -> MarkedL
 
     Raises:
         InputError: no name is in both.
+
+    Example:
+        >>> survey = Survey(("mast", "post"), torch.rand(2, 3).double(), torch.ones(2, 3).double(), None)
+        >>> marks = Marks(("post", "tree"), torch.rand(2, 2).double(), torch.rand(2, 2).double())
+        >>> found = match_landmarks(survey, marks, pixel_sigma=0.1)
+        >>> found.landmarks.names, found.unmarked, found.unsurveyed
+        (('post',), ('mast',), ('tree',))
     """
     index = {name: i for i, name in enumerate(marks.names)}
     common = [name for name in survey.names if name in index]
@@ -162,7 +170,7 @@ def read_features(path: str | Path, pixel_sigma: float) -> Features:
     )
 
 
-def _inverse_range(row: Row) -> tuple[float, float]:
+def _inverse_range(row: TableRow) -> tuple[float, float]:
     distance, sigma, beyond = (row.positive(column) for column in ("range", "range_sigma", "beyond"))
     if beyond is not None and distance is not None:
         raise FileError(f"{row.where}: range or beyond is needed, not both")
@@ -182,6 +190,11 @@ def camera_positions(survey: Survey, cameras: Sequence[str]) -> tuple[MeasuredPo
 
     Raises:
         InputError: a name that is no camera's.
+
+    Example:
+        >>> survey = Survey(("right",), torch.tensor([[10.0, 0.0, 0.5]]), torch.full((1, 3), 0.02), None)
+        >>> camera_positions(survey, ("left", "right"))[0].camera
+        1
     """
     unknown = [name for name in survey.names if name not in cameras]
     if unknown:

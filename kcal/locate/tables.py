@@ -13,7 +13,7 @@ from typing import NamedTuple
 from kcal.errors import FileError
 
 
-class Row(NamedTuple):
+class TableRow(NamedTuple):
     """One line of a table: where it stands, its name, and its cells by column."""
 
     where: str
@@ -57,7 +57,7 @@ def _float(cell: str) -> float:
         return math.nan
 
 
-def read_rows(path: str | Path, header: str, columns: Sequence[str], required: Sequence[str]) -> list[Row]:
+def read_rows(path: str | Path, header: str, columns: Sequence[str], required: Sequence[str]) -> list[TableRow]:
     r"""Read a comma-separated file with a header and at least one line below it.
 
     Columns may come in any order; `name` may be absent (rows are then numbered from 1). Blank lines are skipped, and a
@@ -116,7 +116,7 @@ def read_rows(path: str | Path, header: str, columns: Sequence[str], required: S
         if name in lines_by_name:
             raise FileError(f"{where}: the name {name!r} was used on line {lines_by_name[name]}; names must differ")
         lines_by_name[name] = line
-        found.append(Row(where, name, row))
+        found.append(TableRow(where, name, row))
     return found
 
 

@@ -1,101 +1,112 @@
-"""Linear triangulation (Eq. 9) from rays of two or more cameras, batched, with exact first and second derivatives."""
+"""`Triangulate`: pixel pairs of a stereo rig to points in the rig's own frame, without the Earth."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from kcal.locate.angular import checked_views
+from kcal.lens.rig import StereoRig
+from kcal.lens.tracing import is_differentiated
+from kcal.locate.stereo import (
+    PositionStatus,
+    checked_pairs,
+    checked_rig,
+    fit_pairs,
+    inverse_range,
+    piece_by_piece,
+    reprojection_errors,
+)
 
-# Below this gap of the squared singular values (the rays have unit length, the cameras a spread of one) the answer
-# is not determined: all rays lie along the line through the camera centers.
-_GAP = 1e-18
-# Points farther than this many baselines are at infinity for float64.
-_HORIZON = 1e12
+
+class Triangulation(NamedTuple):
+    """Result of `Triangulate`; no tensor contains NaN, whatever went in.
+
+    Attributes:
+        points: (..., N, 3) meters in the rig frame (the left camera's); zeros unless the status is OK.
+        status: (..., N) int8, codes of `PositionStatus`; never BEARING_ONLY: see `bearing_only`.
+        rays: (..., N, 3) unit vectors of the most likely direction from the left camera; its optical axis where the
+            lens has no ray.
+        reprojection: (..., N, 2) distance in px between mark and reprojected point, left and right; zeros unless OK.
+        inverse_range: (..., N) one over meters from the left camera, negative where the rays diverge.
+        inverse_range_sigma: (..., N) its standard deviation from the marks' noise; zero where nothing is known.
+        range_low: (..., N) meters from the left camera, lower end of the 95 % interval of the marks' noise.
+        range_high: (..., N) its upper end, infinite where the point may be at infinity. The interval is 0 to infinity
+            unless the status is OK or PARALLEL.
+        bearing_only: (..., N) true where the parallax is below three sigma: trust the bearing, not the range.
+    """
+
+    points: Tensor
+    status: Tensor
+    rays: Tensor
+    reprojection: Tensor
+    inverse_range: Tensor
+    inverse_range_sigma: Tensor
+    range_low: Tensor
+    range_high: Tensor
+    bearing_only: Tensor
 
 
-def triangulate_linear(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """The point nearest to all rays in the sense of Eq. 9: the right singular vector of the smallest singular value.
+class Triangulate(nn.Module):
+    """Locate pixel pairs in the rig frame: the positions of `StereoLocalizer`, without the Earth.
 
-    For each camera the three rows of `ray x (R X + t) = 0` are stacked. Eq. 9 has the first two of them in pixels;
-    with unit rays all pixels of a wide lens weigh alike, and the third row keeps rays far off axis well determined.
-    Before the decomposition the world is moved to the middle of the camera centers and scaled by their spread, so
-    that a far origin (ECEF) or an unlike unit costs no digits.
+    The status of a pair is decided from the two rays before anything is divided: `NOT_FINITE` (NaN or infinite
+    pixels), `OUTSIDE_IMAGE` (more than half a pixel outside), `OUTSIDE_LENS` (the lens model has no ray there),
+    `BEHIND` (the rays' lines cross behind exactly one camera), `PARALLEL` (parallel or diverging rays: at or beyond
+    infinity, or along the baseline), else `OK`. Points near infinity are `OK` with a wide range interval.
 
-    Derivatives do not come from the decomposition's own backward pass, which divides by differences of *all*
-    singular values: two chord steps on the eigenvalue equation need only the gap above the smallest. Two steps from
-    an exact root make first and second derivatives exact.
+    There is no branch on values, so that the module compiles and exports. Geometry runs in float64 whatever the
+    pixels' type; derivatives by the pixels are exact and finite, and zero for pairs that are not OK.
 
     Args:
-        cam_from_world: (..., C, 3, 4) matrices [R | t] with R a rotation; leading dimensions broadcast with those of
-            `rays`. C is at least 2.
-        rays: (..., N, C, 3) directions in each camera's frame, any length but zero.
-
-    Returns:
-        points (..., N, 3) in the world frame, float64, and valid (..., N): true where the point is finite, determined
-        and in front of every camera along its ray. Points that are not valid are the middle of the camera centers.
+        rig: two cameras and their relative pose; its covariance is not used.
+        pixel_sigma: standard deviation of the marks, px along each axis, for the range interval. The interval covers
+            the marks' noise only; `StereoLocalizer` adds the errors of the calibration.
 
     Raises:
-        InputError: wrong shapes or dtypes.
-
-    Source: the paper, Eq. 8 and 9 (the DLT of Hartley and Zisserman, section 12.2).
+        InputError: a `pixel_sigma` that is not positive.
+        DegenerateError: a rig without a baseline.
 
     Example:
-        >>> left = torch.eye(3, 4, dtype=torch.float64)
-        >>> right = left.clone()
-        >>> right[0, 3] = -10.0
-        >>> rays = torch.tensor([[[0.0, 0.0, 1.0], [-0.002, 0.0, 1.0]]], dtype=torch.float64)
-        >>> points, valid = triangulate_linear(torch.stack([left, right]), rays)
-        >>> round(points[0, 2].item(), 6), valid.tolist()
-        (5000.0, [True])
+        >>> from kcal.lens.camera import Camera
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> left = torch.tensor([[960.0, 540.0]], dtype=torch.float64)
+        >>> result = Triangulate(rig)(left, left - torch.tensor([3.2, 0.0], dtype=torch.float64))
+        >>> round(result.points[0, 2].item(), 3), PositionStatus(int(result.status[0])).name
+        (5000.0, 'OK')
     """
-    cam_from_world, rays = checked_views(cam_from_world, rays)
-    rotation, translation = cam_from_world[..., :3], cam_from_world[..., 3]
-    centers = -(rotation.mT @ translation[..., None])[..., 0]
-    middle = centers.mean(-2, keepdim=True)
-    spread = torch.linalg.vector_norm(centers - middle, dim=-1).amax(-1, keepdim=True)
-    spread = 2.0 * torch.where(spread > 0, spread, 1.0)
-    local = (rotation @ (middle - centers)[..., None]) / spread[..., None, None]
 
-    length = torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-    usable = (torch.isfinite(length) & (length > 0)).all(-2, keepdim=True)
-    ahead = rays.new_tensor([0.0, 0.0, 1.0])
-    units = torch.where(usable, rays, ahead)
-    units = units / torch.linalg.vector_norm(units, dim=-1, keepdim=True)
+    def __init__(self, rig: StereoRig, pixel_sigma: float = 0.3) -> None:
+        super().__init__()
+        self.pixel_sigma = checked_rig(rig, pixel_sigma)
+        self.rig = rig
 
-    cameras = torch.cat([rotation, local], -1)[..., None, :, :, :]
-    # (..., N, C, 3, 4): the ray crossed with each column of [R | t].
-    system = torch.linalg.cross(*torch.broadcast_tensors(units[..., None], cameras), dim=-2).flatten(-3, -2)
-    solution, determined = _null_vector(system)
-    weight = solution[..., 3:]
-    nearer = weight.abs() * _HORIZON > torch.linalg.vector_norm(solution[..., :3], dim=-1, keepdim=True)
-    finite = nearer & determined[..., None]
-    local_points = torch.where(finite, solution[..., :3], 0.0) / torch.where(finite, weight, 1.0)
+    def forward(self, pixels_left: Tensor, pixels_right: Tensor) -> Triangulation:
+        """Triangulate matched pixels, both (..., N, 2), integer coordinates at pixel centers.
 
-    in_cameras = (cameras[..., :3] @ local_points[..., None, :, None] + cameras[..., 3:])[..., 0]
-    ahead_of_all = ((in_cameras * units).sum(-1) > 0).all(-1, keepdim=True)
-    valid = finite & ahead_of_all & usable[..., 0, :]
-    points = middle + spread[..., None, :] * torch.where(valid, local_points, 0.0)
-    return points, valid[..., 0]
+        Raises:
+            InputError: not floating point, or shapes that are wrong or unlike.
+        """
+        left, right = checked_pairs(pixels_left, pixels_right)
+        differentiated = is_differentiated(left, right, *self.parameters())
 
+        def triangulate(left: Tensor, right: Tensor) -> Triangulation:
+            found = fit_pairs(self.rig, left, right, differentiated=differentiated)
+            reach = inverse_range(found, self.pixel_sigma**2 * found.fit.covariance[5], PositionStatus.OK)
+            ok = reach.status == int(PositionStatus.OK)
+            depth = found.scale / torch.where(ok, found.fit.inverse, 1.0)
+            return Triangulation(
+                points=torch.where(ok[..., None], depth[..., None] * found.fit.direction.mT, 0.0),
+                status=reach.status,
+                rays=(found.fit.direction / found.length[..., None, :]).mT,
+                reprojection=torch.where(ok[..., None], reprojection_errors(found.fit.residual), 0.0),
+                inverse_range=reach.value,
+                inverse_range_sigma=reach.sigma,
+                range_low=reach.interval.low,
+                range_high=reach.interval.high,
+                bearing_only=reach.weak,
+            )
 
-def _null_vector(system: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vector h minimizing |system h|, and whether it is unique; differentiable twice.
-
-    G(h) = (M - λ(h)) h with M = systemᵀ system and λ the Rayleigh quotient vanishes at the answer. In the basis of
-    the other singular vectors its Jacobian is diag(λ_i - λ), held fixed at the known root (a chord step).
-    """
-    with torch.no_grad():
-        _, singular, basis = torch.linalg.svd(system, full_matrices=False)
-        squared = singular * singular
-        gap = squared[..., :3] - squared[..., 3:]
-        determined = gap[..., 2] > _GAP
-        inverse_gap = torch.where(determined[..., None], 1.0 / torch.where(gap > _GAP, gap, 1.0), 0.0)
-        others, h = basis[..., :3, :].mT, basis[..., 3, :, None]
-    for _ in range(2):
-        residual = system @ h
-        value = (residual * residual).sum((-2, -1), keepdim=True) / (h * h).sum((-2, -1), keepdim=True)
-        # (system others)ᵀ residual, not othersᵀ (M h): a product of small numbers keeps its digits.
-        gradient = (system @ others).mT @ residual - value * (others.mT @ h)
-        h = h - others @ (inverse_gap[..., None] * gradient)
-    return h[..., 0], determined
+        return piece_by_piece(triangulate, left, right, differentiated=differentiated)

@@ -1,4 +1,4 @@
-"""Positions against the truth, where somebody knows it: read it, and say how far off each one is."""
+"""Compare positions with the truth where it is known."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.locate.geodesy import Origin
+from kcal.lens.mounting import Origin
 from kcal.locate.positions import Located
 from kcal.locate.survey import read_survey
 
 
 def read_truth(path: str | Path, located: Located) -> Tensor:
-    """True positions (N, 3) east, north, up of the left camera for the located points by name; NaN where unknown.
+    r"""True positions (N, 3) east, north, up of the left camera for the located points by name; NaN where unknown.
 
     Args:
         path: a CSV with name,lat,lon,height or name,east,north,up (of the left camera), other columns as a survey has.
@@ -24,6 +24,18 @@ def read_truth(path: str | Path, located: Located) -> Tensor:
     Raises:
         FileError: see `kcal.locate.survey.read_survey`.
         InputError: no name is in both.
+
+    Example:
+        >>> import tempfile
+        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.locate.positions import locate_points
+        >>> left, right, _ = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))
+        >>> located = locate_points(planned_rig(), left, right, names=["mast"], heading_deg=0.0,
+        ...                         origin=Origin(lat=19.07, lon=72.87, height=14.0))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(folder, "truth.csv").write_text("name,east,north,up\nmast,1,1000,0\n")
+        ...     read_truth(Path(folder, "truth.csv"), located).tolist()
+        [[1.0, 1000.0, 0.0]]
     """
     here = Origin(lat=located.origin.lat, lon=located.origin.lon, height=located.origin.height)
     survey = read_survey(path, here, measured=False)
@@ -35,21 +47,22 @@ def read_truth(path: str | Path, located: Located) -> Tensor:
     return torch.stack([survey.points[index[name]] if name in index else nowhere for name in names])
 
 
-def misses(located: Located, truth: Tensor) -> list[tuple[float, float, bool] | None]:
-    """How far off each position is; None where position or truth is unknown.
+def position_errors(located: Located, truth: Tensor) -> list[tuple[float, float, bool] | None]:
+    """The error of each position; None where position or truth is unknown.
 
-    For each its level distance from the truth and its range minus the true one (meters), and whether the range interval
-    holds the true range.
+    Returns:
+        for each position its horizontal distance from the truth and its range minus the true one (meters), and whether
+        the range interval contains the true range.
 
     Example:
         >>> from kcal.lens.camera import Camera
         >>> from kcal.lens.rig import StereoRig
-        >>> from kcal.locate.positions import locate
+        >>> from kcal.locate.positions import locate_points
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> found = locate(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
+        >>> found = locate_points(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
         ...                origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
-        >>> [round(value, 6) for value in misses(found, torch.tensor([[3.0, 996.0, 0.0]]).double())[0][:1]]
+        >>> [round(value, 6) for value in position_errors(found, torch.tensor([[3.0, 996.0, 0.0]]).double())[0][:1]]
         [5.0]
     """
     out: list[tuple[float, float, bool] | None] = []

@@ -1,17 +1,27 @@
-"""Least squares over the weights of a network, for `kcal.solve`."""
+"""The fit that all networks share: least squares over their weights by Levenberg-Marquardt."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from kcal.nets.mlp import Widths, evaluate, evaluate_with_slopes
-from kcal.solve.dense import DenseLinearization
-from kcal.solve.result import State
+from kcal.nets.mlp import Network, Widths, evaluate, evaluate_with_slopes
+from kcal.solve.dense import DenseLinearization, DenseProblem
+from kcal.solve.lm import LMOptions, minimize
+from kcal.solve.problem import Problem
+from kcal.solve.result import Result, State
 
 
-class NetProblem:
-    """Residuals net(inputs; weights) - targets. The state is one vector of weights (P,).
+@torch.no_grad()
+def fit_weights(net: Network, problem: Problem, start: State, options: LMOptions | None = None) -> Result:
+    """Minimize a problem whose states begin with the network's weights, and copy the weights found into `net`."""
+    result = minimize(problem, start, options)
+    net.weights.copy_(result.state[0])
+    return result
+
+
+class RegressionProblem(DenseProblem):
+    """Residuals net(inputs) - targets, with the Jacobian in closed form. The state is the vector of weights (P,).
 
     Args:
         inputs: (in, N).
@@ -19,28 +29,14 @@ class NetProblem:
         widths: features of each stage.
     """
 
-    batch: tuple[int, ...] = ()
-    joint = False
-
     def __init__(self, inputs: Tensor, targets: Tensor, widths: Widths) -> None:
+        super().__init__(lambda weights: (evaluate(inputs, weights, widths) - targets).flatten(), ())
         self._inputs, self._targets, self._widths = inputs, targets, widths
-        self.residual_count = targets.numel()
-
-    def cost(self, state: State) -> Tensor:
-        """See `Problem.cost`."""
-        return 0.5 * (evaluate(self._inputs, state[0], self._widths) - self._targets).square().sum()
 
     def linearize(self, state: State) -> DenseLinearization:
         """See `Problem.linearize`."""
         net = evaluate_with_slopes(self._inputs, state[0], self._widths)
         residuals = (net.values - self._targets).flatten()
-        # Contiguous with the weights last: what the normal equations read.
+        self.residual_count = len(residuals)
+        # Contiguous with the weights last, as the normal equations read it.
         return DenseLinearization(residuals, net.by_weights.flatten(-2).T.contiguous())
-
-    def select(self, elements: Tensor) -> None:
-        """See `Problem.select`: there is one element only."""
-        return
-
-    def retract(self, state: State, step: State) -> State:
-        """Plain addition."""
-        return (torch.add(state[0], step[0]),)

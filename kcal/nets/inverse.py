@@ -1,49 +1,53 @@
 """The learned inverse of a lens: the paper's Inv_NN (Fig. 8, Eq. 12), as a start for Newton's method.
 
-Three layers see a distorted position and say where the undistorted one lies, relative to a guess in closed form: the
-tilt undone and the radial polynomial of `kcal.lens.inverse_start`, or, as the paper has it, the distorted position
-itself. A network is never exact, and it does not know where a lens folds. So it is no inverse by itself:
-`Camera.unproject` takes it as a first guess, and Newton's method and the valid region decide about the answer.
+Three layers map a distorted position to a correction of a closed-form guess: the tilt undone and the radial polynomial
+of `kcal.lens.inverse_start`, or, as in the paper, the distorted position itself. A network is never exact and does not
+know where a lens folds, so it only gives `Camera.unproject` a first guess. Newton's method and the valid region decide
+about the answer.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Callable
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcal.checks import as_points, keep_float64
-from kcal.errors import InputError
+from kcal.checks import as_points
+from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.inverse_start import start_from, without_tilt
-from kcal.nets.mlp import Widths, evaluate, initial_weights
+from kcal.lens.inverse_start import start_from, undo_tilt
+from kcal.lens.plane import plane_from_points, rays_from_plane
+from kcal.lens.projection import from_pixels
+from kcal.lens.residual import undo_components
+from kcal.nets.fit import RegressionProblem, fit_weights
+from kcal.nets.mlp import Network, evaluate, initial_weights
+from kcal.solve.lm import LMOptions
+from kcal.solve.result import Status
 
-# 1 - |p|² / 4 at 89.9° off axis, the least that the plane z = 1 is divided by.
-_RIM = 1.0 - math.tan(math.radians(89.9 / 2)) ** 2
+# 1 - |p|² / 4 on the chart at 89.9° off axis, the smallest divisor on the way back to the plane z = 1.
+_SMALLEST_DIVISOR = 1.0 - math.tan(math.radians(89.9 / 2)) ** 2
 
 
-class InverseNet(nn.Module):
-    """Distorted to undistorted coordinates by a network of three layers (Eq. 12 of the paper).
+class InverseNet(Network):
+    """Map distorted to undistorted coordinates by a network of three layers (Eq. 12 of the paper).
 
-    Convention: both on the plane of the lens: z = 1, for a fisheye the plane of angles. Distorted positions of a hybrid
-    camera are those before its residual field, which is undone by Newton steps of its own. The network works on a chart
-    where wide angles take no more room than in an image: of the plane z = 1 the stereographic one,
-    p = 2 x / (1 + √(1 + |x|²)), where 90° is |p| = 2; the plane of angles is such a chart itself. With p0 the guess in
-    closed form, p = p0 + a · net(p0 / r): r and a (`reach`, `amplitude`) bring inputs and outputs to the order of one.
-    A new network is all guess: its last layer is zero. Train it with `kcal.nets.inverse_fit.train_inverse`.
+    Convention: both lie on the plane of the lens: z = 1, or the plane of angles for a fisheye. For a hybrid camera,
+    distorted positions are those before its residual field, which has an inverse of its own. The network works on a
+    chart on which wide angles do not grow without bound. For the plane z = 1 it is the stereographic chart
+    p = 2 x / (1 + √(1 + |x|²)), where 90° is |p| = 2; the plane of angles is used as it is. With p0 the closed-form
+    guess, p = p0 + a · net(p0 / r), where r and a (`reach`, `amplitude`) scale inputs and outputs to the order of one.
+    The last layer of a new network is zero, so that it returns the guess. Train it with `train_inverse`.
 
-    The weights are float64 like everything in kcal, and so is `forward`. As a start for Newton's method (`guess`) the
-    correction alone is computed in float32: the iteration that follows asks for no more digits.
+    The weights and `forward` are float64. As a start for Newton's method (`guess`), the correction alone is computed in
+    float32, because the iterations that follow need no more digits.
 
     Args:
-        camera: a single camera; what the guess needs to know of its lens is copied.
-        hidden: features of each of the two hidden layers.
-        radial: correct the closed-form guess; False: correct the distorted position itself, as in the paper (it is
-            taken for the guess on the chart).
-        seed: of the hidden layers' first values.
+        camera: a single camera; the net copies what the guess needs to know of its lens.
+        hidden: number of features in each of the two hidden layers.
+        radial: correct the closed-form guess; False: correct the distorted position itself, as in the paper.
+        seed: seed of the initial weights.
 
     Raises:
         InputError: a batch of cameras, or no hidden feature.
@@ -59,37 +63,32 @@ class InverseNet(nn.Module):
         True
     """
 
-    weights: Tensor
     reach: Tensor
     amplitude: Tensor
     coefficients: Tensor
     start: Tensor
 
     def __init__(self, camera: Camera, *, hidden: int = 12, radial: bool = True, seed: int = 0) -> None:
-        super().__init__()
         values = camera.params.detach()
         if values.ndim != 1:
-            raise InputError(f"one camera has one inverse net, this is a batch of {tuple(values.shape[:-1])}")
-        self.widths: Widths = (2, hidden, hidden, 2)
+            raise InputError(f"InverseNet: a single camera is needed, got a batch of {tuple(values.shape[:-1])}")
+        widths = (2, hidden, hidden, 2)
+        super().__init__(widths, initial_weights(widths, seed).to(values.device))
         self.model, self.radial = camera.model, radial
-        self.weights = nn.Parameter(initial_weights(self.widths, seed).to(values.device), requires_grad=False)
-        for name, value in {
-            "reach": values.new_ones(()),
-            "amplitude": values.new_ones(()),
-            "coefficients": values[5:].clone(),
-            "start": camera.inverse_start.clone(),
-        }.items():
-            self.register_buffer(name, value)
+        self.register_buffer("reach", values.new_ones(()))
+        self.register_buffer("amplitude", values.new_ones(()))
+        self.register_buffer("coefficients", values[5:].clone())
+        self.register_buffer("start", camera.inverse_start.clone())
 
     def closed_form(self, x: Tensor, y: Tensor) -> Tensor:
-        """What the network corrects: the guess (..., 2, N) on the chart for distorted coordinates x, y (..., N)."""
+        """The guess that the network corrects: (..., 2, N) on the chart, for distorted coordinates x, y (..., N)."""
         if self.radial:
-            x, y, _, rest = without_tilt(x, y, self.coefficients, self.model)
+            x, y, _, rest = undo_tilt(x, y, self.coefficients, self.model)
             x, y = self.to_chart(*start_from(x, y, rest, self.start))
         return torch.stack([x, y], -2)
 
     def to_chart(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Undistorted coordinates (..., N) to the network's chart."""
+        """Map undistorted coordinates (..., N) to the network's chart."""
         if self.model.fisheye:
             return x, y
         square = torch.addcmul(x * x, y, y)
@@ -97,23 +96,23 @@ class InverseNet(nn.Module):
         return x * scale, y * scale
 
     def from_chart(self, p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-        """The inverse of `to_chart`; what lies beyond 89.9° is taken for 89.9° off axis in its direction."""
+        """The inverse of `to_chart`; positions beyond 89.9° off axis are moved to 89.9°, in the same direction."""
         if self.model.fisheye:
             return p, q
-        scale = (1.0 - 0.25 * torch.addcmul(p * p, q, q)).clamp(min=_RIM).reciprocal()
+        scale = (1.0 - 0.25 * torch.addcmul(p * p, q, q)).clamp(min=_SMALLEST_DIVISOR).reciprocal()
         return p * scale, q * scale
 
     def forward(self, distorted: Tensor) -> Tensor:
-        """Distorted (..., N, 2) to undistorted coordinates (..., N, 2), as good as the network is; no mask.
+        """Map distorted (..., N, 2) to undistorted coordinates (..., N, 2), approximately and without a validity mask.
 
         Raises:
-            InputError: wrong shapes or an integer dtype.
+            InputError: a wrong shape or an integer dtype.
         """
         distorted = as_points("distorted", distorted, 2)
         return torch.stack(self._corrected(distorted[..., 0], distorted[..., 1], torch.float64), -1)
 
     def guess(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """A start for Newton's method at distorted coordinates x, y (..., N); see `Camera.unproject`."""
+        """The `start` of `Camera.unproject`: roughly undistorted coordinates for distorted ones x, y (..., N)."""
         return self._corrected(x, y, torch.float32)
 
     def _corrected(self, x: Tensor, y: Tensor, precision: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -122,9 +121,143 @@ class InverseNet(nn.Module):
         moved = guess + self.amplitude * correction.to(torch.float64)
         return self.from_chart(moved[..., 0, :], moved[..., 1, :])
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
-        return super()._apply(keep_float64(fn), recurse)
-
     def extra_repr(self) -> str:
         """Widths and what is corrected, for `repr`."""
         return f"widths={self.widths}, corrects {'the radial start' if self.radial else 'the distorted position'}"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class InverseNetOptions:
+    """Options of `train_inverse`.
+
+    Args:
+        hidden: number of features in each hidden layer.
+        radial: see `InverseNet`.
+        samples: (columns, rows) of the training pixels, at Chebyshev nodes: denser towards the image's edges.
+        iterations: maximum number of trial steps of Levenberg-Marquardt.
+        seed: seed of the initial weights.
+    """
+
+    hidden: int = 12
+    radial: bool = True
+    samples: tuple[int, int] = (40, 26)
+    iterations: int = 100
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.hidden < 1 or min(self.samples) < 2 or self.iterations < 1:
+            raise InputError("InverseNetOptions: hidden and iterations must be at least 1, samples at least 2 x 2")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class InverseFit:
+    """A trained inverse net and its accuracy without Newton's method.
+
+    Args:
+        net: the network.
+        rms: RMS reprojection error in pixels of the net's answers, over a grid of pixels of the image that have a ray
+            and were not used for training.
+        largest: the largest of these errors; infinite if an answer lies outside the lens's valid region.
+        start_rms: RMS error of the closed-form guess that the net corrects.
+        start_largest: the largest error of that guess.
+        iterations: number of trial steps taken.
+        status: why the training stopped.
+    """
+
+    net: InverseNet
+    rms: float
+    largest: float
+    start_rms: float
+    start_largest: float
+    iterations: int
+    status: Status
+
+
+@torch.no_grad()
+def train_inverse(camera: Camera, options: InverseNetOptions | None = None) -> InverseFit:
+    """Train an inverse net for a camera: least squares of net(distorted) - undistorted (Eq. 12, the term of y1 and y4).
+
+    The paper trains with Adam on board points. Here the lens is known, so the training data are pixels all over the
+    image with their exact rays, compared on the chart of `InverseNet`, and Levenberg-Marquardt fits the few hundred
+    weights. The same seed gives the same net up to rounding.
+
+    Args:
+        camera: a single camera.
+        options: see `InverseNetOptions`.
+
+    Raises:
+        InputError: a batch of cameras.
+        DegenerateError: too few pixels have a ray to determine half of the weights.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="opencv5",
+        ...                       coefficients=[-0.2, 0.05, 0.01, -0.01, 0.0])
+        >>> fit = train_inverse(camera, InverseNetOptions(hidden=4, iterations=40))
+        >>> fit.start_largest > 1.0, fit.largest < 0.1
+        (True, True)
+    """
+    options = options or InverseNetOptions()
+    net = InverseNet(camera, hidden=options.hidden, radial=options.radial, seed=options.seed)
+    pixels = _training_pixels(camera, options.samples)
+    rays, valid = camera.unproject(pixels)
+    if 4 * int(valid.sum()) < net.weights.numel():
+        raise DegenerateError(
+            f"only {int(valid.sum())} of {len(pixels)} training pixels have a ray, too few for {net.weights.numel()} "
+            "weights; check the camera, use more samples or fewer hidden features"
+        )
+    X, Y, Z = rays[valid].unbind(-1)
+    truth = torch.stack(net.to_chart(*plane_from_points(X, Y, Z, camera.model)))
+    guess = net.closed_form(*_distorted(camera, pixels[valid]))
+    net.reach.copy_(_largest_length(guess))
+    net.amplitude.copy_(_largest_length(truth - guess))
+    problem = RegressionProblem(guess / net.reach, (truth - guess) / net.amplitude, net.widths)
+    # A correction to 1e-9 of its largest value is more than any start needs.
+    limits = LMOptions(max_iterations=options.iterations, tolerance=1e-6, residual_floor=1e-9)
+    result = fit_weights(net, problem, (net.weights.detach(),), limits)
+    # Between the training pixels, and dense enough to find the largest error to a few per cent.
+    pixels = camera.grid(97, 55).reshape(-1, 2)
+    pixels = pixels[camera.unproject(pixels)[1]]
+    x, y = _distorted(camera, pixels)
+    p, q = net.closed_form(x, y)
+    before = _reprojection_errors(camera, pixels, *net.from_chart(p, q))
+    after = _reprojection_errors(camera, pixels, *net(torch.stack([x, y], -1)).unbind(-1))
+    return InverseFit(
+        net=net,
+        rms=_rms(after),
+        largest=float(after.max()),
+        start_rms=_rms(before),
+        start_largest=float(before.max()),
+        iterations=int(result.iterations),
+        status=Status(int(result.status)),
+    )
+
+
+def _training_pixels(camera: Camera, counts: tuple[int, int]) -> Tensor:
+    """Chebyshev nodes (columns * rows, 2) over the image and a margin of 5 %, because nets extrapolate badly."""
+    axes = []
+    for size, count in zip(camera.size, counts, strict=True):
+        place = -torch.cos(math.pi * (torch.arange(count, dtype=torch.float64) + 0.5) / count)
+        axes.append(0.5 * (size - 1) + 0.5 * size * 1.05 * place)
+    grid = torch.stack(torch.meshgrid(*axes, indexing="xy"), -1).reshape(-1, 2)
+    return grid.to(camera.params.device)
+
+
+def _distorted(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Distorted coordinates x, y (N,) of pixels (N, 2); for a hybrid camera, before its residual field."""
+    x, y = from_pixels(pixels[:, 0], pixels[:, 1], camera.params)
+    return (x, y) if camera.field is None else undo_components(x, y, camera.field)[:2]
+
+
+def _reprojection_errors(camera: Camera, pixels: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Reprojection errors (N,) in pixels of points x, y (N,) of the lens's plane."""
+    again, seen = camera.project(torch.stack(rays_from_plane(x, y, camera.model), -1))
+    return torch.where(seen, torch.linalg.vector_norm(again - pixels, dim=-1), torch.inf)
+
+
+def _largest_length(values: Tensor) -> Tensor:
+    """Largest length of vectors (2, N); the floor only keeps a division by it finite."""
+    return torch.linalg.vector_norm(values, dim=0).amax().clamp(min=1e-12)
+
+
+def _rms(values: Tensor) -> float:
+    return float(values.square().mean().sqrt())

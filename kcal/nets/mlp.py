@@ -1,8 +1,8 @@
 """Small fully connected networks as functions of one vector of weights, with closed-form Jacobians.
 
-Convention: features come first and points last, (..., F, N), as everywhere inside kcal. Hidden layers are tanh, so that
-a network is smooth; the last layer is linear. The weights of all layers are one vector: of each layer the matrix
-(out, in) row by row, then the bias (out,). `widths` are the features of each stage: (2, 8, 8, 2) has three layers.
+Convention: features come first and points last, (..., F, N). Hidden layers are tanh, the last layer is linear.
+`widths` lists the features of each stage: (2, 8, 8, 2) has three layers. All weights are one vector: for each layer the
+matrix (out, in) row by row, then the bias (out,).
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ import itertools
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from kcal.checks import Float64Module
 from kcal.errors import InputError
 
 Widths = tuple[int, ...]
-# Spread of the first layer's weights, whose inputs lie in [-1, 1], and of the hidden biases.
-_FIRST, _BIAS = 1.5, 0.5
+# Standard deviations of the initial first-layer weights, whose inputs lie in [-1, 1], and of the hidden biases: wide
+# enough for tanh to bend, narrow enough not to saturate.
+_FIRST_SPREAD, _BIAS_SPREAD = 1.5, 0.5
 
 
 class NetValues(NamedTuple):
@@ -28,8 +30,19 @@ class NetValues(NamedTuple):
     by_weights: Tensor
 
 
+class Network(Float64Module):
+    """Base of the paper's networks: one vector of float64 weights, without gradients until asked."""
+
+    weights: Tensor
+
+    def __init__(self, widths: Widths, weights: Tensor) -> None:
+        super().__init__()
+        self.widths = widths
+        self.weights = nn.Parameter(weights, requires_grad=False)
+
+
 def weight_count(widths: Widths) -> int:
-    """How many weights a network has.
+    """Return the number of weights of a network.
 
     Example:
         >>> weight_count((2, 8, 8, 2))
@@ -39,7 +52,7 @@ def weight_count(widths: Widths) -> int:
 
 
 def initial_weights(widths: Widths, seed: int = 0) -> Tensor:
-    """Random hidden layers and a last layer of zeros: the network's value is zero everywhere.
+    """Draw random hidden layers and a last layer of zeros, so that the network's value is zero everywhere.
 
     Raises:
         InputError: fewer than two stages, or a stage without features.
@@ -50,9 +63,9 @@ def initial_weights(widths: Widths, seed: int = 0) -> Tensor:
     parts = []
     for layer, (inside, out) in enumerate(itertools.pairwise(widths)):
         matrix = torch.randn(out, inside, generator=generator, dtype=torch.float64) * inside**-0.5
-        bias = torch.randn(out, generator=generator, dtype=torch.float64) * _BIAS
+        bias = torch.randn(out, generator=generator, dtype=torch.float64) * _BIAS_SPREAD
         if layer == 0:
-            matrix = matrix * _FIRST
+            matrix = matrix * _FIRST_SPREAD
         if layer == len(widths) - 2:
             matrix, bias = torch.zeros_like(matrix), torch.zeros_like(bias)
         parts += [matrix.flatten(), bias]
@@ -60,7 +73,7 @@ def initial_weights(widths: Widths, seed: int = 0) -> Tensor:
 
 
 def layers(weights: Tensor, widths: Widths) -> list[tuple[Tensor, Tensor]]:
-    """The weights (P,) as one matrix (out, in) and bias (out, 1) a layer."""
+    """Split weights (P,) into one matrix (out, in) and bias (out, 1) per layer."""
     found, place = [], 0
     for inside, out in itertools.pairwise(widths):
         end = place + out * inside
@@ -70,7 +83,7 @@ def layers(weights: Tensor, widths: Widths) -> list[tuple[Tensor, Tensor]]:
 
 
 def evaluate(inputs: Tensor, weights: Tensor, widths: Widths) -> Tensor:
-    """The network's values (..., out, N) at inputs (..., in, N)."""
+    """Evaluate the network: values (..., out, N) at inputs (..., in, N)."""
     *hidden, (matrix, bias) = layers(weights, widths)
     values = inputs
     for inner, offset in hidden:
@@ -79,7 +92,7 @@ def evaluate(inputs: Tensor, weights: Tensor, widths: Widths) -> Tensor:
 
 
 def evaluate_with_slopes(inputs: Tensor, weights: Tensor, widths: Widths) -> NetValues:
-    """As `evaluate`, with derivatives by the inputs and by every weight, by the chain rule from the last layer back."""
+    """As `evaluate`, with derivatives by the inputs and by every weight (backpropagation in closed form)."""
     stack = layers(weights, widths)
     stages = [inputs]
     for matrix, bias in stack[:-1]:
@@ -88,9 +101,8 @@ def evaluate_with_slopes(inputs: Tensor, weights: Tensor, widths: Widths) -> Net
     values = matrix @ stages[-1] + bias
     out, count = values.shape[-2:]
     # Derivative of each value by the sums that enter a stage, (..., stage, out, N).
-    slope = torch.eye(out, dtype=values.dtype, device=values.device)[..., None].expand(
-        *values.shape[:-2], out, out, count
-    )
+    identity = torch.eye(out, dtype=values.dtype, device=values.device)
+    slope = identity[..., None].expand(*values.shape[:-2], out, out, count)
     columns = []
     for stage, (matrix, _) in zip(reversed(stages), reversed(stack), strict=True):
         by_matrix = slope[..., :, None, :, :] * stage[..., None, :, None, :]

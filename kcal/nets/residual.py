@@ -2,82 +2,77 @@
 
     (δA, δK) = net(K*),  A = A* + δA,  K = K* + δK
 
-For one camera K* is a constant, and so is whatever a network makes of it: the corrected camera is a camera of the same
-lens model, and the weights are another way to write its parameters. So this residual can fit nothing that the
-parameters themselves cannot (tests prove it), and it is here to be compared with. What the paper's Fig. 8 draws, a
-correction that depends on the position, is `kcal.lens.residual`.
+For one camera K* is a constant, and so is the network's value. The corrected camera has the same lens model, and the
+weights are only another way to write its parameters, so this net can fit nothing that the parameters cannot (tests
+prove it). It is here for comparison. The correction drawn in the paper's Fig. 8, which depends on the position, is
+`kcal.lens.residual`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kcal.checks import keep_float64
+from kcal.calibrate.bundle.board_problem import BoardProblem
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.projection import INTRINSICS
-from kcal.nets.mlp import Widths, evaluate, evaluate_with_slopes, initial_weights
+from kcal.nets.fit import fit_weights
+from kcal.nets.mlp import Network, evaluate, evaluate_with_slopes, initial_weights
+from kcal.solve.lm import LMOptions
+from kcal.solve.result import Result, State
+from kcal.solve.schur import SchurProblem
 
-# The order of a correction: of fx, fy, cx, cy in focal lengths, of coefficients as a share of themselves, the least.
-_INTRINSIC_UNIT, _LENS_UNIT, _LEAST_UNIT = 1e-3, 1e-2, 1e-9
 _SKEW = INTRINSICS.index("skew")
 
 
-class GlobalResidual(nn.Module):
+class ResidualNet(Network):
     """Corrections of a camera's parameters by a network of three layers that sees its distortion vector (Eq. 11).
 
-    Convention: the order of parameters is `Camera.names`; skew is left as it is. K* is divided by its largest
-    coefficient. Corrections come in units of a thousandth of the focal length (fx, fy, cx, cy) and of a hundredth of
-    each coefficient, because those of high orders count by powers of ten more than others. A new network corrects
-    nothing: its last layer is zero. Float64; weights do not require gradients until asked.
+    Convention: parameters in the order of `Camera.names`; skew is not corrected. The network's input is K* divided by
+    its largest coefficient. Its outputs are scaled to thousandths of the focal length (fx, fy, cx, cy) and hundredths
+    of each coefficient, because coefficients differ by powers of ten. A new network corrects nothing: its last layer is
+    zero. Float64; the weights do not require gradients until asked.
 
     Args:
         camera: a single parametric camera: A* and K*.
-        hidden: features of each of the two hidden layers.
-        seed: of their first values.
+        hidden: number of features in each of the two hidden layers.
+        seed: seed of the initial weights.
 
     Raises:
-        InputError: a batch of cameras, a hybrid one, or a lens without coefficients.
+        InputError: a batch of cameras, a hybrid camera, or a lens without coefficients.
 
     Example:
         >>> start = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.2, 0.05])
-        >>> residual = GlobalResidual(start)
-        >>> bool((residual.camera().params == start.params).all())
+        >>> net = ResidualNet(start)
+        >>> bool((net.camera().params == start.params).all())
         True
     """
 
-    weights: Tensor
     start: Tensor
     inputs: Tensor
     units: Tensor
 
     def __init__(self, camera: Camera, *, hidden: int = 8, seed: int = 0) -> None:
-        super().__init__()
         start = camera.params.detach()
         if start.ndim != 1 or camera.field is not None:
-            raise InputError("GlobalResidual: a single parametric camera is needed")
+            raise InputError("ResidualNet: a single parametric camera is needed")
         if camera.model.size == 0:
-            raise InputError("GlobalResidual: a lens without coefficients has no distortion vector")
-        self.size, self.model = camera.size, camera.model
-        self.corrected = tuple(i for i in range(len(start)) if i != _SKEW)
-        self.widths: Widths = (camera.model.size, hidden, hidden, len(self.corrected))
-        self.weights = nn.Parameter(initial_weights(self.widths, seed).to(start.device), requires_grad=False)
+            raise InputError("ResidualNet: a lens without coefficients has no distortion vector")
+        corrected = tuple(i for i in range(len(start)) if i != _SKEW)
+        widths = (camera.model.size, hidden, hidden, len(corrected))
+        super().__init__(widths, initial_weights(widths, seed).to(start.device))
+        self.size, self.model, self.corrected = camera.size, camera.model, corrected
         lens = start[len(INTRINSICS) :]
-        units = (_LENS_UNIT * start.abs()).clamp(min=_LEAST_UNIT)
-        units[: len(INTRINSICS)] = _INTRINSIC_UNIT * start[:2].mean()
-        for name, value in {
-            "start": start.clone(),
-            "inputs": (lens / lens.abs().max().clamp(min=1e-12))[:, None],
-            "units": units[list(self.corrected)],
-        }.items():
-            self.register_buffer(name, value)
+        # The floors keep the scales of zero coefficients finite.
+        units = (1e-2 * start.abs()).clamp(min=1e-9)
+        units[: len(INTRINSICS)] = 1e-3 * start[:2].mean()
+        self.register_buffer("start", start.clone())
+        self.register_buffer("inputs", (lens / lens.abs().max().clamp(min=1e-12))[:, None])
+        self.register_buffer("units", units[list(corrected)])
 
     def forward(self) -> Tensor:
-        """Corrected parameters (5 + P,), A* + δA and K* + δK."""
+        """Corrected parameters (5 + P,): A* + δA and K* + δK."""
         return self.parameters_at(self.weights)
 
     def parameters_at(self, weights: Tensor) -> Tensor:
@@ -91,8 +86,76 @@ class GlobalResidual(nn.Module):
         return self.units[:, None] * evaluate_with_slopes(self.inputs, weights, self.widths).by_weights[..., 0].T
 
     def camera(self) -> Camera:
-        """The corrected camera: an ordinary one."""
+        """The corrected camera: an ordinary parametric one."""
         return Camera(self().detach(), size=self.size, model=self.model)
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
-        return super()._apply(keep_float64(fn), recurse)
+
+class ResidualProblem(SchurProblem):
+    """Reprojection residuals as functions of a residual net's weights, the board's warp and the board poses.
+
+    A state is the weights (W,), then the state of the board problem, whose camera parameters follow from the weights.
+
+    Args:
+        board: the board problem of one camera; its free parameters are those that the net corrects.
+        net: the network.
+    """
+
+    def __init__(self, board: BoardProblem, net: ResidualNet) -> None:
+        self.batch, self.local_size, self.residual_count = board.batch, board.local_size, board.residual_count
+        self._board, self._net = board, net
+
+    def start(self, state: State) -> State:
+        """A state of the board problem, with the camera parameters replaced by those of the net."""
+        return self._joined(self._net.weights.detach(), state)
+
+    def residuals(self, state: State) -> Tensor:
+        """See `SchurProblem.residuals`."""
+        return self._board.residuals(state[1:])
+
+    def rows(self, state: State) -> Tensor:
+        """See `SchurProblem.rows`."""
+        return self._chain(state, self.local_size).T @ self._board.rows(state[1:])
+
+    def gram(self, state: State) -> Tensor:
+        """See `SchurProblem.gram`; from the products of the board problem's rows, which are far fewer."""
+        chain = self._chain(state, self.local_size)
+        return chain.T @ self._board.gram(state[1:]) @ chain
+
+    def shared_rows(self, state: State) -> Tensor | None:
+        """See `SchurProblem.shared_rows`."""
+        rows = self._board.shared_rows(state[1:])
+        return None if rows is None else self._chain(state, 0).T @ rows
+
+    def retract(self, state: State, step: State) -> State:
+        """See `SchurProblem.retract`."""
+        shared, local = step
+        weights = state[0] + shared[: len(state[0])]
+        # The board problem itself moves only the warp and the poses.
+        still = shared.new_zeros(len(self._net.corrected))
+        board_step = torch.cat([still, shared[len(weights) :]]), local
+        return self._joined(weights, self._board.retract(state[1:], board_step))
+
+    def _joined(self, weights: Tensor, board_state: State) -> State:
+        return (weights, self._net.parameters_at(weights), *board_state[1:])
+
+    def _chain(self, state: State, local: int) -> Tensor:
+        """Derivatives of the board problem's columns (`local` ones, parameters, warp, residual) by this problem's."""
+        others = self._board.shared_size - len(self._net.corrected) + 1
+        before, after = (torch.eye(n, dtype=torch.float64, device=state[0].device) for n in (local, others))
+        return torch.block_diag(before, self._net.slopes(state[0]), after)
+
+
+def train_residual(net: ResidualNet, board: BoardProblem, state: State, options: LMOptions | None = None) -> Result:
+    """Minimize the reprojection error over a residual net's weights, the board's warp and the board poses.
+
+    Args:
+        net: receives the weights found.
+        board: the board problem of one camera; its free parameters are those that the net corrects.
+        state: of the board problem: the initial warp and poses.
+        options: of the solver.
+
+    Returns:
+        The solver's result; its state is (weights, *state of the board problem).
+    """
+    problem = ResidualProblem(board, net)
+    return fit_weights(net, problem, problem.start(state), options)

@@ -21,7 +21,7 @@ from kcal.files import write_atomic
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.positions import Located, Position
 from kcal.locate.region import near, region_rings
-from kcal.locate.stereo import Status
+from kcal.locate.stereo import PositionStatus
 from kcal.report.backdrop import local_image, local_tiles
 from kcal.report.figures import CAMERAS, range_text
 
@@ -57,7 +57,7 @@ def map_page(
     """Make the page: positions with 95 % regions, true ones with arrows, cameras, fields of view, arcs of range.
 
     Args:
-        located: from `kcal.locate.positions.locate`.
+        located: from `kcal.locate_points`.
         truth: (N, 3) true east, north, up in meters, NaN where unknown; an arrow leads from each to its estimate.
         tiles: a folder of map tiles `z/x/y.png` (or .jpg, .webp) in Web Mercator; those in view are embedded.
         image: a GeoTIFF to show below the map, for example an orthophoto; embedded, at most 2048 pixels long.
@@ -161,7 +161,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
     bearings = [
         places(fan((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0) * ends)
         for p in located.positions
-        if p.azimuth_deg is not None and p.status != Status.OK
+        if p.azimuth_deg is not None and p.status != PositionStatus.OK
         for ends in [torch.tensor([[min(p.range_low_m or 0.0, reach)], [reach]], dtype=torch.float64)]
     ]
     arrows, true = [], []

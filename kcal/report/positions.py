@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.locate.positions import Located, Position
-from kcal.locate.stereo import Status
+from kcal.locate.stereo import PositionStatus
 from kcal.report.figures import CAMERAS, FAINT, GRAY, HALO, INK, WARN, new_figure, range_text, save_png
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
     arrow head means that it continues to infinity.
 
     Args:
-        located: from `kcal.locate.positions.locate`.
+        located: from `kcal.locate_points`.
         truth: (N, 3) true east, north, up in meters, NaN where unknown; an arrow leads from each to its estimate.
 
     Returns:
@@ -82,7 +82,9 @@ class _RangeScale:
         if true_enu is not None:
             ranges += list(np.hypot(true_enu[:, 0], true_enu[:, 1]))
         ranges = [value for value in ranges if math.isfinite(value) and value > 0] or [100.0, 1000.0]
-        highs = [p.range_high_m for p in located.positions if p.status == Status.OK and p.range_high_m is not None]
+        highs = [
+            p.range_high_m for p in located.positions if p.status == PositionStatus.OK and p.range_high_m is not None
+        ]
         # One wide interval must not squeeze everything else.
         reach = max([max(ranges), *(min(high, 2.5 * max(ranges)) for high in highs)])
         self.nearest, self.rim = min(ranges), 1.25 * reach
@@ -186,7 +188,7 @@ def _draw_sight(axes: Axes, position: Position, scale: _RangeScale) -> None:
     if low is None or high is None or azimuth is None:
         return
     tilt = math.cos(math.radians(position.elevation_deg or 0.0))
-    known = position.status == Status.OK
+    known = position.status == PositionStatus.OK
     start, end = scale.polar(azimuth, low * tilt), scale.polar(azimuth, min(high * tilt, scale.rim))
     color = INK if known else _UNSURE
     style = {"linewidth": 2.6, "alpha": 0.45} if known else {"linewidth": 1.4, "linestyle": (0, (3, 2))}
@@ -239,7 +241,7 @@ def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: li
     limit = min(max([0.02, *finite]) * 1.3, 2.0)
     for row, (i, (low, high, true)) in enumerate(zip(order, spans, strict=True)):
         position = located.positions[i]
-        color = INK if position.status == Status.OK else _UNSURE
+        color = INK if position.status == PositionStatus.OK else _UNSURE
         ends = max(low, -limit), min(high, limit)
         axes.plot(ends, [row, row], color=color, linewidth=5, alpha=0.4, solid_capstyle="butt")
         if high > limit:

@@ -15,7 +15,7 @@ def position_rows(located: Located, off: list[tuple[float, float, bool] | None] 
 
     Args:
         located: the points.
-        off: from `kcal.locate.truth.misses`, for three more columns.
+        off: from `kcal.locate.truth.position_errors`, for three more columns.
     """
     rows = [["name", "lat °", "lon °", "height m", "range m", "interval m", "status"]]
     rows += [_position_row(position) for position in located.positions]

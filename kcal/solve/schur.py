@@ -22,21 +22,14 @@ class SchurLinearization:
         gram: (..., V, L + S + 1, L + S + 1): for each view the products of its rows, see `SchurProblem.rows`.
         local_size: L.
         shared_rows: (..., S + 1, Q): likewise of Q residuals that depend on the shared parameters alone, or None.
-        slopes: (S, W), if the S shared parameters are functions of W others, over which the problem is solved: their
-            derivatives. All above stays in terms of the S.
     """
 
-    def __init__(
-        self, gram: Tensor, local_size: int, shared_rows: Tensor | None = None, slopes: Tensor | None = None
-    ) -> None:
+    def __init__(self, gram: Tensor, local_size: int, shared_rows: Tensor | None = None) -> None:
         L = local_size
         total = gram[..., L:, L:].sum(-3)
         if shared_rows is not None:
             total = total + shared_rows @ shared_rows.transpose(-1, -2)
         shared, gradient, right = total[..., :-1, :-1], total[..., :-1, -1], gram[..., :L, L:]
-        if slopes is not None:
-            shared, gradient = slopes.T @ shared @ slopes, gradient @ slopes
-            right = torch.cat([right[..., :-1] @ slopes, right[..., -1:]], -1)
         self._local_scale = _inverse_root(gram[..., :L, :L].diagonal(dim1=-2, dim2=-1))
         self._shared_scale = _inverse_root(shared.diagonal(dim1=-2, dim2=-1))
         scale = torch.cat([self._shared_scale, torch.ones_like(total[..., -1, -1:])], -1)

@@ -37,8 +37,7 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
-from kcal.nets.residual import GlobalResidual
-from kcal.nets.residual_fit import train_global
+from kcal.nets.residual import ResidualNet, train_residual
 from kcal.sim.captures import capture_corners, drawn_lens
 from kcal.sim.infinity import error_at_infinity
 from kcal.solve.lm import LMOptions
@@ -121,11 +120,11 @@ def more_models(name: str, views: int, sigma: float, seed: int) -> list[Record]:
     try:
         solved = alone(solve(seen, CalibrationOptions(model="ext20"), lambda _: None))
         camera = Camera(solved.result.state[0], size=seen.image_size, model="ext20")
-        residual = GlobalResidual(camera)
+        residual = ResidualNet(camera)
         problem = BoardProblem(
             BOARD.points, seen.pixels()[:, None], [camera.model], [residual.corrected], terms=solved.problem.terms
         )
-        train_global(problem, solved.result.state, residual, REFIT)
+        train_residual(residual, problem, solved.result.state, REFIT)
         out.note("global", residual.camera(), lens, start)
     except KcalError as error:
         out.failed("global", error, start)

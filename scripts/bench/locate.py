@@ -22,17 +22,17 @@ from kornia.geometry.epipolar import triangulate_points
 from torch import Tensor
 
 import kcal
+from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.angular import triangulate_pairs
 from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
 from kcal.locate.cep import circular_error
-from kcal.locate.covariances import RigCovariance
-from kcal.locate.geodesy import Origin, enu_to_geodetic
+from kcal.locate.geodesy import enu_to_geodetic
+from kcal.locate.linear import triangulate_linear
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.stereo import Status
-from kcal.locate.triangulate import triangulate_linear
+from kcal.locate.stereo import PositionStatus
 from scripts.shared.long_range import ORIGIN, RANGES, rig
 from scripts.shared.page import CONCLUSIONS
 from scripts.shared.timing import ratios, row, show, spread, times
@@ -201,7 +201,7 @@ def coverage(draws: int) -> list[str]:
         for module in (wide, plain):
             answer = module(noisy[:, :2], noisy[:, 2:])
             shares.append(((answer.range_low <= distance) & (distance <= answer.range_high)).double().mean().item())
-        weak = (found.status == int(Status.BEARING_ONLY)).double().mean().item()
+        weak = (found.status == int(PositionStatus.BEARING_ONLY)).double().mean().item()
         lines += show(
             [
                 row(

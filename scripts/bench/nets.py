@@ -26,10 +26,11 @@ from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.inverse import InverseStart
-from kcal.lens.inverse_start import start_from, without_tilt
+from kcal.lens.inverse_start import start_from, undo_tilt
+from kcal.lens.newton import TOLERANCE
 from kcal.lens.projection import from_pixels
 from kcal.lens.residual import FieldGrid, FieldResidual, undo_components
-from kcal.nets.inverse_fit import InverseNetOptions, train_inverse
+from kcal.nets.inverse import InverseNetOptions, train_inverse
 from scripts.bench.lens import LENS, SIZE
 from scripts.bench.lens import build as build_hd
 from scripts.shared.page import write_section
@@ -76,16 +77,16 @@ def random_pixels(camera: Camera, count: int) -> Tensor:
 
 
 def steps_from(camera: Camera, pixels: Tensor, start: InverseStart | None) -> Tensor:
-    """How many full Newton steps each pixel takes to the tolerance of `kcal.lens.inverse`, at the most 12."""
+    """How many full Newton steps each pixel takes to the tolerance of `kcal.lens.newton`, at the most 12."""
     goal_x, goal_y = from_pixels(pixels[:, 0], pixels[:, 1], camera.params)
     if camera.field is not None:
         goal_x, goal_y, _ = undo_components(goal_x, goal_y, camera.field)
     if start is None:
-        x, y, _, rest = without_tilt(goal_x, goal_y, camera.coefficients, camera.model)
+        x, y, _, rest = undo_tilt(goal_x, goal_y, camera.coefficients, camera.model)
         x, y = start_from(x, y, rest, camera.inverse_start)
     else:
         x, y = start(goal_x, goal_y)
-    enough = (1 + goal_x**2 + goal_y**2) * kcal.lens.inverse.TOLERANCE**2
+    enough = (1 + goal_x**2 + goal_y**2) * TOLERANCE**2
     steps = torch.zeros(len(pixels))
     for _ in range(12):
         lens = distort_components(x, y, camera.coefficients, camera.model)

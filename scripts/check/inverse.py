@@ -21,7 +21,7 @@ from rich.progress import track
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.distortion import distort_components, distort_with_jacobian
+from kcal.lens.distortion import distort_components
 from kcal.lens.inverse import prepare_inverse, undistort
 from kcal.lens.model import LensModel
 from kcal.lens.region import in_region
@@ -55,6 +55,12 @@ class Tally:
             setattr(self, field.name, combine((getattr(self, field.name), getattr(other, field.name))))
 
 
+def jacobian(normalized: Tensor, coefficients: Tensor, model: LensModel) -> Tensor:
+    """Derivative (..., N, 2, 2) of the distorted position by the point (..., N, 2)."""
+    lens = distort_components(normalized[..., 0], normalized[..., 1], coefficients, model)
+    return torch.stack(lens.point, -1).unflatten(-1, (2, 2))
+
+
 def check_points(lenses: Tensor, model: LensModel, count: int, generator: torch.Generator) -> Tally:
     """Points of the valid region there and back; lenses are (B, P)."""
     ready = prepare_inverse(lenses, model)
@@ -65,7 +71,7 @@ def check_points(lenses: Tensor, model: LensModel, count: int, generator: torch.
     radius = radius * edge.clamp(max=REACH)
     x, y = radius * unit_x, radius * unit_y
     image = distort_components(x, y, lenses, model)
-    singular = torch.linalg.svdvals(distort_with_jacobian(torch.stack([x, y], -1), lenses, model)[1])[..., -1]
+    singular = torch.linalg.svdvals(jacobian(torch.stack([x, y], -1), lenses, model))[..., -1]
     asked = in_region(x, y, lenses, model, ready.region) & (singular > FLAT)
     asked &= (image.x.abs() < MARGIN) & (image.y.abs() < MARGIN)
     back, valid = undistort(torch.stack([image.x, image.y], -1), lenses, model, ready)
@@ -86,7 +92,7 @@ def check_pixels(lenses: Tensor, model: LensModel, count: int, generator: torch.
     again, seen = camera.project(rays * 5.0)
     error = torch.linalg.vector_norm(again - pixels, dim=-1)
     point, _ = undistort((pixels - camera.center[:, None]) / camera.focal[:, None], lenses, model)
-    steepest = torch.linalg.matrix_norm(distort_with_jacobian(point, lenses, model)[1], ord=2)
+    steepest = torch.linalg.matrix_norm(jacobian(point, lenses, model), ord=2)
     reach = 1 + torch.linalg.vector_norm(point, dim=-1)
     allowed = PIXELS + 4 * torch.finfo(torch.float64).eps * reach * steepest * 2000.0
     wrong = valid & ~(seen & (error < allowed) & torch.isfinite(rays).all(-1))

@@ -23,8 +23,7 @@ from kcal.calibrate.rig.result import RigSolution
 from kcal.calibrate.rig.solve import JointOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, Features, Landmarks, MeasuredPosition, RigData
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.lens.rig import StereoRig
-from kcal.locate.covariances import RigCovariance
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import drift_effect

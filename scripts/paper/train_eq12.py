@@ -36,8 +36,7 @@ from kcal.lens.projection import from_pixels, project_components
 from kcal.lens.residual import FieldGrid, FieldResidual, field_basis
 from kcal.nets.inverse import InverseNet
 from kcal.nets.mlp import evaluate
-from kcal.nets.residual import GlobalResidual
-from kcal.nets.residual_fit import train_global
+from kcal.nets.residual import ResidualNet, train_residual
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import State
 from scripts.shared.page import write_section
@@ -151,7 +150,7 @@ def parametric(data: Data) -> tuple[Fitted, BoardProblem, State]:
     clock = time.process_time()
     result = calibrate_camera(data.seen, CalibrationOptions(model=MODEL, board_warp=True))
     camera = result.camera
-    free = GlobalResidual(camera).corrected
+    free = ResidualNet(camera).corrected
     problem = BoardProblem(
         data.seen.board.points, data.seen.pixels()[:, None], [camera.model], [free],
         free_warp=True, whitening=data.whitening,
@@ -175,12 +174,12 @@ def fit_all(data: Data, steps: int, rates: dict[str, float]) -> dict[str, Fitted
     out = {"20 coefficients, least squares": plain}
 
     clock = time.process_time()
-    residual = GlobalResidual(camera)
-    joint = train_global(problem, state, residual, REFIT)
+    residual = ResidualNet(camera)
+    joint = train_residual(residual, problem, state, REFIT)
     out["Eq. 11 (global), joint least squares"] = Fitted(residual.camera(), joint.state[2], time.process_time() - clock)
 
     views = views_of(data, problem, state)
-    residual = GlobalResidual(camera)
+    residual = ResidualNet(camera)
 
     def by_global(weights: Tensor) -> Tensor:
         return project_components(views.points, residual.parameters_at(weights), camera.model).pixels

@@ -29,8 +29,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.rig.board_consensus import pose_alone
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
-from kcal.nets.pure_lens import PureNetLens
-from kcal.nets.pure_lens_fit import NetLensProblem
+from kcal.nets.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import State
 from scripts.shared.page import DOCS, write_section
@@ -56,17 +55,17 @@ class Run(NamedTuple):
     rate: float | None = None
 
 
-def rms_of(problem: NetLensProblem, cost: Tensor) -> np.ndarray:
+def rms_of(problem: PureLensProblem, cost: Tensor) -> np.ndarray:
     return torch.sqrt(4.0 * cost / problem.residual_count).numpy()
 
 
-def by_lm(problem: NetLensProblem, start: State) -> Run:
+def by_lm(lens: PureLensNet, board: Tensor, pixels: Tensor, poses: tuple[Tensor, Tensor]) -> Run:
     clock = time.process_time()
-    result = minimize(problem, start, LMOptions(max_iterations=1000, tolerance=1e-9))
-    return Run(rms_of(problem, result.history), time.process_time() - clock, result.state)
+    result = train_pure_lens(lens, board, pixels, poses, LMOptions(max_iterations=1000, tolerance=1e-9))
+    return Run(rms_of(PureLensProblem(board, pixels, lens), result.history), time.process_time() - clock, result.state)
 
 
-def descend(problem: NetLensProblem, start: State, method: str, rate: float, steps: int) -> Run:
+def descend(problem: PureLensProblem, start: State, method: str, rate: float, steps: int) -> Run:
     """First-order steps of mean squared error, in units of the Jacobian's columns at the start."""
     length = torch.linalg.vector_norm(problem.rows(start), dim=-1)
     by_local = 1.0 / length[:, :6]
@@ -91,22 +90,22 @@ def descend(problem: NetLensProblem, start: State, method: str, rate: float, ste
     return Run(rms_of(problem, torch.stack(costs)), time.process_time() - clock, state, rate)
 
 
-def best_rate(problem: NetLensProblem, start: State, method: str, steps: int) -> float:
+def best_rate(problem: PureLensProblem, start: State, method: str, steps: int) -> float:
     """The learning rate whose short run ends lowest; divergence counts as infinite."""
     tried = [descend(problem, start, method, rate, max(1, int(TRIAL * steps))) for rate in RATES]
     ends = [float(np.nan_to_num(run.rms[-1], nan=np.inf)) for run in tried]
     return RATES[int(np.argmin(ends))]
 
 
-def held_out(board: Tensor, pixels: Tensor, lens: PureNetLens, state: State, poses: tuple[Tensor, Tensor]) -> float:
+def held_out(board: Tensor, pixels: Tensor, lens: PureLensNet, state: State, poses: tuple[Tensor, Tensor]) -> float:
     """RMS on other views, the lens held and their poses solved, from the true ones."""
     with torch.no_grad():
-        lens.intrinsics.copy_(state[0])
-        lens.weights.copy_(state[1])
+        lens.weights.copy_(state[0])
+        lens.intrinsics.copy_(state[1])
     # Each view by itself: one that goes wrong must not decide about the damping of the others.
     total = 0.0
     for view, rotation, translation in zip(pixels, *poses, strict=True):
-        problem = NetLensProblem(board, view[None], lens, fixed=True)
+        problem = PureLensProblem(board, view[None], lens, fixed=True)
         start = problem.start(rotation[None], translation[None])
         total += float(minimize(problem, start, LMOptions(max_iterations=100)).cost)
     return math.sqrt(4.0 * total / pixels.numel())
@@ -165,7 +164,7 @@ def main() -> None:
         "## A lens that is only a network",
         "",
         f"Made by `scripts/paper/train_net_lens.py`: the pure network lens of the paper's Section 4.3.1 and Fig. 5 "
-        f"(`PureNetLens`, four layers), with intrinsics and poses, on {VIEWS} simulated views of a {COLUMNS}x{ROWS} "
+        f"(`PureLensNet`, four layers), with intrinsics and poses, on {VIEWS} simulated views of a {COLUMNS}x{ROWS} "
         f"board through a lens of 14 coefficients, noise {NOISE} px an axis (RMS {NOISE * math.sqrt(2):.3f}); start in "
         f"closed form. *As in the figure*: it replaces x, y, beginning with random weights; *with a skip*: it adds to "
         "them, beginning with nothing. First-order methods: every parameter in units of its column of the Jacobian at "
@@ -187,11 +186,11 @@ def main() -> None:
             repeats, outside = [], []
             rate: float | None = None
             for seed in range(arguments.seeds):
-                lens = PureNetLens(intrinsics, reach=REACH, skip=skip, seed=seed)
-                problem = NetLensProblem(board, pixels, lens)
+                lens = PureLensNet(intrinsics, reach=REACH, skip=skip, seed=seed)
+                problem = PureLensProblem(board, pixels, lens)
                 start = problem.start(*poses)
                 if method == LM:
-                    repeats.append(by_lm(problem, start))
+                    repeats.append(by_lm(lens, board, pixels, poses))
                 else:
                     rate = best_rate(problem, start, method, arguments.steps) if rate is None else rate
                     repeats.append(descend(problem, start, method, rate, arguments.steps))

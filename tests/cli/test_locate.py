@@ -47,7 +47,7 @@ def test_writes_files_and_a_table(
     # 1 km west (0.0108116 degrees) and 10 m north (9.0e-5); a straight line west bends 5 cm north of the parallel.
     assert line.split()[1:5] == ["-33.8999094", "151.1891884", "10.1", "1000"]
     assert "lost: a mark lies outside its image" in printed
-    assert "calibration and mounting errors are not included" in printed
+    assert "errors in calibration and mounting are not included" in printed
     features = json.loads((folder / "out.geojson").read_text())["features"]
     assert [feature["properties"]["name"] for feature in features[2:]] == ["[b]mast", "lost", "[b]mast"]
     with (folder / "out.csv").open() as file:
@@ -71,7 +71,7 @@ def test_options_for_errors_grids_and_formats(
     assert float(row["range_high_m"]) - 1000 > 5 * (float(plain["range_high_m"]) - 1000)
     assert float(row["up_m"]) < float(plain["up_m"])
     printed = capsys.readouterr().out
-    assert "marks' noise and the calibration's errors and the mounting's errors" in printed
+    assert "noise in the marks and of the errors in calibration and mounting" in printed
     assert "geoid: " in printed
     assert (folder / "out.kml").read_text().startswith("<?xml")
     assert "<event " in (folder / "out.cot").read_text()

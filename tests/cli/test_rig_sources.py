@@ -15,8 +15,9 @@ from kcal.cli.main import main
 from kcal.io.camera_file import camera_to_file
 from kcal.io.rig_file import RigFile
 from kcal.lens.camera import Camera
+from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic
+from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 
 ORIGIN = Origin(lat=-17.5, lon=179.9999, height=40.0)
 CAMERAS = [
@@ -132,7 +133,7 @@ def test_from_survey_to_positions(
         == 0
     )
     printed = capsys.readouterr()
-    assert "95 % of the marks' noise and the calibration's errors and the mounting's errors" in printed.out
+    assert "95 % of the noise in the marks and of the errors in calibration and mounting" in printed.out
     rows = [line.split() for line in printed.out.splitlines() if line.startswith("t")]
     assert len(rows) == 5
     assert [row[-2] for row in rows].count("yes") >= 4

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from kcal.lens.distortion import distort_components
 from kcal.lens.model import LensModel
 
 MODELS = ("opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "ext20", "ext24")
@@ -28,3 +29,14 @@ def parameters(model: str, lens: Tensor) -> Tensor:
     head = torch.tensor([2.1, 1.7, 0.3, -0.2, 0.05], dtype=torch.float64)
     assert lens.shape == (LensModel.named(model).size,)
     return torch.cat([head, lens])
+
+
+def distort_with_jacobian(normalized: Tensor, lens: Tensor, model: str | LensModel) -> tuple[Tensor, Tensor, Tensor]:
+    """Distorted positions (..., N, 2), and derivatives by point (..., N, 2, 2) and coefficients (..., N, 2, P)."""
+    model = LensModel.named(model)
+    found = distort_components(normalized[..., 0], normalized[..., 1], lens, model, range(model.size))
+    by_lens = found.x.new_empty((*found.x.shape, 2, model.size))
+    for i, (du, dv) in enumerate(found.coefficients):
+        by_lens[..., 0, i], by_lens[..., 1, i] = du, dv
+    by_point = torch.stack(found.point, -1).unflatten(-1, (2, 2))
+    return torch.stack([found.x, found.y], -1), by_point, by_lens

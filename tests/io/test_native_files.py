@@ -13,16 +13,14 @@ import torch
 
 from kcal.errors import FileError, InputError
 from kcal.io.camera_file import (
-    BoardRecord,
-    CameraCalibration,
     CameraFile,
-    Exclusion,
     camera_to_file,
     load_camera,
     provenance,
     save_camera,
 )
-from kcal.io.rig_file import RigCalibration, RigFile, load_rig, rig_to_file, save_rig
+from kcal.io.rig_file import RigFile, load_rig, rig_to_file, save_rig
+from kcal.lens.calibration import BoardRecord, CalibrationRecord, Exclusion, RigCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.rig import StereoRig
@@ -53,8 +51,8 @@ def rig(camera: Camera) -> StereoRig:
     return StereoRig(camera, awkward_camera("opencv5"), rotation, torch.tensor([-10.1, 0.2, 1 / 3]).double())
 
 
-def camera_calibration() -> CameraCalibration:
-    return CameraCalibration(
+def camera_calibration() -> CalibrationRecord:
+    return CalibrationRecord(
         rms=0.157,
         views=2,
         points=108,

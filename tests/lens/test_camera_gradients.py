@@ -6,13 +6,12 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from lenses import MODELS, parameters, strong
+from lenses import MODELS, distort_with_jacobian, parameters, strong
 from torch import Tensor, nn
 from torch.autograd import gradcheck, gradgradcheck
 from torch.func import functional_call, jacrev
 
 from kcal.lens.camera import Camera
-from kcal.lens.distortion import distort_with_jacobian
 from kcal.lens.inverse import undistort
 
 POINTS = torch.tensor([[0.1, -0.2, 1.1], [-0.6, 0.5, 1.3], [1.2, 0.9, 2.5]], dtype=torch.float64)

@@ -8,15 +8,16 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lenses import MODELS, parameters, strong
+from lenses import MODELS, distort_with_jacobian, parameters, strong
 from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.distortion import distort, distort_with_jacobian
-from kcal.lens.inverse import undistort, valid_radius
+from kcal.lens.distortion import distort
+from kcal.lens.inverse import undistort
 from kcal.lens.model import LensModel
 from kcal.lens.plane import largest_radius
+from kcal.lens.region import valid_region
 
 # Newton stops at 1e-13 in normalized coordinates, which is 2e-10 px at 2000 px of focal length.
 PIXEL_TOLERANCE = 1e-9
@@ -94,7 +95,7 @@ class TestRoundTrip:
         generator = torch.Generator().manual_seed(seed)
         size = LensModel.named(model).size
         lens = torch.randn(16, size, generator=generator, dtype=torch.float64) * scale * 0.1
-        limit = valid_radius(lens, model).clamp(max=3.0)
+        limit = valid_region(lens, model).radius.clamp(max=3.0)
         angle = torch.rand(16, 40, generator=generator, dtype=torch.float64) * 2 * math.pi
         # Within nine tenths of the fold; at the fold itself the inverse has no finite derivative.
         radius = 0.9 * limit[:, None] * torch.rand(16, 40, generator=generator, dtype=torch.float64)
@@ -169,7 +170,7 @@ class TestFold:
         # x - 0.3 x³ turns at x = 1/sqrt(0.9), where it is 2/3 of that.
         lens = torch.tensor([-0.3, 0.0, 0.0, 0.0], dtype=torch.float64)
         fold = 1 / math.sqrt(0.9)
-        assert float(valid_radius(lens, "opencv4")) == pytest.approx(fold, abs=1e-12)
+        assert float(valid_region(lens, "opencv4").radius) == pytest.approx(fold, abs=1e-12)
         top = 2 / 3 * fold
         targets = torch.tensor([[top - 1e-6, 0.0], [top + 1e-6, 0.0], [0.0, -top - 1e-6], [5.0, 5.0]]).double()
         back, valid = undistort(targets, lens, "opencv4")
@@ -182,7 +183,7 @@ class TestFold:
         # 1 - 0.25 r² vanishes at r = 2.
         lens = torch.zeros(8, dtype=torch.float64)
         lens[5] = -0.25
-        assert float(valid_radius(lens, "opencv8")) == pytest.approx(2.0, abs=1e-12)
+        assert float(valid_region(lens, "opencv8").radius) == pytest.approx(2.0, abs=1e-12)
         camera = Camera.build(focal=(100, 100), center=(0, 0), size=(9, 9), coefficients=lens.tolist(), model="opencv8")
         assert camera.project(torch.tensor([[1.99, 0, 1], [2.01, 0, 1], [9.0, 0, 1]]))[1].tolist() == [
             True,
@@ -194,7 +195,7 @@ class TestFold:
         # Tilted by more than 90° even the axis is behind the sensor; nothing is valid, and nothing fails.
         lens = torch.zeros(14, dtype=torch.float64)
         lens[12] = 2.0
-        assert float(valid_radius(lens, "opencv14")) == 0.0
+        assert float(valid_region(lens, "opencv14").radius) == 0.0
         assert undistort(torch.zeros(1, 2, dtype=torch.float64), lens, "opencv14")[1].tolist() == [False]
 
     def test_what_lies_beside_a_pole_is_found(self) -> None:
@@ -207,8 +208,8 @@ class TestFold:
         torch.testing.assert_close(back, normalized, rtol=0, atol=1e-13)
 
     def test_nothing_goes_wrong_in_a_pinhole(self) -> None:
-        assert float(valid_radius(torch.zeros(0), "pinhole")) == largest_radius(LensModel())
-        assert float(valid_radius(torch.tensor([0.1, 0.0, 0.0, 0.0]), "opencv4")) == largest_radius(LensModel())
+        assert float(valid_region(torch.zeros(0), "pinhole").radius) == largest_radius(LensModel())
+        assert float(valid_region(torch.tensor([0.1, 0.0, 0.0, 0.0]), "opencv4").radius) == largest_radius(LensModel())
 
     @settings(max_examples=15, deadline=None)
     @given(seed=st.integers(0, 2**31), model=st.sampled_from(MODELS))
@@ -218,7 +219,7 @@ class TestFold:
         lens = torch.randn(8, LensModel.named(model).size, generator=generator, dtype=torch.float64) * 0.1
         # Radial terms only up to rounding of the 64 directions: with strong tangential terms the fold is no circle
         # and may reach in between two directions by 1 - cos(π / 64) = 0.1 %.
-        limit = valid_radius(lens, model) * 0.99
+        limit = valid_region(lens, model).radius * 0.99
         angle = torch.rand(8, 400, generator=generator, dtype=torch.float64) * 2 * math.pi
         radius = limit[:, None] * torch.sqrt(torch.rand(8, 400, generator=generator, dtype=torch.float64))
         normalized = torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)], -1)

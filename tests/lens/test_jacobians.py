@@ -11,11 +11,11 @@ import itertools
 import pytest
 import torch
 from differences import numeric
-from lenses import MODELS, parameters, strong
+from lenses import MODELS, distort_with_jacobian, parameters, strong
 from torch import Tensor
 from torch.func import jacfwd
 
-from kcal.lens.distortion import distort, distort_with_jacobian
+from kcal.lens.distortion import distort
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 

@@ -7,8 +7,8 @@ import torch
 from locate_rigs import pinhole_rig, tensor
 
 from kcal.errors import InputError
+from kcal.lens.mounting import Origin
 from kcal.locate.cep import circular_error
-from kcal.locate.geodesy import Origin
 from kcal.locate.localizer import StereoLocalizer
 
 

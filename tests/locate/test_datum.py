@@ -7,8 +7,8 @@ import pyproj
 import pytest
 
 from kcal.errors import FileError, InputError
+from kcal.lens.mounting import Origin
 from kcal.locate.datum import find_geoid, geoid_heights, true_from_grid
-from kcal.locate.geodesy import Origin
 
 
 def grid(path: Path) -> Path:

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from locate_rigs import tensor
 
 from kcal.errors import InputError
+from kcal.lens.mounting import Origin
 from kcal.locate.ellipsoid import ecef_to_geodetic, geodetic_to_ecef
-from kcal.locate.geodesy import Origin, azimuth_elevation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
+from kcal.locate.geodesy import azimuth_elevation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
 
 ORIGINS = [
     Origin(lat=0.0, lon=0.0, height=0.0),

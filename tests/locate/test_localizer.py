@@ -9,13 +9,15 @@ from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turn
 
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
+from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
-from kcal.lens.rig import StereoRig
-from kcal.locate.covariances import RigCovariance, mounting_covariance
-from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic
+from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.localizer import Localization, StereoLocalizer
-from kcal.locate.stereo import Status, Triangulate
+from kcal.locate.mounting import mounting_covariance
+from kcal.locate.stereo import PositionStatus
+from kcal.locate.triangulate import Triangulate
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 RIG = real_rig()
@@ -40,7 +42,7 @@ def test_exact_marks_give_enu_and_wgs84() -> None:
     left, right, _ = RIG(points)
     found = localizer(pixel_sigma=0.01)(left, right)
     enu = points @ enu_from_cam(*ATTITUDE.values()).T
-    assert (found.status == Status.OK).all()
+    assert (found.status == PositionStatus.OK).all()
     # At range Z pixels that hold 1e-13 give Z² / (f b) * 1e-13 m.
     assert ((found.enu - enu).norm(dim=-1) / points.norm(dim=-1)).max() < 1e-10
     expected = enu_to_geodetic(enu, ORIGIN)
@@ -74,7 +76,7 @@ def test_covariance_and_interval_cover_what_noise_does(z: float) -> None:
     root = 0.1 * tensor([1.0, 0, 0, 0], [0.3, 0.8, 0, 0], [0.2, 0, 1.5, 0], [0, 0.1, 0.4, 0.5])
     marks = torch.cat([left, right], -1) + noise(1.0, N, 4) @ root.T
     found = localizer()(marks[:, :2], marks[:, 2:], root @ root.T)
-    assert (found.status == Status.OK).all()
+    assert (found.status == PositionStatus.OK).all()
     # 8000 draws know 95 % to 0.24 %.
     assert 0.94 < covered(found, point.norm()) < 0.96
     spread, claimed = torch.cov(found.enu.T), found.covariance.median(0).values
@@ -140,16 +142,16 @@ def test_refraction_lowers_the_point() -> None:
 
 BAD = [
     # left, right, status; f = 1600 px, b = 10 m, center (959.5, 539.5), sigma 0.3 px
-    ((980.0, 540.0), (970.0, 540.0), Status.OK),
-    ((980.0, 540.0), (979.5, 540.0), Status.BEARING_ONLY),
-    ((970.0, 540.0), (970.0, 540.0), Status.PARALLEL),
-    ((960.0, 540.0), (970.0, 540.0), Status.PARALLEL),
-    ((math.nan, 540.0), (970.0, 540.0), Status.NOT_FINITE),
-    ((980.0, 540.0), (970.0, math.inf), Status.NOT_FINITE),
-    ((-0.6, 540.0), (-20.0, 540.0), Status.OUTSIDE_IMAGE),
-    ((980.0, 540.0), (970.0, 540.0), Status.MASKED),
-    ((980.0, 540.0), (970.0, 540.0), Status.BAD_COVARIANCE),
-    ((980.0, 540.0), (970.0, 540.0), Status.BAD_COVARIANCE),
+    ((980.0, 540.0), (970.0, 540.0), PositionStatus.OK),
+    ((980.0, 540.0), (979.5, 540.0), PositionStatus.BEARING_ONLY),
+    ((970.0, 540.0), (970.0, 540.0), PositionStatus.PARALLEL),
+    ((960.0, 540.0), (970.0, 540.0), PositionStatus.PARALLEL),
+    ((math.nan, 540.0), (970.0, 540.0), PositionStatus.NOT_FINITE),
+    ((980.0, 540.0), (970.0, math.inf), PositionStatus.NOT_FINITE),
+    ((-0.6, 540.0), (-20.0, 540.0), PositionStatus.OUTSIDE_IMAGE),
+    ((980.0, 540.0), (970.0, 540.0), PositionStatus.MASKED),
+    ((980.0, 540.0), (970.0, 540.0), PositionStatus.BAD_COVARIANCE),
+    ((980.0, 540.0), (970.0, 540.0), PositionStatus.BAD_COVARIANCE),
 ]  # fmt: skip
 
 
@@ -162,7 +164,7 @@ def test_statuses_and_no_nan_in_values_or_gradients() -> None:
     mask = torch.ones(len(BAD), dtype=torch.bool)
     mask[7] = False
     found = StereoLocalizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)(left, right, cov, mask)
-    assert [Status(s).name for s in found.status.tolist()] == [row[2].name for row in BAD]
+    assert [PositionStatus(s).name for s in found.status.tolist()] == [row[2].name for row in BAD]
     for name, value in found._asdict().items():
         assert not torch.isnan(value).any(), name
     assert (found.enu[1:] == 0).all()
@@ -248,9 +250,10 @@ def test_batches_pieces_and_precision() -> None:
 def test_agrees_with_triangulate() -> None:
     left, right, _ = RIG(spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64)))
     ours, theirs = localizer(pixel_sigma=0.1)(left, right), Triangulate(RIG, 0.1)(left, right)
-    # The two derive the noise of the range in different ways.
-    assert torch.allclose(ours.range_high, theirs.range_high, rtol=1e-3)
-    assert torch.allclose(ours.range_low, theirs.range_low, rtol=1e-3)
+    assert torch.equal(ours.range_high, theirs.range_high)
+    assert torch.equal(ours.range_low, theirs.range_low)
+    assert torch.equal(ours.inverse_range_sigma, theirs.inverse_range_sigma)
+    assert torch.allclose(ours.enu.norm(dim=-1), theirs.points.norm(dim=-1), rtol=1e-12)
 
 
 def test_sensitivities() -> None:

@@ -9,7 +9,7 @@ from locate_rigs import SIZE, tensor, turned
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.locate.multiview import TriangulateViews
-from kcal.locate.stereo import Status
+from kcal.locate.stereo import PositionStatus
 
 METHODS = ("linear", "angular", "likelihood")
 CAMERAS = [
@@ -42,7 +42,7 @@ def seen(points: torch.Tensor) -> torch.Tensor:
 def test_exact_marks_give_the_point_back(method: str) -> None:
     points = tensor([3.0, 1.0, 60.0], [50.0, 20.0, 500.0], [-300.0, 40.0, 5000.0])
     found = TriangulateViews(CAMERAS, poses(), method=method)(seen(points + SHIFT))
-    assert (found.status == Status.OK).all()
+    assert (found.status == PositionStatus.OK).all()
     # The world's coordinates hold 1e-9 m, the baseline is 32 m.
     assert ((found.points - SHIFT - points).norm(dim=-1) / points.norm(dim=-1)).max() < 1e-8
     assert found.reprojection.max() < 1e-6
@@ -90,7 +90,7 @@ def test_statuses_without_nan(method: str) -> None:
     marks = torch.stack(rows).requires_grad_()
     found = TriangulateViews([camera] * 3, pose, method=method)(marks, cov)
     names = ["OK", "PARALLEL", "PARALLEL", "NOT_FINITE", "OUTSIDE_IMAGE", "BAD_COVARIANCE"]
-    assert [Status(s).name for s in found.status.tolist()] == names
+    assert [PositionStatus(s).name for s in found.status.tolist()] == names
     for name, value in found._asdict().items():
         assert not torch.isnan(value).any(), name
     assert (found.points[1:] == 0).all()

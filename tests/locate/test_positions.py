@@ -16,21 +16,22 @@ import torch
 from locate_rigs import pinhole_rig, real_rig, spread_points, tensor
 
 from kcal.errors import FileError, InputError
+from kcal.lens.mounting import Origin
+from kcal.lens.rig import RigCovariance
 from kcal.locate.cot import to_cot
-from kcal.locate.covariances import RigCovariance
 from kcal.locate.datum import find_geoid
 from kcal.locate.export import to_csv, to_geojson, write_positions
-from kcal.locate.geodesy import Origin, enu_from_cam, enu_to_geodetic, geodetic_to_enu
+from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.locate.kml import to_kml
-from kcal.locate.positions import Located, Position, locate
-from kcal.locate.stereo import Status
+from kcal.locate.positions import Located, Position, locate_points
+from kcal.locate.stereo import PositionStatus
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 RIG = pinhole_rig()  # f b = 16 000 px m, center (959.5, 539.5)
 
 
 def one(left: tuple[float, float], right: tuple[float, float], **options: float) -> Position:
-    return locate(RIG, tensor(left), tensor(right), origin=ORIGIN, heading_deg=0.0, **options).positions[0]
+    return locate_points(RIG, tensor(left), tensor(right), origin=ORIGIN, heading_deg=0.0, **options).positions[0]
 
 
 def mixed() -> Located:
@@ -38,13 +39,13 @@ def mixed() -> Located:
     left = tensor([975.5, 539.5], [960.0, 500.0], [955.0, 500.0], [900.0, 500.0], [-5.0, 3.0], [math.nan, 3.0])
     right = tensor([959.5, 539.5], [959.5, 500.0], [955.0, 500.0], [905.0, 500.0], [1.0, 3.0], [1.0, 3.0])
     names = ["mast", "far", "parallel", "mismatch", "outside", "nothing"]
-    return locate(RIG, left, right, origin=ORIGIN, heading_deg=90.0, names=names)
+    return locate_points(RIG, left, right, origin=ORIGIN, heading_deg=90.0, names=names)
 
 
 def test_end_to_end_with_real_lenses() -> None:
     rig, truth = real_rig(), spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64))
     left, right, _ = rig(truth)
-    located = locate(rig, left, right, origin=ORIGIN, heading_deg=200.0, pitch_deg=3.0, roll_deg=-2.0)
+    located = locate_points(rig, left, right, origin=ORIGIN, heading_deg=200.0, pitch_deg=3.0, roll_deg=-2.0)
     enu = truth @ enu_from_cam(200.0, 3.0, -2.0).T
     assert located.count == 9
     assert (located.enu - enu).norm(dim=-1).max() < 1e-6
@@ -104,7 +105,7 @@ def test_each_failure_says_why_and_carries_no_number_that_could_be_mistaken() ->
 def test_a_match_that_cannot_be_right_is_called_doubtful() -> None:
     # 12 px of vertical disparity on a level rig, half of it in each image.
     position = one((975.5, 539.5), (959.5, 551.5))
-    assert position.status == Status.OK
+    assert position.status == PositionStatus.OK
     assert position.reprojection_px == pytest.approx((6.0, 6.0), abs=0.01)
     assert "doubtful" in position.reason
     assert one((975.5, 539.5), (959.5, 540.0)).reason == ""
@@ -113,7 +114,7 @@ def test_a_match_that_cannot_be_right_is_called_doubtful() -> None:
 def test_pixel_sigma_widens_the_interval() -> None:
     fine, coarse = one((975.5, 539.5), (959.5, 539.5), pixel_sigma=0.1), one((975.5, 539.5), (959.5, 539.5))
     assert coarse.range_low_m < fine.range_low_m < fine.range_m < fine.range_high_m < coarse.range_high_m
-    assert one((975.5, 539.5), (959.5, 539.5), pixel_sigma=4.0).status == Status.BEARING_ONLY
+    assert one((975.5, 539.5), (959.5, 539.5), pixel_sigma=4.0).status == PositionStatus.BEARING_ONLY
 
 
 def test_bad_input_is_refused() -> None:
@@ -125,11 +126,11 @@ def test_bad_input_is_refused() -> None:
         (([[1.0, 2.0]], marks), "tensor"),
     ):
         with pytest.raises(InputError, match=message):
-            locate(RIG, *arguments, origin=ORIGIN, heading_deg=0.0)
+            locate_points(RIG, *arguments, origin=ORIGIN, heading_deg=0.0)
     with pytest.raises(InputError, match="names"):
-        locate(RIG, marks, marks, origin=ORIGIN, heading_deg=0.0, names=["a", "b"])
+        locate_points(RIG, marks, marks, origin=ORIGIN, heading_deg=0.0, names=["a", "b"])
     with pytest.raises(InputError, match="heading"):
-        locate(RIG, marks, marks, origin=ORIGIN, heading_deg=math.nan)
+        locate_points(RIG, marks, marks, origin=ORIGIN, heading_deg=math.nan)
 
 
 def test_cameras_stand_and_look_where_they_should() -> None:
@@ -209,11 +210,11 @@ def test_covariances_circles_and_slopes_of_a_position() -> None:
     assert along == pytest.approx(62.5 * 0.1 * math.sqrt(2), rel=1e-3)
     assert position.cep50_m == pytest.approx(0.6745 * along, rel=0.01)
     assert position.cep95_m == pytest.approx(1.96 * along, rel=0.01)
-    wide = locate(
+    wide = locate_points(
         RIG, tensor([975.5, 539.5]), tensor([959.5, 539.5]), origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1,
         calibration=RigCovariance.of(RIG, pose=torch.diag(tensor(0, 1e-4, 0, 0, 0, 0) ** 2)),
     )  # fmt: skip
-    assert "calibration's errors; mounting errors are not included" in wide.interval_note
+    assert "and of the errors in calibration; errors in mounting are not included" in wide.interval_note
     assert wide.positions[0].covariance[1][1] == pytest.approx(along**2 + (1e-4 * 1e6 / 10) ** 2, rel=1e-3)
 
 
@@ -222,7 +223,7 @@ def test_geoid_heights_are_stated(tmp_path: Path) -> None:
     path = tmp_path / "flat.gtx"
     path.write_bytes(struct.pack(">4d2i9f", -35.0, 150.0, 1.0, 1.0, 3, 3, *[22.5] * 9))
     marks = tensor([975.5, 539.5]), tensor([959.5, 539.5])
-    located = locate(RIG, *marks, origin=ORIGIN, heading_deg=0.0, geoid=find_geoid(path))
+    located = locate_points(RIG, *marks, origin=ORIGIN, heading_deg=0.0, geoid=find_geoid(path))
     assert (located.geoid, located.positions[0].geoid_height) == ("flat", pytest.approx(22.5))
     document = ET.fromstring(to_kml(located))
     coordinates = [element.text.split(",") for element in document.iter("{http://www.opengis.net/kml/2.2}coordinates")]
@@ -265,7 +266,7 @@ def test_cursor_on_target() -> None:
 def test_regions_across_the_antimeridian_are_cut() -> None:
     origin = Origin(lat=10.0, lon=179.9921, height=0.0)
     rig = pinhole_rig()
-    located = locate(rig, tensor([975.5, 539.5]), tensor([959.5, 539.5]), origin=origin, heading_deg=60.0)
+    located = locate_points(rig, tensor([975.5, 539.5]), tensor([959.5, 539.5]), origin=origin, heading_deg=60.0)
     region = to_geojson(located)["features"][-1]["geometry"]
     assert region["type"] == "MultiPolygon"
     sides = sorted((min(lon for lon, _ in ring), max(lon for lon, _ in ring)) for (ring,) in region["coordinates"])

@@ -7,10 +7,10 @@ import torch
 from locate_rigs import real_rig, tensor
 
 from kcal.errors import InputError
+from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import StereoRig
-from kcal.locate.covariances import RigCovariance
-from kcal.locate.geodesy import Origin, enu_from_cam
+from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)

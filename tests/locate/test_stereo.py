@@ -11,7 +11,8 @@ from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turn
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
-from kcal.locate.stereo import Status, Triangulate
+from kcal.locate.stereo import PositionStatus
+from kcal.locate.triangulate import Triangulate
 
 RIG = real_rig()
 
@@ -22,7 +23,7 @@ def test_exact_marks_give_the_point_back_through_real_lenses() -> None:
     assert seen.all()
     result = Triangulate(RIG)(left, right)
     near = points[:, 2] < 1000
-    assert (result.status == Status.OK).all()
+    assert (result.status == PositionStatus.OK).all()
     # Pixels near 1000 hold 1e-13; at range Z that is Z² / (f b) * 1e-13 m.
     assert (result.points - points)[near].norm(dim=-1).max() < 1e-9
     assert ((result.points - points).norm(dim=-1) / points.norm(dim=-1)).max() < 1e-10
@@ -51,12 +52,12 @@ def test_round_trip_for_any_rig(
     left, right, seen = rig(point)
     result = Triangulate(rig)(left, right)
     if bool(seen[0]) and bool(rig.left.inside(left)[0] & rig.right.inside(right)[0]):
-        assert result.status.item() == Status.OK
+        assert result.status.item() == PositionStatus.OK
         # Parallax 1e-4 rad at the worst, pixels rounded to 1e-13.
         assert torch.allclose(result.points, point, rtol=1e-8)
         assert result.range_low < result.points.norm() < result.range_high
     else:
-        assert result.status.item() != Status.OK
+        assert result.status.item() != PositionStatus.OK
 
 
 def test_range_slope_is_z_squared_over_focal_times_baseline() -> None:
@@ -81,8 +82,8 @@ def test_gradients_through_the_lenses() -> None:
 
     def outputs(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor, ...]:
         result = triangulate(left, right)
-        # range_low and range_high are left out: they hold the noise of the parallax fixed on purpose.
-        return result.points, result.reprojection, 1e3 * result.parallax
+        # The inverse range times the baseline is the parallax, 0.03 to 0.2 rad.
+        return result.points, result.reprojection, 1e4 * result.inverse_range
 
     inputs = (left.requires_grad_(), right.requires_grad_())
     # Central differences of pixels: 1e-4 steps against values of 300 m held to 1e-12.
@@ -97,7 +98,7 @@ def test_batches_and_dtypes() -> None:
     deep = triangulate(left.reshape(2, 1, 6, 2), right.reshape(2, 1, 6, 2))
     assert deep.points.shape == (2, 1, 6, 3)
     assert deep.reprojection.shape == (2, 1, 6, 2)
-    for name in ("status", "parallax", "parallax_sigma", "range_low", "range_high", "bearing_only"):
+    for name in ("status", "inverse_range", "inverse_range_sigma", "range_low", "range_high", "bearing_only"):
         assert getattr(deep, name).shape == (2, 1, 6)
     assert torch.allclose(deep.points.reshape(12, 3), flat.points, rtol=1e-12)
     assert triangulate(left[:0], right[:0]).points.shape == (0, 3)
@@ -131,14 +132,14 @@ def test_low_precision_around_the_module_changes_nothing() -> None:
 
 BAD_MARKS = [
     # left, right, status; the pinhole rig has f = 1600 px, b = 10 m and its center at (959.5, 539.5)
-    ((980.0, 540.0), (970.0, 540.0), Status.OK),
-    ((970.0, 540.0), (970.0, 540.0), Status.PARALLEL),
-    ((960.0, 540.0), (970.0, 540.0), Status.PARALLEL),
-    ((math.nan, 540.0), (970.0, 540.0), Status.NOT_FINITE),
-    ((980.0, 540.0), (970.0, math.inf), Status.NOT_FINITE),
-    ((-0.6, 540.0), (-20.0, 540.0), Status.OUTSIDE_IMAGE),
-    ((980.0, 540.0), (970.0, 1079.51), Status.OUTSIDE_IMAGE),
-    ((-0.5, 1079.5), (-0.5, 1079.5), Status.PARALLEL),
+    ((980.0, 540.0), (970.0, 540.0), PositionStatus.OK),
+    ((970.0, 540.0), (970.0, 540.0), PositionStatus.PARALLEL),
+    ((960.0, 540.0), (970.0, 540.0), PositionStatus.PARALLEL),
+    ((math.nan, 540.0), (970.0, 540.0), PositionStatus.NOT_FINITE),
+    ((980.0, 540.0), (970.0, math.inf), PositionStatus.NOT_FINITE),
+    ((-0.6, 540.0), (-20.0, 540.0), PositionStatus.OUTSIDE_IMAGE),
+    ((980.0, 540.0), (970.0, 1079.51), PositionStatus.OUTSIDE_IMAGE),
+    ((-0.5, 1079.5), (-0.5, 1079.5), PositionStatus.PARALLEL),
 ]
 
 
@@ -147,13 +148,13 @@ def test_statuses_and_no_nan_in_values_or_gradients() -> None:
     right = tensor(*(row[1] for row in BAD_MARKS)).requires_grad_()
     result = Triangulate(pinhole_rig())(left, right)
     assert result.status.dtype == torch.int8
-    assert [Status(s).name for s in result.status.tolist()] == [row[2].name for row in BAD_MARKS]
+    assert [PositionStatus(s).name for s in result.status.tolist()] == [row[2].name for row in BAD_MARKS]
     for name, value in result._asdict().items():
         assert not torch.isnan(value).any(), name
     assert (result.points[1:] == 0).all()
     finite = torch.where(torch.isfinite(result.range_high), result.range_high, 0.0)
     low = torch.where(torch.isfinite(result.range_low), result.range_low, 0.0)
-    total = result.points.sum() + result.reprojection.sum() + result.parallax.sum() + low.sum() + finite.sum()
+    total = result.points.sum() + result.reprojection.sum() + result.inverse_range.sum() + low.sum() + finite.sum()
     for gradient in torch.autograd.grad(total, (left, right)):
         assert torch.isfinite(gradient).all()
         assert (gradient[0] != 0).any()
@@ -167,7 +168,7 @@ def test_outside_the_lens() -> None:
     )
     rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
     result = Triangulate(rig)(tensor([3400.0, 500.0], [2100.0, 500.0]), tensor([3390.0, 500.0], [2090.0, 500.0]))
-    assert [Status(s).name for s in result.status.tolist()] == ["OUTSIDE_LENS", "OK"]
+    assert [PositionStatus(s).name for s in result.status.tolist()] == ["OUTSIDE_LENS", "OK"]
 
 
 def test_lines_that_cross_behind_one_camera() -> None:
@@ -178,8 +179,8 @@ def test_lines_that_cross_behind_one_camera() -> None:
     behind = Triangulate(rig)(tensor([959.5 + 800 / 8, 539.5]), tensor([959.5 + 800 / 12, 539.5]))
     left, right, _ = rig(tensor([3.0, 0.0, 20.0]))
     ahead = Triangulate(rig)(left, right)
-    assert Status(int(ahead.status)).name == "OK"
-    assert Status(int(behind.status)).name == "BEHIND"
+    assert PositionStatus(int(ahead.status)).name == "OK"
+    assert PositionStatus(int(behind.status)).name == "BEHIND"
     assert behind.points.abs().max() == 0
 
 
@@ -188,9 +189,9 @@ def test_along_the_baseline_there_is_no_range() -> None:
     rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([0.0, 0.0, -10.0]))
     marks = tensor([959.5, 539.5]).requires_grad_()
     result = Triangulate(rig)(marks, marks)
-    assert Status(int(result.status)).name == "PARALLEL"
+    assert PositionStatus(int(result.status)).name == "PARALLEL"
     assert (result.range_low.item(), result.range_high.item()) == (0.0, math.inf)
-    assert torch.isfinite(torch.autograd.grad(result.points.sum() + result.parallax.sum(), marks)[0]).all()
+    assert torch.isfinite(torch.autograd.grad(result.points.sum() + result.inverse_range.sum(), marks)[0]).all()
 
 
 def test_parallax_and_its_noise_use_the_local_size_of_a_pixel() -> None:
@@ -203,8 +204,12 @@ def test_parallax_and_its_noise_use_the_local_size_of_a_pixel() -> None:
     # Along u, off axis by angle a: d(angle)/du = cos²(a) / f; above the axis only the distance grows: cos(a) / f.
     expected = tensor(1.0, 1 / 1.25, 1 / math.sqrt(1.09)) * math.sqrt(2) * sigma / focal
     # The two views differ by 1e-3 in angle, the differences by 1e-8.
-    assert torch.allclose(result.parallax_sigma, expected, rtol=1e-3)
-    assert result.parallax[0].item() == pytest.approx(math.atan(1e-3), rel=1e-9)
+    # Seen from a short baseline the parallax is baseline * cos(a) / range, a being the angle off axis along u.
+    across = 1e-3 * tensor(1.0, 1 / math.sqrt(1.25), 1.0)
+    assert torch.allclose(across * result.inverse_range_sigma, expected, rtol=1e-3)
+    assert math.asin(1e-3 * result.inverse_range[0].item() / math.hypot(1, 1e-3)) == pytest.approx(
+        math.atan(1e-3), rel=1e-9
+    )
 
 
 class ClosedForm(Camera):

@@ -19,9 +19,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.modules import Unproject
 from kcal.lens.residual import FieldGrid, FieldResidual
-from kcal.nets.fit import NetProblem
-from kcal.nets.inverse import InverseNet
-from kcal.nets.inverse_fit import InverseFit, InverseNetOptions, train_inverse
+from kcal.nets.fit import RegressionProblem
+from kcal.nets.inverse import InverseFit, InverseNet, InverseNetOptions, train_inverse
 from kcal.nets.mlp import evaluate, initial_weights
 
 _BARREL = [-0.28, 0.1, 5e-4, -3e-4, 0.02, 0.05, 0.02, 0.01, 4e-4, -2e-4, -3e-4, 1e-4, 0.004, -0.006]
@@ -197,7 +196,7 @@ def test_jacobian_of_the_training_problem() -> None:
     generator = torch.Generator().manual_seed(0)
     weights = torch.randn(len(initial_weights(widths)), generator=generator, dtype=torch.float64)
     inputs, targets = torch.randn(2, 2, 5, generator=generator, dtype=torch.float64)
-    problem = NetProblem(inputs, targets, widths)
+    problem = RegressionProblem(inputs, targets, widths)
 
     def residuals(w: Tensor) -> Tensor:
         return (evaluate(inputs, w, widths) - targets).flatten()

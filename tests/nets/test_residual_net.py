@@ -11,8 +11,7 @@ from kcal.calibrate.bundle.board_problem import BoardProblem
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.nets.mlp import initial_weights
-from kcal.nets.residual import GlobalResidual
-from kcal.nets.residual_fit import GlobalProblem, train_global
+from kcal.nets.residual import ResidualNet, ResidualProblem, train_residual
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import State
 
@@ -26,20 +25,20 @@ def scene(model: str = "opencv5", free_warp: bool = True) -> tuple[BoardProblem,
     start[:4] += torch.tensor([3.0, -2.0, 1.5, 2.5])
     start[5] += 0.01
     wrong = Camera(start, size=truth.size, model=model)
-    residual = GlobalResidual(wrong)
+    residual = ResidualNet(wrong)
     problem = BoardProblem(BOARD.points, pixels[:, None], [truth.model], [residual.corrected], free_warp=free_warp)
     none = torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
     return problem, (start, torch.zeros(2).double(), *none, *poses), wrong
 
 
-def random_weights(residual: GlobalResidual, seed: int) -> Tensor:
+def random_weights(residual: ResidualNet, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     return 0.3 * torch.randn(residual.weights.shape, generator=generator, dtype=torch.float64)
 
 
 def test_a_new_one_corrects_nothing_and_leaves_skew_alone() -> None:
     _, _, start = scene()
-    residual = GlobalResidual(start)
+    residual = ResidualNet(start)
     assert torch.equal(residual(), start.params)
     residual.weights.copy_(random_weights(residual, 0))
     moved = residual() - start.params
@@ -50,7 +49,7 @@ def test_a_new_one_corrects_nothing_and_leaves_skew_alone() -> None:
 
 def test_slopes_are_those_of_autograd_and_numeric_ones() -> None:
     _, _, start = scene("opencv14")
-    residual = GlobalResidual(start, hidden=3)
+    residual = ResidualNet(start, hidden=3)
     weights = random_weights(residual, 1)
     wanted = torch.func.jacrev(residual.parameters_at)(weights)[list(residual.corrected)]
     torch.testing.assert_close(residual.slopes(weights), wanted)
@@ -61,7 +60,7 @@ def test_slopes_are_those_of_autograd_and_numeric_ones() -> None:
 def test_it_has_no_capacity_beyond_the_parameters(model: str) -> None:
     """However many weights: what they can do to pixels is what the parameters can."""
     _, _, start = scene(model)
-    residual = GlobalResidual(start, hidden=16)
+    residual = ResidualNet(start, hidden=16)
     weights = random_weights(residual, 2)
     rays, valid = start.unproject(start.grid(9, 7).reshape(-1, 2))
     assert bool(valid.all())
@@ -89,8 +88,8 @@ def test_it_ends_where_the_parameters_end(model: str) -> None:
     exact = LMOptions(max_iterations=500, tolerance=1e-14)
     plain = minimize(problem, state, exact)
     for seed in (0, 1):
-        residual = GlobalResidual(start, seed=seed)
-        result = train_global(problem, state, residual, exact)
+        residual = ResidualNet(start, seed=seed)
+        result = train_residual(residual, problem, state, exact)
         assert float(result.cost) == pytest.approx(float(plain.cost), rel=1e-9)
         assert torch.equal(residual.weights, result.state[0])
         fitted = Camera(plain.state[0], size=start.size, model=model)
@@ -101,9 +100,9 @@ def test_it_ends_where_the_parameters_end(model: str) -> None:
 
 def test_derivatives_of_the_problem_are_numeric_ones() -> None:
     problem, state, start = scene()
-    residual = GlobalResidual(start, hidden=2)
+    residual = ResidualNet(start, hidden=2)
     residual.weights.copy_(random_weights(residual, 3) * 0.1)
-    whole = GlobalProblem(problem, residual)
+    whole = ResidualProblem(problem, residual)
     at = whole.start(state)
     count, views = residual.weights.numel() + 2, len(state[-1])
 
@@ -129,14 +128,14 @@ def test_derivatives_of_the_problem_are_numeric_ones() -> None:
 def test_bad_input_is_refused() -> None:
     _, _, start = scene()
     with pytest.raises(InputError, match="single"):
-        GlobalResidual(Camera(start.params.expand(2, -1), size=start.size, model=start.model))
+        ResidualNet(Camera(start.params.expand(2, -1), size=start.size, model=start.model))
     with pytest.raises(InputError, match="distortion vector"):
-        GlobalResidual(Camera.build(focal=(100, 100), center=(50, 50), size=(100, 100), model="pinhole"))
+        ResidualNet(Camera.build(focal=(100, 100), center=(50, 50), size=(100, 100), model="pinhole"))
 
 
 def test_state_and_precision() -> None:
     _, _, start = scene()
-    residual, other = GlobalResidual(start), GlobalResidual(start, seed=1)
+    residual, other = ResidualNet(start), ResidualNet(start, seed=1)
     residual.weights.copy_(random_weights(residual, 4))
     other.load_state_dict(residual.state_dict())
     assert torch.equal(other.half()(), residual())

@@ -15,8 +15,9 @@ from locate_rigs import pinhole_rig, tensor
 from PIL import Image, TiffImagePlugin
 
 from kcal.errors import FileError, InputError
-from kcal.locate.geodesy import Origin, enu_from_cam, geodetic_to_enu
-from kcal.locate.positions import Located, locate
+from kcal.lens.mounting import Origin
+from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
+from kcal.locate.positions import Located, locate_points
 from kcal.report.backdrop import local_image, local_tiles
 from kcal.report.map_page import map_page, save_map
 
@@ -30,7 +31,9 @@ BROWSER = next(
 def scene(origin: Origin = ORIGIN) -> tuple[Located, torch.Tensor]:
     left, right, _ = pinhole_rig()(TRUTH)
     names = ["gate", "</script><b>mast", "ship", "cloud"]
-    located = locate(pinhole_rig(), left, right + tensor([0.3, 0.0]), origin=origin, heading_deg=300.0, names=names)
+    located = locate_points(
+        pinhole_rig(), left, right + tensor([0.3, 0.0]), origin=origin, heading_deg=300.0, names=names
+    )
     return located, TRUTH @ enu_from_cam(300.0).T
 
 

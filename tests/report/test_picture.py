@@ -10,8 +10,9 @@ from locate_rigs import pinhole_rig, tensor
 from matplotlib.figure import Figure
 
 from kcal.errors import InputError
-from kcal.locate.geodesy import Origin, enu_from_cam
-from kcal.locate.positions import Located, locate
+from kcal.lens.mounting import Origin
+from kcal.locate.geodesy import enu_from_cam
+from kcal.locate.positions import Located, locate_points
 from kcal.report.positions import positions_figure, save_positions_picture
 
 HEADING = 300.0
@@ -24,7 +25,7 @@ def scene() -> tuple[Located, torch.Tensor]:
     # One pair more, outside the image, of which the truth is not known.
     left, right = torch.cat([left, tensor([5000.0, 1.0])]), torch.cat([right, tensor([1.0, 1.0])])
     right = right + tensor([0.3, 0.0])
-    located = locate(
+    located = locate_points(
         rig,
         left,
         right,
@@ -95,7 +96,7 @@ def test_one_point_and_many_points(tmp_path: Path, count: int) -> None:
     rig = pinhole_rig()
     points = torch.linspace(80, 6000, count, dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
     left, right, _ = rig(points)
-    located = locate(rig, left, right, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
+    located = locate_points(rig, left, right, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
     path = save_positions_picture(tmp_path / "map.png", located)
     assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
     assert list(tmp_path.iterdir()) == [path]
@@ -103,7 +104,7 @@ def test_one_point_and_many_points(tmp_path: Path, count: int) -> None:
 
 def test_nothing_to_draw_is_drawn_all_the_same(tmp_path: Path) -> None:
     rig, marks = pinhole_rig(), tensor([5000.0, 1.0])
-    located = locate(rig, marks, marks, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
+    located = locate_points(rig, marks, marks, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
     assert save_positions_picture(tmp_path / "map.png", located).stat().st_size > 10_000
 
 

@@ -28,6 +28,7 @@ from kcal.calibrate.camera.outliers import (
     without,
 )
 from kcal.calibrate.camera.prior_comparison import compare_with_prior, weak_prior_term
+from kcal.calibrate.camera.record import camera_calibration
 from kcal.calibrate.camera.solve import Solved, corner_problem, solve
 from kcal.calibrate.camera.warnings import (
     NO_ERROR_BARS,
@@ -147,9 +148,11 @@ def _calibrating(
     observations: Observations, options: CalibrationOptions, progress: Progress
 ) -> Steps[CameraCalibrationResult]:
     if options.reject is not None:
-        return (yield from _calibrate_rejecting(observations, options, options.reject, progress))
-    solved = yield from solve(observations, options, progress)
-    return judged(observations, solved, options)
+        found = yield from _calibrate_rejecting(observations, options, options.reject, progress)
+    else:
+        found = judged(observations, (yield from solve(observations, options, progress)), options)
+    found.camera.calibration = camera_calibration(found, observations)
+    return found
 
 
 def judged(observations: Observations, solved: Solved, options: CalibrationOptions) -> CameraCalibrationResult:

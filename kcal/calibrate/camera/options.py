@@ -14,7 +14,8 @@ from kcal.calibrate.bundle.parameters import Rules, natural_value
 from kcal.calibrate.camera.outliers import OutlierRejection, RejectedCorner, RejectedView
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
-from kcal.io.camera_file import BoardRecord, CameraCalibration, CameraFile, Exclusion, camera_to_file, provenance
+from kcal.io.camera_file import CameraFile, camera_to_file, provenance
+from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, Exclusion
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
@@ -167,6 +168,28 @@ class CameraCalibrationResult:
     rejected_corners: tuple[RejectedCorner, ...] = ()
     rejected_views: tuple[RejectedView, ...] = ()
 
+    def __post_init__(self) -> None:
+        """Give the camera its error bars and history, which it keeps until its parameters change."""
+        known = self.covariance if bool(self.covariance.isfinite().all()) else None
+        self.camera.calibration = CameraCalibration(sigma=self.sigma, covariance=known, record=self._record())
+
+    def _record(self) -> CalibrationRecord:
+        board, warp = self.observations.board, self.board_warp
+        per_view = zip(self.observations.names, self.per_view_rms.tolist(), strict=True)
+        used = {view: rms for view, rms in per_view if not math.isnan(rms)}
+        return CalibrationRecord(
+            rms=self.rms,
+            views=len(used),
+            points=int(self.residuals[..., 0].isfinite().sum()),
+            per_view_rms=used,
+            excluded=self.excluded,
+            board=BoardRecord(columns=board.columns, rows=board.rows, square=board.square),
+            board_warp=None if warp is None else (float(warp[0]), float(warp[1])),
+            stop_reason=self.status.message,
+            iterations=self.iterations,
+            **provenance(),
+        )
+
     @property
     def rejected_share(self) -> float:
         """Share of all corners that was left out, those of left-out views counted."""
@@ -183,34 +206,14 @@ class CameraCalibrationResult:
         )
 
     def file(self, *, name: str = "", source: str | None = None) -> CameraFile:
-        """The camera with its error bars and how it was calibrated, in the form in which it is stored.
+        """The camera with its error bars and history, in the form in which it is stored.
 
         Args:
             name: free text that tells cameras apart.
             source: name of the observations file, if there is one.
         """
-        board, warp = self.observations.board, self.board_warp
-        per_view = zip(self.observations.names, self.per_view_rms.tolist(), strict=True)
-        used = {view: rms for view, rms in per_view if not math.isnan(rms)}
-        return camera_to_file(
-            self.camera,
-            name=name,
-            standard_deviations=self.sigma,
-            covariance=self.covariance if bool(self.covariance.isfinite().all()) else None,
-            calibration=CameraCalibration(
-                rms=self.rms,
-                views=len(used),
-                points=int(self.residuals[..., 0].isfinite().sum()),
-                per_view_rms=used,
-                excluded=self.excluded,
-                board=BoardRecord(columns=board.columns, rows=board.rows, square=board.square),
-                board_warp=None if warp is None else (float(warp[0]), float(warp[1])),
-                stop_reason=self.status.message,
-                iterations=self.iterations,
-                observations=source,
-                **provenance(),
-            ),
-        )
+        record = dataclasses.replace(self._record(), observations=source)
+        return camera_to_file(self.camera, name=name, calibration=record)
 
     def save(self, path: str | Path, *, name: str = "", source: str | None = None) -> Path:
         """Write the camera file, with error bars and record; arguments as in `file`.

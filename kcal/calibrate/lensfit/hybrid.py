@@ -11,6 +11,7 @@ from kcal.calibrate.bundle.batching import alone
 from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.calibrate import judged
 from kcal.calibrate.camera.options import CameraCalibrationResult
+from kcal.calibrate.camera.record import camera_calibration
 from kcal.calibrate.camera.solve import Solved, solve
 from kcal.calibrate.lensfit.field_fit import SEEN, FieldFit, Settled, field_covariance, fit_field, focal_of, settle
 from kcal.calibrate.lensfit.held_out import (
@@ -134,6 +135,7 @@ def calibrate_hybrid(
     else:
         model = base.model if rival is None else LensModel.named(rival.name)
         calibration = judged(observations, solutions[model], options.parametric(model))
+    calibration.camera.calibration = camera_calibration(calibration, observations)
     return HybridResult(
         calibration=calibration,
         kept=kept,

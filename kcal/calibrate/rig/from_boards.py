@@ -67,7 +67,7 @@ class RigCalibrationResult:
         sigma_rotation: (3,) radians, of right_from_left about the right camera's x (pitch), y (yaw) and z (roll).
         sigma_translation: (3,) meters, of right_from_left along the right camera's axes.
         covariance: of both cameras' parameters (zeros where they were held) and right_from_left together, in the order
-            of `kcal.locate.covariances.RigCovariance`.
+            of `kcal.lens.rig.RigCovariance`.
         disagreement: (P,) of the pairs used: above 1, joining the cameras costs a pair more than noise explains; see
             `kcal.calibrate.rig.pair_checks`.
         pixels: (P, 2, N, 2) corners as used, turned where flipped; NaN where not seen.

@@ -1,0 +1,202 @@
+"""Error bars and history of a camera or a rig: plain data that travels with it.
+
+kcal's files store these classes field by field (`kcal.io`), and check types and finite numbers when they are read.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Generic, Literal, TypeVar
+
+from torch import Tensor
+
+from kcal.checks import as_covariance
+from kcal.errors import InputError
+
+
+def _refuse_negative(where: object, names: Iterable[str]) -> None:
+    for name in names:
+        value = getattr(where, name)
+        for number in value.values() if isinstance(value, dict) else (value,):
+            if number is not None and not 0 <= number < math.inf:
+                raise InputError(f"{name} is {number}; it must not be negative")
+
+
+def _refuse_local_time(created: datetime.datetime) -> None:
+    if created.tzinfo is None:
+        raise InputError(f"created is {created.isoformat()}; it needs a timezone")
+
+
+@dataclasses.dataclass(frozen=True)
+class Exclusion:
+    """A view, a corner of one, or a pair that was left out, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BoardRecord:
+    """The board as plain fields: inner corners, and the side of a square in meters."""
+
+    columns: int
+    rows: int
+    square: float
+
+    def __post_init__(self) -> None:
+        if not (self.columns > 0 and self.rows > 0 and self.square > 0):
+            raise InputError(f"board: columns, rows and square must be positive, got {self}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CalibrationRecord:
+    """How a camera was calibrated.
+
+    Args:
+        rms: sqrt(mean ‖r‖²) over the points that were used, pixels.
+        views: how many views were used.
+        points: how many corners were used.
+        per_view_rms: view name -> RMS in pixels, for the views used.
+        excluded: views, and corners of the views used, that were left out, with the reason.
+        board: the board that was shown.
+        board_warp: height of the board's bend in x and y, meters; None if it was not estimated.
+        stop_reason: why the solver stopped.
+        iterations: of the solver.
+        observations: name of the observations file, if there was one.
+        kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
+        created: when, with its time zone.
+    """
+
+    rms: float
+    views: int
+    points: int
+    per_view_rms: dict[str, float]
+    excluded: tuple[Exclusion, ...] = ()
+    board: BoardRecord
+    board_warp: tuple[float, float] | None = None
+    stop_reason: str
+    iterations: int
+    observations: str | None = None
+    kcal_version: str
+    created: datetime.datetime
+
+    def __post_init__(self) -> None:
+        _refuse_negative(self, ("rms", "per_view_rms", "iterations"))
+        _refuse_local_time(self.created)
+        if min(self.views, self.points) < 1:
+            raise InputError(f"views is {self.views} and points is {self.points}; both must be positive")
+        if self.views != len(self.per_view_rms):
+            raise InputError(f"views is {self.views}, but per_view_rms has {len(self.per_view_rms)}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CameraCalibration:
+    """Name, error bars and history of a camera: what its file stores beside the camera.
+
+    Args:
+        name: free text that tells cameras apart, for example `"left"`.
+        sigma: parameter name -> one sigma, in the order of `Camera.names`; None for a parameter that was held fixed or
+            is not determined. The whole is None if no sigmas were computed.
+        covariance: (P, P) of the parameters in the order of `Camera.names`, zero for those held fixed; None if it was
+            not computed.
+        record: how the camera was calibrated, if it was.
+
+    Example:
+        >>> CameraCalibration(name="left", sigma={"fx": 0.5, "fy": 0.5, "skew": None}).sigma["fx"]
+        0.5
+    """
+
+    name: str = ""
+    sigma: Mapping[str, float | None] | None = None
+    covariance: Tensor | None = None
+    record: CalibrationRecord | None = None
+
+    def check(self, count: int) -> None:
+        """Raise `InputError` unless the covariance is one of `count` parameters."""
+        as_covariance("the camera's covariance", self.covariance, count)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RigSource:
+    """One kind of data that a rig was solved from; see `kcal.calibrate.rig.result.SourceResidual`."""
+
+    name: str
+    used: int
+    left_out: int
+    rms_px: float | None = None
+    rms_m: float | None = None
+    sigmas: float | None = None
+
+    def __post_init__(self) -> None:
+        _refuse_negative(self, ("used", "left_out", "rms_px", "rms_m", "sigmas"))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RigCalibration:
+    """How a rig was solved.
+
+    Args:
+        rms: sqrt(mean ‖r‖²) over the points of both cameras, pixels.
+        rms_left: of the left camera alone.
+        rms_right: of the right camera alone.
+        pairs: how many pairs of views were used.
+        per_pair_rms: pair name -> RMS in pixels, for the pairs used.
+        flipped: pairs in which one camera's corner order had to be turned by 180°.
+        excluded: pairs, landmarks and matches left out, with the reason.
+        sources: what the rig was solved from, where that is more than boards.
+        relocked: when only the cameras' attitudes were solved again, and from what.
+        baseline_m: distance between the cameras' centers, meters; must be the length of the translation.
+        frame: what the rig's frame is.
+        kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
+        created: when, with its time zone.
+    """
+
+    rms: float
+    rms_left: float
+    rms_right: float
+    pairs: int
+    per_pair_rms: dict[str, float]
+    flipped: tuple[str, ...] = ()
+    excluded: tuple[Exclusion, ...] = ()
+    sources: tuple[RigSource, ...] = ()
+    relocked: str | None = None
+    baseline_m: float
+    frame: Literal["left camera"] = "left camera"
+    kcal_version: str
+    created: datetime.datetime
+
+    def __post_init__(self) -> None:
+        _refuse_negative(self, ("rms", "rms_left", "rms_right", "per_pair_rms"))
+        _refuse_local_time(self.created)
+        if self.pairs != len(self.per_pair_rms):
+            raise InputError(f"pairs is {self.pairs}, but per_pair_rms has {len(self.per_pair_rms)}")
+        if not self.baseline_m > 0:
+            raise InputError(f"baseline_m is {self.baseline_m}; it must be positive")
+
+
+Attribute = TypeVar("Attribute")
+
+
+class UntilChanged(Generic[Attribute]):
+    """An attribute of a module with a `fingerprint`: None until it is set, and again once the fingerprint has changed.
+
+    So error bars never outlive the parameters that they belong to, however those were changed.
+    """
+
+    def __init__(self, check: Callable[[Any, Attribute], object] = lambda module, value: None) -> None:
+        self.check = check
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, module: Any, owner: type) -> Attribute | None:
+        fingerprint, value = module.__dict__.get(self.name, ("", None))
+        return value if value is not None and fingerprint == module.fingerprint else None
+
+    def __set__(self, module: Any, value: Attribute | None) -> None:
+        if value is not None:
+            self.check(module, value)
+        module.__dict__[self.name] = module.fingerprint, value

@@ -1,0 +1,137 @@
+"""What a file tells besides parameters travels with the camera or rig, is written again, and never outlives them."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from kcal.errors import FileError, InputError
+from kcal.io.camera_file import CameraFile, load_camera, save_camera
+from kcal.io.rig_file import load_rig, save_rig
+from kcal.lens.calibration import CameraCalibration
+from kcal.lens.camera import Camera
+from kcal.lens.rig import RigCovariance, StereoRig
+
+ROOT = Path(__file__).parents[2]
+# Written by version 0.1: cameras, covariances, mounting with link, sources, records.
+SAMPLE = ROOT / "assets" / "sample-rig.json"
+
+
+def assert_same(before: Any, after: Any, where: str = "") -> None:
+    """Equal to the last bit; what is derived on writing (the valid region) to rounding."""
+    if isinstance(before, dict):
+        assert list(before) == list(after), where
+        for key in before:
+            assert_same(before[key], after[key], f"{where}.{key}")
+    elif isinstance(before, list):
+        assert len(before) == len(after), where
+        for i, (one, other) in enumerate(zip(before, after, strict=True)):
+            assert_same(one, other, f"{where}[{i}]")
+    elif ".valid_region." in where:
+        assert after == pytest.approx(before, rel=1e-12, abs=1e-3), where
+    else:
+        assert before == after, where
+
+
+def test_rig_file_of_version_01(tmp_path: Path) -> None:
+    again = save_rig(load_rig(SAMPLE), tmp_path / "rig.json")
+    assert_same(json.loads(SAMPLE.read_text()), json.loads(again.read_text()))
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_camera_file_of_version_01(side: str, tmp_path: Path) -> None:
+    content = {"kcal": "camera", "version": 1, **json.loads(SAMPLE.read_text())[side]}
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(content))
+    camera = load_camera(path)
+    assert camera.calibration is not None
+    assert camera.calibration.record is not None
+    assert camera.calibration.record.views == 20
+    assert_same(content, json.loads(save_camera(camera, tmp_path / "again.json").read_text()))
+    renamed = save_camera(camera, tmp_path / "again.json", name="west")
+    assert CameraFile.load(renamed).name == "west"
+
+
+def test_files_with_little_in_them(tmp_path: Path) -> None:
+    """No error bars, no record, no name: the oldest files."""
+    content = json.loads(SAMPLE.read_text())
+    for key in ("covariance", "mounting", "calibration"):
+        content[key] = None
+    for side in ("left", "right"):
+        content[side] |= {"standard_deviations": None, "covariance": None, "calibration": None}
+    path = tmp_path / "rig.json"
+    path.write_text(json.dumps(content))
+    rig = load_rig(path)
+    assert (rig.covariance, rig.mounting, rig.calibration) == (None, None, None)
+    assert_same(content, json.loads(save_rig(rig, tmp_path / "again.json").read_text()))
+    content["left"] |= {"name": ""}
+    bare = {"kcal": "camera", "version": 1, **content["left"]}
+    path.write_text(json.dumps(bare))
+    assert load_camera(path).calibration is None
+    assert_same(bare, json.loads(save_camera(load_camera(path), tmp_path / "again.json").read_text()))
+
+
+def test_copies_and_pickles_keep_it() -> None:
+    rig = load_rig(SAMPLE)
+    assert rig.covariance is not None
+    for other in (copy.copy(rig), copy.deepcopy(rig), pickle.loads(pickle.dumps(rig)), rig.to(torch.float32)):
+        assert other.covariance is not None
+        assert torch.equal(other.covariance.matrix, rig.covariance.matrix)
+        assert other.mounting is not None
+        assert other.calibration == rig.calibration
+        assert other.left.calibration is not None
+        assert other.left.calibration.name == "left"
+    # It is no part of the state, and the state loads into rigs that know nothing.
+    assert not any("calibration" in key or "covariance" in key for key in rig.state_dict())
+    plain = load_rig(SAMPLE)
+    plain.load_state_dict(rig.state_dict())
+    assert plain.covariance is not None
+
+
+def test_it_does_not_outlive_the_parameters() -> None:
+    rig = load_rig(SAMPLE)
+    known = rig.left.calibration
+    moved = rig.left.with_parameters(rig.left.params + 1e-9)
+    assert moved.calibration is None
+    with torch.no_grad():
+        rig.left.params[0] += 1e-9
+    assert rig.left.calibration is None
+    assert (rig.covariance, rig.mounting, rig.calibration) == (None, None, None)
+    assert rig.right.calibration is not None
+    with torch.no_grad():
+        rig.left.params.copy_(load_rig(SAMPLE).left.params)
+    assert rig.left.calibration is known
+    turned = StereoRig(rig.left, rig.right, rig.right_from_left_rotation, 2 * rig.right_from_left_translation)
+    assert turned.covariance is None
+    turned.load_state_dict(rig.state_dict())
+    assert turned.covariance is None
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    rig = load_rig(SAMPLE)
+    with pytest.raises(InputError, match=r"\(26, 26\) is needed"):
+        rig.covariance = RigCovariance(matrix=torch.eye(6, dtype=torch.float64))
+    camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+    with pytest.raises(InputError, match=r"\(5, 5\) is needed"):
+        camera.calibration = CameraCalibration(covariance=torch.eye(6, dtype=torch.float64))
+    content = json.loads(SAMPLE.read_text())
+    for change, complaint in (
+        ({"link": content["mounting"]["link"][1:]}, "link must be 26 x 6"),
+        ({"covariance": None}, "link needs the mounting's covariance"),
+        ({"lat": 95.0}, "lat"),
+        ({"speed": 1.0}, "Extra"),
+    ):
+        path = tmp_path / "rig.json"
+        path.write_text(json.dumps(content | {"mounting": content["mounting"] | change}))
+        with pytest.raises(FileError, match=complaint):
+            load_rig(path)
+    for change, complaint in (({"rms": -1.0}, "rms"), ({"color": "red"}, "Unexpected|Extra"), ({"pairs": 3}, "pairs")):
+        path.write_text(json.dumps(content | {"calibration": content["calibration"] | change}))
+        with pytest.raises(FileError, match=complaint):
+            load_rig(path)

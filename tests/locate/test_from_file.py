@@ -1,0 +1,68 @@
+"""A rig file becomes a localizer with the same errors as on the command line."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from kcal.cli.main import app
+from kcal.errors import InputError
+from kcal.io.rig_file import load_rig
+from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.rig import RigCovariance
+from kcal.locate.localizer import StereoLocalizer
+
+SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
+LEFT, RIGHT = torch.tensor([[960.0, 540.0], [700.0, 600.0]]), torch.tensor([[925.0, 535.0], [620.0, 592.0]])
+
+
+def test_the_same_intervals_as_the_command(tmp_path: Path) -> None:
+    marks = tmp_path / "points.csv"
+    rows = [f"{left[0]},{left[1]},{right[0]},{right[1]}" for left, right in zip(LEFT, RIGHT, strict=True)]
+    marks.write_text("\n".join(["left_u,left_v,right_u,right_v", *rows]) + "\n")
+    out = tmp_path / "positions.csv"
+    done = CliRunner().invoke(app, ["locate", str(SAMPLE), str(marks), "--pixel-sigma", "0.1", "-o", str(out)])
+    assert done.exit_code == 0, done.output
+    for localize in (
+        StereoLocalizer(load_rig(SAMPLE), pixel_sigma=0.1),
+        StereoLocalizer.from_file(SAMPLE, pixel_sigma=0.1),
+    ):
+        assert localize.included == ("marks", "calibration", "mounting")
+        found = localize(LEFT, RIGHT)
+        for i, row in enumerate(csv.DictReader(out.open())):
+            assert float(row["range_low_m"]) == float(found.range_low[i])
+            assert float(row["range_high_m"]) == float(found.range_high[i])
+            assert float(row["cov_ee_m2"]) == float(found.covariance[i, 0, 0])
+            assert float(row["lat"]) == float(found.geodetic[i, 0])
+
+
+def test_what_is_given_replaces_what_the_rig_knows() -> None:
+    rig = load_rig(SAMPLE)
+    assert rig.mounting is not None
+    own = StereoLocalizer(rig)(LEFT, RIGHT)
+    exact = RigCovariance.of(rig)
+    narrow = StereoLocalizer(rig, calibration=exact)(LEFT, RIGHT)
+    assert (narrow.inverse_range_sigma < own.inverse_range_sigma).all()
+    elsewhere = StereoLocalizer(rig, origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0)
+    assert elsewhere.included == ("marks", "calibration")
+    assert torch.equal(elsewhere(LEFT, RIGHT).inverse_range_sigma, own.inverse_range_sigma)
+    # Without the link, errors of calibration and mounting are taken as independent: another covariance.
+    loose = StereoLocalizer(rig, mounting=rig.mounting.covariance)
+    assert not torch.allclose(loose(LEFT, RIGHT).covariance, own.covariance, rtol=1e-5)
+
+
+def test_half_a_mounting_is_refused() -> None:
+    rig = load_rig(SAMPLE)
+    origin = Origin(lat=0.0, lon=0.0, height=0.0)
+    for options in ({"origin": origin}, {"heading_deg": 10.0}, {"pitch_deg": 1.0}):
+        with pytest.raises(InputError, match="belong together"):
+            StereoLocalizer(rig, **options)
+    rig.mounting = None
+    with pytest.raises(InputError, match="does not say where it stands"):
+        StereoLocalizer(rig)
+    rig.mounting = Mounting(origin=origin, heading_deg=10.0)
+    assert StereoLocalizer(rig).attitude_deg == (10.0, 0.0, 0.0)
