@@ -17,6 +17,7 @@ FLOORS = {
     "report": 8,
     "nets": 7,
     "locate": 7,
+    "calibrate/batch": 6,
     "calibrate/lensfit": 6,
     "calibrate/camera": 5,
     "calibrate/rig": 5,

@@ -105,7 +105,7 @@ def solve(
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
     from kcal.locate.mounting import placed_rig
-    from kcal.report.figures import check_picture_format
+    from kcal.report.figures import check_picture
     from kcal.report.rig import save_rig_picture
 
     sources = Sources(
@@ -114,8 +114,7 @@ def solve(
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     if picture is not None:
-        check_picture_format(picture)
-        check_writable(picture)
+        check_picture(picture)
     if not any((pairs, landmarks, marks, features, positions, baseline)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     if refine_cameras:

@@ -18,9 +18,9 @@ from kcal.calibrate.bundle.board_problem import BoardProblem
 from kcal.calibrate.camera.layer import CalibratedViews, calibrate_views
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.lens.model import LensModel
-from scripts.bench.solver import MODELS, NOISE, SIZE, simulate
 from scripts.shared.page import write_section
 from scripts.shared.timing import row, show
+from scripts.shared.views import MODELS, NOISE, SIZE, simulate
 
 VIEWS, REPEATS, STEP = (30, 200, 800), 3, 1e-3
 WEAK = {5: None, 14: 0.3}

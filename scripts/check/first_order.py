@@ -28,9 +28,9 @@ from kcal.calibrate.bundle.views import free_parameters
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import LMOptions, minimize
-from scripts.bench.solver import COLUMNS, MODELS, NOISE, ROWS, SIZE, simulate
 from scripts.shared.page import DOCS, write_section
 from scripts.shared.timing import show
+from scripts.shared.views import COLUMNS, MODELS, NOISE, ROWS, SIZE, simulate
 
 VIEWS = 15
 RATES = [10.0**e for e in range(-8, 5)]

@@ -28,7 +28,7 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import drift_effect
 from kcal.report.rig import save_rig_picture
-from scripts.bench.locate import ORIGIN, RANGES, rig
+from scripts.shared.long_range import ORIGIN, RANGES, rig
 from scripts.shared.page import CONCLUSIONS, DOCS
 from scripts.shared.timing import row, show
 

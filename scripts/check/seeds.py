@@ -24,9 +24,9 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import SolverStatus
-from scripts.bench.solver import MODELS, SIZE, flipped_views, image_error, observed, simulate
 from scripts.shared.page import write_section
 from scripts.shared.timing import show
+from scripts.shared.views import MODELS, SIZE, flipped_views, image_error, observed, simulate
 
 SAME = 1e-6
 # Typical sizes of coefficients that may have either sign.

@@ -10,7 +10,7 @@ with A*, K* and the poses held: y3 are corners and y3* their projections, y1 pos
 inverse net, trained along with it, makes of the projections. Both residuals get that here, the global one of Eq. 11
 and a field as in Fig. 8, and both are also fitted jointly with warp and poses by Levenberg-Marquardt.
 
-Data, splits and measure are those of `scripts/bench/hybrid.py`: whole blocks of views held out, poses solved again.
+Data, splits and measure are those of `scripts/shared/wide_lens.py`: whole blocks of views held out, poses solved again.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from kcal.nets.inverse import InverseNet
 from kcal.nets.mlp import evaluate
 from kcal.nets.residual import ResidualNet, train_residual
 from kcal.solve.lm import LMOptions, minimize
-from scripts.bench.hybrid import folds, held_out, load, subset
 from scripts.shared.page import write_section
 from scripts.shared.timing import row, show
+from scripts.shared.wide_lens import folds, held_out, load, subset
 
 PAGE = "hybrid.md"
 MODEL = "ext20"

@@ -65,6 +65,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
     minimum, noise = solution.minimum, solution.views.prior_noise
     return CameraCalibrationResult(
         camera=camera,
+        observations=observations,
         rms=rms,
         weighted_rms=None
         if problem.whitening is None and problem.loss is None

@@ -11,7 +11,6 @@ from kcal.calibrate.bundle.batching import together
 from kcal.calibrate.camera.assess import assess
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.outliers import solve_without_outliers
-from kcal.calibrate.camera.record import camera_calibration
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.solve import solve
 from kcal.calibrate.search.model_ladder import Progress
@@ -66,12 +65,9 @@ def calibrate_camera(
     """
     options = options or CalibrationOptions()
     if options.reject is None:
-        result = assess(observations, solve(observations, options, progress), options)
-    else:
-        kept = solve_without_outliers(observations, options, options.reject, progress)
-        result = kept.complete(assess(kept.observations, kept.solution, options), len(observations.views))
-    result.camera.calibration = camera_calibration(result, observations)
-    return result
+        return assess(observations, solve(observations, options, progress), options)
+    kept = solve_without_outliers(observations, options, options.reject, progress)
+    return kept.complete(assess(kept.observations, kept.solution, options), observations)
 
 
 def calibrate_cameras(

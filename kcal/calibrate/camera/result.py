@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from kcal.corners.observations import Observations
+from kcal.io.camera_file import CameraFile, camera_to_file, provenance
+from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, Exclusion
 from kcal.lens.camera import Camera
 from kcal.solve.result import SolverStatus
 
@@ -68,6 +73,7 @@ class CameraCalibrationResult:
         status: why the solver stopped.
         iterations: trial steps of the solver, all starts and models together.
         warnings: what the user should doubt, and what to do about it.
+        observations: what was calibrated from.
         fixed: names of the parameters that the options held.
         led_by_prior: names of the parameters that a prior determines more than the views do: without it their σ would
             be more than 1.4 times as large.
@@ -88,10 +94,33 @@ class CameraCalibrationResult:
     status: SolverStatus
     iterations: int
     warnings: tuple[str, ...]
+    observations: Observations
     fixed: tuple[str, ...] = ()
     led_by_prior: tuple[str, ...] = ()
     rejected_corners: tuple[RejectedCorner, ...] = ()
     rejected_views: tuple[RejectedView, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Give the camera its error bars and history, which it keeps until its parameters change."""
+        known = self.covariance if bool(self.covariance.isfinite().all()) else None
+        self.camera.calibration = CameraCalibration(sigma=self.sigma, covariance=known, record=self._record())
+
+    def _record(self) -> CalibrationRecord:
+        board, warp = self.observations.board, self.board_warp
+        per_view = zip(self.observations.names, self.per_view_rms.tolist(), strict=True)
+        used = {view: rms for view, rms in per_view if not math.isnan(rms)}
+        return CalibrationRecord(
+            rms=self.rms,
+            views=len(used),
+            points=int(self.residuals[..., 0].isfinite().sum()),
+            per_view_rms=used,
+            excluded=self.excluded,
+            board=BoardRecord(columns=board.columns, rows=board.rows, square=board.square),
+            board_warp=None if warp is None else (float(warp[0]), float(warp[1])),
+            stop_reason=self.status.message,
+            iterations=self.iterations,
+            **provenance(),
+        )
 
     @property
     def rejected_share(self) -> float:
@@ -99,3 +128,29 @@ class CameraCalibrationResult:
         gone = len(self.rejected_corners) + sum(view.corners for view in self.rejected_views)
         used = int(torch.isfinite(self.residuals).all(-1).sum())
         return gone / (gone + used)
+
+    @property
+    def excluded(self) -> tuple[Exclusion, ...]:
+        """Views, then single corners, that were left out, each with its reason."""
+        return (
+            *(Exclusion(name=view.view, reason=view.reason) for view in self.rejected_views),
+            *(Exclusion(name=f"{c.view} corner {c.corner}", reason=c.reason) for c in self.rejected_corners),
+        )
+
+    def file(self, *, name: str = "", source: str | None = None) -> CameraFile:
+        """The camera with its error bars and history, in the form in which it is stored.
+
+        Args:
+            name: free text that tells cameras apart.
+            source: name of the observations file, if there is one.
+        """
+        record = dataclasses.replace(self._record(), observations=source)
+        return camera_to_file(self.camera, name=name, calibration=record)
+
+    def save(self, path: str | Path, *, name: str = "", source: str | None = None) -> Path:
+        """Write the camera file, with error bars and record; arguments as in `file`.
+
+        Raises:
+            FileError: the file cannot be written.
+        """
+        return self.file(name=name, source=source).save(path)

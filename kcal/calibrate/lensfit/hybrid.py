@@ -10,7 +10,6 @@ import torch
 from kcal.calibrate.bundle.views import Views, free_parameters
 from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.assess import assess
-from kcal.calibrate.camera.record import camera_calibration
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.solve import Solution, solve
 from kcal.calibrate.lensfit.field_fit import (
@@ -139,11 +138,10 @@ def calibrate_hybrid(
     kept = converged is not None and (wins or not options.gate)
     corners = views.corner_count
     if converged is not None and kept:
-        calibration = _result(views, observations.image_size, base, converged)
+        calibration = _result(views, observations, base, converged)
     else:
         model = base.model if rival is None else LensModel.named(rival.name)
         calibration = assess(observations, solutions[model], options.parametric(model))
-    calibration.camera.calibration = camera_calibration(calibration, observations)
     return HybridResult(
         calibration=calibration,
         kept=kept,
@@ -195,17 +193,20 @@ def _reason(base: FieldFit, rival: Contender | None, wins: bool, converged: bool
     return f"better than a parametric model, {sure}: {found}"
 
 
-def _result(views: Views, size: tuple[int, int], base: FieldFit, converged: ConvergedField) -> CameraCalibrationResult:
+def _result(
+    views: Views, observations: Observations, base: FieldFit, converged: ConvergedField
+) -> CameraCalibrationResult:
     field, covariance = converged.field, field_covariance(base, converged.forms)
     free = free_parameters(base.model)
     problem = views.problem(base.model, free, field=field)
     state = problem.tidy(converged.state)
     residual = FieldResidual(field.grid, field.weights)
-    camera = HybridCamera(state.parameters, size=size, model=base.model, residual=residual)
+    camera = HybridCamera(state.parameters, size=observations.image_size, model=base.model, residual=residual)
     squared, seen = problem.pixel_errors(state).square().sum(-2), problem.seen
     of_all = covariance.new_zeros(len(camera.names), len(camera.names))
     of_all[torch.tensor(free)[:, None], torch.tensor(free)] = covariance[: len(free), : len(free)]
     return CameraCalibrationResult(
+        observations=observations,
         camera=camera,
         rms=float(torch.sqrt(squared.sum() / seen.sum())),
         weighted_rms=None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Hashable, Sequence
+from pathlib import Path
 from typing import Literal
 
 from kcal.calibrate.camera.options import CalibrationOptions
@@ -95,3 +96,7 @@ class HybridResult:
     effective: float
     units: int
     largest: float
+
+    def save(self, path: str | Path, *, name: str = "", source: str | None = None) -> Path:
+        """Write the file of the camera that is returned; see `CameraCalibrationResult.save`."""
+        return self.calibration.save(path, name=name, source=source)

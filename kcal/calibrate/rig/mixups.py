@@ -105,7 +105,7 @@ def _features_behind(problem: RigProblem, state: RigState, covariance: SharedCov
     for block in problem.blocks:
         if isinstance(block, FeatureBlock):
             # The last local unknown is the inverse range; what the cameras' errors make of it is added.
-            follow, own = (value[start : start + len(block), -1] for value in problem.linearize(state).answers())
+            follow, own = (value[start : start + len(block), -1] for value in problem.linearize(state).local_response())
             variance = covariance.of(follow)[0].diagonal() + own[:, -1]
             return int((state.inverse_range < -_BEHIND_SIGMAS * variance.sqrt()).sum()), len(block)
         start += len(block)

@@ -17,7 +17,6 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.warnings import check_focal
 from kcal.calibrate.rig import adjustment
 from kcal.calibrate.rig.sources import RigData
-from kcal.cli.calibrate import record
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.projection import project_components
@@ -221,7 +220,7 @@ class TestWhatCannotBeComputed:
         assert bool(result.covariance.diagonal()[:4].isnan().all())
         assert any("no error bars" in text for text in result.warnings)
         assert not any("do not determine" in text for text in result.warnings)
-        assert record(result, seen, "left", "left.json").covariance is None
+        assert result.file(name="left", source="left.json").covariance is None
 
     def test_a_rig_takes_no_such_prior(self) -> None:
         cameras = (camera(), camera())
