@@ -228,8 +228,8 @@ WITHOUT_EXAMPLE = {
     "save_positions_picture",
     "save_rig_picture",
 }
-# Types that are to be renamed or hidden: kcal.calibrate.lensfit's prior of a field.
-PENDING = {"Prior"}
+# A type that is to be hidden: the prior of a residual field.
+PENDING = {"FieldPrior"}
 
 
 def test_the_list() -> None:

@@ -106,7 +106,7 @@ class ParameterConstraints:
             raise InputError(f"parameter {min(twice)} is tied twice: write one tie with all parameters that are equal")
         for name, (mean, sigma) in self.priors.items():
             if not (math.isfinite(mean) and math.isfinite(sigma) and sigma > 0):
-                raise InputError(f"prior of {name}: needs a value and a positive deviation, got {mean} ± {sigma}")
+                raise InputError(f"prior of {name} is {mean} ± {sigma}; it needs a positive standard deviation")
 
     def allows(self, model: LensModel) -> bool:
         """Whether a smaller model, its missing coefficients taken as zero, satisfies the constraints."""
