@@ -160,13 +160,14 @@ def _solve_rig(
     """Solve the rig of the two camera files in `output`; returns the pairs used and their corners."""
     from kcal.calibrate.rig.from_boards import calibrate_rig
     from kcal.calibrate.rig.pairs import pair_by_name
+    from kcal.calibrate.rig.solve import RigOptions
     from kcal.cli.console import err, out
     from kcal.io.camera_file import load_camera
     from kcal.locate.check import triangulated_sides
 
     cameras = load_camera(output / "left.camera.json"), load_camera(output / "right.camera.json")
     pairs = pair_by_name(left.names, right.names)
-    result = calibrate_rig(*cameras, left, right, pairs)
+    result = calibrate_rig(*cameras, left, right, pairs, RigOptions(reject=False))
     result.save(output / "rig.json")
     sides = triangulated_sides(result.stereo(), left.board.columns, left.board.rows, result.pixels)
     out.print(
