@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib import patheffects
@@ -100,25 +100,17 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
         return np.asarray(offset / distance * np.log1p(distance / unit) / math.log1p(reach / unit))
 
     circle = np.linspace(0.0, 2.0 * math.pi, 200)
-    for power in range(-1, 7):
-        for step in (1.0, 2.5, 5.0):
-            radius = step * 10.0**power
-            if nearest / 4 <= radius <= reach and step in (1.0, 5.0):
-                ring = np.log1p(radius / unit) / math.log1p(reach / unit)
-                axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=_FAINT, linewidth=0.7, linestyle=":")
-                text = f"{radius / 1000:g} km" if radius >= 1000 else f"{radius:g} m"
-                axes.text(0.0, ring, text, fontsize=8, color="#4b5563", ha="center", va="bottom", path_effects=_HALO)
+    for radius in (step * 10.0**power for power in range(-1, 7) for step in (1.0, 5.0)):
+        if nearest / 4 <= radius <= reach:
+            ring = np.log1p(radius / unit) / math.log1p(reach / unit)
+            axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=_FAINT, linewidth=0.7, linestyle=":")
+            text = f"{radius / 1000:g} km" if radius >= 1000 else f"{radius:g} m"
+            axes.text(0.0, ring, text, fontsize=8, color="#4b5563", ha="center", va="bottom", path_effects=_HALO)
     for kind, (points, names, used) in places.items():
         drawn, good = place(points), np.array(used)
         marker = {"landmarks": "^", "boards": "s", "features": "o"}[kind]
-        style: dict[str, Any] = {
-            "linestyle": "none",
-            "markersize": 6,
-            "color": _COLORS[kind],
-            "markerfacecolor": "white",
-        }
-        axes.plot(*drawn[good].T, marker=marker, label=kind, **style)
-        axes.plot(*drawn[~good].T, marker="x", color=_WRONG, linestyle="none", markersize=8, markeredgewidth=1.8)
+        axes.plot(*drawn[good].T, marker, label=kind, markersize=6, color=_COLORS[kind], markerfacecolor="white")
+        axes.plot(*drawn[~good].T, "x", color=_WRONG, markersize=8, markeredgewidth=1.8)
         for xy, name, fine in zip(drawn, names, used, strict=True):
             if not fine or (kind == "landmarks" and len(names) <= 30):
                 color = _COLORS[kind] if fine else _WRONG
@@ -171,7 +163,7 @@ def _draw_items(axes: Axes, result: RigResult) -> None:
 
 def _label(item: ItemResidual) -> str:
     name = item.name if len(item.name) <= 28 else f"{item.name[:27]}…"
-    return f"{item.source[:-1]} {name}"
+    return dataclasses.replace(item, name=name).label
 
 
 def _footer(result: RigResult) -> str:
@@ -182,5 +174,5 @@ def _footer(result: RigResult) -> str:
         values += [] if source.rms_m is None else [f"{source.rms_m:.3f} m"]
         parts.append(f"{source.source}: {', '.join(values)}, {source.sigmas:.2f} sigma")
     lines = ["   ".join(parts)]
-    lines += [f"{item.source[:-1]} {item.name}: {item.reason}" for item in result.left_out[:3]]
+    lines += [f"{item.label}: {item.reason}" for item in result.left_out[:3]]
     return "\n".join(lines)

@@ -101,36 +101,36 @@ class Block(ABC):
     @property
     def counts(self) -> Tensor:
         """(V,) residuals of each item."""
-        return 2 * self.seen.sum((-2, -1)) + self.prior_count()
+        return 2 * self.seen.sum((-2, -1)) + self._prior_count()
 
-    def prior_count(self) -> Tensor:
+    def _prior_count(self) -> Tensor:
         """(V,) residuals besides the pixels."""
         return torch.zeros(len(self), dtype=torch.int64)
 
     @abstractmethod
-    def place(self, state: RigState) -> tuple[Tensor, Tensor]:
+    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         """Y (V, 3, N) and w (V, 1, 1)."""
 
     @abstractmethod
-    def by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
         """Derivatives (V, L, 2, N) of pixels by the unknowns, from those by q (V, 3, 2, N)."""
 
     @abstractmethod
     def retract(self, state: RigState, step: Tensor) -> RigState:
         """Apply a step (V, L) to this block's part of the state."""
 
-    def by_warp(self, state: RigState, by_q: Tensor) -> Tensor:
+    def _by_warp(self, state: RigState, by_q: Tensor) -> Tensor:
         """Derivatives (V, 2, 2, N) of pixels by the board's warp, where that is free."""
         raise NotImplementedError
 
-    def prior(self, state: RigState) -> Tensor | None:
+    def _prior(self, state: RigState) -> Tensor | None:
         """(V, L + 1, Q): derivatives of Q residuals of what is known beforehand; the last row holds the residuals."""
         return None
 
     def _projected(
         self, cameras: Sequence[PosedCamera], state: RigState, derivatives: bool
     ) -> Iterator[tuple[int, PosedCamera, Tensor, Tensor, Projection, Tensor]]:
-        y, w = self.place(state)
+        y, w = self._place(state)
         for c, posed in enumerate(cameras):
             q = posed.rotation @ (y - w * posed.center[:, None])
             wanted = posed.free.indices if derivatives else None
@@ -147,7 +147,7 @@ class Block(ABC):
     def residuals(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
         """(V, R) whitened residuals, pixels first."""
         white = torch.einsum("vcuwn,vcwn->vcun", self.whitening, self.errors(cameras, state)).flatten(1)
-        prior = self.prior(state)
+        prior = self._prior(state)
         return white if prior is None else torch.cat([white, prior[:, -1]], -1)
 
     def rows(self, cameras: Sequence[PosedCamera], state: RigState, shared_size: int) -> Tensor:
@@ -156,7 +156,7 @@ class Block(ABC):
         for c, posed, q, w, found, error in self._projected(cameras, state, True):
             rows = q.new_zeros((len(self), self.size + shared_size + 1, 2, q.shape[-1]))
             by_q = torch.einsum("vkun,kj->vjun", found.by_point, posed.rotation)
-            rows[:, : self.size] = self.by_local(state, by_q, posed.center)
+            rows[:, : self.size] = self._by_local(state, by_q, posed.center)
             shared = rows[:, self.size : -1]
             shared[:, posed.inner] = posed.free.collapse(found.by_camera, -3)
             if posed.turn is not None:
@@ -164,11 +164,11 @@ class Block(ABC):
             if posed.shift is not None:
                 shared[:, posed.shift] = -w[..., None] * by_q
             if self.free_warp:
-                shared[:, -2:] = self.by_warp(state, by_q)
+                shared[:, -2:] = self._by_warp(state, by_q)
             rows[:, -1] = error
             rows = torch.where(self.seen[:, c, None, None, :], rows, 0.0)
             out.append(torch.einsum("vuwn,vpwn->vpun", self.whitening[:, c], rows).flatten(-2))
-        prior = self.prior(state)
+        prior = self._prior(state)
         if prior is not None:
             rows = prior.new_zeros((len(self), self.size + shared_size + 1, prior.shape[-1]))
             rows[:, : self.size], rows[:, -1] = prior[:, :-1], prior[:, -1]
@@ -189,17 +189,16 @@ class BoardBlock(Block):
     def _bent(self, state: RigState) -> Tensor:
         return torch.cat([self._board[:2], self._board[2:] + state.warp @ self._shape])
 
-    def place(self, state: RigState) -> tuple[Tensor, Tensor]:
-        """See `Block.place`."""
+    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         points = state.board_rotation @ self._bent(state) + state.board_translation[..., None]
         return points, points.new_ones(len(self), 1, 1)
 
-    def by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
-        """See `Block.by_local`: by ω through ω × (R x), then by v."""
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
+        # By ω through ω × (R x), then by v.
         return step_rows(by_q, state.board_rotation @ self._bent(state))
 
-    def by_warp(self, state: RigState, by_q: Tensor) -> Tensor:
-        """See `Block.by_warp`: along the board's normal."""
+    def _by_warp(self, state: RigState, by_q: Tensor) -> Tensor:
+        # Along the board's normal.
         along = torch.einsum("vkun,vk->vun", by_q, state.board_rotation[..., 2])
         return along[:, None] * self._shape[:, None]
 
@@ -219,20 +218,17 @@ class LandmarkBlock(Block):
         super().__init__(pixels[:, :, None], whitening[:, :, None])
         self._surveyed, self._sigma = points, sigma
 
-    def prior_count(self) -> Tensor:
-        """See `Block.prior_count`."""
+    def _prior_count(self) -> Tensor:
         return torch.full((len(self),), 3)
 
-    def place(self, state: RigState) -> tuple[Tensor, Tensor]:
-        """See `Block.place`."""
+    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         return state.points[..., None], state.points.new_ones(len(self), 1, 1)
 
-    def by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
-        """See `Block.by_local`."""
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
         return by_q
 
-    def prior(self, state: RigState) -> Tensor | None:
-        """See `Block.prior`: the survey."""
+    def _prior(self, state: RigState) -> Tensor | None:
+        # The survey.
         error = (state.points - self._surveyed) / self._sigma
         return torch.cat([torch.diag_embed(1.0 / self._sigma), error[:, None]], 1)
 
@@ -252,23 +248,21 @@ class FeatureBlock(Block):
         self._mean, self._weight = inverse_range, torch.where(torch.isfinite(sigma), 1.0 / sigma, 0.0)
         self._anchor = anchor
 
-    def prior_count(self) -> Tensor:
-        """See `Block.prior_count`."""
+    def _prior_count(self) -> Tensor:
         return (self._weight > 0).long()
 
-    def place(self, state: RigState) -> tuple[Tensor, Tensor]:
-        """See `Block.place`."""
+    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         inverse = state.inverse_range[:, None]
         return (state.direction + inverse * self._anchor)[..., None], inverse[..., None]
 
-    def by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
-        """See `Block.by_local`: by two steps across the direction, then by ρ."""
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
+        # By two steps across the direction, then by ρ.
         along = (self._anchor - center).expand_as(state.direction)
         moves = torch.stack([*side_axes(state.direction), along], 1)
         return torch.einsum("vjun,vlj->vlun", by_q, moves)
 
-    def prior(self, state: RigState) -> Tensor | None:
-        """See `Block.prior`: what is known of the range."""
+    def _prior(self, state: RigState) -> Tensor | None:
+        # What is known of the range.
         zero = torch.zeros_like(self._weight)
         error = (state.inverse_range - self._mean) * self._weight
         return torch.stack([zero, zero, self._weight, error], 1)[..., None]

@@ -35,6 +35,16 @@ class Poses:
     rotation: Tensor
     translation: Tensor
 
+    @classmethod
+    def at(cls, rotation: Tensor, center: Tensor) -> Poses:
+        """World to camera, of a camera whose center is in the world."""
+        return cls(rotation, -(rotation @ center))
+
+    @property
+    def center(self) -> Tensor:
+        """The point that is moved to the origin."""
+        return self.inverse().translation
+
     def after(self, other: Poses) -> Poses:
         """This motion applied after another."""
         return Poses(

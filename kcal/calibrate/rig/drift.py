@@ -130,8 +130,6 @@ def measure_drift(
     start = Start(
         rotation=torch.stack([rotation, right, rotation, right]),
         center=torch.stack([center, right_center, center, right_center]),
-        board_rotation=torch.empty(0, 3, 3, dtype=torch.float64),
-        board_translation=torch.empty(0, 3, dtype=torch.float64),
     )
     if landmarks is not None:
         unseen = torch.full_like(landmarks.pixels, math.nan)
