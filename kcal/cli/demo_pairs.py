@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kcal.cli.console import err, out, print_table
-from kcal.cli.demo_steps import SIDES, again, locate_points, print_results, run
+from kcal.cli.demo_steps import SIDES, locate_again, print_results, run
 from kcal.errors import FileError
 
 if TYPE_CHECKING:
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from kcal.locate.geodesy import Origin
     from kcal.locate.marks import Marks
 
-_PIXEL_SIGMA = 0.3  # as `kcal locate` assumes
-
 
 def real_pairs(
     output: Path, folder: Path, size: str, square: str, board: Board, origin: Origin | None, heading: float
 ) -> None:
     """Calibrate from a folder of pairs, and locate two opposite corners of each board, whose distance is known."""
-    from kcal.locate.geodesy import Origin
-    from kcal.locate.marks import write_marks
+    from kcal.io.rig_file import load_rig
+    from kcal.lens.mounting import Origin
+    from kcal.locate.marks import read_marks, write_marks
+    from kcal.locate.positions import locate_points
     from kcal.report.tables import diagonal_rows
 
     for side in SIDES:
@@ -36,13 +36,15 @@ def real_pairs(
 
     write_marks(output / "points.csv", _board_ends(output, board))
     where = origin or Origin(lat=0.0, lon=0.0, height=0.0)
-    located = locate_points(output, _PIXEL_SIGMA, origin=where, heading=heading)
+    command = locate_again(output, f"--origin={where.lat},{where.lon},{where.height}", f"--heading={heading}")
+    marks = read_marks(output / "points.csv")
+    rig = load_rig(output / "rig.json")
+    located = locate_points(rig, marks.left, marks.right, origin=where, heading_deg=heading, names=marks.names)
     out.print("\nThe board's diagonal, true against estimated", markup=False)
     print_table(diagonal_rows(located, board))
     if origin is None:
         err.print("[yellow]note:[/] no --origin was given: positions are placed at latitude 0, longitude 0")
-    place = f"--origin={where.lat},{where.lon},{where.height}"
-    print_results(output, again(output, _PIXEL_SIGMA, place, f"--heading={heading}"))
+    print_results(output, command)
 
 
 def _side_images(folder: Path, side: str) -> list[Path]:

@@ -8,17 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kcal.cli.console import out, print_table, steps
-from kcal.cli.demo_steps import SIDES, again, locate_points, print_results, run
-from kcal.cli.locate import locate_marks
+from kcal.cli.demo_steps import SIDES, locate_again, print_results, run
+from kcal.files import write_atomic
 
 if TYPE_CHECKING:
     from kcal.locate.positions import Located
-    from kcal.sim.scene import DemoScene
+    from kcal.sim.scene import DemoScene, NamedPoints
 
 
 def simulated_site(output: Path, seed: int) -> None:
     """Render the site of a seed, run the whole chain, compare with the truth, and write everything to a folder."""
+    from kcal.io.rig_file import load_rig
     from kcal.locate.marks import Marks, write_marks
+    from kcal.locate.positions import locate_points
     from kcal.report.tables import truth_rows
     from kcal.sim.scene import DemoScene
 
@@ -41,7 +43,7 @@ def simulated_site(output: Path, seed: int) -> None:
         camera, picture = output / f"{side}.camera.json", output / f"{side}.png"
         run("calibrate", output / f"{side}.near.obs.json", "-o", camera, "--name", side, "--picture", picture)
     clock.lap("calibration")
-    _write_survey(scene, output / "survey.csv")
+    _write_places(output / "survey.csv", scene.surveyed(scene.landmarks), sigma=scene.survey_sigma)
     marks = scene.landmark_marks
     write_marks(output / "landmarks.csv", Marks(scene.landmarks.names, marks.left, marks.right))
     cameras, pairs = ([output / f"{side}.{kind}.json" for side in SIDES] for kind in ("camera", "pair.obs"))
@@ -54,9 +56,11 @@ def simulated_site(output: Path, seed: int) -> None:
 
     marks, targets = scene.target_marks, scene.targets
     write_marks(output / "points.csv", Marks(targets.names, marks.left, marks.right))
-    located = locate_points(output, scene.mark_sigma, truth=targets.enu)
-    noiseless = Marks(targets.names, marks.true_left, marks.true_right)
-    exact = locate_marks(output / "rig.json", noiseless, pixel_sigma=scene.mark_sigma)
+    _write_places(output / "truth.csv", targets)
+    command = locate_again(output, "--pixel-sigma", scene.mark_sigma, "--truth", output / "truth.csv")
+    rig = load_rig(output / "rig.json")
+    located = locate_points(rig, marks.left, marks.right, pixel_sigma=scene.mark_sigma, names=targets.names)
+    exact = locate_points(rig, marks.true_left, marks.true_right, pixel_sigma=scene.mark_sigma, names=targets.names)
     clock.lap("positions and maps")
     rows = truth_rows(located, exact, targets.enu)
     out.print("\nTrue against estimated positions", markup=False)
@@ -66,7 +70,6 @@ def simulated_site(output: Path, seed: int) -> None:
         "rig and its mounting. The last column is the error that the same rig makes with marks that have no noise: the "
         "calibration's share."
     )
-    command = again(output, scene.mark_sigma)
     _write_summary(output, scene, rows, command, located)
     out.print(f"Time: {clock.text()}.")
     print_results(output, command, summary=True)
@@ -101,14 +104,12 @@ def _render(scene: DemoScene, folder: Path) -> None:
             write_png(place / f"{view.name}.png", view.image.numpy())
 
 
-def _write_survey(scene: DemoScene, path: Path) -> None:
-    """Write the landmarks as a surveyor would hand them over."""
-    from kcal.files import write_atomic
-
-    surveyed = scene.surveyed(scene.landmarks)
-    lines = ["name,east,north,up,sigma"]
-    for name, place in zip(surveyed.names, surveyed.enu.tolist(), strict=True):
-        lines.append(",".join([name, *(f"{value:.3f}" for value in place), f"{scene.survey_sigma:g}"]))
+def _write_places(path: Path, points: NamedPoints, sigma: float | None = None) -> None:
+    """Write places as a surveyor hands them over, to a millimeter with a sigma, and exactly without."""
+    lines = ["name,east,north,up" if sigma is None else "name,east,north,up,sigma"]
+    for name, place in zip(points.names, points.enu.tolist(), strict=True):
+        exact = map(repr, place)
+        lines.append(",".join([name, *(exact if sigma is None else (*(f"{v:.3f}" for v in place), f"{sigma:g}"))]))
     write_atomic(path, "\n".join(lines) + "\n")
 
 

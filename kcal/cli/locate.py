@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from kcal.cli.console import out, print_table, print_wrote, steps
 from kcal.errors import DegenerateError, InputError
 from kcal.files import check_writable
-
-if TYPE_CHECKING:
-    from kcal.locate.geodesy import Origin
-    from kcal.locate.marks import Marks
-    from kcal.locate.positions import Located
 
 
 def locate_command(
@@ -113,9 +108,18 @@ def locate_command(
     `kcal locate rig.json points.csv --origin -33.9,151.2,10 --heading 250 --pitch -1.5 -o p.geojson -o p.csv
     --picture map.png`
     """
+    import math
+
+    import torch
+
+    from kcal.io.rig_file import load_rig
+    from kcal.lens.mounting import Origin
+    from kcal.lens.rig import RigCovariance
+    from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import check_format, write_positions
-    from kcal.locate.geodesy import Origin
     from kcal.locate.marks import read_marks
+    from kcal.locate.mounting import mounting_covariance
+    from kcal.locate.positions import locate_points
     from kcal.locate.truth import position_errors, read_truth
     from kcal.report.figures import check_picture
     from kcal.report.map_page import check_map_format, save_map
@@ -137,20 +141,38 @@ def locate_command(
         raise typer.BadParameter("--pitch, --roll and --grid belong to --heading; the rig file has its own attitude")
     # Parsed before the rig is read, so that a wrong option is reported first.
     place = None if origin is None else Origin.parse(origin)
-    located = locate_marks(
-        rig,
-        read_marks(points),
+    marks = read_marks(points)
+    solved = load_rig(rig)
+    calibration, link = solved.covariance, None
+    if yaw_sigma:
+        yaw = torch.zeros(6, 6, dtype=torch.float64)
+        yaw[1, 1] = math.radians(yaw_sigma) ** 2
+        more = RigCovariance.of(solved, pose=yaw)
+        calibration = more if calibration is None else RigCovariance(matrix=calibration.matrix + more.matrix)
+    mounting = mounting_covariance(origin_m=[origin_sigma] * 3, attitude_deg=(0.0, 0.0, heading_sigma))
+    if place is None or heading is None:
+        stored = solved.mounting
+        if stored is None:
+            raise InputError(f"{rig}: the file has no position of the rig; give --origin and --heading")
+        mounting = mounting if stored.covariance is None else mounting + stored.covariance
+        link = stored.link
+    elif grid is not None:
+        heading = true_from_grid(heading, place, grid)
+    located = locate_points(
+        solved,
+        marks.left,
+        marks.right,
         origin=place,
-        heading=heading,
-        pitch=pitch,
-        roll=roll,
-        grid=grid,
+        heading_deg=heading,
+        pitch_deg=pitch,
+        roll_deg=roll,
         pixel_sigma=pixel_sigma,
-        yaw_sigma=yaw_sigma,
-        heading_sigma=heading_sigma,
-        origin_sigma=origin_sigma,
+        names=marks.names,
+        calibration=calibration,
+        mounting=mounting if bool(mounting.any()) else None,
+        link=link,
         refraction=refraction,
-        geoid=geoid,
+        geoid=find_geoid(geoid),
     )
     true = None if truth is None else read_truth(truth, located)
     written = [*outputs, *(path for path in (picture, web_map) if path is not None)]
@@ -174,64 +196,3 @@ def locate_command(
     print_wrote(*written)
     if located.count == 0:
         raise DegenerateError(f"{points}: none of the {len(located.positions)} pairs could be located; see the table")
-
-
-def locate_marks(
-    rig: Path,
-    marks: Marks,
-    *,
-    origin: Origin | None = None,
-    heading: float | None = None,
-    pitch: float = 0.0,
-    roll: float = 0.0,
-    grid: str | None = None,
-    pixel_sigma: float,
-    yaw_sigma: float = 0.0,
-    heading_sigma: float = 0.0,
-    origin_sigma: float = 0.0,
-    refraction: float = 0.0,
-    geoid: Path | None = None,
-) -> Located:
-    """Locate marks with a rig file and all errors that it contains; arguments are the command's options."""
-    import math
-
-    import torch
-
-    from kcal.io.rig_file import load_rig
-    from kcal.lens.rig import RigCovariance
-    from kcal.locate.datum import find_geoid, true_from_grid
-    from kcal.locate.mounting import mounting_covariance
-    from kcal.locate.positions import locate_points
-
-    solved = load_rig(rig)
-    calibration, link = solved.covariance, None
-    if yaw_sigma:
-        yaw = torch.zeros(6, 6, dtype=torch.float64)
-        yaw[1, 1] = math.radians(yaw_sigma) ** 2
-        more = RigCovariance.of(solved, pose=yaw)
-        calibration = more if calibration is None else RigCovariance(matrix=calibration.matrix + more.matrix)
-    standing = mounting_covariance(origin_m=[origin_sigma] * 3, attitude_deg=(0.0, 0.0, heading_sigma))
-    if origin is None or heading is None:
-        stored = solved.mounting
-        if stored is None:
-            raise InputError(f"{rig}: the file has no position of the rig; give --origin and --heading")
-        standing = standing if stored.covariance is None else standing + stored.covariance
-        link = stored.link
-    elif grid is not None:
-        heading = true_from_grid(heading, origin, grid)
-    return locate_points(
-        solved,
-        marks.left,
-        marks.right,
-        origin=origin,
-        heading_deg=heading,
-        pitch_deg=pitch,
-        roll_deg=roll,
-        pixel_sigma=pixel_sigma,
-        names=marks.names,
-        calibration=calibration,
-        mounting=standing if bool(standing.any()) else None,
-        link=link,
-        refraction=refraction,
-        geoid=find_geoid(geoid),
-    )

@@ -56,7 +56,7 @@ def local_tiles(folder: str | Path, view: Box) -> dict[str, Any]:
             data = base64.b64encode(path.read_bytes()).decode()
             images[f"{zoom}/{path.parent.name}/{path.stem}"] = f"data:{_KINDS[path.suffix.lower()]};base64,{data}"
     if not images:
-        raise FileError(f"{folder}: no tile zoom/x/y.png shows this area")
+        raise FileError(f"{folder}: no tile zoom/x/y.png shows this place")
     return {"images": images, "zooms": [used[0], used[-1]], "name": folder.name}
 
 

@@ -18,7 +18,7 @@ from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 
 INK, GRAY, FAINT, ACCENT, WARN = "#111827", "#4b5563", "#9aa3af", "#2b6cb0", "#c02a6b"
-CAMERAS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
+CAMERA_COLORS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
 # White around text that lies on lines.
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 

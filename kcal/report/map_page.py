@@ -23,7 +23,7 @@ from kcal.locate.positions import Located, Position
 from kcal.locate.region import near, region_rings
 from kcal.locate.stereo import PositionStatus
 from kcal.report.backdrop import local_image, local_tiles
-from kcal.report.figures import CAMERAS, range_text
+from kcal.report.figures import CAMERA_COLORS, range_text
 
 ARCS_M = (250.0, 1000.0, 5000.0)
 _ONLINE = {
@@ -145,7 +145,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
     ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
     reach = 1.15 * max([*ranges, 300.0])
     cameras, edges = [], []
-    for view, color, side in zip(located.cameras, CAMERAS, _label_sides(located), strict=False):
+    for view, color, side in zip(located.cameras, CAMERA_COLORS, _label_sides(located), strict=False):
         outline = None
         if view.azimuths_deg is not None:
             first, last = view.azimuths_deg

@@ -15,7 +15,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.locate.positions import Located, Position
 from kcal.locate.stereo import PositionStatus
-from kcal.report.figures import CAMERAS, FAINT, GRAY, HALO, INK, WARN, new_figure, range_text, save_png
+from kcal.report.figures import CAMERA_COLORS, FAINT, GRAY, HALO, INK, WARN, new_figure, range_text, save_png
 
 Array = NDArray[np.float64]
 
@@ -138,7 +138,7 @@ def _draw_map(axes: Axes, located: Located, true_enu: Array | None, shown: list[
             place[0], place[1], range_text(arc), fontsize=8.5, color=GRAY, rotation=turn, rotation_mode="anchor",
             ha="left" if outward else "right", va="center",
         )  # fmt: skip
-    for camera, color in zip(located.cameras, CAMERAS, strict=False):
+    for camera, color in zip(located.cameras, CAMERA_COLORS, strict=False):
         foot = np.asarray(camera.enu[:2])
         if camera.azimuths_deg is not None:
             first, last = camera.azimuths_deg

@@ -19,7 +19,7 @@ _LONGEST_STEP = 0.2  # change of a slope in one step
 _AIM_GOAL, _AIM_ERROR = 1e-8, 1e-6  # pixels
 
 
-class SightLines(NamedTuple):
+class LinesOfSight(NamedTuple):
     """The line of sight of each pixel: the points (x, y) + z (slope_x, slope_y) at every depth z.
 
     Attributes:
@@ -90,7 +90,7 @@ class ChiefRays:
             name=prescription.name,
         )
 
-    def lines(self, pixels: Tensor) -> SightLines:
+    def lines(self, pixels: Tensor) -> LinesOfSight:
         """Find the lines of sight of pixels (N, 2), in front of the lens.
 
         The chief ray that lands on a pixel is found by Newton's method in its slopes at the stop; from there it is
@@ -125,7 +125,7 @@ class ChiefRays:
         # Light travels along +z, but the camera looks along -z: mirroring changes nothing in a lens.
         points = rays.points * rays.points.new_tensor([1.0, 1.0, -1.0])
         slopes = -rays.directions[:, :2] / rays.directions[:, 2:]
-        return SightLines(points[:, :2] - points[:, 2:] * slopes, slopes)
+        return LinesOfSight(points[:, :2] - points[:, 2:] * slopes, slopes)
 
     def land(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (N, 2) of the chief rays that leave the stop with slopes (N, 2), and whether they get there."""

@@ -17,7 +17,7 @@ from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardLike, BoardPose, LensLike, RigLike, board_points
 
-_DRAWS = 4096
+_POSE_DRAWS = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,8 +145,8 @@ def rig_pose(rig: RigLike, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
 
 
 def _check_draws(count: int, name: str, limits: tuple[float, float]) -> None:
-    if not isinstance(count, int) or not 1 <= count <= _DRAWS:
-        raise InputError(f"count: a whole number from 1 to {_DRAWS} is needed, got {count!r}")
+    if not isinstance(count, int) or not 1 <= count <= _POSE_DRAWS:
+        raise InputError(f"count: a whole number from 1 to {_POSE_DRAWS} is needed, got {count!r}")
     if not 0 < limits[0] <= limits[1] < math.inf:
         raise InputError(f"{name} {limits}: two positive numbers are needed, the smaller first")
 
@@ -168,7 +168,7 @@ def _draw(
     generator: torch.Generator,
     options: PoseOptions,
 ) -> _Drawn:
-    random = torch.rand((_DRAWS, 6), dtype=torch.float64, generator=generator)
+    random = torch.rand((_POSE_DRAWS, 6), dtype=torch.float64, generator=generator)
     with torch.no_grad():
         aim = random[:, :2] * torch.tensor(camera.size, dtype=torch.float64) - 0.5
         # A pixel without a ray gives the optical axis: one more board in the middle.
@@ -201,14 +201,14 @@ def _choose(
     points = board_points(board, options.border)
     columns = board.columns + 2 * options.border
     # Most draws end here: the outermost four points are a few percent of the work.
-    seen, _ = _see(drawn, torch.arange(_DRAWS), cameras, points[[0, columns - 1, -columns, -1]], options)
+    seen, _ = _see(drawn, torch.arange(_POSE_DRAWS), cameras, points[[0, columns - 1, -columns, -1]], options)
     index = seen.nonzero()[:, 0]
     whole, places = _see(drawn, index, cameras, points, options)
     index, places = index[whole], places[whole]
     found = len(index)
     if found < count:
         raise InputError(
-            f"only {found} of {_DRAWS} drawn boards are completely seen and {count} are needed; "
+            f"only {found} of {_POSE_DRAWS} drawn boards are completely seen and {count} are needed; "
             "use a smaller board, another distance, less tilt or a smaller margin"
         )
     rotation, translation = drawn.rotation[index], drawn.translation[index]

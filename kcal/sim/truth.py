@@ -18,7 +18,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.sim.chebyshev import tabulate
-from kcal.sim.chief import ChiefRays, SightLines, solve_2x2
+from kcal.sim.chief import ChiefRays, LinesOfSight, solve_2x2
 from kcal.sim.prescription import PRESCRIPTIONS, Prescription
 from kcal.sim.raytrace import Misalignment
 from kcal.sim.rectangle import PixelRectangle
@@ -137,16 +137,16 @@ class TruthLens:
         pixels = as_points("pixels", pixels, 2)
         return ((pixels >= self.low) & (pixels <= self.high)).all(-1)
 
-    def trace(self, pixels: Tensor) -> SightLines:
+    def trace(self, pixels: Tensor) -> LinesOfSight:
         """Trace the lines of sight of pixels (N, 2) without the table; raise `InputError` where there are none."""
         lines = self._chief.lines(pixels)
         at = lines.origins + self._origin[2] * lines.slopes - self._origin[:2]
-        return SightLines(self._wander * at, lines.slopes)
+        return LinesOfSight(self._wander * at, lines.slopes)
 
-    def lines(self, pixels: Tensor) -> SightLines:
+    def lines(self, pixels: Tensor) -> LinesOfSight:
         """Read the lines of sight of pixels (N, 2) that the lens covers from the table."""
         values = torch.cat([self._table.values(part) for part in pixels.split(_POINTS_AT_ONCE)])
-        return SightLines(values[:, :2], values[:, 2:])
+        return LinesOfSight(values[:, :2], values[:, 2:])
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the directions of pixels (..., N, 2) at infinity: unit rays (..., N, 3), valid (..., N).

@@ -120,18 +120,18 @@ def run_tasks(tasks: Iterable[Task], done: Done, workers: Pool) -> None:
             if isinstance(future.exception(), BrokenExecutor):
                 casualties.append(task)
             else:
-                added.extend(done(task, _result_or_error(future)))
+                added.extend(done(task, _result_of(future)))
         if casualties and not pending:
             workers.restart()
             for task in casualties:
-                outcome = _result_or_error(workers.submit(task))
+                outcome = _result_of(workers.submit(task))
                 if isinstance(outcome, WorkerDiedError):
                     workers.restart()
                 added.extend(done(task, outcome))
             casualties.clear()
 
 
-def _result_or_error(future: Future[Any]) -> Any:
+def _result_of(future: Future[Any]) -> Any:
     """The result, or the exception instead of raising it."""
     error = future.exception()
     if error is None:

@@ -9,7 +9,7 @@ from calibrate_scenes import camera, motions, observe, pixels_of
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.outliers import OutlierRejection
-from kcal.io.camera_file import CameraFile
+from kcal.io.camera_file import CameraFile, load_camera, save_camera
 
 
 def test_all_that_is_known_is_in_the_file(tmp_path: Path) -> None:
@@ -37,3 +37,11 @@ def test_all_that_is_known_is_in_the_file(tmp_path: Path) -> None:
     assert record.excluded == result.excluded
     assert record.excluded[0].name == f"{seen.names[2]} corner 7"
     assert record.observations == "left.obs.json"
+
+    # The camera itself carries all of it, until its parameters change.
+    carried = load_camera(save_camera(result.camera, tmp_path / "again.camera.json")).calibration
+    assert carried is not None
+    assert carried.record is not None
+    assert carried.record.excluded == result.excluded
+    assert carried.sigma is not None
+    assert carried.sigma["fx"] == result.sigma["fx"]
