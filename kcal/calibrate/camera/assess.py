@@ -102,7 +102,8 @@ def _uncertainty(
         return Uncertainty(state.parameters.new_zeros(0, 0), torch.zeros(0, dtype=torch.bool)), []
     # Barriers before folds are no information about the lens.
     known = [term for term in minimum.terms if isinstance(term, GaussianPrior)]
-    plain = solution.problem_for(observations, options.loss, known)
+    corners = observations.pixels(), observations.covariances()
+    plain = solution.problem_for(*corners, options.loss, known)
     linear, count = plain.linearize(state), plain.shared_size + 6 * len(state.translation)
     own = uncertainty_of(linear, plain.residual_count + plain.prior_count, count)
     unquestioned = options.weak_prior is not None or options.camera is not None or not minimum.rivals
@@ -111,7 +112,7 @@ def _uncertainty(
     noise = max((2.0 * float(linear.cost) / plain.residual_count) ** 0.5, LEAST_NOISE)
     start = minimum.rivals[0][1]
     prior = weak_prior_term(solution.views, start, model, noise)
-    with_prior = solution.problem_for(observations, options.loss, [*known, prior])
+    with_prior = solution.problem_for(*corners, options.loss, [*known, prior])
     comparison = compare_with_prior(solution.views, with_prior, plain, start, state, own)
     if comparison is None:
         return own, []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from kcal.calibrate.bundle.batching import minimize
@@ -77,7 +79,7 @@ def first_model(
     return best[1], best[2], spent
 
 
-def poses_under(camera: Camera, views: CameraViews, names: tuple[str, ...]) -> BoardState:
+def poses_under(camera: Camera, views: CameraViews, names: Sequence[str]) -> BoardState:
     """Board poses under a known camera, refined one by one, with both tilts of each tried."""
     seen = torch.isfinite(views.pixels).all(-1)
     camera = Camera(camera.params.detach().double().cpu(), size=camera.size, model=camera.model)

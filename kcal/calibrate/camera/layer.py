@@ -15,7 +15,7 @@ from kcal.calibrate.bundle.priors import GaussianPrior, Term
 from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.camera.exact_minimum import exact_minimum
 from kcal.calibrate.camera.options import CalibrationOptions
-from kcal.calibrate.camera.solve import solve
+from kcal.calibrate.camera.solve import solve_corners
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -73,30 +73,6 @@ class CalibratedViews:
         """As a state of `BoardProblem`, out of the graph."""
         pose = self.cam_from_board_rotation, self.cam_from_board_translation
         return map_state(torch.detach, BoardState(self.parameters, self.board_warp, *pose))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Board:
-    points: Tensor
-
-
-@dataclasses.dataclass(frozen=True)
-class _Corners:
-    """What `kcal.calibrate.camera.solve.solve` needs of observations."""
-
-    board: _Board
-    image_size: tuple[int, int]
-    corners: Tensor
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(f"view {i}" for i in range(len(self.corners)))
-
-    def pixels(self) -> Tensor:
-        return self.corners
-
-    def covariances(self) -> Tensor | None:
-        return None
 
 
 def calibrate_views(
@@ -174,9 +150,9 @@ def calibrate_views(
     data = (pixels, board_points, means)
     fixed = tuple(tensor.detach() for tensor in data)
     if start is None:
-        corners = _Corners(_Board(fixed[1]), size, fixed[0])
         priors = {n: (float(m), s) for (n, (_, s)), m in zip(options.priors.items(), fixed[2], strict=True)}
-        begin = solve(corners, dataclasses.replace(options, priors=priors), lambda _: None).result.state
+        changed = dataclasses.replace(options, priors=priors)
+        begin = solve_corners(fixed[1], fixed[0], size, changed, lambda _: None).result.state
         reach = Views(board_points=fixed[1], pixels=fixed[0]).observed_radius(begin)
     else:
         begin, reach = start.state(), start.reach

@@ -120,7 +120,7 @@ def solve_without_outliers(
 
 def _rejected_corners(every: Observations, solution: Solution, rejected: Tensor) -> tuple[RejectedCorner, ...]:
     """Rejected corners (V, N), with their residuals at a solution without them."""
-    problem, state = solution.problem_for(every), solution.result.state
+    problem, state = solution.problem_for(every.pixels(), every.covariances()), solution.result.state
     plain = problem.pixel_errors(state).norm(dim=-2)
     weighted = problem.corner_residuals(state, weighted=True)
     limits = corner_limits(torch.where(rejected[..., None], torch.nan, weighted))
@@ -143,14 +143,14 @@ def _robust_residuals(observations: Observations, solution: Solution) -> tuple[T
     Infinite where the lens does not reach a corner at all.
     """
     state, spent = solution.result.state, 0
-    whole = solution.problem_for(observations)
+    whole = solution.problem_for(observations.pixels(), observations.covariances())
     for _ in range(_CAUCHY_ROUNDS):
         residuals = whole.corner_residuals(state, weighted=True)
         reached = torch.isfinite(residuals).all(-1)
         some = without(observations, range(len(observations.views)), whole.seen & ~reached)
         scale = max(_CAUCHY_SCALE * float(noise_scale(residuals.flatten(0, 1))), LEAST_NOISE)
         loss = RobustLoss(kind="cauchy", scale=scale)
-        result = minimize(solution.problem_for(some, loss), state, _ROUGH)
+        result = minimize(solution.problem_for(some.pixels(), some.covariances(), loss), state, _ROUGH)
         spent += int(result.iterations)
         if result.status == SolverStatus.BAD_START:
             break

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -21,6 +20,7 @@ from kcal.calibrate.camera.initial_model import first_model, poses_under
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.search.direct_solve import solve_directly
 from kcal.calibrate.search.model_ladder import Minimum, Progress, nested_models, solve_ladder
+from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
@@ -38,42 +38,6 @@ _PRIOR_ROUNDS, _SAME = 5, 1e-4
 _NEAR_DAMPING = 1e-8
 # For a first model from which the last one is reached directly.
 _ROUGH = LMOptions(max_iterations=100, tolerance=1e-5)
-
-
-class BoardPoints(Protocol):
-    """A board: where its corners lie."""
-
-    @property
-    def points(self) -> Tensor:
-        """(N, 3) meters."""
-        ...
-
-
-class Corners(Protocol):
-    """What is calibrated from: `kcal.corners.observations.Observations`, or tensors."""
-
-    @property
-    def board(self) -> BoardPoints:
-        """The board that was shown."""
-        ...
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """(width, height) pixels."""
-        ...
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the views."""
-        ...
-
-    def pixels(self) -> Tensor:
-        """(V, N, 2), NaN where not seen."""
-        ...
-
-    def covariances(self) -> Tensor | None:
-        """(V, N, 2, 2) px², or None."""
-        ...
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -99,38 +63,57 @@ class Solution:
     variance: float | None
 
     def problem_for(
-        self, corners: Corners, loss: RobustLoss | None = None, terms: Sequence[Term] | None = None
+        self,
+        pixels: Tensor,
+        covariances: Tensor | None,
+        loss: RobustLoss | None = None,
+        terms: Sequence[Term] | None = None,
     ) -> BoardProblem:
         """The problem of any corners of this camera, with their weights and by default with this solution's terms."""
-        covariances = None if self.variance is None else corners.covariances()
         weights = None if covariances is None or self.variance is None else whitening(covariances, self.variance)
-        views = dataclasses.replace(self.views, pixels=corners.pixels(), whitening=weights, loss=loss)
+        views = dataclasses.replace(self.views, pixels=pixels, whitening=weights, loss=loss)
         return views.problem(
             self.problem.model, self.problem.free, terms=self.minimum.terms if terms is None else terms
         )
 
 
-def solve(observations: Corners, options: CalibrationOptions, progress: Progress) -> Solution:
+def solve(observations: Observations, options: CalibrationOptions, progress: Progress) -> Solution:
     """Find the minimum for all corners given, as `calibrate_camera` describes it and with its errors."""
-    model, solver = options.lens, options.solver
-    views = CameraViews(
-        board_points=observations.board.points,
-        pixels=observations.pixels(),
-        free_warp=options.board_warp,
-        size=observations.image_size,
-        constraints=options.constraints(observations.image_size),
+    return solve_corners(
+        observations.board.points,
+        observations.pixels(),
+        observations.image_size,
+        options,
+        progress,
+        covariances=observations.covariances(),
+        names=observations.names,
     )
-    unknowns = len(views.constraints.free_parameters(model)) + 2 * options.board_warp
-    _check(views, observations.names, unknowns, _MINIMUM_VIEWS if options.camera is None else 1)
+
+
+def solve_corners(
+    board_points: Tensor,
+    pixels: Tensor,
+    size: tuple[int, int],
+    options: CalibrationOptions,
+    progress: Progress,
+    covariances: Tensor | None = None,
+    names: Sequence[str] = (),
+) -> Solution:
+    """As `solve`, for tensors: board points (N, 3), pixels (V, N, 2), covariances (V, N, 2, 2), names of the views."""
+    model, solver = options.lens, options.solver
+    names = names or [f"view {i}" for i in range(len(pixels))]
+    constraints, warp = options.constraints(size), options.board_warp
+    views = CameraViews(board_points=board_points, pixels=pixels, free_warp=warp, size=size, constraints=constraints)
+    _check(views, names, len(constraints.free_parameters(model)), _MINIMUM_VIEWS if options.camera is None else 1)
 
     weak_prior = options.weak_prior if options.camera is None and is_overparameterized(model) else None
     if options.camera is None:
-        models = [lens for lens in nested_models(model) if views.constraints.allows(lens)]
+        models = [lens for lens in nested_models(model) if constraints.allows(lens)]
         rough = _ROUGH if weak_prior is not None and len(models) > 1 else solver
-        first, undistorted, spent = first_model(views, models[0], options.start_focal(views.size), rough)
+        first, undistorted, spent = first_model(views, models[0], options.start_focal(size), rough)
     else:
         models = [model]
-        first = undistorted = poses_under(options.camera, views, observations.names)
+        first = undistorted = poses_under(options.camera, views, names)
         spent = 0
     progress(f"start ({models[0]})")
     if weak_prior is not None:
@@ -162,7 +145,7 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
         problem = views.lens_problem(model, terms=minimum.terms)
         rivals = tuple((float(views.lens_problem(model).cost(state)), state) for _, state in minimum.rivals)
         minimum = dataclasses.replace(minimum, rivals=rivals, terms=problem.terms)
-    covariances = observations.covariances() if options.weighted else None
+    covariances = covariances if options.weighted else None
     solution = Solution(
         views=views,
         problem=problem,
@@ -175,7 +158,7 @@ def solve(observations: Corners, options: CalibrationOptions, progress: Progress
     )
     if covariances is None and options.loss is None:
         return solution
-    problem = solution.problem_for(observations, options.loss)
+    problem = solution.problem_for(pixels, covariances, options.loss)
     result = minimize(problem, result.state, solver)
     return dataclasses.replace(solution, problem=problem, result=result, spent=spent + int(result.iterations))
 
@@ -202,7 +185,7 @@ def _reweight_priors(
     return views, result, spent
 
 
-def _check(views: CameraViews, names: Sequence[str], shared: int, fewest: int) -> None:
+def _check(views: CameraViews, names: Sequence[str], parameters: int, fewest: int) -> None:
     """Raise where there are too few views or corners, or where a view does not determine a pose."""
     pixels = views.pixels
     seen = torch.isfinite(pixels).all(-1).sum(-1)
@@ -227,7 +210,7 @@ def _check(views: CameraViews, names: Sequence[str], shared: int, fewest: int) -
     thin = (width < _MINIMUM_WIDTH).nonzero()[:, 0].tolist()
     if thin:
         raise InputError(f"view {names[thin[0]]!r}: its corners coincide or the board is seen edge-on; remove the view")
-    unknowns = shared + 6 * len(pixels)
+    unknowns = parameters + 2 * views.free_warp + 6 * len(pixels)
     if 2 * int(seen.sum()) <= unknowns:
         raise DegenerateError(
             f"{int(seen.sum())} corners cannot determine {unknowns} parameters: add views or choose a smaller model"
