@@ -62,7 +62,11 @@ def assert_the_printed_command_gives_the_same(run: Run, text: str) -> None:
     command = shlex.split(text.split("Locate again by hand:")[1])
     assert command[:2] == ["kcal", "locate"]
     assert run(*command[1:])[0] == 0
-    assert json.loads(Path("again.geojson").read_text()) == json.loads(Path("out", "points.geojson").read_text())
+    again, first = (json.loads(Path(name).read_text()) for name in ("again.geojson", "out/points.geojson"))
+    assert len(again["features"]) == len(first["features"]) > 0
+    for one, other in zip(again["features"], first["features"], strict=True):
+        # Where memory lies decides the order of sums, and with it the last digits.
+        assert one["properties"] == pytest.approx(other["properties"], rel=1e-6)
 
 
 class TestRealImages:
