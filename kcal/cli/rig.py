@@ -29,7 +29,7 @@ class _RigGroup(TyperGroup):
 app = typer.Typer(cls=_RigGroup, rich_markup_mode="markdown", help="Solve a rig, and check it later.")
 
 
-def solve(
+def solve_command(
     left: Annotated[Path, typer.Argument(help="Camera file of the left camera.")],
     right: Annotated[Path, typer.Argument(help="Camera file of the right camera.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write.")],
@@ -193,5 +193,5 @@ def print_rig(result: RigResult, lines: list[str]) -> None:
         err.print("[yellow]warning:[/]", text)
 
 
-app.command("solve", hidden=True)(solve)
+app.command("solve", hidden=True)(solve_command)
 app.command("check")(check)

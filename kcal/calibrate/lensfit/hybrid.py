@@ -138,7 +138,7 @@ def calibrate_hybrid(
     kept = converged is not None and (wins or not options.gate)
     corners = views.corner_count
     if converged is not None and kept:
-        calibration = _result(views, observations, base, converged)
+        calibration = _hybrid_calibration(views, observations, base, converged)
     else:
         model = base.model if rival is None else LensModel.named(rival.name)
         calibration = assess(observations, solutions[model], options.parametric(model))
@@ -193,7 +193,7 @@ def _reason(base: FieldFit, rival: Contender | None, wins: bool, converged: bool
     return f"better than a parametric model, {sure}: {found}"
 
 
-def _result(
+def _hybrid_calibration(
     views: Views, observations: Observations, base: FieldFit, converged: ConvergedField
 ) -> CameraCalibrationResult:
     field, covariance = converged.field, field_covariance(base, converged.forms)

@@ -111,7 +111,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
         if abs(work.sigma_corner / before - 1.0) < 1e-3:
             break
     _, found = work.solve(masks, options.solver)
-    return _result(work, found, masks, reasons, initial, warnings)
+    return _rig_result(work, found, masks, reasons, initial, warnings)
 
 
 def _without_rayless(data: RigData) -> tuple[RigData, list[str]]:
@@ -202,7 +202,7 @@ def _suspicions(work: Adjustment, masks: PerKind, reasons: Reasons, solver: LMOp
     ]
 
 
-def _result(
+def _rig_result(
     work: Adjustment, found: Result, masks: PerKind, reasons: Reasons, initial: InitialPoses, warnings: list[str]
 ) -> RigResult:
     data, state, problem = work.data, work.part(masks), work.problem(masks)

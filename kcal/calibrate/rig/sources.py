@@ -25,7 +25,7 @@ def _positive(name: str, value: float) -> None:
         raise InputError(f"{name}: a positive number is needed, got {value}")
 
 
-def _marked(kind: str, names: tuple[str, ...], pixels: Tensor) -> None:
+def _check_marks(kind: str, names: tuple[str, ...], pixels: Tensor) -> None:
     """Refuse marks that are not one in each camera for each name."""
     count = len(names)
     if pixels.ndim != 3 or pixels.shape[::2] != (count, 2):
@@ -105,7 +105,7 @@ class Landmarks:
                 f"landmarks: points and sigma ({count}, 3) are needed, got {tuple(self.points.shape)} and "
                 f"{tuple(self.sigma.shape)}"
             )
-        _marked("landmarks", self.names, self.pixels)
+        _check_marks("landmarks", self.names, self.pixels)
         require_finite("landmarks: points", as_points("landmarks: points", self.points, 3))
         if not bool((torch.isfinite(self.sigma) & (self.sigma > 0)).all()):
             raise InputError("landmarks: every sigma must be a positive number of meters; nothing is surveyed exactly")
@@ -136,7 +136,7 @@ class Features:
 
     def __post_init__(self) -> None:
         count = len(self.names)
-        _marked("features", self.names, self.pixels)
+        _check_marks("features", self.names, self.pixels)
         if self.inverse_range.shape != (count,) or self.inverse_range_sigma.shape != (count,):
             raise InputError(f"features: inverse_range and its sigma ({count},) are needed")
         if not bool((torch.isfinite(self.inverse_range) & (self.inverse_range_sigma > 0)).all()):
