@@ -32,7 +32,8 @@ def real_pairs(
         camera, picture = output / f"{side}.camera.json", output / f"{side}.png"
         run("calibrate", output / f"{side}.obs.json", "-o", camera, "--picture", picture)
     cameras, seen = ([output / f"{side}.{kind}.json" for side in SIDES] for kind in ("camera", "obs"))
-    run("rig", *cameras, "--pairs", *seen, "-o", output / "rig.json")
+    # Few pairs: none is left out, so that each board can be compared.
+    run("rig", *cameras, "--pairs", *seen, "--keep-all", "-o", output / "rig.json")
 
     write_marks(output / "points.csv", _board_ends(output, board))
     where = origin or Origin(lat=0.0, lon=0.0, height=0.0)
