@@ -6,24 +6,24 @@ from kcal.calibrate.camera.calibrate import calibrate_cameras as calibrate_camer
 from kcal.calibrate.camera.layer import CalibratedViews as CalibratedViews
 from kcal.calibrate.camera.layer import CalibrationLayer as CalibrationLayer
 from kcal.calibrate.camera.options import CalibrationOptions as CalibrationOptions
-from kcal.calibrate.camera.options import CameraCalibrationResult as CameraCalibrationResult
-from kcal.calibrate.camera.outliers import OutlierRejection as OutlierRejection
-from kcal.calibrate.camera.outliers import RejectedCorner as RejectedCorner
-from kcal.calibrate.camera.outliers import RejectedView as RejectedView
+from kcal.calibrate.camera.options import OutlierRejection as OutlierRejection
+from kcal.calibrate.camera.result import CameraCalibrationResult as CameraCalibrationResult
+from kcal.calibrate.camera.result import RejectedCorner as RejectedCorner
+from kcal.calibrate.camera.result import RejectedView as RejectedView
 from kcal.calibrate.lensfit.hybrid import calibrate_hybrid as calibrate_hybrid
 from kcal.calibrate.lensfit.options import HybridOptions as HybridOptions
 from kcal.calibrate.lensfit.options import HybridResult as HybridResult
 from kcal.calibrate.rig.drift import Drift as Drift
 from kcal.calibrate.rig.drift import measure_drift as measure_drift
-from kcal.calibrate.rig.from_boards import RigCalibrationResult as RigCalibrationResult
-from kcal.calibrate.rig.from_boards import RigOptions as RigOptions
 from kcal.calibrate.rig.from_boards import calibrate_rig as calibrate_rig
+from kcal.calibrate.rig.initial_poses import TurnedBoard as TurnedBoard
 from kcal.calibrate.rig.pairs import pair_by_name as pair_by_name
+from kcal.calibrate.rig.pairs import paired_boards as paired_boards
 from kcal.calibrate.rig.pairs import read_pairs as read_pairs
 from kcal.calibrate.rig.result import ItemResidual as ItemResidual
-from kcal.calibrate.rig.result import RigSolution as RigSolution
+from kcal.calibrate.rig.result import RigResult as RigResult
 from kcal.calibrate.rig.result import SourceResidual as SourceResidual
-from kcal.calibrate.rig.solve import JointOptions as JointOptions
+from kcal.calibrate.rig.solve import RigOptions as RigOptions
 from kcal.calibrate.rig.solve import solve_rig as solve_rig
 from kcal.calibrate.rig.sources import Baseline as Baseline
 from kcal.calibrate.rig.sources import Boards as Boards
@@ -115,6 +115,8 @@ from kcal.locate.positions import Located as Located
 from kcal.locate.positions import Position as Position
 from kcal.locate.positions import Viewpoint as Viewpoint
 from kcal.locate.positions import locate_points as locate_points
+from kcal.locate.relock import check_rig as check_rig
+from kcal.locate.relock import relocked as relocked
 from kcal.locate.stereo import PositionStatus as PositionStatus
 from kcal.locate.survey import MarkedLandmarks as MarkedLandmarks
 from kcal.locate.survey import Survey as Survey
@@ -139,7 +141,7 @@ from kcal.report.positions import save_positions_picture as save_positions_pictu
 from kcal.report.rig import save_rig_picture as save_rig_picture
 from kcal.solve.lm import LevenbergMarquardt as LevenbergMarquardt
 from kcal.solve.lm import LMOptions as LMOptions
-from kcal.solve.result import Status as Status
+from kcal.solve.result import SolverStatus as SolverStatus
 from kcal.solve.robust import RobustLoss as RobustLoss
 
 __version__: str

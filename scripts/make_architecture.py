@@ -32,7 +32,7 @@ LOOKS = {
     "calibrate/lensfit": (3.4, "hybrid cameras"),
     "locate": (1.0, "pixels to positions"),
     "calibrate/camera": (3.2, "one camera"),
-    "calibrate/rig": (1.9, "several cameras"),
+    "calibrate/rig": (1.0, "several cameras"),
     "calibrate/search": (3.4, "several minima"),
     "nets": (4.6, "the paper's networks"),
     "sim": (0.0, "simulated truth"),

@@ -7,6 +7,7 @@ Everything comes from kcal's own commands: `kcal board` and `kcal demo`.
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import subprocess
 import sys
@@ -29,6 +30,7 @@ def kcal(*arguments: str) -> None:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     boards = ASSETS / "boards"
     boards.mkdir(parents=True, exist_ok=True)
     for size, square, page in BOARDS:

@@ -17,6 +17,7 @@ FLOORS = {
     "report": 8,
     "nets": 7,
     "locate": 7,
+    "calibrate/batch": 6,
     "calibrate/lensfit": 6,
     "calibrate/camera": 5,
     "calibrate/rig": 5,
@@ -130,6 +131,28 @@ def test_no_module_imports_itself_through_others() -> None:
         for path in MODULES
     }
     assert circle(graph) == []
+
+
+# The same thing at two places: one minimization, and one of a batch.
+SHARED_NAMES = {"minimize"}
+
+
+def defined_twice(sources: dict[str, str]) -> dict[str, list[str]]:
+    """Functions and classes at the top of a module whose name another module defines too."""
+    homes: dict[str, list[str]] = {}
+    for module, source in sources.items():
+        for node in ast.parse(source).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name not in SHARED_NAMES:
+                homes.setdefault(node.name, []).append(module)
+    return {name: modules for name, modules in homes.items() if len(modules) > 1}
+
+
+def test_a_name_means_one_thing() -> None:
+    assert defined_twice({name_of(path): path.read_text(encoding="utf-8") for path in MODULES}) == {}
+
+
+def test_a_planted_second_meaning_is_seen() -> None:
+    assert defined_twice({"a": "def f(): ...", "b": "class f: ...", "c": "g = 1"}) == {"f": ["a", "b"]}
 
 
 def test_a_planted_circle_is_seen() -> None:

@@ -77,8 +77,7 @@ def test_from_images_to_positions(images: Path, tmp_path: Path) -> None:
     # Cameras to a rig; where it stands is measured.
     pairs = kcal.pair_by_name(seen["left"].names, seen["right"].names)
     solved = kcal.calibrate_rig(cameras["left"], cameras["right"], seen["left"], seen["right"], pairs)
-    rig = solved.rig
-    rig.covariance = kcal.RigCovariance.of(rig, joint=solved.covariance)
+    rig = solved.stereo()
     rig.mounting = kcal.Mounting(
         origin=ORIGIN, heading_deg=35.0, covariance=kcal.mounting_covariance(origin_m=[0.02] * 3)
     )

@@ -7,24 +7,26 @@ from typing import Annotated
 
 import typer
 
-from kcal.cli.console import out
+from kcal.cli.console import out, print_wrote
 from kcal.files import check_writable
 
 
-def bake(
+def bake_command(
     camera: Annotated[Path, typer.Argument(help="Camera file from `kcal calibrate`.", show_default=False)],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="FILE", help="File to write, .npz; beside the camera if not given."),
+        typer.Option(
+            "-o", "--output", metavar="FILE", help="File to write, .npz; beside the camera file if not given."
+        ),
     ] = None,
     tolerance: Annotated[
-        float, typer.Option("--tolerance", min=1e-8, help="Largest error in pixels, in both directions.")
+        float, typer.Option("--tolerance", min=1e-8, help="Largest allowed error in pixels, in both directions.")
     ] = 1e-3,
 ) -> None:
-    """Turn a camera into lookup tables, for programs that know no lens formulas.
+    """Turn a camera into lookup tables, for programs without lens models.
 
-    Writes one .npz file with two bicubic tables, pixels to rays and rays to pixels, the coarsest that keep the
-    tolerance. What the arrays mean, and how to read them with numpy alone, is written in `kcal/io/lookup_file.py`.
+    Writes one .npz file with two bicubic tables, pixels to rays and rays to pixels, as coarse as the tolerance allows.
+    `kcal/io/lookup_file.py` explains the arrays and how to read them with numpy alone.
 
     **Example**
 
@@ -35,9 +37,9 @@ def bake(
 
     from kcal.io.camera_file import load_camera
     from kcal.io.lookup_file import save_lookup
-    from kcal.lens.bake import bake as bake_camera
+    from kcal.lens.bake import bake
 
-    lookup = bake_camera(load_camera(camera), tolerance)
+    lookup = bake(load_camera(camera), tolerance)
     save_lookup(lookup, path)
     for which, table, bound, coverage in zip(
         ("pixels to rays", "rays to pixels"),
@@ -49,4 +51,4 @@ def bake(
         rows, columns = table.cells.shape
         lost = "" if coverage == 1.0 else f"; answers for {coverage:.1%} of the image's valid pixels"
         out.print(f"{which}: {columns} x {rows} cells, error at most {bound:.1e} px{lost}")
-    out.print(f"wrote {path}", markup=False)
+    print_wrote(path)

@@ -1,21 +1,21 @@
-"""`kcal batch`: many cameras at once, in parallel, begun again where it stopped."""
+"""`kcal batch`: many cameras at once, in parallel, continued after an interruption."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.console import err, out, steps
+from kcal.cli.console import err, out, print_table, print_wrote, steps
 from kcal.cli.detect import Refine
+from kcal.errors import DegenerateError, InputError
 
 if TYPE_CHECKING:
-    from kcal.cli.batch_results import Row
+    from kcal.calibrate.batch.results import SummaryRow
 
 
-def batch(
+def batch_command(
     cameras: Annotated[
         Path,
         typer.Argument(
@@ -24,12 +24,13 @@ def batch(
             show_default=False,
         ),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results; made if missing.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results; made if it is missing.")],
     size: Annotated[
         str | None, typer.Option("--board", metavar="CxR", help="Inner corners, columns by rows.", show_default=False)
     ] = None,
     square: Annotated[
-        str | None, typer.Option("--square", metavar="LENGTH", help="Side of a square: 25mm.", show_default=False)
+        str | None,
+        typer.Option("--square", metavar="LENGTH", help="Side of a square with its unit: 25mm.", show_default=False),
     ] = None,
     model: Annotated[str, typer.Option(metavar="NAME", help="Lens model, see `kcal calibrate`.")] = "opencv5",
     refine: Annotated[
@@ -37,20 +38,23 @@ def batch(
     ] = Refine.erf,
     board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how each board bends.")] = False,
     workers: Annotated[
-        int, typer.Option(help="Processes on this machine; 0 for one a core.", min=0, show_default=False)
+        int,
+        typer.Option(help="Processes on this machine; one per core if not given.", min=0, show_default=False),
     ] = 0,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="A Dask scheduler whose workers see the same files: tcp://host:8786."),
+        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers see the same files: tcp://host:8786."),
     ] = None,
-    time_limit: Annotated[float, typer.Option(help="Seconds for one image or one calibration.", min=1)] = 300.0,
+    time_limit: Annotated[
+        float, typer.Option(metavar="S", help="Seconds for one image or one calibration.", min=1)
+    ] = 300.0,
 ) -> None:
     """Calibrate many cameras: images in, observations, camera files and one table out.
 
-    Writes NAME.obs.json and NAME.camera.json for each camera, and summary.csv. What is finished is kept in a folder
-    .work, named by what it was made from: the same command continues an interrupted run, and does only what is new
-    when images, options or cameras were added. A camera or an image that fails is listed with its reason and does not
-    stop the others; the exit code is then 1. Dask workers should have one thread each (--nthreads 1).
+    Writes NAME.obs.json and NAME.camera.json for each camera, and summary.csv. Finished work is kept in a folder
+    .work: the same command continues an interrupted run, and does only what is new when images, options or cameras
+    were added. A camera or an image that fails is listed with its reason and does not stop the others; the exit code
+    is then 1. Dask workers should have one thread each (--nthreads 1).
 
     **Examples**
 
@@ -60,11 +64,9 @@ def batch(
 
     `kcal batch /shared/cameras --board 9x6 --square 25mm -o /shared/results --scheduler tcp://10.0.0.1:8786`
     """
-    from kcal.cli.batch_jobs import BatchOptions, read_jobs
-    from kcal.cli.batch_results import Results, write_summary
-    from kcal.cli.batch_run import pool, run_tasks
+    from kcal.calibrate.batch.jobs import BatchOptions, pieces, read_jobs
+    from kcal.calibrate.batch.results import calibrate_batch
     from kcal.corners.board import Board
-    from kcal.errors import DegenerateError, InputError
     from kcal.lens.model import LensModel
 
     if (size is None) != (square is None):
@@ -73,39 +75,27 @@ def batch(
     LensModel.named(model)
     jobs = read_jobs(cameras, board, model)
     options = BatchOptions(refine=refine.value, board_warp=board_warp, time_limit=time_limit)
-    results = Results(output, jobs, options)
     try:
-        with (
-            steps("images and cameras", results.total) as advance,
-            pool(workers or os.cpu_count() or 1, scheduler) as crew,
-        ):
-            run_tasks(results.tasks(advance), results.done, crew)
+        with steps("images and cameras", pieces(jobs)) as advance:
+            report = calibrate_batch(jobs, output, options, workers=workers, scheduler=scheduler, progress=advance)
     except KeyboardInterrupt:
         err.print("interrupted; what is finished is kept: run the same command to continue")
         raise typer.Exit(130) from None
-    rows = results.rows()
-    summary = write_summary(output / "summary.csv", rows)
-    _print(rows)
-    out.print(f"{results.reused} of {results.total} pieces of work were there already", markup=False)
-    out.print(f"wrote {summary}", markup=False)
-    failed = [row.camera for row in rows if row.error]
+    heads = ["camera", "views", "RMS px", "fx", "± σ", "cx", "cy", "model", "note"]
+    print_table([heads, *map(_cells, report.rows)], left=(0, 7, 8))
+    out.print(f"{report.reused} of {report.total} pieces of work were there already", markup=False)
+    print_wrote(report.summary)
+    failed = [row.camera for row in report.rows if row.error]
     if failed:
-        raise DegenerateError(f"{len(failed)} of {len(rows)} cameras failed: {', '.join(failed[:5])}; see the table")
+        raise DegenerateError(
+            f"{len(failed)} of {len(report.rows)} cameras failed: {', '.join(failed[:5])}; see the table"
+        )
 
 
-def _print(rows: list[Row]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for title in ("camera", "views", "RMS px", "fx", "± σ", "cx", "cy", "model"):
-        table.add_column(title, no_wrap=True, justify="left" if title in ("camera", "model") else "right")
-    table.add_column("note")
-    for row in rows:
-        numbers = ["", "", "", "", ""]
-        if row.rms is not None:
-            spread = "" if row.sigma_fx is None else f"{row.sigma_fx:.3f}"
-            numbers = [f"{row.rms:.4f}", f"{row.fx:.3f}", spread, f"{row.cx:.3f}", f"{row.cy:.3f}"]
-        note = f"[red]failed:[/] {escape(row.error)}" if row.error else escape(row.warnings)
-        table.add_row(escape(row.camera), f"{row.views} of {row.images}", *numbers, row.model, note)
-    out.print(table)
+def _cells(row: SummaryRow) -> list[str]:
+    numbers = ["", "", "", "", ""]
+    if row.rms is not None:
+        spread = "" if row.sigma_fx is None else f"{row.sigma_fx:.3f}"
+        numbers = [f"{row.rms:.4f}", f"{row.fx:.3f}", spread, f"{row.cx:.3f}", f"{row.cy:.3f}"]
+    note = f"failed: {row.error}" if row.error else row.warnings
+    return [row.camera, f"{row.views} of {row.images}", *numbers, row.model, note]

@@ -12,7 +12,7 @@ from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 
 
-def board(
+def board_command(
     size: Annotated[
         str,
         typer.Option(
@@ -30,14 +30,14 @@ def board(
         typer.Option(
             "--page",
             metavar="PAGE",
-            help="A5, A4, A3, A2, A1, A0, letter, legal, tabloid, or auto: as large as needed.",
+            help="Page size: A5, A4, A3, A2, A1, A0, letter, legal, tabloid, or auto for as large as needed.",
         ),
     ] = "auto",
 ) -> None:
     """Draw a checkerboard or a ChArUco board to print at true scale.
 
-    Print it at 100 % ("actual size"), measure the ruler below it, and glue it to something flat and stiff. Choose one
-    odd and one even number (9x6, 7x6): then corners can be numbered alike however the board is held.
+    Print it at 100 % ("actual size"), check the printed ruler, and glue the board to something flat and stiff. Choose
+    one odd and one even number (9x6, 7x6): such a board looks different when it is turned by 180°.
 
     **Examples**
 
@@ -60,6 +60,6 @@ def board(
     write_atomic(output, to_svg(sheet.drawing) if suffix == ".svg" else to_pdf(sheet.drawing))
     out.print(f"{output}: {pattern}, page {sheet.drawing.width:g}x{sheet.drawing.height:g} mm")
     if sheet.quiet < 1:
-        out.print(f"note: only {sheet.quiet:.1f} squares of white round the board; keep what lies behind it light")
+        out.print(f"note: only {sheet.quiet:.1f} squares of white around the board; keep the background light")
     if not pattern.unambiguous:
         out.print("note: this board looks the same turned by 180°; for stereo use one odd and one even number")

@@ -3,33 +3,39 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from kcal.locate.budget import RangeError
+from kcal.cli.console import out, print_table, print_wrote
+from kcal.errors import InputError
 
 
-def budget(
-    rig: Annotated[Path | None, typer.Argument(help="A calibrated rig; without one, the planned rig below.")] = None,
-    focal: Annotated[float, typer.Option(metavar="PX", help="Of the planned rig: focal length in pixels.")] = 1600.0,
-    baseline: Annotated[float, typer.Option(metavar="M", help="Of the planned rig: distance of the cameras.")] = 10.0,
+def budget_command(
+    rig: Annotated[
+        Path | None, typer.Argument(help="Rig file; the planned rig of --focal and --baseline if not given.")
+    ] = None,
+    focal: Annotated[float, typer.Option(metavar="PX", help="Focal length of the planned rig, pixels.")] = 1600.0,
+    baseline: Annotated[
+        float, typer.Option(metavar="M", help="Distance between the cameras of the planned rig, meters.")
+    ] = 10.0,
     distances: Annotated[
-        str, typer.Option(metavar="M,M,...", help="Ranges for the table.")
+        str, typer.Option(metavar="M,M,...", help="Ranges in the table, meters.")
     ] = "100,250,500,1000,2500,5000",
-    disparity: Annotated[float, typer.Option(metavar="PX", help="Error of the match.", min=0)] = 0.1,
-    yaw: Annotated[float, typer.Option(metavar="DEG", help="Error of the relative yaw.", min=0)] = 0.01,
-    baseline_error: Annotated[float, typer.Option(metavar="M", help="Error of the baseline.", min=0)] = 0.001,
-    timing: Annotated[float, typer.Option(metavar="S", help="Time between the two images.", min=0)] = 0.01,
-    speed: Annotated[float, typer.Option(metavar="M/S", help="Of the target, along the baseline.", min=0)] = 20.0,
-    picture: Annotated[Path | None, typer.Option(help="A .png file for the plot.")] = None,
+    disparity: Annotated[float, typer.Option(metavar="PX", help="Disparity error, pixels.", min=0)] = 0.1,
+    yaw: Annotated[float, typer.Option(metavar="DEG", help="Relative yaw error, degrees.", min=0)] = 0.01,
+    baseline_error: Annotated[float, typer.Option(metavar="M", help="Baseline error, meters.", min=0)] = 0.001,
+    timing: Annotated[float, typer.Option(metavar="S", help="Time between the two images, seconds.", min=0)] = 0.01,
+    speed: Annotated[
+        float, typer.Option(metavar="M/S", help="Speed of the target along the baseline, meters a second.", min=0)
+    ] = 20.0,
+    picture: Annotated[Path | None, typer.Option(help="PNG file to write: a plot of the errors.")] = None,
 ) -> None:
-    """Range errors against distance: by disparity, relative yaw, baseline and timing, each alone.
+    """Print range errors from disparity, relative yaw, baseline and timing, each alone, at several ranges.
 
-    Exact, not to first order: an error that makes the disparity smaller moves a far point much farther out than the
-    same error of the other sign moves it in, and may move it beyond infinity. The last column is the slope, which is
-    what the formula Z² Δd / (f B) gives.
+    The errors are exact. One that makes the disparity smaller moves a far point much farther out than the same error
+    of the other sign moves it in, and may move it beyond infinity. The last column is the first-order error, which the
+    formula Z² Δd / (f B) gives.
 
     **Examples**
 
@@ -43,17 +49,13 @@ def budget(
 
     import torch
 
-    from kcal.cli.console import out
-    from kcal.errors import InputError
-    from kcal.files import check_writable
     from kcal.io.rig_file import load_rig
     from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
     from kcal.report.budget import save_budget_picture
-    from kcal.report.figures import check_picture_format
+    from kcal.report.figures import check_picture
 
     if picture is not None:
-        check_picture_format(picture)
-        check_writable(picture)
+        check_picture(picture)
     try:
         far = [float(value) for value in distances.split(",")]
     except ValueError:
@@ -73,34 +75,22 @@ def budget(
         out.print(f"planned rig: f {focal:g} px, baseline {baseline:g} m, f B {focal * baseline:g} px m")
     else:
         out.print(f"{rig}: baseline {float(chosen.baseline):g} m", markup=False)
-    for line in _table(far, found, labels):
-        out.print(line, markup=False)
+    rows = [["range m", "error", "nearer m", "farther m", "first order m"]]
+    for i, distance in enumerate(far):
+        for name, error in found.items():
+            rows.append([f"{distance:g}", labels[name], *(_signed_meters(float(value[i])) for value in error)])
+    print_table(rows, left=(1,))
     if picture is not None:
         sweep = torch.logspace(math.log10(min(far)), math.log10(max(far)), 121, dtype=torch.float64)
         # The ends themselves, which rounding of the logarithm may push out of view.
         sweep = sweep.clamp(min(far), max(far))
         if len(far) < 2:
-            raise InputError("distances: two at least are needed for a plot")
+            raise InputError("distances: a plot needs at least two")
         save_budget_picture(picture, sweep, range_errors(chosen, sweep, errors), labels)
-        out.print(f"wrote {picture}", markup=False)
+    print_wrote(picture)
 
 
-def _table(far: list[float], found: dict[str, RangeError], labels: dict[str, str]) -> list[str]:
-    rows = [["range m", "error", "nearer m", "farther m", "first order m"]]
-    for i, distance in enumerate(far):
-        for name, error in found.items():
-            values = (_meters(float(value[i])) for value in error)
-            rows.append([f"{distance:g}", labels[name], *values])
-    widths = [max(len(row[column]) for row in rows) for column in range(5)]
-    lines = []
-    for first, name, *numbers in rows:
-        cells = [first.rjust(widths[0]), name.ljust(widths[1])]
-        cells += [number.rjust(width) for number, width in zip(numbers, widths[2:], strict=True)]
-        lines.append("  ".join(cells))
-    return lines
-
-
-def _meters(value: float) -> str:
+def _signed_meters(value: float) -> str:
     if value == float("inf"):
         return "∞"
     return f"{value:+.3f}" if abs(value) < 1 else f"{value:+.2f}" if abs(value) < 100 else f"{value:+.1f}"

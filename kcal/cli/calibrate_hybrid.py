@@ -1,8 +1,11 @@
-"""`kcal calibrate --model hybrid`: the evidence on the screen, the winner in the file."""
+"""`kcal calibrate --model hybrid`: prints how the models compare, and writes the camera that is better."""
 
 from __future__ import annotations
 
 from pathlib import Path
+
+from kcal.cli.console import out, print_table, print_wrote, steps, warn
+from kcal.errors import InputError
 
 
 def calibrate_hybrid_file(
@@ -17,16 +20,13 @@ def calibrate_hybrid_file(
     groups: str,
 ) -> None:
     """Calibrate, print how the models compare on held-out views, and write the camera and its pictures."""
-    from rich.table import Table
-
     from kcal.calibrate.lensfit.hybrid import HybridOptions, calibrate_hybrid
-    from kcal.cli.calibrate import record
-    from kcal.cli.console import err, out, steps
     from kcal.corners.observations import Observations
-    from kcal.errors import InputError
+    from kcal.report.calibration import save_calibration_picture
+    from kcal.report.field import save_field_picture
 
     if groups not in ("blocks", "views"):
-        raise InputError(f"--groups {groups!r}: blocks or views")
+        raise InputError(f"--groups {groups}: write blocks or views")
     options = HybridOptions(
         board_warp=board_warp, focal=focal, field_of_view=fov, groups="views" if groups == "views" else "blocks"
     )
@@ -34,25 +34,16 @@ def calibrate_hybrid_file(
     with steps("calibrating", len(options.models) + len(options.rivals)) as advance:
         result = calibrate_hybrid(seen, options, advance)
     found = result.calibration
-    record(found, seen, name or observations.name.split(".")[0], observations.name).save(output)
-    written = [output]
+    written = [result.save(output, name=name, source=observations.name)]
     if picture is not None:
-        from kcal.report.calibration import save_calibration_picture
-
-        written.append(save_calibration_picture(picture, seen, found))
+        written.append(save_calibration_picture(picture, found))
         if result.kept:
-            from kcal.report.field import save_field_picture
-
             written.append(save_field_picture(picture.with_suffix(".field.png"), seen, found.camera))
 
     width, height = seen.image_size
     out.print(f"{len(seen.views)} views, {width}x{height} px; held out in {result.groups} groups, a fifth at a time")
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("model", no_wrap=True)
-    table.add_column("held-out RMS, px", justify="right", no_wrap=True)
-    for model, rms in sorted(result.held_out.items(), key=lambda entry: entry[1]):
-        table.add_row(model, f"{rms:.4f}")
-    out.print(table)
+    ranking = sorted(result.held_out.items(), key=lambda entry: entry[1])
+    print_table([["model", "held-out RMS, px"], *([model, f"{rms:.4f}"] for model, rms in ranking)])
     out.print(result.reason)
     if result.kept:
         out.print(
@@ -62,6 +53,5 @@ def calibrate_hybrid_file(
     else:
         out.print(f"{found.camera.model}: RMS [bold]{found.rms:.4f} px[/]; {found.status.message}")
     for text in found.warnings:
-        err.print("[yellow]warning:[/]", text, markup=True)
-    for path in written:
-        out.print(f"wrote {path}", markup=False)
+        warn(text)
+    print_wrote(*written)

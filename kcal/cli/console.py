@@ -1,33 +1,49 @@
-"""What all commands share: where to print, and a progress bar for long work."""
+"""Printing for all commands: output, warnings, tables, and progress bars for long work."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TypeVar
+from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-T = TypeVar("T")
-
-# A table cut to fit the 80 columns of a pipe would lose names and digits.
-_PIPE_WIDTH = 200
+out = Console(soft_wrap=True, highlight=False)
+err = Console(stderr=True, soft_wrap=True, highlight=False)
 
 
-def _console(stderr: bool) -> Console:
-    console = Console(stderr=stderr, soft_wrap=True, highlight=False)
-    if not console.is_terminal:
-        console.width = _PIPE_WIDTH
-    return console
+def warn(text: str) -> None:
+    """Print a warning to the error stream."""
+    err.print("[yellow]warning:[/]", escape(text))
 
 
-out, err = _console(stderr=False), _console(stderr=True)
+def print_wrote(*paths: Path | None) -> None:
+    """Print which files were written; None stands for a file that was not asked for."""
+    for path in paths:
+        if path is not None:
+            out.print(f"wrote {path}", markup=False)
 
 
-def _progress() -> Progress:
-    return Progress(
+def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> None:
+    """Print rows of cells in columns that are as wide as they need to be: a pipe cuts neither names nor digits.
+
+    Args:
+        rows: the first row has the heads.
+        left: columns that are aligned to the left; all others are aligned to the right.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = zip(row, widths, strict=True)
+        aligned = [cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(cells)]
+        out.print("  ".join(aligned).rstrip(), markup=False)
+
+
+@contextmanager
+def steps(description: str, total: int) -> Iterator[Callable[[str], None]]:
+    """Show a progress bar on the error stream: call the value with a text after each step."""
+    with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -35,19 +51,7 @@ def _progress() -> Progress:
         console=err,
         transient=True,
         disable=not err.is_terminal,
-    )
-
-
-def track(items: Iterable[T], description: str, total: int) -> Iterator[T]:
-    """Iterate with a progress bar on the error stream, gone when done."""
-    with _progress() as progress:
-        yield from progress.track(items, description=description, total=total)
-
-
-@contextmanager
-def steps(description: str, total: int) -> Iterator[Callable[[str], None]]:
-    """A bar for work that reports itself: call the value with a text after each step."""
-    with _progress() as progress:
+    ) as progress:
         task = progress.add_task(description, total=total)
 
         def advance(text: str) -> None:

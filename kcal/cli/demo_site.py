@@ -4,91 +4,75 @@ from __future__ import annotations
 
 import math
 import time
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kcal.cli.demo import SIDES, calibrate, detect, write_marks
-from kcal.cli.demo_tables import print_results, print_truth, truth_rows
+from kcal.cli.console import out, print_table, steps
+from kcal.cli.demo_steps import SIDES, locate_again, print_results, run
+from kcal.files import write_atomic
 
 if TYPE_CHECKING:
-    from kcal.calibrate.camera.calibrate import CameraCalibrationResult
-    from kcal.calibrate.rig.result import RigSolution
-    from kcal.cli.rig_joint import Sources
-    from kcal.corners.observations import Observations
-    from kcal.lens.mounting import Mounting
     from kcal.locate.positions import Located
-    from kcal.sim.scene import DemoScene
-
-_FILES = ("left.camera.json", "right.camera.json")
+    from kcal.sim.scene import DemoScene, NamedPoints
 
 
-def simulated(output: Path, seed: int) -> None:
-    """Render the site of a seed, go through the whole chain, compare with the truth, write everything to a folder."""
-    from kcal.cli.console import out
-    from kcal.corners.board import Board
+def simulated_site(output: Path, seed: int) -> None:
+    """Render the site of a seed, run the whole chain, compare with the truth, and write everything to a folder."""
     from kcal.io.rig_file import load_rig
-    from kcal.lens.rig import RigCovariance
-    from kcal.locate.export import write_positions
+    from kcal.locate.marks import Marks, write_marks
     from kcal.locate.positions import locate_points
-    from kcal.report.map_page import save_map
-    from kcal.report.positions import save_positions_picture
+    from kcal.report.tables import truth_rows
     from kcal.sim.scene import DemoScene
 
     clock = _Clock()
     scene = DemoScene(seed=seed)
     out.print(
         f"A simulated site: two cameras {float(scene.rig.baseline):.3f} m apart behind ray-traced lenses, "
-        f"{scene.near_views} close views each, {scene.pair_views} views of a large board together, "
+        f"{scene.near_views} close views by each camera, {scene.pair_views} views of a large board by both, "
         f"{len(scene.landmarks.names)} surveyed landmarks, {len(scene.targets.names)} targets."
     )
-    files = _render(scene, output / "images")
+    _render(scene, output / "images")
     clock.lap("rendering")
-    boards = {
-        kind: Board(columns=size.columns, rows=size.rows, square=size.square)
-        for kind, size in (("near", scene.near_board), ("pair", scene.pair_board))
-    }
-    seen = {key: detect(paths, boards[key[1]], output / f"{key[0]}.{key[1]}.obs.json") for key, paths in files.items()}
+    boards = {"near": scene.near_board, "pair": scene.pair_board}
+    for side in SIDES:
+        for kind, board in boards.items():
+            size = "--board", f"{board.columns}x{board.rows}", "--square", f"{board.square}m"
+            run("detect", output / "images" / f"{side}-{kind}", *size, "-o", output / f"{side}.{kind}.obs.json")
     clock.lap("detection")
-    cameras = {side: calibrate(seen[side, "near"], side, output) for side in SIDES}
+    for side in SIDES:
+        camera, picture = output / f"{side}.camera.json", output / f"{side}.png"
+        run("calibrate", output / f"{side}.near.obs.json", "-o", camera, "--name", side, "--picture", picture)
     clock.lap("calibration")
-    sources = _write_sources(scene, output)
-    solution, there = _solve(sources, output)
+    _write_places(output / "survey.csv", scene.surveyed(scene.landmarks), sigma=scene.survey_sigma)
+    marks = scene.landmark_marks
+    write_marks(output / "landmarks.csv", Marks(scene.landmarks.names, marks.left, marks.right))
+    cameras, pairs = ([output / f"{side}.{kind}.json" for side in SIDES] for kind in ("camera", "pair.obs"))
+    run(
+        "rig", *cameras, "--pairs", *pairs,
+        "--landmarks", output / "survey.csv", "--marks", output / "landmarks.csv", "--mark-sigma", scene.mark_sigma,
+        f"--origin={scene.lat},{scene.lon},{scene.height}", "-o", output / "rig.json", "--picture", output / "rig.png",
+    )  # fmt: skip
     clock.lap("rig")
 
     marks, targets = scene.target_marks, scene.targets
-    write_marks(output / "points.csv", targets.names, marks.left, marks.right)
+    write_marks(output / "points.csv", Marks(targets.names, marks.left, marks.right))
+    _write_places(output / "truth.csv", targets)
+    command = locate_again(output, "--pixel-sigma", scene.mark_sigma, "--truth", output / "truth.csv")
     rig = load_rig(output / "rig.json")
-    locate_marks = partial(
-        locate_points,
-        rig,
-        origin=there.origin,
-        heading_deg=there.heading_deg,
-        pitch_deg=there.pitch_deg,
-        roll_deg=there.roll_deg,
-        pixel_sigma=scene.mark_sigma,
-        names=targets.names,
-        calibration=RigCovariance.of(rig, joint=solution.joint_covariance()),
-        mounting=there.covariance,
-    )
-    located = locate_marks(marks.left, marks.right)
-    exact = locate_marks(marks.true_left, marks.true_right)
-    write_positions(output / "points.geojson", located)
-    write_positions(output / "positions.csv", located)
-    save_positions_picture(output / "map.png", located, targets.enu)
-    save_map(output / "map.html", located, targets.enu)
+    located = locate_points(rig, marks.left, marks.right, pixel_sigma=scene.mark_sigma, names=targets.names)
+    exact = locate_points(rig, marks.true_left, marks.true_right, pixel_sigma=scene.mark_sigma, names=targets.names)
     clock.lap("positions and maps")
-    print_truth(located, exact, targets.enu)
+    rows = truth_rows(located, exact, targets.enu)
+    out.print("\nTrue against estimated positions", markup=False)
+    print_table(rows)
     out.print(
-        f"Marks have {scene.mark_sigma:g} px of noise in each image. The interval counts that and the errors of the "
-        f"rig "
-        "and its mounting. The last column is what the same rig gives for marks without noise: the calibration's own "
-        "share of the error."
+        f"Marks have {scene.mark_sigma:g} px of noise in each image. The interval includes that and the errors of the "
+        "rig and its mounting. The last column is the error that the same rig makes with marks that have no noise: the "
+        "calibration's share."
     )
-    again = f"kcal locate {output}/rig.json {output}/points.csv --pixel-sigma {scene.mark_sigma:g} -o again.geojson"
-    _write_summary(output, scene, seen, cameras, solution, truth_rows(located, exact, targets.enu), again, located)
+    _write_summary(output, scene, rows, command, located)
     out.print(f"Time: {clock.text()}.")
-    print_results(output, again, summary=True)
+    print_results(output, command, summary=True)
 
 
 class _Clock:
@@ -108,97 +92,49 @@ class _Clock:
         return ", ".join([*parts, f"together {sum(seconds for _, seconds in self._laps):.1f} s"])
 
 
-def _render(scene: DemoScene, folder: Path) -> dict[tuple[str, str], list[Path]]:
-    """Write the site's images; returns the files by camera and kind."""
-    from kcal.cli.console import steps
+def _render(scene: DemoScene, folder: Path) -> None:
+    """Write the site's images, a folder for each camera and kind of board."""
     from kcal.io.images import write_png
     from kcal.sim.scene import render_demo
 
-    files: dict[tuple[str, str], list[Path]] = {}
     with steps("rendering", scene.images) as advance:
         for view in render_demo(scene, advance):
             place = folder / f"{view.camera}-{view.kind}"
             place.mkdir(parents=True, exist_ok=True)
-            path = write_png(place / f"{view.name}.png", view.image.numpy())
-            files.setdefault((view.camera, view.kind), []).append(path)
-    return files
+            write_png(place / f"{view.name}.png", view.image.numpy())
 
 
-def _write_sources(scene: DemoScene, output: Path) -> Sources:
-    """What the rig is solved from: boards, and landmarks with their marks, as a surveyor would hand them over."""
-    from kcal.cli.rig_joint import Sources
-    from kcal.files import write_atomic
-
-    surveyed, marks = scene.surveyed(scene.landmarks), scene.landmark_marks
-    lines = ["name,east,north,up,sigma"]
-    for name, place in zip(surveyed.names, surveyed.enu.tolist(), strict=True):
-        lines.append(",".join([name, *(f"{value:.3f}" for value in place), f"{scene.survey_sigma:g}"]))
-    survey = write_atomic(output / "survey.csv", "\n".join(lines) + "\n")
-    write_marks(output / "landmarks.csv", surveyed.names, marks.left, marks.right)
-    return Sources(
-        pairs=(output / "left.pair.obs.json", output / "right.pair.obs.json"),
-        landmarks=survey,
-        marks=output / "landmarks.csv",
-        origin=f"{scene.lat},{scene.lon},{scene.height:g}",
-        mark_sigma=scene.mark_sigma,
-    )
+def _write_places(path: Path, points: NamedPoints, sigma: float | None = None) -> None:
+    """Write places as a surveyor hands them over, to a millimeter with a sigma, and exactly without."""
+    lines = ["name,east,north,up" if sigma is None else "name,east,north,up,sigma"]
+    for name, place in zip(points.names, points.enu.tolist(), strict=True):
+        exact = map(repr, place)
+        lines.append(",".join([name, *(exact if sigma is None else (*(f"{v:.3f}" for v in place), f"{sigma:g}"))]))
+    write_atomic(path, "\n".join(lines) + "\n")
 
 
-def _solve(sources: Sources, output: Path) -> tuple[RigSolution, Mounting]:
-    from kcal.calibrate.rig.solve import solve_rig
-    from kcal.cli.console import steps
-    from kcal.cli.rig_joint import gather, mounting, record, show
-    from kcal.errors import DegenerateError
-    from kcal.io.camera_file import CameraFile
-    from kcal.report.rig import save_rig_picture
-
-    cameras = CameraFile.load(output / _FILES[0]), CameraFile.load(output / _FILES[1])
-    data, origin = gather(cameras, sources, prior=False)
-    with steps("solving the rig", 1) as advance:
-        solution = solve_rig(data)
-        advance("done")
-    there = mounting(solution, origin)
-    if there is None:
-        raise DegenerateError("the landmarks do not say where the cameras stand")
-    record(solution, cameras, there, fixed=True).save(output / "rig.json")
-    save_rig_picture(output / "rig.png", solution)
-    show(solution, there)
-    return solution, there
-
-
-def _held(located: Located, scene: DemoScene) -> int:
-    """How many intervals hold the true range."""
-    return sum(
-        position.range_low_m is not None
-        and position.range_low_m <= float(true.norm()) <= (position.range_high_m or math.inf)
-        for position, true in zip(located.positions, scene.targets.enu, strict=True)
-        if position.enu is not None
-    )
-
-
-def _write_summary(
-    output: Path,
-    scene: DemoScene,
-    seen: dict[tuple[str, str], Observations],
-    cameras: dict[str, CameraCalibrationResult],
-    solution: RigSolution,
-    table: list[list[str]],
-    again: str,
-    located: Located,
-) -> None:
+def _write_summary(output: Path, scene: DemoScene, table: list[list[str]], command: str, located: Located) -> None:
+    from kcal.corners.observations import Observations
+    from kcal.io.rig_file import RigFile
+    from kcal.locate.truth import position_errors
     from kcal.report.summary import Part, save_summary
 
-    found = {kind: sum(len(seen[side, kind].views) for side in SIDES) for kind in ("near", "pair")}
-    sigma = solution.relative_covariance().diagonal().sqrt()
-    rms = ", ".join(f"{side} {result.rms:.3f} px" for side, result in cameras.items())
+    found = sum(len(Observations.load(output / f"{side}.near.obs.json").views) for side in SIDES)
+    rig = RigFile.load(output / "rig.json")
+    assert rig.covariance is not None
+    yaw = math.degrees(math.sqrt(rig.covariance[-5][-5]))
+    cameras = zip(SIDES, (rig.left.calibration, rig.right.calibration), strict=True)
+    rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
+    pairs = 0 if rig.calibration is None else rig.calibration.pairs
+    inside = sum(miss is not None and miss[2] for miss in position_errors(located, scene.targets.enu))
     parts = [
         Part(
             heading="What came out",
             text=(
                 f"{located.count} of {len(located.positions)} targets were located from one pair of pixels each. Their "
                 f"pixels were marked with {scene.mark_sigma:g} px of noise, and at long range that decides: a tenth of "
-                "a pixel of disparity is 156 m at 5 km. The interval should hold the true range in 19 cases of 20; "
-                f"here it does in {_held(located, scene)} of {located.count}. 'Across' is the error across the line of "
+                "a pixel of disparity is 156 m at 5 km. The interval should contain the true range in 19 cases of 20; "
+                f"here it does in {inside} of {located.count}. 'Across' is the error across the line of "
                 "sight. The last column is the error that is left when the marks have no noise: what the calibration "
                 "itself does.",
             ),
@@ -213,7 +149,7 @@ def _write_summary(
         Part(
             heading="1. Each camera was calibrated",
             text=(
-                f"A board was photographed {scene.near_views} times by each camera; it was found in {found['near']} of "
+                f"A board was photographed {scene.near_views} times by each camera; it was found in {found} of "
                 f"{2 * scene.near_views} pictures. What the lens model leaves over is small: {rms}. The truth is a "
                 "lens traced ray by ray through seven pieces of glass that are not quite centered.",
             ),
@@ -225,12 +161,10 @@ def _write_summary(
         Part(
             heading="2. The rig was solved",
             text=(
-                f"A large board seen by both cameras ({found['pair'] // 2} times) and {len(scene.landmarks.names)} "
+                f"A large board seen by both cameras ({pairs} times) and {len(scene.landmarks.names)} "
                 f"landmarks surveyed to {100 * scene.survey_sigma:g} cm tell where the cameras stand and look: "
-                f"baseline {float(solution.stereo().baseline):.4f} m (true {float(scene.rig.baseline):.4f} m), "
-                f"relative "
-                f"yaw known to {float(sigma[1].rad2deg()):.5f} degrees. A hundredth of a degree would be 436 m at 5 "
-                f"km.",
+                f"baseline {float(rig.rig().baseline):.4f} m (true {float(scene.rig.baseline):.4f} m), "
+                f"relative yaw known to {yaw:.5f} degrees. A hundredth of a degree would be 436 m at 5 km.",
             ),
             pictures=((output / "rig.png", "What is left over, by source"),),
         ),
@@ -240,7 +174,7 @@ def _write_summary(
                 "Print a board (kcal board), photograph it, and go on as the README shows. With the files in this "
                 "folder:",
             ),
-            code=again,
+            code=command,
         ),
     ]  # fmt: skip
     lead = (

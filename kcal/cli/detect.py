@@ -24,13 +24,13 @@ class Refine(StrEnum):
     none = "none"
 
 
-def detect(
+def detect_command(
     images: Annotated[
         list[str],
         typer.Argument(
             metavar="IMAGES",
-            help="Images of one camera: files, folders or quoted wildcards; or one video; or a stream, rtsp://... or "
-            "camera:0.",
+            help="Images of one camera: files, folders or quoted wildcards; or one video, or a stream (rtsp://..., "
+            "camera:0).",
             show_default=False,
         ),
     ],
@@ -50,21 +50,25 @@ def detect(
         Refine, typer.Option("--refine", metavar="METHOD", help="erf (most accurate), saddle, opencv, skimage or none.")
     ] = Refine.erf,
     gallery: Annotated[
-        Path | None, typer.Option(help="A .png file: the views with their corners, worst first.")
+        Path | None, typer.Option(help="PNG file to write: the views with their corners, worst first.")
     ] = None,
-    coverage: Annotated[Path | None, typer.Option(help="A .png file: where in the image corners were seen.")] = None,
+    coverage: Annotated[
+        Path | None, typer.Option(help="PNG file to write: where in the image corners were seen.")
+    ] = None,
     time_limit: Annotated[
-        float, typer.Option(help="Seconds for one image; a slower one is given up and listed.", min=0.1)
+        float, typer.Option(metavar="S", help="Seconds after which the search in one image is given up.", min=0.1)
     ] = 60.0,
-    duration: Annotated[float, typer.Option(help="Seconds for which a live stream is watched.", min=1.0)] = 120.0,
+    duration: Annotated[
+        float, typer.Option(metavar="S", help="Seconds for which a stream is watched.", min=1.0)
+    ] = 120.0,
     keep: Annotated[
-        Path | None, typer.Option(help="A folder for the frames of a video or stream that became views, as PNG.")
+        Path | None, typer.Option(help="Folder for the frames of a video or stream that became views, as PNG.")
     ] = None,
 ) -> None:
     """Find the board in the images of one camera.
 
-    Writes the corners of every view and the reason for every image that gave none. EXIF orientation is ignored: pixels
-    count as the sensor wrote them. Only when no image shows the board is nothing written.
+    Writes the corners of each view, and the reason for each image in which no board was found. EXIF orientation is
+    ignored: pixels are used as the sensor wrote them. Nothing is written if no image shows the board.
 
     **Examples**
 
@@ -80,11 +84,10 @@ def detect(
 
     pictures = [path for path in (gallery, coverage) if path is not None]
     if pictures:
-        from kcal.report.figures import check_picture_format
+        from kcal.report.figures import check_picture
 
         for path in pictures:
-            check_picture_format(path)
-            check_writable(path)
+            check_picture(path)
     check_writable(output)
     board = Board.parse(size, square)
 
@@ -131,7 +134,7 @@ def detect(
     found, unseen = len(observations.views), sum(view.pixels.count(None) for view in observations.views)
     out.print(f"{escape(str(output))}: board found in {found} {source} of {width}x{height} px")
     if turned:
-        out.print(f"note: {len(turned)} images ask to be turned (EXIF); kcal takes pixels as the sensor wrote them")
+        out.print(f"note: {len(turned)} images have an EXIF rotation, which kcal ignores")
     if unseen:
         out.print(f"corners left out as uncertain: {unseen} of {found * board.corners}")
     for failure in observations.failures:

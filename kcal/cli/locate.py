@@ -3,82 +3,101 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from kcal.locate.positions import Located, Position
+from kcal.cli.console import out, print_table, print_wrote, steps
+from kcal.errors import DegenerateError, InputError
+from kcal.files import check_writable
 
 
-def locate(
+def locate_command(
     rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
     points: Annotated[Path, typer.Argument(help="CSV with the columns name,left_u,left_v,right_u,right_v.")],
     origin: Annotated[
         str | None,
         typer.Option(
             metavar="LAT,LON,HEIGHT",
-            help="Left camera: degrees, degrees, meters above the WGS84 ellipsoid. From the rig file if it has it.",
+            help="Position of the left camera: degrees, degrees, meters above the WGS84 ellipsoid; from the rig file "
+            "if not given.",
         ),
     ] = None,
     heading: Annotated[
         float | None,
-        typer.Option(metavar="DEG", help="Azimuth of the left camera's axis, clockwise from true north."),
+        typer.Option(
+            metavar="DEG", help="Azimuth of the left camera's axis, clockwise from true north; needed with --origin."
+        ),
     ] = None,
-    pitch: Annotated[float, typer.Option(metavar="DEG", help="Elevation of the left camera's axis, up.")] = 0.0,
+    pitch: Annotated[
+        float, typer.Option(metavar="DEG", help="Elevation of the left camera's axis, positive up.")
+    ] = 0.0,
     roll: Annotated[
         float, typer.Option(metavar="DEG", help="Roll of the left camera, clockwise as seen from behind it.")
     ] = 0.0,
     grid: Annotated[
         str | None,
-        typer.Option(metavar="CRS", help="The heading counts from this map's grid north, e.g. EPSG:32643."),
+        typer.Option(
+            metavar="CRS",
+            help="Map whose grid north --heading counts from, for example EPSG:32643; true north if not given.",
+        ),
     ] = None,
-    pixel_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of the marks along each axis.")] = 0.3,
+    pixel_sigma: Annotated[
+        float, typer.Option(metavar="PX", help="Standard deviation of the marks along each axis.")
+    ] = 0.3,
     yaw_sigma: Annotated[
-        float, typer.Option(metavar="DEG", help="One sigma of the rig's relative yaw; it widens the intervals.", min=0)
+        float,
+        typer.Option(metavar="DEG", help="Standard deviation of the relative yaw, added to the rig file's.", min=0),
     ] = 0.0,
     heading_sigma: Annotated[
-        float, typer.Option(metavar="DEG", help="One sigma of the heading; it widens the regions.", min=0)
+        float, typer.Option(metavar="DEG", help="Standard deviation of the heading, added to the rig file's.", min=0)
     ] = 0.0,
     origin_sigma: Annotated[
-        float, typer.Option(metavar="M", help="One sigma of the origin along each axis.", min=0)
+        float,
+        typer.Option(
+            metavar="M", help="Standard deviation of the origin along each axis, added to the rig file's.", min=0
+        ),
     ] = 0.0,
     refraction: Annotated[
-        float, typer.Option(metavar="K", help="Bending of light; 0.13 in standard air, 0 for straight lines.")
+        float,
+        typer.Option(metavar="K", help="Refraction coefficient: 0.13 in standard air, 0 for straight lines of sight."),
     ] = 0.0,
     geoid: Annotated[
-        Path | None, typer.Option(help="A geoid grid (.tif, .gtx); one that PROJ finds is used if not given.")
+        Path | None, typer.Option(help="Geoid grid file (.tif, .gtx); one that PROJ finds if not given.")
     ] = None,
     truth: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="True positions, name,lat,lon,height: errors in the table and on the maps."),
+        typer.Option(
+            metavar="CSV", help="True positions, name,lat,lon,height, to show errors in the table and on the maps."
+        ),
     ] = None,
     output: Annotated[
         list[Path] | None,
-        typer.Option("--output", "-o", help="A .geojson, .csv, .kml or .cot file to write; may be repeated."),
+        typer.Option("--output", "-o", help="File to write, .geojson, .csv, .kml or .cot; may be repeated."),
     ] = None,
-    picture: Annotated[Path | None, typer.Option(help="A .png file for the map.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="PNG file to write: the map and the intervals.")] = None,
     web_map: Annotated[
-        Path | None, typer.Option("--map", help="An .html file for an interactive map that needs no network.")
+        Path | None, typer.Option("--map", help="HTML file to write: an interactive map that needs no network.")
     ] = None,
     tiles: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="For --map: tiles FOLDER/zoom/x/y.png to embed.")
+        Path | None, typer.Option(metavar="FOLDER", help="With --map: folder of tiles FOLDER/zoom/x/y.png to embed.")
     ] = None,
-    image: Annotated[Path | None, typer.Option(metavar="TIF", help="For --map: a GeoTIFF to embed.")] = None,
+    image: Annotated[Path | None, typer.Option(metavar="TIF", help="With --map: GeoTIFF to embed.")] = None,
     online: Annotated[
-        bool, typer.Option("--online", help="For --map: let the page load tiles of OpenStreetMap.")
+        bool, typer.Option("--online", help="With --map: let the page load tiles of OpenStreetMap.")
     ] = False,
 ) -> None:
-    """Locate what was marked in both images: latitude, longitude, height and an honest range interval.
+    """Locate points that were marked in both images: latitude, longitude, height and a 95 % range interval.
 
-    The interval holds the true range for 95 % of marks with the given noise. Errors of the rig come on top: those that
-    the rig file holds are included, and `--yaw-sigma` adds some; 0.01° of relative yaw is 436 m at 5 km with a baseline
-    of 10 m. Where the parallax is below three sigma only the bearing is given. Heights are ellipsoidal; with a geoid
-    grid the files also hold the height of the geoid.
+    The interval includes noise in the marks, and the errors of calibration and mounting that the rig file contains.
+    0.01° of relative yaw is 436 m at 5 km with a baseline of 10 m; `--yaw-sigma` adds such an error. If the parallax is
+    below three sigma, only the bearing is given. Heights are ellipsoidal; with a geoid grid the files also contain the
+    height of the geoid.
 
-    A rig that was solved with landmarks knows where it stands: then no `--origin` and `--heading` are needed.
+    The rig file of a rig that was solved with landmarks contains its position: `--origin` and `--heading` are then not
+    needed.
 
-    Ends with exit code 1 if nothing at all could be located.
+    The exit code is 1 if nothing could be located.
 
     **Examples**
 
@@ -93,29 +112,26 @@ def locate(
 
     import torch
 
-    from kcal.cli.console import out, steps
-    from kcal.errors import DegenerateError, InputError
-    from kcal.files import check_writable
-    from kcal.io.rig_file import RigFile
+    from kcal.io.rig_file import load_rig
+    from kcal.lens.mounting import Origin
     from kcal.lens.rig import RigCovariance
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import check_format, write_positions
-    from kcal.locate.geodesy import Origin
     from kcal.locate.marks import read_marks
     from kcal.locate.mounting import mounting_covariance
     from kcal.locate.positions import locate_points
     from kcal.locate.truth import position_errors, read_truth
-    from kcal.report.figures import check_picture_format
+    from kcal.report.figures import check_picture
     from kcal.report.map_page import check_map_format, save_map
     from kcal.report.positions import save_positions_picture
+    from kcal.report.tables import position_rows
 
     outputs = output or []
     for path in outputs:
         check_format(path)
         check_writable(path, rig, points, *([truth] if truth else []))
     if picture is not None:
-        check_picture_format(picture)
-        check_writable(picture)
+        check_picture(picture)
     if web_map is not None:
         check_map_format(web_map)
         check_writable(web_map)
@@ -123,45 +139,40 @@ def locate(
         raise typer.BadParameter("--origin and --heading belong together")
     if heading is None and (pitch or roll or grid is not None):
         raise typer.BadParameter("--pitch, --roll and --grid belong to --heading; the rig file has its own attitude")
-    # Before the rig is read: a wrong option is told first.
+    # Parsed before the rig is read, so that a wrong option is reported first.
     place = None if origin is None else Origin.parse(origin)
     marks = read_marks(points)
-    file = RigFile.load(rig)
-    solved = file.rig()
-    calibration = file.joint_covariance()
+    solved = load_rig(rig)
+    calibration, link = solved.covariance, None
     if yaw_sigma:
         yaw = torch.zeros(6, 6, dtype=torch.float64)
         yaw[1, 1] = math.radians(yaw_sigma) ** 2
-        more = RigCovariance.of(solved, pose=yaw).matrix
-        calibration = more if calibration is None else calibration + more
-    link = None
-    standing = mounting_covariance(origin_m=[origin_sigma] * 3, attitude_deg=(0.0, 0.0, heading_sigma))
+        more = RigCovariance.of(solved, pose=yaw)
+        calibration = more if calibration is None else RigCovariance(matrix=calibration.matrix + more.matrix)
+    mounting = mounting_covariance(origin_m=[origin_sigma] * 3, attitude_deg=(0.0, 0.0, heading_sigma))
     if place is None or heading is None:
-        stored = file.mounting
+        stored = solved.mounting
         if stored is None:
-            raise InputError(f"{rig}: does not say where the rig stands; give --origin and --heading")
-        place = Origin(lat=stored.lat, lon=stored.lon, height=stored.height)
-        heading, pitch, roll = stored.heading_deg, stored.pitch_deg, stored.roll_deg
-        if stored.covariance is not None:
-            standing = standing + torch.tensor(stored.covariance, dtype=torch.float64)
-        if stored.link is not None:
-            link = torch.tensor(stored.link, dtype=torch.float64)
-    heights = find_geoid(geoid)
+            raise InputError(f"{rig}: the file has no position of the rig; give --origin and --heading")
+        mounting = mounting if stored.covariance is None else mounting + stored.covariance
+        link = stored.link
+    elif grid is not None:
+        heading = true_from_grid(heading, place, grid)
     located = locate_points(
         solved,
         marks.left,
         marks.right,
         origin=place,
-        heading_deg=heading if grid is None else true_from_grid(heading, place, grid),
+        heading_deg=heading,
         pitch_deg=pitch,
         roll_deg=roll,
         pixel_sigma=pixel_sigma,
         names=marks.names,
-        calibration=None if calibration is None else RigCovariance.of(solved, joint=calibration),
-        mounting=standing if bool(standing.any()) else None,
+        calibration=calibration,
+        mounting=mounting if bool(mounting.any()) else None,
         link=link,
         refraction=refraction,
-        geoid=heights,
+        geoid=find_geoid(geoid),
     )
     true = None if truth is None else read_truth(truth, located)
     written = [*outputs, *(path for path in (picture, web_map) if path is not None)]
@@ -175,52 +186,13 @@ def locate(
         if web_map is not None:
             save_map(web_map, located, true, tiles=tiles, image=image, online=online)
             advance(web_map.name)
-    for line in _table(located, None if true is None else position_errors(located, true)):
-        out.print(line, markup=False)
+    rows = position_rows(located, None if true is None else position_errors(located, true))
+    print_table(rows, left=(0, len(rows[0]) - 1))
     for position in located.positions:
         if position.reason:
             out.print(f"* {position.name}: {position.reason}", markup=False)
-    out.print(f"Interval: {located.interval_note}; marks have {pixel_sigma:g} px.")
-    out.print(f"Heights are ellipsoidal; geoid: {located.geoid or 'none at hand'}.")
-    for path in written:
-        out.print(f"wrote {path}", markup=False)
+    out.print(f"Interval: {located.interval_note}; marks have {pixel_sigma:g} px of noise.")
+    out.print(f"Heights are ellipsoidal; geoid: {located.geoid or 'none found'}.")
+    print_wrote(*written)
     if located.count == 0:
         raise DegenerateError(f"{points}: none of the {len(located.positions)} pairs could be located; see the table")
-
-
-def _table(located: Located, off: list[tuple[float, float, bool] | None] | None = None) -> list[str]:
-    """Aligned lines as wide as they need: a table fitted to the 80 columns of a pipe would cut names and digits."""
-    rows = [["name", "lat °", "lon °", "height m", "range m", "interval m", "status"]]
-    rows += [_row(position) for position in located.positions]
-    if off is not None:
-        rows[0][-1:-1] = ["off level m", "off in range m", "in interval"]
-        for row, miss in zip(rows[1:], off, strict=True):
-            row[-1:-1] = (
-                ["", "", ""] if miss is None else [_meters(miss[0]), f"{miss[1]:+.1f}", "yes" if miss[2] else "no"]
-            )
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    lines = []
-    for name, *numbers, status in rows:
-        cells = [name.ljust(widths[0])]
-        cells += [number.rjust(width) for number, width in zip(numbers, widths[1:-1], strict=True)]
-        lines.append("  ".join([*cells, status]))
-    return lines
-
-
-def _row(position: Position) -> list[str]:
-    low, high = position.range_low_m, position.range_high_m
-    numbers = ["", "", "", ""]
-    if position.lat is not None and position.lon is not None and position.height is not None:
-        numbers = [
-            f"{position.lat:.7f}",
-            f"{position.lon:.7f}",
-            f"{position.height:.1f}",
-            _meters(position.range_m or 0),
-        ]
-    interval = "" if low is None or high is None else f"{_meters(low)} – {_meters(high)}"
-    status = position.status.name.lower().replace("_", " ")
-    return [position.name, *numbers, interval, f"{status} *" if position.reason else status]
-
-
-def _meters(value: float) -> str:
-    return "∞" if value == float("inf") else f"{value:.1f}" if value < 1000 else f"{value:.0f}"

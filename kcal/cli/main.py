@@ -9,22 +9,22 @@ import typer
 from rich.markup import escape
 
 import kcal
-from kcal.cli.bake import bake
-from kcal.cli.batch import batch
-from kcal.cli.board import board
-from kcal.cli.budget import budget
-from kcal.cli.calibrate import calibrate
+from kcal.cli.bake import bake_command
+from kcal.cli.batch import batch_command
+from kcal.cli.board import board_command
+from kcal.cli.budget import budget_command
+from kcal.cli.calibrate import calibrate_command
 from kcal.cli.console import err
-from kcal.cli.demo import demo
-from kcal.cli.detect import detect
-from kcal.cli.locate import locate
+from kcal.cli.demo import demo_command
+from kcal.cli.detect import detect_command
+from kcal.cli.locate import locate_command
 from kcal.cli.rig import app as rig
-from kcal.cli.undistort import undistort
+from kcal.cli.undistort import undistort_command
 from kcal.errors import KcalError
 
 app = typer.Typer(
     name="kcal",
-    help="Calibrate cameras, solve stereo rigs, and locate what they see on the Earth.",
+    help="Calibrate cameras, solve stereo rigs, and locate on the Earth what they see.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -39,7 +39,7 @@ def _print_version(wanted: bool) -> None:
 
 
 @app.callback()
-def _root(
+def _global_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
     ] = False,
@@ -47,20 +47,20 @@ def _root(
     pass
 
 
-app.command("demo")(demo)
-app.command("board")(board)
-app.command("detect")(detect)
-app.command("calibrate")(calibrate)
-app.command("batch")(batch)
+app.command("demo")(demo_command)
+app.command("board")(board_command)
+app.command("detect")(detect_command)
+app.command("calibrate")(calibrate_command)
+app.command("batch")(batch_command)
 app.add_typer(rig, name="rig")
-app.command("locate")(locate)
-app.command("budget")(budget)
-app.command("undistort")(undistort)
-app.command("bake")(bake)
+app.command("locate")(locate_command)
+app.command("budget")(budget_command)
+app.command("undistort")(undistort_command)
+app.command("bake")(bake_command)
 
 
 def main() -> None:
-    """Run the command line: one line on the error stream and exit code 1 for what kcal refuses."""
+    """Run the command line; an error of kcal is one line on the error stream and exit code 1."""
     try:
         app()
     except KcalError as error:

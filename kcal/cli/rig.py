@@ -1,7 +1,8 @@
-"""`kcal rig`: two cameras and what both have seen to a rig file."""
+"""Solve a rig from two cameras and what both have seen (`kcal rig`)."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,10 +13,8 @@ from kcal.cli.rig_check import check
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
-    from kcal.calibrate.rig.from_boards import RigCalibrationResult
-    from kcal.cli.rig_joint import Sources
-    from kcal.io.camera_file import CameraFile
-    from kcal.io.rig_file import RigFile
+    from kcal.calibrate.rig.result import RigResult
+    from kcal.lens.rig import StereoRig
 
 
 class _RigGroup(TyperGroup):
@@ -30,7 +29,7 @@ class _RigGroup(TyperGroup):
 app = typer.Typer(cls=_RigGroup, rich_markup_mode="markdown", help="Solve a rig, and check it later.")
 
 
-def solve(
+def solve_command(
     left: Annotated[Path, typer.Argument(help="Camera file of the left camera.")],
     right: Annotated[Path, typer.Argument(help="Camera file of the right camera.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write.")],
@@ -76,18 +75,10 @@ def solve(
     ] = "fixed",
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Leave nothing out; only warn.")] = False,
     refine_cameras: Annotated[
-        bool,
-        typer.Option("--refine-cameras", help="Boards only: solve for intrinsics and lenses again, jointly."),
+        bool, typer.Option("--refine-cameras", help="Solve for intrinsics and lenses too: --intrinsics free.")
     ] = False,
-    board_warp: Annotated[
-        bool, typer.Option("--board-warp", help="Boards only: also estimate how the board bends.")
-    ] = False,
-    reject: Annotated[
-        bool, typer.Option("--reject", help="Boards only: leave out pairs that noise cannot explain.")
-    ] = False,
-    picture: Annotated[
-        Path | None, typer.Option(help="A .png file: residuals by source and a plan. Not for boards only.")
-    ] = None,
+    board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
+    picture: Annotated[Path | None, typer.Option(help="A .png file: residuals by source and a plan.")] = None,
 ) -> None:
     """Solve a stereo rig: where the right camera stands from the left, and where both stand on the Earth.
 
@@ -95,10 +86,10 @@ def solve(
     positions: any of them, or all together in one adjustment. What contradicts the rest is left out and named. Boards
     are paired by name (left01.jpg with right01.jpg) or by a CSV; one that was read from its other end is turned.
 
-    The board's accuracy limits long ranges: watch the σ of the yaw. With a baseline of 10 m, 0.01° of yaw is 436 m at
-    5 km. Landmarks and far features hold it better than boards do.
+    Watch the σ of the yaw, which limits long ranges: with a baseline of 10 m, 0.01° of yaw is 436 m at 5 km. Landmarks
+    and far features determine it better than boards do.
 
-    `kcal rig check` looks later whether the cameras still stand as they did.
+    `kcal rig check` tells later whether the cameras have turned since.
 
     **Examples**
 
@@ -107,9 +98,15 @@ def solve(
     `kcal rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv --features far.csv
     --baseline 10.02±0.005 -o rig.json --picture rig.png`
     """
-    from kcal.cli.rig_joint import Sources
+    from kcal.calibrate.rig.solve import RigOptions, solve_rig
+    from kcal.cli.console import out, steps
+    from kcal.cli.rig_sources import Sources, read_sources
     from kcal.files import check_writable
-    from kcal.report.figures import check_picture_format
+    from kcal.io.camera_file import load_camera
+    from kcal.io.rig_file import save_rig
+    from kcal.locate.mounting import placed_rig
+    from kcal.report.figures import check_picture
+    from kcal.report.rig import save_rig_picture
 
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
@@ -117,148 +114,84 @@ def solve(
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     if picture is not None:
-        check_picture_format(picture)
-        check_writable(picture)
-    if sources.only_boards and sources.pairs is None:
+        check_picture(picture)
+    if not any((pairs, landmarks, marks, features, positions, baseline)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
-    if sources.only_boards and sources.pairs is not None and not picture and intrinsics == "fixed":
-        _from_boards(
-            left, right, sources.pairs, match, output, reject, refine_cameras=refine_cameras, board_warp=board_warp
-        )
-        return
-    if refine_cameras or board_warp or reject:
-        raise InputError(
-            "--refine-cameras, --board-warp and --reject are for boards only; use --intrinsics prior or free here"
-        )
-    _from_all(left, right, sources, output, picture, intrinsics, reject=not keep_all)
-
-
-def _from_all(
-    left: Path,
-    right: Path,
-    sources: Sources,
-    output: Path,
-    picture: Path | None,
-    intrinsics: Literal["fixed", "prior", "free"],
-    *,
-    reject: bool,
-) -> None:
-    from kcal.calibrate.rig.solve import JointOptions, solve_rig
-    from kcal.cli.console import out, steps
-    from kcal.cli.rig_joint import gather, mounting, record, show
-    from kcal.io.camera_file import CameraFile
-    from kcal.report.rig import save_rig_picture
-
-    cameras = CameraFile.load(left), CameraFile.load(right)
-    data, origin = gather(cameras, sources, prior=intrinsics == "prior")
+    if refine_cameras:
+        if intrinsics == "prior":
+            raise InputError("--refine-cameras lets the cameras free, --intrinsics prior does not; choose one")
+        intrinsics = "free"
+    data, frame, unpaired = read_sources((load_camera(left), load_camera(right)), sources, prior=intrinsics == "prior")
     with steps("solving the rig", 1) as advance:
-        solution = solve_rig(data, JointOptions(intrinsics=intrinsics, reject=reject))
+        result = solve_rig(data, RigOptions(intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all))
         advance("done")
-    there = mounting(solution, origin)
-    record(solution, cameras, there, fixed=intrinsics == "fixed").save(output)
+    rig = result.stereo() if frame is None else placed_rig(result, frame)
+    # Everything that can fail comes before the file.
+    lines = rig_lines(result, rig, unpaired)
+    save_rig(rig, output)
     if picture is not None:
-        save_rig_picture(picture, solution)
-    show(solution, there)
+        save_rig_picture(picture, result)
+    print_rig(result, lines)
     for path in (output, *([picture] if picture else [])):
         out.print(f"wrote {path}", markup=False)
 
 
-def _from_boards(
-    left: Path,
-    right: Path,
-    pairs: tuple[Path, Path],
-    match: Path | None,
-    output: Path,
-    reject: bool,
-    *,
-    refine_cameras: bool,
-    board_warp: bool,
-) -> None:
-    import math
-
-    from kcal.calibrate.rig.from_boards import RigOptions, calibrate_rig
-    from kcal.calibrate.rig.pairs import pair_by_name, read_pairs
-    from kcal.cli.console import err, out, steps
-    from kcal.corners.observations import Observations
-    from kcal.io.camera_file import CameraFile
+def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
+    """What a result says: residuals by source, the relative pose with its sigmas, the board's squares, the mounting."""
     from kcal.locate.check import triangulated_sides
 
-    cameras = CameraFile.load(left), CameraFile.load(right)
-    seen = Observations.load(pairs[0]), Observations.load(pairs[1])
-    names = seen[0].names, seen[1].names
-    matched = read_pairs(match, *names) if match is not None else pair_by_name(*names)
-    with steps("solving the rig", 1) as advance:
-        result = calibrate_rig(
-            cameras[0].camera(),
-            cameras[1].camera(),
-            seen[0],
-            seen[1],
-            matched,
-            RigOptions(refine_cameras=refine_cameras, board_warp=board_warp, reject=reject),
-        )
-        advance("done")
-    rig_record(result, None if refine_cameras else cameras).save(output)
-
-    alone = len(names[0]) + len(names[1]) - 2 * len(matched)
-    out.print(f"{len(result.pairs)} of {len(matched)} pairs used, {alone} views without partner")
-    out.print(
-        f"RMS [bold]{result.rms:.4f} px[/] (left {result.rms_left:.4f}, right {result.rms_right:.4f}); "
-        f"{result.status.message}"
-    )
+    rows = [["source", "used", "left out", "RMS px", "RMS m", "sigmas"]]
+    for source in result.sources:
+        cells = ["" if value is None else f"{value:.4f}" for value in (source.rms_px, source.rms_m)]
+        sigmas = "" if math.isnan(source.sigmas) else f"{source.sigmas:.2f}"
+        rows.append([source.source, f"{source.used}", f"{source.left_out}", *cells, sigmas])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
+    boards, mounting = result.data.boards, rig.mounting
+    exact = all(found is given for found, given in zip(result.cameras, result.data.cameras, strict=True))
     pitch, yaw, roll = (math.degrees(value) for value in result.sigma_rotation.tolist())
-    out.print(
-        f"baseline [bold]{float(result.rig.baseline):.6f} m[/] ± {_along(result):.6f}; "
-        f"σ of yaw {yaw:.5f}°, pitch {pitch:.5f}°, roll {roll:.5f}°"
-        + ("" if refine_cameras else " with both cameras taken as exact")
-    )
-    side, spread = triangulated_sides(result.rig, seen[0].board.columns, seen[0].board.rows, result.pixels)
-    true = seen[0].board.square
-    out.print(f"triangulated squares: {1e3 * side:.4f} mm ± {1e3 * spread:.4f} mm, the board's are {1e3 * true:.4f} mm")
-    for pair in result.flipped:
-        out.print(f"turned by 180°: {pair[0]}, {pair[1]} (the board was read from its other end)", markup=False)
-    for pair, reason in result.excluded:
-        err.print("[yellow]left out:[/]", f"{pair[0]}, {pair[1]}: {reason}")
+    lines += [
+        f"RMS [bold]{result.rms:.4f} px[/] (left {result.rms_px[0]:.4f}, right {result.rms_px[1]:.4f}); "
+        f"{result.status.message}",
+        f"baseline [bold]{float(rig.baseline):.6f} m[/] ± {result.sigma_baseline:.6f}; σ of yaw {yaw:.5f}°, pitch "
+        f"{pitch:.5f}°, roll {roll:.5f}°{' with both cameras taken as exact' if exact else ''}",
+    ]
+    if boards is not None:
+        lines.append(f"{len(result.pairs)} of {len(boards.names)} pairs used, {unpaired} views without partner")
+        if result.pairs:
+            side, spread = triangulated_sides(rig, boards.board.columns, boards.board.rows, result.pixels)
+            lines.append(
+                f"triangulated squares: {1e3 * side:.4f} mm ± {1e3 * spread:.4f} mm, the board's are "
+                f"{1e3 * boards.board.square:.4f} mm"
+            )
+    if result.board_warp is not None:
+        x, y = (1e3 * result.board_warp).tolist()
+        lines.append(f"board warp: {x:+.3f} mm along its rows, {y:+.3f} mm along its columns")
+    if mounting is not None and mounting.covariance is not None:
+        sigma = mounting.covariance.diagonal().sqrt().tolist()
+        place = mounting.origin
+        lines.append(
+            f"left camera at {place.lat:.7f}, {place.lon:.7f}, {place.height:.3f} m above the ellipsoid "
+            f"(± {max(sigma[:2]):.3f} m level, {sigma[2]:.3f} m up), heading {mounting.heading_deg:.4f}° ± "
+            f"{math.degrees(sigma[5]):.4f}, pitch {mounting.pitch_deg:.4f}°, roll {mounting.roll_deg:.4f}°"
+        )
+    return lines
+
+
+def print_rig(result: RigResult, lines: list[str]) -> None:
+    """Print the lines of a result, and what was turned, left out and should be doubted."""
+    from kcal.cli.console import err, out
+
+    for line in lines:
+        out.print(line)
+    for turned in result.flipped:
+        text = f"turned by 180°: {turned.board} ({turned.camera}; the board was read from its other end)"
+        out.print(text, markup=False)
+    for item in result.left_out:
+        err.print("[yellow]left out:[/]", f"{item.label}: {item.reason}")
     for text in result.warnings:
         err.print("[yellow]warning:[/]", text)
-    out.print(f"wrote {output}", markup=False)
 
 
-def rig_record(result: RigCalibrationResult, cameras: tuple[CameraFile, CameraFile] | None) -> RigFile:
-    """The rig file of a result; `cameras` are kept whole where they were not solved again."""
-    from kcal.io.camera_file import provenance
-    from kcal.io.rig_file import rig_to_file
-    from kcal.lens.calibration import Exclusion, RigCalibration
-
-    return rig_to_file(
-        result.rig,
-        left=cameras[0] if cameras else None,
-        right=cameras[1] if cameras else None,
-        covariance=result.covariance,
-        calibration=RigCalibration(
-            rms=result.rms,
-            rms_left=result.rms_left,
-            rms_right=result.rms_right,
-            pairs=len(result.pairs),
-            per_pair_rms={
-                _name(pair): rms for pair, rms in zip(result.pairs, result.per_pair_rms.tolist(), strict=True)
-            },
-            flipped=tuple(_name(pair) for pair in result.flipped),
-            excluded=tuple(Exclusion(name=_name(pair), reason=reason) for pair, reason in result.excluded),
-            baseline_m=float(result.rig.baseline),
-            **provenance(),
-        ),
-    )
-
-
-def _name(pair: tuple[str, str]) -> str:
-    return f"{pair[0]} {pair[1]}"
-
-
-def _along(result: RigCalibrationResult) -> float:
-    """σ of the baseline's length, meters, from the σ of the translation along it."""
-    direction = result.rig.right_from_left_translation / result.rig.baseline
-    return float(((direction * result.sigma_translation) ** 2).sum().sqrt())
-
-
-app.command("solve", hidden=True)(solve)
+app.command("solve", hidden=True)(solve_command)
 app.command("check")(check)

@@ -1,4 +1,4 @@
-"""`kcal rig check`: do the cameras still stand as they did? And `--relock`: a corrected rig in place of the old one."""
+"""Check whether the cameras of a rig have turned, and correct the rig file (`kcal rig check`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kcal.errors import InputError
 if TYPE_CHECKING:
     from kcal.calibrate.rig.drift import Drift
     from kcal.calibrate.rig.sources import Features, Landmarks
-    from kcal.io.rig_file import RigFile
+    from kcal.lens.rig import StereoRig
     from kcal.locate.marks import Marks
 
 
@@ -23,7 +23,7 @@ def check(
     ],
     reference: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="The same static things marked in images of when the rig was solved."),
+        typer.Option(metavar="CSV", help="The same static things, marked in images from when the rig was solved."),
     ] = None,
     landmarks: Annotated[
         Path | None, typer.Option(metavar="CSV", help="Surveyed places among the marks, as for `kcal rig`.")
@@ -35,11 +35,12 @@ def check(
 ) -> None:
     """Check whether the cameras have turned since the rig was solved, and what that does to ranges.
 
-    Needs things that do not move, marked in new images: either the same as in images of then (`--reference`; what they
-    are and how far away does not matter), or surveyed places (`--landmarks`; the rig must have been solved with some).
-    Forty features of 0.1 px tell the yaw to a thousandth of a degree. Things that moved are left out and named.
+    Needs things that do not move, marked in new images: either the same things as in old images (`--reference`; what
+    they are and how far away does not matter), or surveyed places (`--landmarks`; the rig must have been solved with
+    some). Forty features marked to 0.1 px determine the yaw to a thousandth of a degree. Things that moved are left out
+    and named.
 
-    With `--relock` the rig file is replaced by one with the attitudes of now; the old one stays beside it.
+    With `--relock` the rig file is replaced by one with the present attitudes; the old one is kept beside it.
 
     **Examples**
 
@@ -47,32 +48,29 @@ def check(
 
     `kcal rig check rig.json --landmarks survey.csv --marks now.csv --relock`
     """
-    from kcal.calibrate.rig.drift import measure_drift
     from kcal.cli.console import err, out
     from kcal.files import check_writable
-    from kcal.io.rig_file import RigFile
+    from kcal.io.rig_file import load_rig
     from kcal.locate.marks import read_marks
-    from kcal.locate.relock import known_before, standing
+    from kcal.locate.relock import check_rig
 
     if reference is None and landmarks is None:
-        raise InputError("give --reference (marks of the same things in images of then) or --landmarks (a survey)")
+        raise InputError("give --reference (marks of the same things in old images) or --landmarks (a survey)")
     if relock:
         check_writable(rig, marks, *(path for path in (reference, landmarks) if path is not None))
-    file = RigFile.load(rig)
+    old = load_rig(rig)
     now = read_marks(marks, single=True)
     features = None if reference is None else _features(read_marks(reference, single=True), now, mark_sigma)
-    surveyed = None if landmarks is None else _landmarks(file, landmarks, now, mark_sigma)
-    drift = measure_drift(
-        file.rig(), features=features, landmarks=surveyed, pose=standing(file), before=known_before(file)
-    )
-    for line in _table(file, drift):
+    surveyed = None if landmarks is None else _landmarks(old, landmarks, now, mark_sigma)
+    drift = check_rig(old, features=features, landmarks=surveyed)
+    for line in _table(old, drift):
         out.print(line, markup=False)
     for item in drift.left_out:
         err.print("[yellow]left out:[/]", f"{item.name}: {item.reason}")
     if drift.variance > 1:
         err.print(
             f"[yellow]warning:[/] residuals are {drift.variance**0.5:.1f} times as large as the marks' noise says; "
-            "sigmas were widened"
+            "sigmas were multiplied by that"
         )
     out.print(
         "the relative attitude has [bold]changed[/] beyond chance"
@@ -80,7 +78,7 @@ def check(
         else "no change of the relative attitude beyond chance"
     )
     if relock:
-        kept = _relock(rig, file, drift, marks)
+        kept = _relock(rig, old, drift, marks)
         out.print(f"kept the old rig as {kept}", markup=False)
         out.print(f"wrote {rig}", markup=False)
 
@@ -92,7 +90,7 @@ def _features(then: Marks, now: Marks, sigma: float) -> Features:
 
     common = [name for name in then.names if name in now.names]
     if not common:
-        raise InputError("no name is in both files of marks; the same things must have the same names")
+        raise InputError("no name is in both files of marks; give the same things the same names")
     before = then.pixels[[then.names.index(name) for name in common]]
     after = now.pixels[[now.names.index(name) for name in common]]
     return Features(
@@ -104,18 +102,15 @@ def _features(then: Marks, now: Marks, sigma: float) -> Features:
     )
 
 
-def _landmarks(file: RigFile, path: Path, now: Marks, sigma: float) -> Landmarks:
-    from kcal.locate.geodesy import Origin
+def _landmarks(rig: StereoRig, path: Path, now: Marks, sigma: float) -> Landmarks:
     from kcal.locate.survey import match_landmarks, read_survey
 
-    stands = file.mounting
-    if stands is None:
+    if rig.mounting is None:
         raise InputError("the rig file does not say where the rig stands; solve it with landmarks, or use --reference")
-    here = Origin(lat=stands.lat, lon=stands.lon, height=stands.height)
-    return match_landmarks(read_survey(path, here), now, sigma).landmarks
+    return match_landmarks(read_survey(path, rig.mounting.origin), now, sigma).landmarks
 
 
-def _table(file: RigFile, drift: Drift) -> list[str]:
+def _table(rig: StereoRig, drift: Drift) -> list[str]:
     import math
 
     from kcal.locate.monitor import drift_effect
@@ -138,18 +133,19 @@ def _table(file: RigFile, drift: Drift) -> list[str]:
         rows.append([name, *cells, used])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    effect = drift_effect(file.rig(), drift.rig, drift.relative_covariance)
+    effect = drift_effect(rig, drift.rig, drift.relative_covariance)
     for distance, found, sigma in zip(*(value.tolist() for value in effect), strict=True):
         shift = "infinity" if math.isinf(found) else f"{found:.1f} m ({found - distance:+.1f} ± {sigma:.1f} m)"
         lines.append(f"with the old rig a target at {distance:g} m is found at {shift}")
     return lines
 
 
-def _relock(path: Path, file: RigFile, drift: Drift, marks: Path) -> Path:
-    """Replace the rig file; returns where the old one is now."""
+def _relock(path: Path, old: StereoRig, drift: Drift, marks: Path) -> Path:
+    """Replace the rig file; returns where the old one is kept."""
     import datetime
 
-    from kcal.files import dump_json, write_atomic
+    from kcal.files import write_atomic
+    from kcal.io.rig_file import save_rig
     from kcal.locate.relock import relocked
 
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
@@ -158,8 +154,8 @@ def _relock(path: Path, file: RigFile, drift: Drift, marks: Path) -> Path:
     while kept.exists():
         number += 1
         kept = path.with_name(f"{path.stem}.before-{stamp}-{number}{path.suffix}")
-    new = relocked(file, drift, f"{stamp}, from {marks.name}")
-    # The old one first: whatever happens in between, a good rig is there.
-    write_atomic(kept, dump_json(file.dump()))
-    new.save(path)
+    new = relocked(old, drift, f"{stamp}, from {marks.name}")
+    # The old one first: whatever happens in between, there is a good rig.
+    write_atomic(kept, path.read_bytes())
+    save_rig(new, path)
     return kept

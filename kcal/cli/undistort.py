@@ -1,4 +1,4 @@
-"""`kcal undistort`: images without the lens's distortion, and the pinhole camera that they fit."""
+"""`kcal undistort`: images without lens distortion, and their pinhole camera."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from kcal.cli.console import err, out, steps
+from kcal.cli.console import err, out, print_wrote, steps
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from kcal.lens.images import Undistort
 
 
-def undistort(
+def undistort_command(
     images: Annotated[
         list[str],
         typer.Argument(
@@ -28,7 +28,10 @@ def undistort(
     alpha: Annotated[
         float,
         typer.Option(
-            "--alpha", min=0, max=1, help="0: only pixels that the source shows; 1: all of the source, black round it."
+            "--alpha",
+            min=0,
+            max=1,
+            help="0 keeps only pixels that the source shows, 1 all of the source with a black rim.",
         ),
     ] = 0.0,
     mask: Annotated[
@@ -38,10 +41,10 @@ def undistort(
     """Remove the lens's distortion from images.
 
     Writes NAME.png for each image (8 or 16 bits, gray or color as the source) and CAMERA_undistorted.json, the
-    pinhole camera of the new images, into the folder. Straight lines become straight; where the source shows nothing
-    the images are black. EXIF orientation is ignored: pixels count as the sensor wrote them.
+    pinhole camera of the new images. Straight lines become straight; pixels that the source does not show are black.
+    EXIF orientation is ignored: pixels are used as the sensor wrote them.
 
-    A bad image does not stop the others: it is reported, and the command fails at the end.
+    A bad image does not stop the others: it is reported, and the exit code is 1.
 
     **Examples**
 
@@ -85,14 +88,13 @@ def undistort(
     share = float(module.mask.double().mean())
     out.print(f"{len(paths) - len(failures)} of {len(paths)} images undistorted, {width}x{height} px")
     out.print(f"new camera: fx {fx:.2f}, fy {fy:.2f}, cx {cx:.2f}, cy {cy:.2f}; {100 * share:.1f} % of pixels valid")
-    for path in (output, camera_path, *([mask_path] if mask else [])):
-        out.print(f"wrote {path}", markup=False)
+    print_wrote(output, camera_path, mask_path if mask else None)
     if failures:
         raise FileError(f"{len(failures)} of {len(paths)} images could not be undistorted: {failures[0]}")
 
 
 def _outputs(paths: list[Path], folder: Path, others: list[Path]) -> list[Path]:
-    """The file for each image, all different, and none of them an input."""
+    """Choose the file for each image: all different, and none of them an input."""
     inputs = {path.resolve() for path in paths}
     taken: dict[Path, str] = {path: "a file of this command" for path in others}
     outputs = []
@@ -124,7 +126,7 @@ def _convert(path: Path, target: Path, module: Undistort) -> None:
     from kcal.io.images import decode_image, write_png
 
     data = read_bytes(path)
-    # Refuses damaged files, which a decoder alone would fill with gray.
+    # This refuses damaged files, which `decode_image` alone would fill with gray.
     decode_gray(data, path)
     image = torch.from_numpy(decode_image(data, path))
     (height, width), size = image.shape[:2], module.camera.size

@@ -119,7 +119,7 @@ def _full_step(
     return newton_step(x, y, lens.x - goal_x, lens.y - goal_y, inverse_jacobian(lens.point))
 
 
-def _start(
+def _newton_start(
     goal_x: Tensor, goal_y: Tensor, coefficients: Tensor, model: LensModel, ready: PreparedInverse
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor, LensModel]]:
     """Where Newton's method starts, and what it solves: the goal and the lens with the tilt undone."""
@@ -133,7 +133,7 @@ def _solve_eagerly(
     target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel, ready: PreparedInverse
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Plain Newton for all points, then the safeguarded solver for those that did not converge."""
-    x, y, (goal_x, goal_y, own, rest) = _start(target_x, target_y, coefficients, model, ready)
+    x, y, (goal_x, goal_y, own, rest) = _newton_start(target_x, target_y, coefficients, model, ready)
     lens = distort_components(x, y, own, rest)
     inverse: Jacobian = ()
     keep = last = False
@@ -162,7 +162,7 @@ def _solve_in_fixed_steps(
     target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel, ready: PreparedInverse
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The same steps for every point. Points that stray, near a fold or without a preimage, fail the last check."""
-    x, y, (goal_x, goal_y, own, rest) = _start(target_x, target_y, coefficients, model, ready)
+    x, y, (goal_x, goal_y, own, rest) = _newton_start(target_x, target_y, coefficients, model, ready)
     for _ in range(_STEPS):
         x, y = _full_step(x, y, goal_x, goal_y, own, rest)
     lens = distort_components(x, y, coefficients, model, slopes=not model.radial)

@@ -70,7 +70,7 @@ def ray_starts(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor) -> tuple[T
     with torch.no_grad():
         depth = torch.zeros_like(Z)
         for _ in range(_STEPS):
-            wanted, pupil = _evaluate(X, Y, Z, coefficients, depth)
+            wanted, pupil = _pupil_at(X, Y, Z, coefficients, depth)
             step = (wanted - depth) * pupil.gain
             depth = depth + step
             found = pupil.found & (step * step <= _LAST_STEP**2 * (X * X + Y * Y + Z * Z))
@@ -78,7 +78,7 @@ def ray_starts(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor) -> tuple[T
                 break
     if is_differentiated(X, Y, Z, coefficients):
         for _ in range(2):
-            wanted, pupil = _evaluate(X, Y, Z, coefficients, depth)
+            wanted, pupil = _pupil_at(X, Y, Z, coefficients, depth)
             depth = depth + (wanted - depth) * pupil.gain
     return depth, found
 
@@ -86,11 +86,11 @@ def ray_starts(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor) -> tuple[T
 def entrance_pupil(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor) -> Pupil:
     """As `ray_starts`, with what closed-form derivatives need."""
     depth, found = ray_starts(X, Y, Z, coefficients)
-    _, pupil = _evaluate(X, Y, Z, coefficients, depth)
+    _, pupil = _pupil_at(X, Y, Z, coefficients, depth)
     return pupil._replace(found=found)
 
 
-def _evaluate(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, depth: Tensor) -> tuple[Tensor, Pupil]:
+def _pupil_at(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, depth: Tensor) -> tuple[Tensor, Pupil]:
     """The right side of the equation for a ray that starts at `depth`."""
     first, second = unbind_last(coefficients[..., 1:3])
     across, below = X * X + Y * Y, Z - depth

@@ -233,11 +233,11 @@ def undo_components(x: Tensor, y: Tensor, field: Field) -> tuple[Tensor, Tensor,
         found_x, found_y, solved = solve(x, y, field)
     if is_differentiated(x, y, field.weights):
         for _ in range(2):
-            found_x, found_y = _full_step(found_x, found_y, x, y, field)
+            found_x, found_y = _field_step(found_x, found_y, x, y, field)
     return found_x, found_y, solved
 
 
-def _full_step(x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, field: Field) -> tuple[Tensor, Tensor]:
+def _field_step(x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, field: Field) -> tuple[Tensor, Tensor]:
     here = correct_components(x, y, field)
     return newton_step(x, y, here.x - goal_x, here.y - goal_y, inverse_jacobian(here.point))
 
@@ -263,7 +263,7 @@ def _undo_eagerly(goal_x: Tensor, goal_y: Tensor, field: Field) -> tuple[Tensor,
 def _undo_in_fixed_steps(goal_x: Tensor, goal_y: Tensor, field: Field) -> tuple[Tensor, Tensor, Tensor]:
     x, y = goal_x, goal_y
     for _ in range(_FIXED):
-        x, y = _full_step(x, y, goal_x, goal_y, field)
+        x, y = _field_step(x, y, goal_x, goal_y, field)
     here = correct_components(x, y, field, slopes=False)
     return x, y, is_solved(here.x - goal_x, here.y - goal_y, goal_x, goal_y)
 

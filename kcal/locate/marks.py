@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import FileError
+from kcal.files import write_atomic
 from kcal.locate.tables import TableRow, read_rows
 
 PIXELS = ("left_u", "left_v", "right_u", "right_v")
@@ -63,6 +64,17 @@ def read_marks(path: str | Path, *, single: bool = False) -> Marks:
     rows = read_rows(path, _HEADER, ("name", *PIXELS, "note"), PIXELS)
     table = torch.tensor([_four_pixels(row, single) for row in rows], dtype=torch.float64)
     return Marks(names=tuple(row.name for row in rows), left=table[:, :2], right=table[:, 2:])
+
+
+def write_marks(path: str | Path, marks: Marks) -> Path:
+    """Write marks as `read_marks` reads them, exact to the last bit.
+
+    Raises:
+        FileError: the file cannot be written.
+    """
+    rows = zip(marks.names, marks.left.tolist(), marks.right.tolist(), strict=True)
+    lines = [_HEADER, *(",".join([name, *map(repr, (*left, *right))]) for name, left, right in rows)]
+    return write_atomic(path, "\n".join(lines) + "\n")
 
 
 def _four_pixels(row: TableRow, single: bool) -> list[float]:

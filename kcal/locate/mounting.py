@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.result import RigSolution
+from kcal.calibrate.rig.result import RigResult
 from kcal.errors import InputError
 from kcal.lens.mounting import Mounting, Origin
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import StereoRig
 from kcal.locate.ellipsoid import ecef_from_enu_rotation
 from kcal.locate.geodesy import enu_to_geodetic
 
@@ -70,11 +70,11 @@ def mounting_of(
     )
 
 
-def placed_rig(result: RigSolution, origin: Origin) -> StereoRig:
-    """The rig of a solution with its covariance, and with its mounting if the data determine it.
+def placed_rig(result: RigResult, origin: Origin) -> StereoRig:
+    """The rig of a result with everything that is known of it: also its mounting, if the data determine it.
 
     Args:
-        result: from `kcal.solve_rig`.
+        result: from `kcal.solve_rig`; its first camera is the left one.
         origin: of the frame in which landmarks and positions were given.
 
     Example:
@@ -92,7 +92,6 @@ def placed_rig(result: RigSolution, origin: Origin) -> StereoRig:
         (0.0, False)
     """
     rig = result.stereo()
-    rig.covariance = RigCovariance.of(rig, joint=result.joint_covariance())
     covariance = result.mounting_covariance(0)
     if result.absolute and bool(torch.isfinite(covariance).all()):
         rig.mounting = mounting_of(result.rotation[0], result.center[0], covariance, origin, result.mounting_link())

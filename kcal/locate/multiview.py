@@ -15,7 +15,7 @@ from kcal.lens.tracing import is_differentiated
 from kcal.locate.angular import triangulate_angular
 from kcal.locate.linear import triangulate_linear
 from kcal.locate.max_likelihood import RelativeCamera, inverse_covariances, most_likely, position_slope, symmetric
-from kcal.locate.stereo import PositionStatus, with_status
+from kcal.locate.stereo import PositionStatus, flag_positions
 
 Method = Literal["linear", "angular", "likelihood"]
 
@@ -145,7 +145,7 @@ class TriangulateViews(nn.Module):
             (~sound, PositionStatus.BAD_COVARIANCE),
             (~finite, PositionStatus.NOT_FINITE),
         ):
-            code = with_status(code, condition, status)
+            code = flag_positions(code, condition, status)
         return self._refined(cameras, pixels, points, rays[0], code, weight)
 
     def _refined(
@@ -166,7 +166,7 @@ class TriangulateViews(nn.Module):
         )  # fmt: skip
         if self.method == "likelihood":
             ok = ok & (fit.inverse > 0)
-            code = with_status(code, (code == int(PositionStatus.OK)) & ~ok, PositionStatus.PARALLEL)
+            code = flag_positions(code, (code == int(PositionStatus.OK)) & ~ok, PositionStatus.PARALLEL)
             points = (scale / torch.where(ok, fit.inverse, 1.0))[..., None] * fit.direction.mT
         points = torch.where(ok[..., None], points, 0.0)
         rotation, translation = self.cam_from_world[0, :, :3], self.cam_from_world[0, :, 3]

@@ -1,4 +1,4 @@
-"""A rig file whose cameras have been found turned, brought up to date."""
+"""Check whether a solved rig has turned, and correct it."""
 
 from __future__ import annotations
 
@@ -7,87 +7,85 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.drift import Drift
-from kcal.io.rig_file import RigFile, RigMounting, RigPose
+from kcal.calibrate.rig.drift import Drift, measure_drift
+from kcal.calibrate.rig.sources import Features, Landmarks
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.mounting import attitude
 
 
-def standing(file: RigFile) -> tuple[Tensor, Tensor] | None:
-    """The left camera's pose in the local frame at its own place: cam_from_enu (3, 3) and zeros; None if not stored."""
-    stands = file.mounting
-    if stands is None:
-        return None
-    rotation = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
-    return rotation, torch.zeros(3, dtype=torch.float64)
+def check_rig(rig: StereoRig, *, features: Features | None = None, landmarks: Landmarks | None = None) -> Drift:
+    """Measure how the cameras have turned (`measure_drift`) with what the rig knows of itself.
 
-
-def known_before(file: RigFile) -> tuple[Tensor, Tensor] | None:
-    """Covariances (3, 3) of the relative turn and of the left camera's attitude, both about camera axes, as stored."""
-    joint, stands = file.joint_covariance(), file.mounting
-    if joint is None:
-        return None
-    left = torch.zeros(3, 3, dtype=torch.float64)
-    pose = standing(file)
-    if stands is not None and pose is not None and stands.covariance is not None:
-        left = pose[0] @ torch.tensor(stands.covariance, dtype=torch.float64)[3:, 3:] @ pose[0].T
-    return joint[-6:-3, -6:-3], left
-
-
-def relocked(file: RigFile, drift: Drift, note: str) -> RigFile:
-    """The rig file with the attitudes that `measure_drift` found.
-
-    Cameras and their places stay. The covariance of the drift is added to that of the rig: the errors of then are
-    still in it, those of the check come on top.
+    Its mounting gives the left camera's pose for landmarks, and its covariance says how well the attitudes were known.
 
     Args:
-        file: the old rig file.
+        rig: as it was solved, with its `covariance` and, for landmarks, its `mounting`.
+        features: see `measure_drift`.
+        landmarks: see `measure_drift`; in the frame of `rig.mounting.origin`.
+
+    Raises:
+        InputError: nothing to measure with, or landmarks for a rig without mounting.
+        DegenerateError: too little to tell the turn.
+
+    Example:
+        >>> from kcal.locate.budget import planned_rig
+        >>> rig, rows = planned_rig(), torch.tensor([[-90.0, 2, 300], [80, -9, 250], [4, 6, 400], [30, 20, 200]])
+        >>> pixels = torch.cat([torch.stack(rig(rows.double())[:2], 1)] * 2, 1)  # the same then and now
+        >>> unknown = torch.zeros(4).double(), torch.full((4,), torch.inf).double()
+        >>> static = Features(names=tuple("abcd"), pixels=pixels, inverse_range=unknown[0],
+        ...                   inverse_range_sigma=unknown[1])
+        >>> check_rig(rig, features=static).significant
+        False
+    """
+    pose: tuple[Tensor, Tensor] | None = None
+    left = torch.zeros(3, 3, dtype=torch.float64)
+    if rig.mounting is not None:
+        stands = rig.mounting
+        rotation = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
+        pose = rotation, torch.zeros(3, dtype=torch.float64)
+        if stands.covariance is not None:
+            left = rotation @ stands.covariance[3:, 3:] @ rotation.T
+    before = None if rig.covariance is None else (rig.covariance.matrix[-6:-3, -6:-3], left)
+    return measure_drift(rig, features=features, landmarks=landmarks, pose=pose, before=before)
+
+
+def relocked(rig: StereoRig, drift: Drift, note: str) -> StereoRig:
+    """The rig with the attitudes that `check_rig` found; cameras and their places stay.
+
+    The covariance of the drift is added to that of the rig: the errors of the first solution are still in it, and those
+    of the check come on top.
+
+    Args:
+        rig: the rig as it was solved.
         drift: what was found.
         note: when and from what, for the record.
 
     Example:
-        >>> from kcal.io.rig_file import rig_to_file
         >>> from kcal.locate.budget import planned_rig
-        >>> callable(relocked), rig_to_file(planned_rig()).mounting
-        (True, None)
+        >>> rig, rows = planned_rig(), torch.tensor([[-90.0, 2, 300], [80, -9, 250], [4, 6, 400], [30, 20, 200]])
+        >>> pixels = torch.cat([torch.stack(rig(rows.double())[:2], 1)] * 2, 1)
+        >>> unknown = torch.zeros(4).double(), torch.full((4,), torch.inf).double()
+        >>> static = Features(names=tuple("abcd"), pixels=pixels, inverse_range=unknown[0],
+        ...                   inverse_range_sigma=unknown[1])
+        >>> bool(relocked(rig, check_rig(rig, features=static), "Monday").baseline == rig.baseline)
+        True
     """
-    covariance = file.joint_covariance()
-    size = 10 + len(file.left.coefficients) + len(file.right.coefficients) + 6
-    joint = torch.zeros(size, size, dtype=torch.float64) if covariance is None else covariance.clone()
-    joint[-6:, -6:] += drift.pose_covariance
-    mounting = file.mounting
-    if mounting is not None and drift.cam_from_local is not None and drift.left_covariance is not None:
-        rotation = drift.cam_from_local
+    new = StereoRig(rig.left, rig.right, drift.rig.right_from_left_rotation, drift.rig.right_from_left_translation)
+    if rig.covariance is not None:
+        joint = rig.covariance.matrix.clone()
+        joint[-6:, -6:] += drift.pose_covariance
+        new.covariance = RigCovariance(matrix=joint)
+    new.mounting = rig.mounting
+    if rig.mounting is not None and drift.cam_from_local is not None and drift.left_covariance is not None:
+        rotation, covariance = drift.cam_from_local, rig.mounting.covariance
         heading, pitch, roll = attitude(rotation.T)
-        spread = None
-        if mounting.covariance is not None:
-            matrix = torch.tensor(mounting.covariance, dtype=torch.float64)
-            matrix[3:, 3:] += rotation.T @ drift.left_covariance @ rotation
-            spread = tuple(map(tuple, matrix.tolist()))
-        mounting = RigMounting(
-            lat=mounting.lat,
-            lon=mounting.lon,
-            height=mounting.height,
-            heading_deg=heading,
-            pitch_deg=pitch,
-            roll_deg=roll,
-            covariance=spread,
-            link=mounting.link,
+        if covariance is not None:
+            covariance = covariance.clone()
+            covariance[3:, 3:] += rotation.T @ drift.left_covariance @ rotation
+        new.mounting = dataclasses.replace(
+            rig.mounting, heading_deg=heading, pitch_deg=pitch, roll_deg=roll, covariance=covariance
         )
-    rig = drift.rig
-    calibration = file.calibration
-    if calibration is not None:
-        calibration = dataclasses.replace(calibration, relocked=note, baseline_m=float(rig.baseline))
-    return RigFile(
-        left=file.left,
-        right=file.right,
-        right_from_left=RigPose.model_validate(
-            {
-                "rotation": rig.right_from_left_rotation.tolist(),
-                "translation": rig.right_from_left_translation.tolist(),
-            }
-        ),
-        covariance=None if covariance is None else tuple(map(tuple, joint.tolist())),
-        mounting=mounting,
-        calibration=calibration,
-    )
+    if rig.calibration is not None:
+        new.calibration = dataclasses.replace(rig.calibration, relocked=note, baseline_m=float(new.baseline))
+    return new

@@ -39,7 +39,7 @@ class PositionStatus(enum.IntEnum):
     BAD_COVARIANCE = 8
 
 
-def with_status(code: Tensor, condition: Tensor, status: PositionStatus) -> Tensor:
+def flag_positions(code: Tensor, condition: Tensor, status: PositionStatus) -> Tensor:
     """`code` (int8) with `status` where the condition is true."""
     return torch.where(condition, code.new_full((), int(status)), code)
 
@@ -122,7 +122,7 @@ def sight_lines(rig: StereoRig, pixels_left: Tensor, pixels_right: Tensor) -> Si
         (~inside, PositionStatus.OUTSIDE_IMAGE),
         (~finite, PositionStatus.NOT_FINITE),
     ):
-        code = with_status(code, condition, status)
+        code = flag_positions(code, condition, status)
     return SightLines(rays_left, points, code, along_baseline)
 
 
@@ -198,10 +198,10 @@ def fit_pairs(
     with torch.no_grad():
         lines = sight_lines(rig, left, right)
         weight, sound = inverse_covariances(cov)
-        code = with_status(lines.status, ~sound, PositionStatus.BAD_COVARIANCE)
-        code = with_status(code, ~finite, PositionStatus.NOT_FINITE)
+        code = flag_positions(lines.status, ~sound, PositionStatus.BAD_COVARIANCE)
+        code = flag_positions(code, ~finite, PositionStatus.NOT_FINITE)
         if mask is not None:
-            code = with_status(code, ~mask, PositionStatus.MASKED)
+            code = flag_positions(code, ~mask, PositionStatus.MASKED)
         met = code == int(PositionStatus.OK)
         usable = met | ((code == int(PositionStatus.PARALLEL)) & ~lines.along_baseline)
         scale = rig.baseline.detach()
@@ -255,10 +255,10 @@ def inverse_range(found: PairFit, variance: Tensor, weak_status: PositionStatus)
     with torch.no_grad():
         weak = usable & (~known | (value < BEARING_SIGMAS * sigma))
         lost = usable & ~(value > 0)
-        code = with_status(code, weak & (code == int(PositionStatus.OK)), weak_status)
-        code = with_status(code, lost, PositionStatus.PARALLEL)
+        code = flag_positions(code, weak & (code == int(PositionStatus.OK)), weak_status)
+        code = flag_positions(code, lost, PositionStatus.PARALLEL)
         # What the closed form put at infinity may have come back in front of the rig.
-        code = with_status(code, usable & ~lost & ~weak, PositionStatus.OK)
+        code = flag_positions(code, usable & ~lost & ~weak, PositionStatus.OK)
     return InverseRange(value, sigma, range_interval(value, sigma, known), weak, code)
 
 

@@ -1,7 +1,7 @@
-"""What was surveyed or is known of the surroundings of a rig, from CSV files into its local frame.
+"""Read what was surveyed or is known of the surroundings of a rig from CSV files into its local frame.
 
-Latitudes and longitudes go through Earth-centered coordinates, so that curvature is in them; heights are above the
-WGS84 ellipsoid. Local meters are east, north, up of the same origin.
+Latitudes and longitudes go through Earth-centered coordinates, so that the Earth's curvature is included; heights are
+above the WGS84 ellipsoid. Local meters are east, north, up of the same origin.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from kcal.locate.tables import TableRow, read_rows
 
 _EARTH, _LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
 _PLACES = ("name", *_EARTH, *_LOCAL, "sigma", "sigma_up", "note")
-# One over meters: the inverse range of a star is known to this.
+# 1/m: how well the inverse range of a star is known.
 _INFINITY_SIGMA = 1e-12
 
 
@@ -109,7 +109,7 @@ class MarkedLandmarks(NamedTuple):
 
 
 def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float) -> MarkedLandmarks:
-    """Bring survey and marks together by name.
+    """Match surveyed places and marks by name.
 
     Raises:
         InputError: no name is in both.
@@ -141,10 +141,10 @@ def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float) -> MarkedL
 
 
 def read_features(path: str | Path, pixel_sigma: float) -> Features:
-    r"""Read matched far features: `name,left_u,left_v,right_u,right_v` and what is known of their range, if anything.
+    r"""Read matched far features: `name,left_u,left_v,right_u,right_v` and what is known of their ranges, if anything.
 
-    `range` and `range_sigma` in meters from the rig, `range` alone `inf` for a star; or `beyond`, a distance that the
-    feature is farther away than; or nothing, and then it only ties the epipolar geometry.
+    Either `range` and `range_sigma`, meters from the rig (`inf` without sigma for a star); or `beyond`, meters than
+    which the feature is farther away; or nothing: then it determines the epipolar geometry only.
 
     Raises:
         FileError: see `kcal.locate.tables.read_rows`; a range without its sigma, or with `beyond`.

@@ -24,7 +24,7 @@ from kcal.lens.residual import undo_components
 from kcal.nets.fit import RegressionProblem, fit_weights
 from kcal.nets.mlp import Network, evaluate, initial_weights
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Status
+from kcal.solve.result import SolverStatus
 
 # 1 - |p|² / 4 on the chart at 89.9° off axis, the smallest divisor on the way back to the plane z = 1.
 _SMALLEST_DIVISOR = 1.0 - math.tan(math.radians(89.9 / 2)) ** 2
@@ -170,7 +170,7 @@ class InverseFit:
     start_rms: float
     start_largest: float
     iterations: int
-    status: Status
+    status: SolverStatus
 
 
 @torch.no_grad()
@@ -228,7 +228,7 @@ def train_inverse(camera: Camera, options: InverseNetOptions | None = None) -> I
         start_rms=_rms(before),
         start_largest=float(before.max()),
         iterations=int(result.iterations),
-        status=Status(int(result.status)),
+        status=SolverStatus(int(result.status)),
     )
 
 

@@ -122,8 +122,8 @@ class PureLensNet(Network):
 class PureLensProblem(SchurProblem):
     """Reprojection residuals (pixels) of boards through a pure network lens.
 
-    A state is (weights (W,), intrinsics (4,), rotations (V, 3, 3), translations (V, 3)). The weights and intrinsics are
-    shared, the pose of the board in each view is local.
+    A state is (weights (W,), intrinsics (4,), rotations (V, 3, 3), translations (V, 3)). The shared part of a step is
+    intrinsics, then weights; the local part is the pose of the board in each view.
 
     Args:
         board_points: (N, 3) meters.
@@ -139,7 +139,7 @@ class PureLensProblem(SchurProblem):
         self._board, self._net, self._fixed = board_points.T, net, fixed
         self._target = pixels.transpose(-1, -2)
         self.residual_count = pixels.numel()
-        self.shared_size = 0 if fixed else net.weights.numel() + 4
+        self.shared_size = 0 if fixed else 4 + net.weights.numel()
 
     def start(self, rotation: Tensor, translation: Tensor) -> State:
         """The state of the lens as it is, with these poses."""
@@ -160,7 +160,7 @@ class PureLensProblem(SchurProblem):
         rotated, points = self._points(state)
         lens = self._net.pixels_with_slopes(points, *state[:2])
         error = torch.where(points[..., 2:, :] > 0, lens.pixels - self._target, torch.nan)[..., None, :, :]
-        shared = [] if self._fixed else [lens.by_weights, lens.by_intrinsics]
+        shared = [] if self._fixed else [lens.by_intrinsics, lens.by_weights]
         return torch.cat([step_rows(lens.by_point, rotated), *shared, error], -3).flatten(-2)
 
     def retract(self, state: State, step: State) -> State:
@@ -168,7 +168,7 @@ class PureLensProblem(SchurProblem):
         weights, intrinsics, rotation, translation = state
         shared, local = step
         if not self._fixed:
-            weights, intrinsics = weights + shared[:-4], intrinsics + shared[-4:]
+            intrinsics, weights = intrinsics + shared[:4], weights + shared[4:]
         return (weights, intrinsics, *apply_twist(rotation, translation, local))
 
 

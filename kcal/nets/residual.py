@@ -13,7 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.projection import INTRINSICS
@@ -110,20 +110,20 @@ class ResidualProblem(SchurProblem):
 
     def residuals(self, state: State) -> Tensor:
         """See `SchurProblem.residuals`."""
-        return self._board.residuals(state[1:])
+        return self._board.residuals(BoardState(*state[1:]))
 
     def rows(self, state: State) -> Tensor:
         """See `SchurProblem.rows`."""
-        return self._chain(state, self.local_size).T @ self._board.rows(state[1:])
+        return self._chain(state, self.local_size).T @ self._board.rows(BoardState(*state[1:]))
 
     def gram(self, state: State) -> Tensor:
         """See `SchurProblem.gram`; from the products of the board problem's rows, which are far fewer."""
         chain = self._chain(state, self.local_size)
-        return chain.T @ self._board.gram(state[1:]) @ chain
+        return chain.T @ self._board.gram(BoardState(*state[1:])) @ chain
 
     def shared_rows(self, state: State) -> Tensor | None:
         """See `SchurProblem.shared_rows`."""
-        rows = self._board.shared_rows(state[1:])
+        rows = self._board.shared_rows(BoardState(*state[1:]))
         return None if rows is None else self._chain(state, 0).T @ rows
 
     def retract(self, state: State, step: State) -> State:
@@ -133,7 +133,7 @@ class ResidualProblem(SchurProblem):
         # The board problem itself moves only the warp and the poses.
         still = shared.new_zeros(len(self._net.corrected))
         board_step = torch.cat([still, shared[len(weights) :]]), local
-        return self._joined(weights, self._board.retract(state[1:], board_step))
+        return self._joined(weights, self._board.retract(BoardState(*state[1:]), board_step))
 
     def _joined(self, weights: Tensor, board_state: State) -> State:
         return (weights, self._net.parameters_at(weights), *board_state[1:])

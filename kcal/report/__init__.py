@@ -1,1 +1,1 @@
-"""Pictures of what was measured (floor 5)."""
+"""Pictures, pages and the map."""

@@ -1,4 +1,4 @@
-"""What may lie below a map without a network: a folder of tiles or a GeoTIFF, embedded as data."""
+"""Embed a folder of map tiles or a GeoTIFF in a map that works without a network."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from pyproj.exceptions import ProjError
 from kcal.errors import FileError, InputError
 
 _KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
-# Embedded tiles in bytes; finer levels are left out beyond.
+# Limits that keep a page easy to send: bytes of tiles (finer levels are left out), pixels of an image's longer side.
 _MOST_BYTES = 24_000_000
 _LONGER_SIDE = 2048
 # TIFF tags of GeoTIFF 1.1 (OGC 19-008r4).
-_SCALE, _TIES, _MATRIX, _KEYS = 33550, 33922, 34264, 34735
+_SCALE, _TIE_POINTS, _MATRIX, _KEYS = 33550, 33922, 34264, 34735
 _GEOGRAPHIC, _PROJECTED, _RASTER_TYPE = 2048, 3072, 1025
 _POINT_IS_CENTER = 2
 Box = tuple[float, float, float, float]
 
 
 def local_tiles(folder: str | Path, view: Box) -> dict[str, Any]:
-    """The tiles `z/x/y.png` of a folder that show the view (south, west, north, east), coarse levels first.
+    """Embed the tiles `z/x/y.png` of a folder that show the view (south, west, north, east), coarse levels first.
 
     Raises:
         FileError: no folder, or no tile in it that shows the view.
@@ -67,11 +67,11 @@ def _tile(lat: float, lon: float, zoom: int) -> tuple[int, int]:
 
 
 def local_image(path: str | Path) -> dict[str, Any]:
-    """A GeoTIFF turned into Web Mercator: its picture as data and its bounds in degrees.
+    """Warp a GeoTIFF to Web Mercator, and embed its picture with its bounds in degrees.
 
     Raises:
-        FileError: missing, or no image.
-        InputError: an image without a place on the Earth, or in an unknown coordinate system.
+        FileError: the file is missing or no image.
+        InputError: an image without georeference, or in an unknown coordinate system.
     """
     path = Path(path)
     try:
@@ -106,7 +106,7 @@ def local_image(path: str | Path) -> dict[str, Any]:
 
 
 def _placing(path: Path, tags: dict[int, Any]) -> tuple[NDArray[np.float64], pyproj.CRS]:
-    """(2, 3) from pixel corners to the image's own coordinates, and their system."""
+    """Read the (2, 3) matrix from pixel corners to the image's own coordinates, and their system."""
     keys = np.asarray(tags.get(_KEYS, ()), dtype=int).reshape(-1, 4)[1:]
     code = {int(key): int(value) for key, place, _, value in keys if place == 0}
     epsg = code.get(_PROJECTED) or code.get(_GEOGRAPHIC)
@@ -114,8 +114,8 @@ def _placing(path: Path, tags: dict[int, Any]) -> tuple[NDArray[np.float64], pyp
         raise InputError(f"{path}: no GeoTIFF with an EPSG coordinate system")
     if _MATRIX in tags:
         matrix = np.asarray(tags[_MATRIX], dtype=float).reshape(4, 4)[:2][:, [0, 1, 3]]
-    elif _SCALE in tags and _TIES in tags:
-        (sx, sy), (i, j, _, x, y) = tags[_SCALE][:2], tags[_TIES][:5]
+    elif _SCALE in tags and _TIE_POINTS in tags:
+        (sx, sy), (i, j, _, x, y) = tags[_SCALE][:2], tags[_TIE_POINTS][:5]
         matrix = np.array([[sx, 0.0, x - i * sx], [0.0, -sy, y + j * sy]])
     else:
         raise InputError(f"{path}: a GeoTIFF without a scale and tie point, or a transformation")
@@ -130,7 +130,7 @@ def _placing(path: Path, tags: dict[int, Any]) -> tuple[NDArray[np.float64], pyp
 def _warp(
     pixels: NDArray[np.uint8], matrix: NDArray[np.float64], to_map: pyproj.Transformer, box: Box
 ) -> NDArray[np.uint8]:
-    """The nearest source pixel for each pixel of a Web Mercator raster; transparent outside."""
+    """Take the nearest source pixel for each pixel of a Web Mercator raster; transparent outside."""
     left, bottom, right, top = box
     step = max(right - left, top - bottom) / min(_LONGER_SIDE, max(pixels.shape[:2]))
     columns, rows = max(1, round((right - left) / step)), max(1, round((top - bottom) / step))

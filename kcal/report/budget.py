@@ -1,4 +1,4 @@
-"""A picture of a depth budget: range errors against distance, on logarithmic scales."""
+"""Draw a depth budget: range errors against range, on logarithmic scales."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from torch import Tensor
 from kcal.locate.budget import RangeError
 from kcal.report.figures import new_figure, save_png
 
-_COLORS = {"disparity": "#2b6cb0", "yaw": "#c02a6b", "baseline": "#4b5563", "timing": "#dd7a1f"}
+_SOURCE_COLORS = {"disparity": "#2b6cb0", "yaw": "#c02a6b", "baseline": "#4b5563", "timing": "#dd7a1f"}
 
 
 def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]) -> Figure:
-    """Lines for each source: outward solid, inward dotted, the slope of the first order thin and dashed.
+    """Draw lines for each source: outward error solid, inward dotted, first order thin and dashed.
 
     Args:
         distances: (D,) meters.
-        found: from `range_errors`.
-        labels: what each source's line is called.
+        found: errors by source, from `range_errors`.
+        labels: source -> text in the legend.
     """
     figure = new_figure(8.6, 6.0)
     axes = figure.add_subplot()
     far = distances.numpy()
     for name, error in found.items():
-        color = _COLORS.get(name, "#111827")
+        color = _SOURCE_COLORS.get(name, "#111827")
         outward = error.farther.clone()
-        # Infinity is not drawn: the line leaves the picture there.
+        # Infinite errors are not drawn: the line leaves the picture there.
         outward[~outward.isfinite()] = float("nan")
         axes.plot(far, outward.numpy(), color=color, linewidth=2.0, label=labels.get(name, name))
         axes.plot(far, error.nearer.abs().numpy(), color=color, linewidth=1.4, linestyle=":")

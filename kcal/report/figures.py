@@ -1,28 +1,73 @@
-"""What all pictures share: no global state, PNG files written whole."""
+"""Shared parts of all pictures: colors, axes of an image, magnified arrows, and PNG files that are written whole."""
 
 from __future__ import annotations
 
 import io
+import math
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
 
 from kcal.errors import InputError
-from kcal.files import write_atomic
+from kcal.files import check_writable, write_atomic
+
+INK, GRAY, FAINT, ACCENT, WARN = "#111827", "#4b5563", "#9aa3af", "#2b6cb0", "#c02a6b"
+CAMERA_COLORS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
+# White around text that lies on lines.
+HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 
 def new_figure(width: float, height: float, dpi: int = 130) -> Figure:
-    """A figure of so many inches that belongs to no window."""
+    """Make a figure of that many inches that belongs to no window and no global state."""
     figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
 
-def check_picture_format(path: str | Path) -> None:
-    """Raise `InputError` unless `path` ends with .png."""
+def range_text(meters: float) -> str:
+    """Write a range with its unit: 250 m, 5 km."""
+    return f"{meters / 1000:g} km" if meters >= 1000 else f"{meters:g} m"
+
+
+def frame_image(axes: Axes, size: tuple[int, int], margin: float = 0.0) -> None:
+    """Show an image's pixels (width, height), v down, with a margin of that share of its size."""
+    (width, height), (across, down) = size, (margin * size[0], margin * size[1])
+    axes.set(xlim=(-0.5 - across, width - 0.5 + across), ylim=(height - 0.5 + down, -0.5 - down))
+    axes.set(aspect="equal", xlabel="u, pixels", ylabel="v, pixels")
+
+
+def draw_arrows(
+    axes: Axes,
+    places: NDArray[np.float64],
+    arrows: NDArray[np.float64],
+    wanted: float,
+    *colors: ArrayLike,
+    **style: Any,
+) -> float:
+    """Draw arrows (..., 2) at pixels (..., 2), magnified by the round factor at or below `wanted`; return it."""
+    power = 10.0 ** math.floor(math.log10(wanted))
+    scale = power * max(step for step in (1, 2, 5) if step * power <= wanted)
+    across, down = np.moveaxis(scale * arrows, -1, 0)
+    axes.quiver(places[..., 0], places[..., 1], across, down, *colors, angles="xy", scale_units="xy", scale=1, **style)
+    return scale
+
+
+def check_picture(path: str | Path) -> None:
+    """Raise an error now if `path` could not be written as a picture later.
+
+    Raises:
+        InputError: a suffix other than .png.
+        FileError: the file cannot be written.
+    """
     if Path(path).suffix.lower() != ".png":
         raise InputError(f"{path}: the picture is a PNG; the file name must end with .png")
+    check_writable(path)
 
 
 def save_png(path: str | Path, figure: Figure) -> Path:
@@ -32,7 +77,7 @@ def save_png(path: str | Path, figure: Figure) -> Path:
         InputError: a suffix other than .png.
         FileError: the file cannot be written.
     """
-    check_picture_format(path)
+    check_picture(path)
     data = io.BytesIO()
     figure.savefig(data, format="png")
     return write_atomic(path, data.getvalue())

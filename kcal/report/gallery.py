@@ -1,4 +1,4 @@
-"""Pictures of a detection: every view with its corners, worst first, and what of the image the board has covered."""
+"""Draw a detection: every view with its corners, worst first, and where in the image corners were seen."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from matplotlib.patches import Rectangle
 from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError
-from kcal.report.figures import new_figure, save_png
+from kcal.report.figures import ACCENT, INK, WARN, frame_image, new_figure, save_png
 
-_INK, _FAINT, _ACCENT, _WARN = "#111827", "#9aa3af", "#2b6cb0", "#c02a6b"
-_MOST = 24  # views in a gallery
+_MOST_VIEWS = 24  # views in a gallery
 _ACROSS = 4
 _THUMB = 480  # pixels of a view's longer side
 _CELLS = 8  # of the coverage map along the image's longer side
@@ -33,7 +32,7 @@ def gallery_figure(observations: Observations) -> Figure:
         observations: with the paths of their images; a view whose image is not there is drawn on gray.
     """
     order = sorted(range(len(observations.views)), key=lambda i: _badness(observations.views[i]), reverse=True)
-    shown = order[:_MOST]
+    shown = order[:_MOST_VIEWS]
     across = max(1, min(_ACROSS, len(shown)))
     down = max(1, math.ceil(len(shown) / across))
     width, height = observations.image_size
@@ -47,20 +46,20 @@ def gallery_figure(observations: Observations) -> Figure:
     for place, i in enumerate(shown):
         _draw_view(figure.add_subplot(grid[place // across, place % across]), observations, observations.views[i])
     title = f"{len(observations.views)} views, worst first"
-    if len(order) > _MOST:
-        title += f" (the {_MOST} worst)"
+    if len(order) > _MOST_VIEWS:
+        title += f" (the {_MOST_VIEWS} worst)"
     if observations.failures:
         title += f"; without a board: {len(observations.failures)}"
-    figure.text(0.02, 1 - 0.3 / tall, title, fontsize=13, color=_INK, va="center")
+    figure.text(0.02, 1 - 0.3 / tall, title, fontsize=13, color=INK, va="center")
     for row, text in enumerate(listed):
-        figure.text(0.02, (foot - 0.15 - 0.22 * row) / tall, text[:130], fontsize=8, color=_WARN, va="center")
+        figure.text(0.02, (foot - 0.15 - 0.22 * row) / tall, text[:130], fontsize=8, color=WARN, va="center")
     return figure
 
 
 def coverage_figure(observations: Observations) -> Figure:
-    """Draw where corners were seen, one color a view (the paper's Fig. 1), over how often each part was reached.
+    """Draw where corners were seen, one color per view (the paper's Fig. 1), over how many views reached each part.
 
-    Parts of the image that no corner reached are hatched: there the lens model extrapolates.
+    Parts that no corner reached are hatched: the lens model extrapolates there.
     """
     width, height = observations.image_size
     pixels = observations.pixels().numpy()
@@ -90,16 +89,13 @@ def coverage_figure(observations: Observations) -> Figure:
                 height / rows,
                 fill=False,
                 hatch="///",
-                edgecolor=_WARN,
+                edgecolor=WARN,
                 linewidth=0,
                 alpha=0.6,
             )
         )
     axes.scatter(u, v, c=views, cmap="turbo", s=7, linewidths=0)
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
-    axes.set_xlabel("u, pixels")
-    axes.set_ylabel("v, pixels")
+    frame_image(axes, observations.image_size)
     reached = 100.0 * float((cells > 0).mean())
     axes.set_title(
         f"{len(pixels)} views, {int(seen.sum())} corners; {reached:.0f} % of the image reached, hatched: not",
@@ -120,10 +116,10 @@ def save_coverage(path: str | Path, observations: Observations) -> Path:
 
 
 def _badness(view: View) -> tuple[int, float]:
-    return view.pixels.count(None), _sigma(view) or 0.0
+    return view.pixels.count(None), _predicted_sigma(view) or 0.0
 
 
-def _sigma(view: View) -> float | None:
+def _predicted_sigma(view: View) -> float | None:
     """Root mean square of the corners' predicted standard deviations, px."""
     if view.covariance is None:
         return None
@@ -137,22 +133,20 @@ def _draw_view(axes: Axes, observations: Observations, view: View) -> None:
     axes.imshow(_thumbnail(view, (width, height)), cmap="gray", vmin=0, vmax=255, extent=whole)
     places = np.array([(math.nan, math.nan) if pixel is None else pixel for pixel in view.pixels])
     first = places[: observations.board.columns]
-    axes.plot(first[:, 0], first[:, 1], color=_ACCENT, linewidth=1.2)
-    axes.scatter(places[:, 0], places[:, 1], s=9, color=_WARN, linewidths=0)
-    axes.scatter(places[:1, 0], places[:1, 1], s=60, facecolors="none", edgecolors=_ACCENT, linewidths=1.6)
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
-    sigma, unseen = _sigma(view), view.pixels.count(None)
+    axes.plot(first[:, 0], first[:, 1], color=ACCENT, linewidth=1.2)
+    axes.scatter(places[:, 0], places[:, 1], s=9, color=WARN, linewidths=0)
+    axes.scatter(places[:1, 0], places[:1, 1], s=60, facecolors="none", edgecolors=ACCENT, linewidths=1.6)
+    frame_image(axes, (width, height))
+    axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    sigma, unseen = _predicted_sigma(view), view.pixels.count(None)
     text = view.name if len(view.name) <= 34 else "…" + view.name[-33:]
     text += f"  σ {sigma:.3f} px" if sigma is not None else ""
     text += f"  {unseen} left out" if unseen else ""
-    axes.set_title(text, fontsize=8.5, loc="left", pad=3, color=_WARN if unseen else _INK)
+    axes.set_title(text, fontsize=8.5, loc="left", pad=3, color=WARN if unseen else INK)
 
 
 def _thumbnail(view: View, size: tuple[int, int]) -> npt.NDArray[np.uint8]:
-    """The view's image, every so many pixels, or gray where the file is not there any more."""
+    """Subsample the view's image; gray where the file is missing or has another size."""
     gray = np.full((2, 2), 200, np.uint8)
     if view.image is None:
         return gray

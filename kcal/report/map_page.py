@@ -1,7 +1,7 @@
-"""An interactive map as one HTML file that needs nothing else: no network, no server, no other file.
+"""Write an interactive map as one HTML file that needs no network, no server and no other file.
 
-Leaflet (BSD-2-Clause, in the folder `leaflet`) draws; all geometry is computed here, on the ellipsoid, and written into
-the page. Unless online tiles are asked for, the page's own content policy forbids it to load anything at all.
+Leaflet (BSD-2-Clause, in the folder `leaflet`) draws. All geometry is computed here, on the ellipsoid, and written into
+the page. Without online tiles, the page's content policy forbids it to load anything.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from kcal.locate.positions import Located, Position
 from kcal.locate.region import near, region_rings
 from kcal.locate.stereo import PositionStatus
 from kcal.report.backdrop import local_image, local_tiles
+from kcal.report.figures import CAMERA_COLORS, range_text
 
 ARCS_M = (250.0, 1000.0, 5000.0)
-_COLORS = ("#2b6cb0", "#dd7a1f")
 _ONLINE = {
     "url": "https://tile.openstreetmap.org/{z}/{x}/{y}.png",
     "attribution": '&copy; <a href="https://www.openstreetmap.org/copyright">OpenStreetMap</a> contributors',
 }
-_STYLE = """
+_MAP_STYLE = """
 html, body { margin: 0; height: 100%; font: 14px/1.4 system-ui, sans-serif; color: #111827; }
 body { display: flex; flex-direction: column; }
 header { padding: 8px 14px; border-bottom: 1px solid #d1d5db; }
@@ -54,17 +54,17 @@ def map_page(
     image: str | Path | None = None,
     online: bool = False,
 ) -> str:
-    """The page: positions with 95 % regions, true ones with arrows, cameras, fields of view, arcs at 250 m to 5 km.
+    """Make the page: positions with 95 % regions, true ones with arrows, cameras, fields of view, arcs of range.
 
     Args:
         located: from `kcal.locate_points`.
         truth: (N, 3) true east, north, up in meters, NaN where unknown; an arrow leads from each to its estimate.
         tiles: a folder of map tiles `z/x/y.png` (or .jpg, .webp) in Web Mercator; those in view are embedded.
-        image: a GeoTIFF to lie below, for example an orthophoto; embedded, at 2048 pixels along its longer side.
+        image: a GeoTIFF to show below the map, for example an orthophoto; embedded, at most 2048 pixels long.
         online: also load tiles of OpenStreetMap when the page is opened with a network.
 
     Raises:
-        InputError: a truth of the wrong shape, or an image without a place on the Earth.
+        InputError: a truth of the wrong shape, or an image without georeference.
         FileError: a folder or file that cannot be read.
     """
     if truth is not None and tuple(truth.shape) != (len(located.positions), 3):
@@ -79,19 +79,19 @@ def map_page(
     content["online"] = _ONLINE if online else None
     library = resources.files("kcal.report") / "leaflet"
     style = (library / "leaflet.css").read_text(encoding="utf-8")
-    # Pictures of controls that this page does not show.
+    # This page does not show the controls of these pictures.
     for picture in ("images/layers.png", "images/layers-2x.png", "images/marker-icon.png"):
         style = style.replace(f"url({picture})", "none")
     own = (resources.files("kcal.report") / "map_page.js").read_text(encoding="utf-8")
-    # Inside a script element nothing but "</" ends the text.
+    # Only "</" could end the text of a script element.
     payload = json.dumps(content, allow_nan=False).replace("</", "<\\/")
     allowed = "data: https://tile.openstreetmap.org" if online else "data:"
     title = f"{located.count} of {len(located.positions)} points located"
     note = (
         f"From {located.origin.lat:.6f}°, {located.origin.lon:.6f}°, heading {located.heading_deg:g}° from true north. "
-        f"Regions and intervals: {located.interval_note}. Geoid: {located.geoid or 'none at hand'}."
+        f"Regions and intervals: {located.interval_note}. Geoid: {located.geoid or 'none found'}."
     )
-    key = "White dots: estimated; click one for its numbers. Black outlines: where it lies with 95 %."
+    key = "White dots: estimated; click one for its numbers. Black outlines: 95 % regions."
     key += " Red dots: true, with an arrow to the estimate." if truth is not None else ""
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -102,7 +102,7 @@ def map_page(
  content="default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src {allowed}">
 <title>{html.escape(title)}</title>
 <style>{style}</style>
-<style>{_STYLE}</style>
+<style>{_MAP_STYLE}</style>
 </head>
 <body>
 <header><b>{html.escape(title)}</b><p>{html.escape(note)}<br>{html.escape(key)}</p></header>
@@ -145,7 +145,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
     ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
     reach = 1.15 * max([*ranges, 300.0])
     cameras, edges = [], []
-    for view, color, side in zip(located.cameras, _COLORS, _label_sides(located), strict=True):
+    for view, color, side in zip(located.cameras, CAMERA_COLORS, _label_sides(located), strict=False):
         outline = None
         if view.azimuths_deg is not None:
             first, last = view.azimuths_deg
@@ -157,11 +157,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
         cameras.append({"name": view.name, "place": place, "fan": outline, "color": color, "side": side})
     low, high = (min(edges), max(edges)) if edges else (-180.0, 180.0)
     sweep = torch.linspace(low, high, 90, dtype=torch.float64) + located.heading_deg
-    arcs = [
-        {"name": f"{arc:g} m" if arc < 1000 else f"{arc / 1000:g} km", "line": places(fan((0, 0, 0), sweep, arc))}
-        for arc in ARCS_M
-        if arc < reach
-    ]
+    arcs = [{"name": range_text(arc), "line": places(fan((0, 0, 0), sweep, arc))} for arc in ARCS_M if arc < reach]
     bearings = [
         places(fan((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0) * ends)
         for p in located.positions
@@ -179,7 +175,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
             azimuth = math.degrees(math.atan2(float(miss[0]), float(miss[1])))
             arrows.append({"line": [spot, (position.lat, near(position.lon, located.origin.lon))], "azimuth": azimuth})
     points = [
-        {"name": p.name, "place": (p.lat, near(p.lon, located.origin.lon)), "rows": _rows(p)}
+        {"name": p.name, "place": (p.lat, near(p.lon, located.origin.lon)), "rows": _popup_rows(p)}
         for p in located.positions
         if p.lat is not None and p.lon is not None
     ]
@@ -191,11 +187,11 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
 
 
 def _label_sides(located: Located) -> tuple[str, str]:
-    """On which side of its dot each camera's name is written: outward, as the two stand close."""
+    """Choose on which side of its dot each camera's name is written: outward, since the two are close."""
     return ("left", "right") if located.cameras[1].enu[0] >= 0 else ("right", "left")
 
 
-def _rows(position: Position) -> list[tuple[str, str]]:
+def _popup_rows(position: Position) -> list[tuple[str, str]]:
     rows = [
         ("latitude", f"{position.lat:.7f}°"),
         ("longitude", f"{position.lon:.7f}°"),

@@ -1,4 +1,4 @@
-"""A picture of located points: a map with a logarithmic range scale, and the range intervals side by side."""
+"""Draw located points: a map with a logarithmic range scale, and the range intervals side by side."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -16,24 +15,23 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.locate.positions import Located, Position
 from kcal.locate.stereo import PositionStatus
-from kcal.report.figures import new_figure, save_png
+from kcal.report.figures import CAMERA_COLORS, FAINT, GRAY, HALO, INK, WARN, new_figure, range_text, save_png
 
 Array = NDArray[np.float64]
 
-_LEFT, _RIGHT, _POINT, _TRUE, _FAINT, _UNSURE = "#2b6cb0", "#dd7a1f", "#111827", "#c02a6b", "#9aa3af", "#8a5a00"
+_UNSURE = "#8a5a00"
 # The arcs of the paper's figure first, then rounder fillers where there is room.
 _ARCS = [250, 1000, 5000, 100, 500, 2500, *(k * 10.0**e for e in (0, 1, 4, 5) for k in (1, 2.5, 5)), 10.0**6]
 _PERCENT = (-1.0, -0.3, -0.1, -0.03, -0.01, -0.003, 0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 _NAMED = 40
-_HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 
 def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
     """Draw located points as seen from above, north up, and their range intervals.
 
-    Distances from the left camera are drawn as log(1 + range / r0), azimuths as they are, so that 100 m and 5 km can
-    both be read. A bar along the line of sight is the 95 % range interval (`Located.interval_note` says of which
-    errors); with an arrow head it goes on to infinity.
+    Distances from the left camera are drawn as log(1 + range / r0), so that 100 m and 5 km are both readable; azimuths
+    are true. A bar along the line of sight is the 95 % range interval (`Located.interval_note` lists its errors); an
+    arrow head means that it continues to infinity.
 
     Args:
         located: from `kcal.locate_points`.
@@ -52,7 +50,7 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
     scale = _RangeScale(located, true_enu)
     figure = new_figure(13.0, 7.4)
     plan, ranges = figure.subplots(1, 2, width_ratios=[1.45, 1.0])
-    _draw_plan(plan, located, true_enu, shown, scale)
+    _draw_map(plan, located, true_enu, shown, scale)
     _draw_ranges(ranges, located, true_enu, shown)
     figure.suptitle(
         f"{located.count} of {len(located.positions)} points located from "
@@ -61,7 +59,7 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
         ha="left",
         fontsize=14,
     )
-    figure.text(0.015, 0.02, _footer(located), fontsize=9, color="#4b5563", va="bottom", linespacing=1.4)
+    figure.text(0.015, 0.02, _interval_footer(located), fontsize=9, color=GRAY, va="bottom", linespacing=1.4)
     figure.subplots_adjust(left=0.015, right=0.975, top=0.91, bottom=0.17, wspace=0.14)
     return figure
 
@@ -77,7 +75,7 @@ def save_positions_picture(path: str | Path, located: Located, truth: Tensor | N
 
 
 class _RangeScale:
-    """ENU meters to the plane of the map: azimuth kept, range turned into log(1 + range / r0), the rim at 1."""
+    """Map ENU meters to the plane: azimuth unchanged, range as log(1 + range / r0), the rim at 1."""
 
     def __init__(self, located: Located, true_enu: Array | None) -> None:
         ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
@@ -96,7 +94,7 @@ class _RangeScale:
         return np.asarray(np.log1p(np.minimum(meters, self.rim) / self._r0) / math.log1p(self.rim / self._r0))
 
     def place(self, enu: Array) -> Array:
-        """(..., 2 or more) east, north in meters to map coordinates (..., 2)."""
+        """Turn east and north (..., 2 or more) in meters into map coordinates (..., 2)."""
         distance = np.hypot(enu[..., 0], enu[..., 1])[..., None]
         return np.asarray(enu[..., :2] / np.maximum(distance, 1e-9) * self.radius(distance))
 
@@ -105,7 +103,7 @@ class _RangeScale:
         return np.stack([np.sin(azimuth) * self.radius(meters), np.cos(azimuth) * self.radius(meters)], -1)
 
     def arcs(self) -> list[float]:
-        """Round ranges far enough from each other to be labeled."""
+        """Choose round ranges that are far enough from each other to be labeled."""
         chosen: list[float] = []
         for arc in _ARCS:
             apart = all(abs(self.radius(arc) - self.radius(other)) > 0.09 for other in chosen)
@@ -118,11 +116,7 @@ def _xy(place: Array) -> tuple[float, float]:
     return float(place[0]), float(place[1])
 
 
-def _length(meters: float) -> str:
-    return f"{meters / 1000:g} km" if meters >= 1000 else f"{meters:g} m"
-
-
-def _draw_plan(axes: Axes, located: Located, true_enu: Array | None, shown: list[int], scale: _RangeScale) -> None:
+def _draw_map(axes: Axes, located: Located, true_enu: Array | None, shown: list[int], scale: _RangeScale) -> None:
     # Azimuths count from the heading here, so that a view across north is one stretch.
     edges = [(a - located.heading_deg + 180) % 360 - 180 for c in located.cameras for a in c.azimuths_deg or ()]
     low, high = (min(edges), max(edges)) if edges else (-180.0, 180.0)
@@ -134,23 +128,23 @@ def _draw_plan(axes: Axes, located: Located, true_enu: Array | None, shown: list
     for arc in scale.arcs():
         line = scale.polar(sweep, arc)
         extent.append(line)
-        axes.plot(*line.T, color=_FAINT, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
+        axes.plot(*line.T, color=FAINT, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
         direction = line[-1] - line[-2]
         place = line[-1] + direction / np.hypot(*direction) * 0.012
         turn = (90.0 - sweep[-1]) - 90.0
         turn = (turn + 90) % 180 - 90
         outward = direction[0] >= 0
         axes.text(
-            place[0], place[1], _length(arc), fontsize=8.5, color="#4b5563", rotation=turn, rotation_mode="anchor",
+            place[0], place[1], range_text(arc), fontsize=8.5, color=GRAY, rotation=turn, rotation_mode="anchor",
             ha="left" if outward else "right", va="center",
         )  # fmt: skip
-    for camera, color in zip(located.cameras, (_LEFT, _RIGHT), strict=True):
+    for camera, color in zip(located.cameras, CAMERA_COLORS, strict=False):
         foot = np.asarray(camera.enu[:2])
         if camera.azimuths_deg is not None:
             first, last = camera.azimuths_deg
             fan = np.radians(np.linspace(first, first + (last - first) % 360, 120))
             rim = foot + scale.rim * np.stack([np.sin(fan), np.cos(fan)], -1)
-            # Straight lines from a camera beside the center are curved on a logarithmic map: follow them.
+            # Straight lines from a camera beside the center are curved on a logarithmic map.
             steps = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 60)])[:, None]
             outline = np.concatenate([foot + steps * (rim[0] - foot), rim, (foot + steps * (rim[-1] - foot))[::-1]])
             wedge = scale.place(outline)
@@ -166,10 +160,10 @@ def _draw_plan(axes: Axes, located: Located, true_enu: Array | None, shown: list
     points = [scale.place(np.asarray(located.positions[i].enu)) for i in shown if located.positions[i].enu]
     if points:
         axes.plot(
-            *np.stack(points).T, "o", color=_POINT, markerfacecolor="white", markersize=6, zorder=7, label="estimated"
+            *np.stack(points).T, "o", color=INK, markerfacecolor="white", markersize=6, zorder=7, label="estimated"
         )
     if true_enu is not None:
-        axes.plot([], [], "x", color=_TRUE, markeredgewidth=1.6, label="true (arrow to estimated)")
+        axes.plot([], [], "x", color=WARN, markeredgewidth=1.6, label="true (arrow to estimated)")
     if len(shown) <= _NAMED:
         _draw_names(axes, located, shown, scale, float(sweep[-1]))
     box = np.concatenate(extent)
@@ -189,14 +183,14 @@ def _draw_plan(axes: Axes, located: Located, true_enu: Array | None, shown: list
 
 
 def _draw_sight(axes: Axes, position: Position, scale: _RangeScale) -> None:
-    """The interval along the line of sight; dashed where only the bearing is known."""
+    """Draw the interval along the line of sight; dashed if only the bearing is known."""
     low, high, azimuth = position.range_low_m, position.range_high_m, position.azimuth_deg
     if low is None or high is None or azimuth is None:
         return
     tilt = math.cos(math.radians(position.elevation_deg or 0.0))
     known = position.status == PositionStatus.OK
     start, end = scale.polar(azimuth, low * tilt), scale.polar(azimuth, min(high * tilt, scale.rim))
-    color = _POINT if known else _UNSURE
+    color = INK if known else _UNSURE
     style = {"linewidth": 2.6, "alpha": 0.45} if known else {"linewidth": 1.4, "linestyle": (0, (3, 2))}
     axes.plot(*np.stack([start, end]).T, color=color, solid_capstyle="butt", zorder=3, **style)
     if high * tilt > scale.rim:
@@ -207,18 +201,18 @@ def _draw_sight(axes: Axes, position: Position, scale: _RangeScale) -> None:
 
 
 def _draw_truth(axes: Axes, position: Position, true: Array, scale: _RangeScale) -> None:
-    axes.plot(*true, "x", color=_TRUE, markersize=7, markeredgewidth=1.6, zorder=8)
+    axes.plot(*true, "x", color=WARN, markersize=7, markeredgewidth=1.6, zorder=8)
     if position.enu is not None:
         estimate = scale.place(np.asarray(position.enu))
         if np.hypot(*(estimate - true)) > 0.012:
             axes.annotate(
                 "", _xy(estimate), _xy(true), zorder=8,
-                arrowprops={"arrowstyle": "->", "color": _TRUE, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 2},
+                arrowprops={"arrowstyle": "->", "color": WARN, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 2},
             )  # fmt: skip
 
 
 def _draw_names(axes: Axes, located: Located, shown: list[int], scale: _RangeScale, labels_deg: float) -> None:
-    """Each name beside its point, on the side without other points and without the labels of the arcs."""
+    """Write each name beside its point, away from other points and from the labels of the arcs."""
     anchors = []
     for i in shown:
         position = located.positions[i]
@@ -234,12 +228,12 @@ def _draw_names(axes: Axes, located: Located, shown: list[int], scale: _RangeSca
         side = -1 if crowded or labeled else 1
         axes.annotate(
             located.positions[i].name, _xy(anchor), (8 * side, 0), textcoords="offset points", fontsize=9, zorder=9,
-            ha="left" if side > 0 else "right", va="center", path_effects=_HALO,
+            ha="left" if side > 0 else "right", va="center", path_effects=HALO,
         )  # fmt: skip
 
 
 def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: list[int]) -> None:
-    """Intervals and truths relative to the estimate: on a scale of ranges, 1 % would not be seen."""
+    """Draw intervals and true ranges relative to the estimate: on a scale of ranges, 1 % would be invisible."""
     axes.set_title("95 % interval of the range, relative to the estimate", fontsize=10.5, color="#374151")
     order = sorted(shown, key=lambda i: located.positions[i].range_m or located.positions[i].range_low_m or 0.0)
     spans = [_relative(located.positions[i], None if true_enu is None else true_enu[i]) for i in order]
@@ -247,26 +241,26 @@ def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: li
     limit = min(max([0.02, *finite]) * 1.3, 2.0)
     for row, (i, (low, high, true)) in enumerate(zip(order, spans, strict=True)):
         position = located.positions[i]
-        color = _POINT if position.status == PositionStatus.OK else _UNSURE
+        color = INK if position.status == PositionStatus.OK else _UNSURE
         ends = max(low, -limit), min(high, limit)
         axes.plot(ends, [row, row], color=color, linewidth=5, alpha=0.4, solid_capstyle="butt")
         if high > limit:
             axes.plot(limit, row, ">", color=color, markersize=7, clip_on=False)
         if position.range_m is not None:
-            axes.plot(0.0, row, "o", color=_POINT, markerfacecolor="white", markersize=6, zorder=3)
+            axes.plot(0.0, row, "o", color=INK, markerfacecolor="white", markersize=6, zorder=3)
         if true is not None:
             beyond = abs(true) > limit
             axes.plot(
                 math.copysign(min(abs(true), limit), true),
                 row,
                 (">" if true > 0 else "<") if beyond else "x",
-                color=_TRUE,
+                color=WARN,
                 markersize=7,
                 markeredgewidth=1.6,
                 zorder=4,
                 clip_on=False,
             )
-    # Linear up to 1 %, logarithmic beyond: 100 m and 5 km differ by a factor of fifty.
+    # Linear up to 1 %, logarithmic beyond: intervals at 100 m and at 5 km differ by a factor of fifty.
     axes.set_xscale("symlog", linthresh=0.01, linscale=1.0)
     ticks = [tick for tick in _PERCENT if abs(tick) < limit]
     axes.set_xticks(ticks, [f"{100 * tick:+g} %" if tick else "0" for tick in ticks], fontsize=9)
@@ -283,7 +277,7 @@ def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: li
 
 
 def _relative(position: Position, true: Array | None) -> tuple[float, float, float | None]:
-    """Lower end, upper end and truth as fractions of the estimate, or of the nearest range where there is none."""
+    """Return lower end, upper end and truth relative to the estimate, or to the nearest range if there is none."""
     base = position.range_m or position.range_low_m or 1.0
     low = base if position.range_low_m is None else position.range_low_m
     high = base if position.range_high_m is None else position.range_high_m
@@ -295,7 +289,7 @@ def _estimate(position: Position) -> str:
     return "bearing only" if position.range_m is None else f"{position.range_m:,.0f} m"
 
 
-def _footer(located: Located) -> str:
+def _interval_footer(located: Located) -> str:
     lines = [f"Bars: range interval, {located.interval_note}; marks have {located.pixel_sigma:g} px of noise."]
     failed: Sequence[Position] = [p for p in located.positions if p.range_low_m is None]
     lines += [f"{p.name}: {p.reason}" for p in failed[:3]]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib import patheffects
@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from kcal.calibrate.rig.result import ItemResidual, RigSolution
+from kcal.calibrate.rig.result import ItemResidual, RigResult
 from kcal.report.figures import new_figure, save_png
 
 Array = NDArray[np.float64]
@@ -30,65 +30,65 @@ _HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 _ROWS = 45
 
 
-def rig_figure(solution: RigSolution) -> Figure:
+def rig_figure(result: RigResult) -> Figure:
     """Draw a plan of the site, residuals by source, and each item's residual in sigmas; what was left out in magenta.
 
     In the plan distances from the rig are drawn as log(1 + range / r0), directions as they are.
 
     Args:
-        solution: from `kcal.calibrate.rig.solve.solve_rig`.
+        result: from `kcal.calibrate.rig.solve.solve_rig`.
 
     Returns:
         A matplotlib figure that belongs to no window and no global state.
     """
     figure = new_figure(13.0, 7.6)
     plan, bars = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
-    _draw_plan(plan, solution)
-    _draw_items(bars, solution)
-    rig, sigma = solution.stereo(), solution.relative_covariance().diagonal().sqrt()
+    _draw_plan(plan, result)
+    _draw_items(bars, result)
+    rig, sigma = result.stereo(), result.relative_covariance().diagonal().sqrt()
     yaw = math.degrees(float(sigma[1]))
     figure.suptitle(
-        f"Rig of {len(solution.names)} cameras, baseline {float(rig.baseline):.4f} m, relative yaw ± {yaw:.5f}°",
+        f"Rig of {len(result.names)} cameras, baseline {float(rig.baseline):.4f} m, relative yaw ± {yaw:.5f}°",
         x=0.015,
         ha="left",
         fontsize=14,
     )
-    figure.text(0.015, 0.02, _footer(solution), fontsize=9, color="#4b5563", va="bottom", linespacing=1.45)
+    figure.text(0.015, 0.02, _footer(result), fontsize=9, color="#4b5563", va="bottom", linespacing=1.45)
     figure.subplots_adjust(left=0.015, right=0.975, top=0.9, bottom=0.19, wspace=0.28)
     return figure
 
 
-def save_rig_picture(path: str | Path, solution: RigSolution) -> Path:
+def save_rig_picture(path: str | Path, result: RigResult) -> Path:
     """Write the picture of `rig_figure` as a PNG, atomically.
 
     Raises:
         InputError: a suffix other than .png.
         FileError: the file cannot be written.
     """
-    return save_png(path, rig_figure(solution))
+    return save_png(path, rig_figure(result))
 
 
-def _flat(solution: RigSolution, points: Array) -> Array:
+def _flat(result: RigResult, points: Array) -> Array:
     """East and north, or right and forward of the first camera where the frame is its own."""
-    return points[..., :2] if solution.absolute else points[..., [0, 2]]
+    return points[..., :2] if result.absolute else points[..., [0, 2]]
 
 
-def _places(solution: RigSolution) -> dict[str, tuple[Array, list[str], list[bool]]]:
+def _places(result: RigResult) -> dict[str, tuple[Array, list[str], list[bool]]]:
     """Places on the plan of landmarks, boards and features, their names, and whether they are used."""
     out: dict[str, tuple[Array, list[str], list[bool]]] = {}
-    for kind, points in solution.places().items():
-        items = {item.name: item.used for item in solution.items if item.source == kind}
+    for kind, points in result.places().items():
+        items = {item.name: item.used for item in result.items if item.source == kind}
         names = [name for name in points if name in items]
         if names:
             places = np.stack([points[name].numpy() for name in names])
-            out[kind] = (_flat(solution, places), names, [items[name] for name in names])
+            out[kind] = (_flat(result, places), names, [items[name] for name in names])
     return out
 
 
-def _draw_plan(axes: Axes, solution: RigSolution) -> None:
-    centers = _flat(solution, solution.center.numpy())
+def _draw_plan(axes: Axes, result: RigResult) -> None:
+    centers = _flat(result, result.center.numpy())
     middle = centers.mean(0)
-    places = _places(solution)
+    places = _places(result)
     spans = [np.hypot(*(centers - middle).T)] + [np.hypot(*(xy - middle).T) for xy, _, _ in places.values()]
     reach = max(float(np.max(span)) for span in spans) * 1.15
     nearest = min((float(np.min(span)) for span in spans[1:]), default=reach)
@@ -100,25 +100,17 @@ def _draw_plan(axes: Axes, solution: RigSolution) -> None:
         return np.asarray(offset / distance * np.log1p(distance / unit) / math.log1p(reach / unit))
 
     circle = np.linspace(0.0, 2.0 * math.pi, 200)
-    for power in range(-1, 7):
-        for step in (1.0, 2.5, 5.0):
-            radius = step * 10.0**power
-            if nearest / 4 <= radius <= reach and step in (1.0, 5.0):
-                ring = np.log1p(radius / unit) / math.log1p(reach / unit)
-                axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=_FAINT, linewidth=0.7, linestyle=":")
-                text = f"{radius / 1000:g} km" if radius >= 1000 else f"{radius:g} m"
-                axes.text(0.0, ring, text, fontsize=8, color="#4b5563", ha="center", va="bottom", path_effects=_HALO)
+    for radius in (step * 10.0**power for power in range(-1, 7) for step in (1.0, 5.0)):
+        if nearest / 4 <= radius <= reach:
+            ring = np.log1p(radius / unit) / math.log1p(reach / unit)
+            axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=_FAINT, linewidth=0.7, linestyle=":")
+            text = f"{radius / 1000:g} km" if radius >= 1000 else f"{radius:g} m"
+            axes.text(0.0, ring, text, fontsize=8, color="#4b5563", ha="center", va="bottom", path_effects=_HALO)
     for kind, (points, names, used) in places.items():
         drawn, good = place(points), np.array(used)
         marker = {"landmarks": "^", "boards": "s", "features": "o"}[kind]
-        style: dict[str, Any] = {
-            "linestyle": "none",
-            "markersize": 6,
-            "color": _COLORS[kind],
-            "markerfacecolor": "white",
-        }
-        axes.plot(*drawn[good].T, marker=marker, label=kind, **style)
-        axes.plot(*drawn[~good].T, marker="x", color=_WRONG, linestyle="none", markersize=8, markeredgewidth=1.8)
+        axes.plot(*drawn[good].T, marker, label=kind, markersize=6, color=_COLORS[kind], markerfacecolor="white")
+        axes.plot(*drawn[~good].T, "x", color=_WRONG, markersize=8, markeredgewidth=1.8)
         for xy, name, fine in zip(drawn, names, used, strict=True):
             if not fine or (kind == "landmarks" and len(names) <= 30):
                 color = _COLORS[kind] if fine else _WRONG
@@ -126,12 +118,12 @@ def _draw_plan(axes: Axes, solution: RigSolution) -> None:
                     name, (float(xy[0]), float(xy[1])), (6, 0), textcoords="offset points", fontsize=8, color=color,
                     va="center",
                 )  # fmt: skip
-    if any(not item.used for item in solution.items):
+    if any(not item.used for item in result.items):
         axes.plot([], [], "x", color=_WRONG, markeredgewidth=1.8, label="left out")
-    looks = solution.rotation[:, 2].numpy()
-    for c, name in enumerate(solution.names):
+    looks = result.rotation[:, 2].numpy()
+    for c, name in enumerate(result.names):
         here = place(centers[c])
-        ahead = _flat(solution, looks[c])
+        ahead = _flat(result, looks[c])
         ahead = ahead / max(float(np.hypot(*ahead)), 1e-9)
         axes.annotate(
             "", (float(here[0] + 0.12 * ahead[0]), float(here[1] + 0.12 * ahead[1])), (float(here[0]), float(here[1])),
@@ -143,13 +135,13 @@ def _draw_plan(axes: Axes, solution: RigSolution) -> None:
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axes.axis("off")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.005), ncols=4, fontsize=9, frameon=False)
-    where = "north up" if solution.absolute else "first camera's axis up"
+    where = "north up" if result.absolute else "first camera's axis up"
     axes.set_title(f"From above, {where}, ranges on a logarithmic scale", fontsize=10.5, color="#374151")
 
 
-def _draw_items(axes: Axes, solution: RigSolution) -> None:
+def _draw_items(axes: Axes, result: RigResult) -> None:
     """A bar for each item: the worst ones where there are many."""
-    items = sorted(solution.items, key=lambda item: (item.source, item.used, -item.sigmas))
+    items = sorted(result.items, key=lambda item: (item.source, item.used, -item.sigmas))
     if len(items) > _ROWS:
         wrong = [item for item in items if not item.used]
         good = sorted((item for item in items if item.used), key=lambda item: -item.sigmas)
@@ -165,22 +157,22 @@ def _draw_items(axes: Axes, solution: RigSolution) -> None:
     axes.set(xlim=(0, limit), ylim=(len(items) - 0.4, -0.6), xlabel="residual in sigmas; 1 is typical")
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(axis="y", length=0)
-    shown = "" if len(items) == len(solution.items) else f", the worst {len(items)} of {len(solution.items)}"
+    shown = "" if len(items) == len(result.items) else f", the worst {len(items)} of {len(result.items)}"
     axes.set_title(f"Residuals by item{shown}", fontsize=10.5, color="#374151")
 
 
 def _label(item: ItemResidual) -> str:
     name = item.name if len(item.name) <= 28 else f"{item.name[:27]}…"
-    return f"{item.source[:-1]} {name}"
+    return dataclasses.replace(item, name=name).label
 
 
-def _footer(solution: RigSolution) -> str:
+def _footer(result: RigResult) -> str:
     parts = []
-    for source in solution.sources:
+    for source in result.sources:
         values = [f"{source.used} used"] + ([f"{source.left_out} left out"] if source.left_out else [])
         values += [] if source.rms_px is None else [f"{source.rms_px:.3f} px"]
         values += [] if source.rms_m is None else [f"{source.rms_m:.3f} m"]
         parts.append(f"{source.source}: {', '.join(values)}, {source.sigmas:.2f} sigma")
     lines = ["   ".join(parts)]
-    lines += [f"{item.source[:-1]} {item.name}: {item.reason}" for item in solution.left_out[:3]]
+    lines += [f"{item.label}: {item.reason}" for item in result.left_out[:3]]
     return "\n".join(lines)

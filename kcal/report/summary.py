@@ -1,4 +1,4 @@
-"""One HTML page that says what was done and what came out, with its pictures inside: it opens without a network."""
+"""Write one HTML page that explains what was done and what came out; its pictures are embedded."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kcal.corners.images import read_bytes
 from kcal.errors import InputError
 from kcal.files import write_atomic
 
-_STYLE = """
+_PAGE_STYLE = """
 :root { color-scheme: light; }
 body { font: 16px/1.55 system-ui, sans-serif; color: #111827; background: #f3f4f6; margin: 0; }
 main { max-width: 62rem; margin: 0 auto; padding: 2rem 1.2rem 4rem; }
@@ -39,9 +39,9 @@ class Part:
     """A part of the page: a heading, sentences, and what belongs to them.
 
     Args:
-        heading: of the part.
-        text: paragraphs.
-        table: rows of cells, the first row being the heads; none: no table.
+        heading: its heading.
+        text: its paragraphs.
+        table: rows of cells, the first row with the heads; empty for no table.
         pictures: PNG or JPEG files with their captions, side by side where there is room.
         code: a command to copy, or "".
     """
@@ -54,12 +54,12 @@ class Part:
 
 
 def summary_page(title: str, lead: str, parts: Sequence[Part]) -> str:
-    """The page as HTML.
+    """Make the page as HTML.
 
     Args:
-        title: of the page.
-        lead: one paragraph under it.
-        parts: in their order.
+        title: its title.
+        lead: one paragraph under the title.
+        parts: the parts, in order.
 
     Raises:
         FileError: a picture cannot be read.
@@ -71,11 +71,11 @@ def summary_page(title: str, lead: str, parts: Sequence[Part]) -> str:
         >>> "<td>gate</td><td>100</td>" in page, "http" in page
         (True, False)
     """
-    body = "\n".join(_part(part) for part in parts)
+    body = "\n".join(_section(part) for part in parts)
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n<main>\n"
+        f"<title>{html.escape(title)}</title>\n<style>{_PAGE_STYLE}</style>\n</head>\n<body>\n<main>\n"
         f"<h1>{html.escape(title)}</h1>\n<p>{html.escape(lead)}</p>\n{body}\n</main>\n</body>\n</html>\n"
     )
 
@@ -90,20 +90,20 @@ def save_summary(path: str | Path, title: str, lead: str, parts: Sequence[Part])
     return write_atomic(path, summary_page(title, lead, parts))
 
 
-def _part(part: Part) -> str:
+def _section(part: Part) -> str:
     lines = ["<section>", f"<h2>{html.escape(part.heading)}</h2>"]
     lines += [f"<p>{html.escape(text)}</p>" for text in part.text]
     if part.table:
-        lines.append(_table(part))
+        lines.append(_html_table(part))
     if part.pictures:
-        figures = "\n".join(_picture(path, caption) for path, caption in part.pictures)
+        figures = "\n".join(_figure(path, caption) for path, caption in part.pictures)
         lines.append(f'<div class="row">\n{figures}\n</div>')
     if part.code:
         lines.append(f"<pre>{html.escape(part.code)}</pre>")
     return "\n".join([*lines, "</section>"])
 
 
-def _table(part: Part) -> str:
+def _html_table(part: Part) -> str:
     if len({len(row) for row in part.table}) > 1:
         raise InputError(f"the table of {part.heading!r}: rows of different lengths")
     head, *rows = part.table
@@ -112,7 +112,7 @@ def _table(part: Part) -> str:
     return '<div class="scroll"><table>\n' + "\n".join(lines) + "\n</table></div>"
 
 
-def _picture(path: str | Path, caption: str) -> str:
+def _figure(path: str | Path, caption: str) -> str:
     data = read_bytes(path)
     kinds = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg"}
     kind = next((name for start, name in kinds.items() if data.startswith(start)), None)

@@ -1,4 +1,4 @@
-"""The simulator's checkerboard: its size, its pose, its true corners, and its colors averaged over small areas."""
+"""The simulator's checkerboard: size, pose, true corners, and colors averaged over small areas."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kcal.errors import InputError
 
 
 class LensLike(Protocol):
-    """Anything that sees: a `Camera`, or a `TruthLens`."""
+    """Anything that projects: a `Camera` or a `TruthLens`."""
 
     size: tuple[int, int]
 
@@ -62,7 +62,7 @@ class RigLike(Protocol):
 
 
 class BoardLike(Protocol):
-    """Anything that says how many inner corners a board has and how large its squares are, in meters."""
+    """Anything with a number of inner corners and a square size in meters."""
 
     @property
     def columns(self) -> int:
@@ -123,9 +123,9 @@ def check_pose(cam_from_board: tuple[Tensor, Tensor]) -> BoardPose:
 
 
 def board_points(board: BoardLike, border: int = 0) -> Tensor:
-    """Corner positions on the board, row by row: (columns * rows, 3) float64 meters, corner 0 at the origin.
+    """Return the corners on the board, row by row: (columns * rows, 3) float64 meters, corner 0 at the origin.
 
-    With `border` the grid goes on by so many squares on every side; 1 reaches the outer edge of the outer squares.
+    `border` adds that many squares on every side; 1 reaches the outer edge of the outer squares.
 
     Example:
         >>> board_points(BoardSize(3, 2, 0.5))[:, :2].tolist()
@@ -143,7 +143,7 @@ def board_points(board: BoardLike, border: int = 0) -> Tensor:
 
 
 def project_board(camera: LensLike, cam_from_board: tuple[Tensor, Tensor], board: BoardLike) -> tuple[Tensor, Tensor]:
-    """True pixels of the inner corners.
+    """Project the inner corners to their true pixels.
 
     Args:
         camera: a single camera, or a true lens.
@@ -177,7 +177,7 @@ class Colors(NamedTuple):
 
 
 def area_colors(a: Tensor, b: Tensor, width_a: Tensor, width_b: Tensor, board: BoardLike, margin: int) -> Colors:
-    """The pattern averaged over boxes around board positions: exact integrals, so that edges never move.
+    """Average the pattern over boxes around board positions, by exact integrals, so that edges do not move.
 
     The black share of a checkerboard is (1 + q(a) q(b)) / 2 with a square wave q along each axis. Box averages of
     both factors come from their antiderivatives (the triangle wave for q), as in I. Quilez, "Box-filtered procedural

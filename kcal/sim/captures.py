@@ -1,4 +1,4 @@
-"""Corners of a board as a lens sees them in many views, with noise: what a calibration is given, without any images."""
+"""Simulate the corners of a board in many views, with noise, without rendering images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kcal.sim.truth import TruthLens
 
 # The board of the paper: 6 x 7 corners, squares of 5 cm.
 PAPER_BOARD = BoardSize(7, 6, 0.05)
-# The sensor goes with the glass: its tilt, and how far the axis misses its middle, in pixels, for a strength of 1.
+# Misalignment of the sensor at a strength of 1: its tilt, and the axis's distance from its middle in pixels.
 _SENSOR_TILT, _AXIS = math.radians(0.2), 8.0
 
 
@@ -40,11 +40,11 @@ class Capture(NamedTuple):
 
 
 def drawn_lens(name: str, strength: float, seed: int, *, focal: float | None = None, wander: float = 0.1) -> TruthLens:
-    """A ray-traced lens that was put together as badly as `strength` says: 1 is ordinary, 3 poor, 0 perfect.
+    """Draw a ray-traced lens with errors of assembly: a strength of 1 is ordinary, 3 poor, 0 perfect.
 
-    For a strength of 1, one sigma along each axis: glass is decentered by the prescription's tolerance (22 µm of 2.8 mm
-    for the surveillance lens, with 0.2 degrees of tilt), the sensor is tilted by 0.2 degrees, and the axis meets it
-    8 px from its middle.
+    A strength of 1 means one sigma along each axis: glass is decentered by the prescription's tolerance (22 µm of
+    2.8 mm for the surveillance lens, with 0.2 degrees of tilt), the sensor is tilted by 0.2 degrees, and the axis meets
+    it 8 px from its middle.
 
     Args:
         name: of a prescription: "surveillance", "machine-vision" or "webcam".
@@ -83,13 +83,13 @@ def capture_corners(
     fill: tuple[float, float] = (0.25, 0.8),
     options: PoseOptions | None = None,
 ) -> Capture:
-    """Corners of a board in poses that cover the image, with Gaussian noise.
+    """Simulate the corners of a board in poses that cover the image, with Gaussian noise.
 
     Args:
         lens: true lens.
         views: how many.
-        sigma: noise in pixels, for each axis.
-        seed: of poses and noise; noise of another sigma is the same noise, scaled.
+        sigma: noise in pixels along each axis.
+        seed: of poses and noise; another sigma scales the same noise.
         board: its size.
         fill: smallest and largest share of the image's width or height that the board takes.
         options: limits of tilt, roll and margins.

@@ -1,4 +1,4 @@
-"""Functions of a pixel as sums of products of Chebyshev polynomials: smooth ones to rounding, with derivatives."""
+"""Tabulate smooth functions of a pixel as sums of Chebyshev polynomials, exact to rounding, with derivatives."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kcal.sim.rectangle import Window
+from kcal.sim.rectangle import PixelRectangle
 
 
 def nodes(degree: int) -> Tensor:
@@ -18,7 +18,7 @@ def nodes(degree: int) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class ChebyshevTable:
     """K functions on a rectangle of pixels; see `tabulate`.
 
     Args:
@@ -26,16 +26,16 @@ class Table:
         coefficients: (degree + 1, K, degree + 1), of x and of y.
     """
 
-    window: Window
+    window: PixelRectangle
     coefficients: Tensor
 
     def values(self, pixels: Tensor) -> Tensor:
-        """(N, K) of pixels (N, 2)."""
+        """Return the values (N, K) at pixels (N, 2)."""
         across, down = (self._basis(pixels, axis)[0] for axis in (0, 1))
         return self._sum(across, down)
 
     def with_slopes(self, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Values (N, K), and their derivatives by x and by y, per pixel."""
+        """Return values (N, K), and their derivatives by x and by y, per pixel."""
         (across, across_slope), (down, down_slope) = (self._basis(pixels, axis) for axis in (0, 1))
         left, left_slope = (basis @ self.coefficients.flatten(1) for basis in (across, across_slope))
         left, left_slope = (value.unflatten(-1, self.coefficients.shape[1:]) for value in (left, left_slope))
@@ -61,11 +61,11 @@ class Table:
         return torch.stack(values[: degree + 1], -1), torch.stack(slopes[: degree + 1], -1) / half
 
 
-def tabulate(function: Callable[[Tensor], Tensor], window: Window, degree: int) -> Table:
+def tabulate(function: Callable[[Tensor], Tensor], window: PixelRectangle, degree: int) -> ChebyshevTable:
     """Interpolate a function of pixels, (N, 2) to (N, K), over a window at Chebyshev points.
 
     Example:
-        >>> table = tabulate(lambda pixels: torch.exp(pixels / 100), Window(-10, -10, 120, 80), 12)
+        >>> table = tabulate(lambda pixels: torch.exp(pixels / 100), PixelRectangle(-10, -10, 120, 80), 12)
         >>> [round(value, 9) for value in table.values(torch.tensor([[50.0, 20.0]]).double())[0].tolist()]
         [1.648721271, 1.221402758]
     """
@@ -80,4 +80,4 @@ def tabulate(function: Callable[[Tensor], Tensor], window: Window, degree: int) 
     transform = torch.cos(order[:, None] * angles) * (2.0 / (degree + 1))
     transform[0] *= 0.5
     coefficients = torch.einsum("ai,ijk,bj->akb", transform, sampled, transform)
-    return Table(window, coefficients.contiguous())
+    return ChebyshevTable(window, coefficients.contiguous())

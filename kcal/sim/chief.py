@@ -1,4 +1,4 @@
-"""Chief rays: through the middle of the aperture stop, from a pixel back to its line of sight in front of the lens."""
+"""Trace chief rays: from a pixel through the middle of the aperture stop to its line of sight in front of the lens."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.sim.prescription import Prescription, focal_length
 from kcal.sim.raytrace import Misalignment, Placed, place, trace
 
-_STEPS = 40
-_NUDGE = 1e-6  # of a slope, for derivatives
-_LONGEST = 0.2  # change of a slope in one step
-_GOAL, _ENOUGH = 1e-8, 1e-6  # pixels
+_AIM_STEPS = 40
+_SLOPE_NUDGE = 1e-6  # of a slope, for derivatives
+_LONGEST_STEP = 0.2  # change of a slope in one step
+_AIM_GOAL, _AIM_ERROR = 1e-8, 1e-6  # pixels
 
 
-class Lines(NamedTuple):
+class LinesOfSight(NamedTuple):
     """The line of sight of each pixel: the points (x, y) + z (slope_x, slope_y) at every depth z.
 
     Attributes:
@@ -73,10 +73,10 @@ class ChiefRays:
         misalignment: Misalignment,
         sensor_tilt: tuple[float, float],
     ) -> ChiefRays:
-        """A lens of `focal_mm` millimeters before a sensor on which that is `focal` pixels."""
+        """Place a lens of `focal_mm` millimeters before a sensor on which that is `focal` pixels."""
         scale = 1e-3 * focal_mm / focal_length(prescription)
         surfaces = place(prescription, 1e-3 * focal_mm, scale, misalignment)
-        # Pieces of glass are moved, the barrel is not.
+        # Misalignment moves pieces of glass, not the barrel.
         length = scale * sum(surface.thickness for surface in prescription.surfaces)
         return ChiefRays(
             surfaces=surfaces,
@@ -90,8 +90,8 @@ class ChiefRays:
             name=prescription.name,
         )
 
-    def lines(self, pixels: Tensor) -> Lines:
-        """Lines of sight of pixels (N, 2), in front of the lens.
+    def lines(self, pixels: Tensor) -> LinesOfSight:
+        """Find the lines of sight of pixels (N, 2), in front of the lens.
 
         The chief ray that lands on a pixel is found by Newton's method in its slopes at the stop; from there it is
         traced backward through the front of the lens.
@@ -100,20 +100,20 @@ class ChiefRays:
             InputError: no chief ray reaches a pixel.
         """
         slopes = (pixels - self.axis) / self._pixels_per_slope()
-        for _ in range(_STEPS):
+        for _ in range(_AIM_STEPS):
             landed, valid = self.land(slopes)
             error = landed - pixels
             off = torch.linalg.vector_norm(error, dim=-1)
-            if bool((off < _GOAL).all()):
+            if bool((off < _AIM_GOAL).all()):
                 break
             across, down = (
-                (self.land(slopes + slopes.new_tensor(nudge))[0] - landed) / _NUDGE
-                for nudge in ((_NUDGE, 0.0), (0.0, _NUDGE))
+                (self.land(slopes + slopes.new_tensor(nudge))[0] - landed) / _SLOPE_NUDGE
+                for nudge in ((_SLOPE_NUDGE, 0.0), (0.0, _SLOPE_NUDGE))
             )
             step = solve_2x2(across, down, error)
             length = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
-            slopes = slopes - step * (_LONGEST / length.clamp_min(1e-300)).clamp_max(1.0)
-        missed = ~(valid & (off < _ENOUGH))
+            slopes = slopes - step * (_LONGEST_STEP / length.clamp_min(1e-300)).clamp_max(1.0)
+        missed = ~(valid & (off < _AIM_ERROR))
         stop = self.surfaces[self.stop].vertex.expand(len(pixels), 3)
         rays = trace(self.surfaces[: self.stop], stop, -_unit(slopes), backward=True)
         missed |= ~rays.valid | ~(rays.directions[:, 2] < 0)
@@ -122,10 +122,10 @@ class ChiefRays:
                 f"lens {self.name}: no chief ray reaches {int(missed.sum())} of {len(pixels)} pixels; a smaller image, "
                 "a longer focal length or less misalignment is needed"
             )
-        # Light travels along +z and the camera looks along -z: mirrored, which a lens does not notice.
+        # Light travels along +z, but the camera looks along -z: mirroring changes nothing in a lens.
         points = rays.points * rays.points.new_tensor([1.0, 1.0, -1.0])
         slopes = -rays.directions[:, :2] / rays.directions[:, 2:]
-        return Lines(points[:, :2] - points[:, 2:] * slopes, slopes)
+        return LinesOfSight(points[:, :2] - points[:, 2:] * slopes, slopes)
 
     def land(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (N, 2) of the chief rays that leave the stop with slopes (N, 2), and whether they get there."""

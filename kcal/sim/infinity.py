@@ -1,4 +1,4 @@
-"""How far a calibrated camera is from the true lens, where it matters at long range: at infinity."""
+"""Compare a calibrated camera with the true lens at infinity, where errors matter at long range."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import LensLike
 
-_ROUNDS = 4
-_NUDGE = 1e-6  # radians
+_TURN_STEPS = 4
+_TURN_NUDGE = 1e-6  # radians, for central differences
 
 
 class InfinityError(NamedTuple):
@@ -21,10 +21,10 @@ class InfinityError(NamedTuple):
     Attributes:
         rms: sqrt(mean ‖e‖²) over the image, pixels.
         maximum: largest ‖e‖, pixels.
-        rotation: (3, 3) camera_from_truth: the turn of the camera frame that no board can tell, and no rig needs.
+        rotation: (3, 3) camera_from_truth: the turn of the camera frame, which no board determines and no rig needs.
         pixels: (rows, columns, 2) where it was measured.
-        errors: (rows, columns, 2) where the camera sees what the truth sees at `pixels`, minus those; NaN where the
-            camera sees it nowhere.
+        errors: (rows, columns, 2) pixel at which the camera sees what the truth sees at `pixels`, minus that pixel;
+            NaN where the camera does not see it.
         valid: share of `pixels` that the camera sees.
     """
 
@@ -38,15 +38,15 @@ class InfinityError(NamedTuple):
 
 @torch.no_grad()
 def error_at_infinity(camera: LensLike, truth: LensLike, *, columns: int = 49, rows: int = 28) -> InfinityError:
-    """Where a camera sees distant points, against where the truth does, all over the image.
+    """Measure over the whole image how far a camera's pixels of distant points are from the true ones.
 
-    Every pixel of a grid over the whole image looks along a true direction; the camera projects that direction, after
-    the one rotation of all directions that makes the RMS smallest. This is mrcal's projection difference with its
+    Each pixel of a grid has a true direction. The camera projects these directions after the rotation that makes the
+    RMS smallest. This is mrcal's projection difference with its
     implied rotation fitted at infinity (mrcal.secretsauce.org/differencing.html).
 
     Args:
-        camera: what was calibrated: a `Camera`, or anything that projects.
-        truth: what is true; anything that unprojects.
+        camera: the calibrated camera: a `Camera`, or anything that projects.
+        truth: the true lens: anything that unprojects.
         columns: of the grid, whose outermost pixels are the image's.
         rows: of the grid.
 
@@ -74,20 +74,21 @@ def error_at_infinity(camera: LensLike, truth: LensLike, *, columns: int = 49, r
         raise InputError("error_at_infinity: the camera and the truth have no rays in common")
     rotation = _kabsch(rays[both], seen_rays[both])
     flat = pixels.reshape(-1, 2)
-    errors, valid = _errors(camera, flat, rays, known, rotation)
-    for _ in range(_ROUNDS):
+    errors, valid = _errors_after_turn(camera, flat, rays, known, rotation)
+    for _ in range(_TURN_STEPS):
         used = valid
         slopes = []
         for axis in torch.eye(3, dtype=torch.float64):
             ends = [
-                _errors(camera, flat, rays, known, rotation_from_vector(s * _NUDGE * axis) @ rotation) for s in (1, -1)
+                _errors_after_turn(camera, flat, rays, known, rotation_from_vector(s * _TURN_NUDGE * axis) @ rotation)
+                for s in (1, -1)
             ]
             used = used & ends[0][1] & ends[1][1]
-            slopes.append((ends[0][0] - ends[1][0]) / (2 * _NUDGE))
+            slopes.append((ends[0][0] - ends[1][0]) / (2 * _TURN_NUDGE))
         jacobian = torch.stack([slope[used].reshape(-1) for slope in slopes], -1)
         step = torch.linalg.lstsq(jacobian, -errors[used].reshape(-1, 1)).solution[:, 0]
         rotation = rotation_from_vector(step) @ rotation
-        errors, valid = _errors(camera, flat, rays, known, rotation)
+        errors, valid = _errors_after_turn(camera, flat, rays, known, rotation)
     length = torch.linalg.vector_norm(errors[valid], dim=-1)
     return InfinityError(
         rms=float(torch.sqrt((length**2).mean())),
@@ -99,13 +100,15 @@ def error_at_infinity(camera: LensLike, truth: LensLike, *, columns: int = 49, r
     )
 
 
-def _errors(camera: LensLike, pixels: Tensor, rays: Tensor, known: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+def _errors_after_turn(
+    camera: LensLike, pixels: Tensor, rays: Tensor, known: Tensor, rotation: Tensor
+) -> tuple[Tensor, Tensor]:
     found, valid = camera.project((rays @ rotation.T) * 1e9)
     return found - pixels, valid & known
 
 
 def _kabsch(source: Tensor, target: Tensor) -> Tensor:
-    """The rotation that turns unit vectors (N, 3) into others best (W. Kabsch, Acta Cryst. A32, 1976)."""
+    """Find the rotation that best turns unit vectors (N, 3) into others (W. Kabsch, Acta Cryst. A32, 1976)."""
     u, _, vh = torch.linalg.svd(target.T @ source)
     sign = torch.ones(3, dtype=torch.float64)
     sign[2] = torch.sign(torch.linalg.det(u @ vh))

@@ -1,8 +1,8 @@
-"""Where to hold a board: poses that are completely seen, tilted in all directions, and spread over image and depth.
+"""Choose poses of a board that are completely visible, tilted in all directions, and spread over image and depth.
 
-Poses are drawn at random, those that are not completely seen are dropped, and of the rest those are kept that lie
-farthest from each other (greedy farthest-point choice: T. Gonzalez, "Clustering to minimize the maximum intercluster
-distance", 1985). Extremes come first, which is what a calibration needs, and no draw is ever repeated endlessly.
+Poses are drawn at random, those that are not completely visible are dropped, and of the rest the ones farthest from
+each other are chosen (T. Gonzalez, "Clustering to minimize the maximum intercluster distance", 1985). Extreme poses
+come first, as a calibration needs them, and the number of draws is fixed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardLike, BoardPose, LensLike, RigLike, board_points
 
-_DRAWS = 4096
+_POSE_DRAWS = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ def sample_board_poses(
     fill: tuple[float, float] = (0.4, 0.9),
     options: PoseOptions | None = None,
 ) -> list[BoardPose]:
-    """Poses for the calibration of one camera: over the whole image, at several distances, tilted in all directions.
+    """Choose poses to calibrate one camera: over the whole image, at several distances, tilted in all directions.
 
     Args:
         camera: a single camera, or a true lens.
@@ -83,7 +83,7 @@ def sample_board_poses(
         True
     """
     options = options or PoseOptions()
-    _check(count, "fill", fill)
+    _check_draws(count, "fill", fill)
     width, height = camera.size
     extent = ((board.columns + 1) * board.square, (board.rows + 1) * board.square)
     focal = camera.focal.detach()
@@ -102,7 +102,7 @@ def sample_pair_poses(
     distance: tuple[float, float],
     options: PoseOptions | None = None,
 ) -> list[BoardPose]:
-    """Poses that both cameras of a rig see completely, tilted against the line from the rig's middle.
+    """Choose poses that both cameras of a rig see completely, tilted against the line from the rig's middle.
 
     Args:
         rig: two cameras.
@@ -130,7 +130,7 @@ def sample_pair_poses(
         True
     """
     options = options or PoseOptions()
-    _check(count, "distance", distance)
+    _check_draws(count, "distance", distance)
     rotation, translation = rig.right_from_left_rotation, rig.right_from_left_translation
     middle = -0.5 * rotation.T @ translation
     drawn = _draw(rig.left, board, distance, middle, generator, options)
@@ -139,14 +139,14 @@ def sample_pair_poses(
 
 
 def rig_pose(rig: RigLike, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
-    """right_from_board of a board whose pose in the left camera is given."""
+    """Convert left_from_board to right_from_board."""
     rotation, translation = left_from_board
     return BoardPose(rig.right_from_left_rotation @ rotation, rig.right_from_left(translation))
 
 
-def _check(count: int, name: str, limits: tuple[float, float]) -> None:
-    if not isinstance(count, int) or not 1 <= count <= _DRAWS:
-        raise InputError(f"count: a whole number from 1 to {_DRAWS} is needed, got {count!r}")
+def _check_draws(count: int, name: str, limits: tuple[float, float]) -> None:
+    if not isinstance(count, int) or not 1 <= count <= _POSE_DRAWS:
+        raise InputError(f"count: a whole number from 1 to {_POSE_DRAWS} is needed, got {count!r}")
     if not 0 < limits[0] <= limits[1] < math.inf:
         raise InputError(f"{name} {limits}: two positive numbers are needed, the smaller first")
 
@@ -168,16 +168,16 @@ def _draw(
     generator: torch.Generator,
     options: PoseOptions,
 ) -> _Drawn:
-    random = torch.rand((_DRAWS, 6), dtype=torch.float64, generator=generator)
+    random = torch.rand((_POSE_DRAWS, 6), dtype=torch.float64, generator=generator)
     with torch.no_grad():
         aim = random[:, :2] * torch.tensor(camera.size, dtype=torch.float64) - 0.5
-        # A pixel beyond the lens's fold gives the optical axis: one more board in the middle.
+        # A pixel without a ray gives the optical axis: one more board in the middle.
         rays, _ = camera.unproject(aim)
     near, far = distance
     depth = near * (far / near) ** random[:, 2]
     center = rays * depth[:, None]
     sight = center - eye if eye is not None else center
-    # Between a quarter of the largest tilt and all of it: boards square to the sight say nothing of the focal length.
+    # Between a quarter of the largest tilt and all of it: untilted boards do not determine the focal length.
     tilt, towards = options.max_tilt * (0.25 + 0.75 * random[:, 3]), 2 * math.pi * random[:, 4]
     roll = options.max_roll * (2 * random[:, 5] - 1)
     zero = torch.zeros_like(tilt)
@@ -201,14 +201,14 @@ def _choose(
     points = board_points(board, options.border)
     columns = board.columns + 2 * options.border
     # Most draws end here: the outermost four points are a few percent of the work.
-    seen, _ = _see(drawn, torch.arange(_DRAWS), cameras, points[[0, columns - 1, -columns, -1]], options)
+    seen, _ = _see(drawn, torch.arange(_POSE_DRAWS), cameras, points[[0, columns - 1, -columns, -1]], options)
     index = seen.nonzero()[:, 0]
     whole, places = _see(drawn, index, cameras, points, options)
     index, places = index[whole], places[whole]
     found = len(index)
     if found < count:
         raise InputError(
-            f"only {found} of {_DRAWS} drawn boards are completely seen and {count} are needed; "
+            f"only {found} of {_POSE_DRAWS} drawn boards are completely seen and {count} are needed; "
             "use a smaller board, another distance, less tilt or a smaller margin"
         )
     rotation, translation = drawn.rotation[index], drawn.translation[index]

@@ -1,7 +1,7 @@
 """Lens prescriptions: radii, thicknesses and refractive indices of real designs, and their paraxial properties.
 
 A prescription is what a lens designer publishes. Scaled to a focal length and traced ray by ray
-(`kcal.sim.raytrace`), it distorts as glass does, and no polynomial of kcal is in it. Lengths are millimeters and light
+(`kcal.sim.raytrace`), it distorts like a real lens, without any lens model of kcal. Lengths are millimeters and light
 travels along +z, as in the literature; indices are those of the helium d line (587.6 nm).
 """
 
@@ -49,8 +49,8 @@ class Prescription:
             media.
         stop: its place in `surfaces`.
         focal: focal length in pixels with which its image covers 1920 x 1080.
-        tolerance: how well such lenses are put together: decentering of a piece of glass, one sigma along each axis, as
-            a share of the focal length. Strong aspheres forgive far less than spheres.
+        tolerance: error of assembly: decentering of each piece of glass, one sigma along each axis, as a share of the
+            focal length. Strong aspheres tolerate far less than spheres.
 
     Raises:
         InputError: a stop that is no plane in one medium.
@@ -91,9 +91,10 @@ class Prescription:
 
 
 def system_matrix(prescription: Prescription) -> tuple[float, float, float, float]:
-    """Paraxial matrix (A, B, C, D) from the front vertex to the last one: (height, slope) go to (A h + B s, C h + D s).
+    """Compute the paraxial matrix (A, B, C, D) from the front vertex to the last one.
 
-    Slopes are those of the ray in air (E. Hecht, *Optics*, section 6.2, for the reduced angles used inside).
+    It turns a height h and a slope s into (A h + B s, C h + D s). Slopes
+    are those of the ray in air (E. Hecht, *Optics*, section 6.2, for the reduced angles used inside).
     """
     a, b, c, d = 1.0, 0.0, 0.0, 1.0
     before = 1.0
@@ -111,12 +112,6 @@ def system_matrix(prescription: Prescription) -> tuple[float, float, float, floa
 def focal_length(prescription: Prescription) -> float:
     """Effective focal length, millimeters."""
     return -1.0 / system_matrix(prescription)[2]
-
-
-def back_focus(prescription: Prescription) -> float:
-    """Distance from the last vertex to the image of a point at infinity, millimeters."""
-    a, _, c, _ = system_matrix(prescription)
-    return -a / c
 
 
 _PLANE = math.inf

@@ -1,8 +1,8 @@
-"""Sequential ray tracing through tilted and decentered surfaces, in float64 and for any number of rays at once.
+"""Trace rays through tilted and decentered surfaces, in float64 and for any number of rays at once.
 
-Each surface has its own frame: its vertex and a rotation. A ray is moved into that frame, meets the conic in closed
-form (aspheres by Newton's method) and is bent by Snell's law in vector form: with unit direction d, unit normal n
-against which the light travels (n · d > 0) and the ratio m of the indices before and behind,
+Each surface has its own frame: its vertex and a rotation. A ray is moved into that frame, intersected with the conic in
+closed form (aspheres by Newton's method) and refracted by Snell's law in vector form: with unit direction d, unit
+normal n against which the light travels (n · d > 0) and the ratio m of the indices before and behind,
 
     d' = m d + (sqrt(1 - m² (1 - (n · d)²)) - m n · d) n
 
@@ -25,10 +25,10 @@ from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.prescription import Prescription, Surface
 
-_NEWTON = 30
-_SETTLED = 1e-15
+_ASPHERE_STEPS = 30
+_ASPHERE_GOAL = 1e-15
 # Tilt that goes with a decentering of one focal length, radians.
-_TILT = 0.436
+_TILT_PER_DECENTER = 0.436
 
 
 class Placed(NamedTuple):
@@ -42,7 +42,7 @@ class Placed(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """Points (..., 3) on rays, unit directions (..., 3), and valid (...): met every surface and was not reflected."""
+    """Points (..., 3) on rays, unit directions (..., 3), and valid (...): the ray passed every surface."""
 
     points: Tensor
     directions: Tensor
@@ -51,7 +51,7 @@ class Rays(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Misalignment:
-    """How a lens was put together: per piece of glass, in the order of `Prescription.elements`.
+    """Errors of a lens's assembly, one entry per piece of glass in the order of `Prescription.elements`.
 
     Args:
         decenter: shift of each piece along x and y, in shares of the focal length.
@@ -69,7 +69,7 @@ class Misalignment:
 
     @staticmethod
     def draw(prescription: Prescription, strength: float, generator: torch.Generator) -> Misalignment:
-        """Gaussian errors of assembly: `strength` times the prescription's tolerance.
+        """Draw Gaussian errors of assembly: `strength` times the prescription's tolerance.
 
         For the surveillance lens of 2.8 mm and a strength of 1 that is 22 µm and 0.2 degrees, one sigma of each axis.
         """
@@ -77,12 +77,12 @@ class Misalignment:
             raise InputError(f"misalignment strength {strength}: a number that is not negative is needed")
         shape = (2, len(prescription.elements), 2)
         drawn = strength * prescription.tolerance * torch.randn(shape, dtype=torch.float64, generator=generator)
-        shifts, turns = drawn[0].tolist(), (_TILT * drawn[1]).tolist()
+        shifts, turns = drawn[0].tolist(), (_TILT_PER_DECENTER * drawn[1]).tolist()
         return Misalignment(decenter=tuple(map(tuple, shifts)), tilt=tuple(map(tuple, turns)))
 
 
 def place(prescription: Prescription, focal: float, scale: float, misalignment: Misalignment) -> list[Placed]:
-    """The surfaces of a lens with its front vertex at the origin.
+    """Place the surfaces of a lens with its front vertex at the origin.
 
     Args:
         prescription: of the lens.
@@ -121,7 +121,7 @@ def place(prescription: Prescription, focal: float, scale: float, misalignment: 
 
 
 def trace(surfaces: Sequence[Placed], points: Tensor, directions: Tensor, *, backward: bool = False) -> Rays:
-    """Send rays through surfaces, one after the other; they end on the last one, bent by it.
+    """Trace rays through surfaces, one after the other; they end on the last one, refracted by it.
 
     Args:
         surfaces: in the order of `place`.
@@ -149,9 +149,9 @@ def trace(surfaces: Sequence[Placed], points: Tensor, directions: Tensor, *, bac
 
 
 def meet(surface: Surface, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Where lines meet a surface near its vertex, in its frame: points (..., 3), and whether they do."""
+    """Intersect lines with a surface near its vertex, in its frame: points (..., 3), and whether they meet."""
     c, k = surface.curvature, surface.conic
-    # To the plane through the vertex first: the roots are then small and lose no digits.
+    # From the plane through the vertex, so that the roots are small and lose no digits.
     start = points - directions * (points[..., 2:] / directions[..., 2:])
     forward = torch.where(directions[..., 2:] < 0, -directions, directions)
     x, y, _ = start.unbind(-1)
@@ -162,15 +162,15 @@ def meet(surface: Surface, points: Tensor, directions: Tensor) -> tuple[Tensor, 
     t = squared / (b + torch.sqrt(torch.where(met, under, 1.0)))
     at = start + t[..., None] * forward
     if surface.even:
-        # From the plane: where the asphere turns away from its conic, another root may be nearer to that.
+        # From the plane, not from the conic: where the asphere is far from it, another root may be nearer.
         at, longest = start, 0.2 * abs(surface.radius)
-        for _ in range(_NEWTON):
+        for _ in range(_ASPHERE_STEPS):
             height, slope = _sag(surface, (at[..., :2] ** 2).sum(-1))
             across = 2 * slope * (at[..., 0] * L + at[..., 1] * M)
             step = (height - at[..., 2]) / (N - across)
             step = step.clamp(-longest, longest)
             at = at + step[..., None] * forward
-            if not bool((step.abs() > _SETTLED).any()):
+            if not bool((step.abs() > _ASPHERE_GOAL).any()):
                 break
         # A line may miss the conic and still meet the asphere.
         met = step.abs() < 1e-12
@@ -185,7 +185,7 @@ def normals(surface: Surface, at: Tensor) -> Tensor:
 
 
 def refract(directions: Tensor, normal: Tensor, ratio: float) -> tuple[Tensor, Tensor]:
-    """Snell's law: directions behind a surface, and whether light gets there at all (no total reflection)."""
+    """Apply Snell's law: directions behind a surface, and whether there are any (no total reflection)."""
     if ratio == 1.0:
         return directions, torch.ones(directions.shape[:-1], dtype=torch.bool)
     cosine = (directions * normal).sum(-1, keepdim=True)

@@ -1,8 +1,8 @@
-"""Images of a checkerboard through a distorting lens, with true corners: light first, then optics, then the sensor.
+"""Render images of a checkerboard through a distorting lens, with known corners: light, then optics, then the sensor.
 
-Every pixel is unprojected through the inverse of the lens and meets the board's plane; where an edge is near, the
-pattern is integrated over parts of the pixel. Then come blur and averaging over the pixel's area (both in linear light,
-and before the pixel grid could alias), vignetting, noise and rounding to 8 bits.
+Each pixel is unprojected through the inverse of the lens to the board's plane; near an edge the pattern is integrated
+over parts of the pixel. Then follow blur and averaging over the pixel's area (both in linear light, and before the
+pixel grid could alias), vignetting, noise, and rounding to 8 bits.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.sim.board import BoardLike, BoardPose, area_colors, board_points, check_board, check_pose
-from kcal.sim.rectangle import Window, grow, pixel_axes
+from kcal.sim.rectangle import PixelRectangle, grow, pixel_axes
 from kcal.sim.window import AnyLens, invert_window
 
 _FAR = 1e9  # squares: nothing is painted there
-_REACH = 0.625  # pixels from a pixel's center to where its outermost samples end
+_SAMPLE_REACH = 0.625  # pixels from a pixel's center to where its outermost samples end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,11 +73,11 @@ def render_board(
     options: RenderOptions | None = None,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Image of a checkerboard as the camera sees it.
+    """Render a checkerboard as the camera sees it.
 
-    The square diagonally outside corner 0 is black; see `board_points` for where corners lie and `project_board`
-    for their true pixels. A board that reaches beyond the image, or beyond what the lens can image, is drawn as far
-    as it is seen; `project_board` says which corners are.
+    The square diagonally outside corner 0 is black. `board_points` gives the corners on the board, `project_board`
+    their true pixels and which of them are visible. A board that reaches beyond the image, or beyond what the lens can
+    image, is drawn as far as it is visible.
 
     The lens is inverted every 8 px and interpolated by cubics; edges are integrated in closed form over quarters of a
     pixel. A straight edge lies within 1e-9 px of where it should, and a cubic fitted to the noise-free image finds
@@ -121,7 +121,7 @@ def render_light(
     board: BoardLike,
     options: RenderOptions | None = None,
 ) -> Tensor:
-    """The image as it falls on the sensor, before noise and rounding: (height, width) float64 gray levels.
+    """Render the image as it falls on the sensor, before noise and rounding: (height, width) float64 gray levels.
 
     Arguments and errors are those of `render_board`.
 
@@ -140,14 +140,14 @@ def render_light(
     pose = check_pose(cam_from_board)
     radius = math.ceil(4 * options.blur)
     width, height = camera.size
-    image = _background(Window(0, 0, width, height), camera.size, options)
+    image = _background(PixelRectangle(0, 0, width, height), camera.size, options)
     paper = _paper_window(camera, pose, board, options.margin, radius)
     if paper.width > 0 and paper.height > 0:
-        # What is just outside the window is blurred into it.
+        # Light from just outside the window is blurred into it.
         light = _light(camera, pose, board, grow(paper, radius), options)
         rows, columns = slice(paper.top, paper.top + paper.height), slice(paper.left, paper.left + paper.width)
-        image[rows, columns] = _blur(light, options.blur, radius)
-    x, y = pixel_axes(Window(0, 0, width, height))
+        image[rows, columns] = _blur_to_pixels(light, options.blur, radius)
+    x, y = pixel_axes(PixelRectangle(0, 0, width, height))
     x, y = x - (width - 1) / 2, y - (height - 1) / 2
     image *= 1 - options.vignetting * (x**2 + y[:, None] ** 2) / (x[-1] ** 2 + y[-1] ** 2)
     return image if options.gamma == 1 else 255 * (image.clamp_min(0) / 255) ** (1 / options.gamma)
@@ -159,7 +159,9 @@ def _in_light(options: RenderOptions) -> RenderOptions:
     return options if options.gamma == 1 else replace(options, **levels)
 
 
-def _light(camera: AnyLens, pose: BoardPose, board: BoardLike, window: Window, options: RenderOptions) -> Tensor:
+def _light(
+    camera: AnyLens, pose: BoardPose, board: BoardLike, window: PixelRectangle, options: RenderOptions
+) -> Tensor:
     """The scene in gray levels, before the optics: (2 height, 2 width), four samples in each pixel of a window.
 
     Along x and y, a sample is the average over half a pixel, and of two such averages a quarter of a pixel apart: what
@@ -174,8 +176,8 @@ def _light(camera: AnyLens, pose: BoardPose, board: BoardLike, window: Window, o
 
     # Board squares per pixel, along x and y. Every edge of the pattern and of the paper lies at a whole number.
     a_x, a_y, b_x, b_y = *_slopes(grown_a), *_slopes(grown_b)
-    edge_a = (a - a.round()).abs() <= _REACH * (a_x.abs() + a_y.abs())
-    edge_b = (b - b.round()).abs() <= _REACH * (b_x.abs() + b_y.abs())
+    edge_a = (a - a.round()).abs() <= _SAMPLE_REACH * (a_x.abs() + a_y.abs())
+    edge_b = (b - b.round()).abs() <= _SAMPLE_REACH * (b_x.abs() + b_y.abs())
     outside = 1.5 + options.margin
     near = (a > -outside) & (a < board.columns - 1 + outside) & (b > -outside) & (b < board.rows - 1 + outside)
     rows, columns = ((edge_a | edge_b) & near).nonzero(as_tuple=True)
@@ -207,8 +209,10 @@ def _paint(
     return around + (options.white - around) * paper - (options.white - options.black) * black
 
 
-def _board_coordinates(camera: AnyLens, pose: BoardPose, board: BoardLike, window: Window) -> tuple[Tensor, Tensor]:
-    """Where each pixel's ray meets the board's plane, x and y in squares; far away where it does not."""
+def _board_coordinates(
+    camera: AnyLens, pose: BoardPose, board: BoardLike, window: PixelRectangle
+) -> tuple[Tensor, Tensor]:
+    """Find where each pixel's ray meets the board's plane, x and y in squares; far away where it does not."""
     looks, valid = invert_window(camera, window)
     x, y, *origins = looks.unbind(-1)
     plane = torch.stack([pose.rotation[:, 0], pose.rotation[:, 1], pose.translation / board.square], -1)
@@ -218,14 +222,14 @@ def _board_coordinates(camera: AnyLens, pose: BoardPose, board: BoardLike, windo
     unseen = ~valid | (depth <= 1e-12)
     a, b = a / depth, b / depth
     if origins:
-        # Lines that start beside the camera's origin: by where they start, and by what that takes of the way.
+        # Lines of sight that start beside the camera's origin.
         start_a, start_b, nearer = ((row[0] * origins[0] + row[1] * origins[1]) / board.square for row in rows)
         a, b = start_a + a * (1 - nearer), start_b + b * (1 - nearer)
     return a.masked_fill_(unseen, _FAR), b.masked_fill_(unseen, _FAR)
 
 
-def _paper_window(camera: AnyLens, pose: BoardPose, board: BoardLike, margin: int, radius: int) -> Window:
-    """The part of the image that the paper and its blur reach; the whole image where that is uncertain."""
+def _paper_window(camera: AnyLens, pose: BoardPose, board: BoardLike, margin: int, radius: int) -> PixelRectangle:
+    """Bound the part of the image that the paper and its blur reach; the whole image where that is uncertain."""
     outline = _outline(board, 1 + margin) @ pose.rotation.T + pose.translation
     if bool((outline[:, 2] <= 0).any()):
         raise InputError("render_board: the board reaches behind the camera; move it forward (z is depth)")
@@ -234,7 +238,7 @@ def _paper_window(camera: AnyLens, pose: BoardPose, board: BoardLike, margin: in
     width, height = camera.size
     pixels, valid = camera.project(outline)
     if not bool(valid.all()):
-        return Window(0, 0, width, height)
+        return PixelRectangle(0, 0, width, height)
     # The outline is known at points only, and bends a little between them.
     low, high = pixels.amin(0), pixels.amax(0)
     pad = radius + 3 + 0.01 * float((high - low).max())
@@ -242,7 +246,7 @@ def _paper_window(camera: AnyLens, pose: BoardPose, board: BoardLike, margin: in
     right, bottom = (
         min(size, math.ceil(float(value) + pad) + 1) for size, value in zip(camera.size, high, strict=True)
     )
-    return Window(left, top, max(0, right - left), max(0, bottom - top))
+    return PixelRectangle(left, top, max(0, right - left), max(0, bottom - top))
 
 
 def _outline(board: BoardLike, border: int) -> Tensor:
@@ -254,14 +258,14 @@ def _outline(board: BoardLike, border: int) -> Tensor:
     return ((1 - share) * ring[:-1] + share * ring[1:]).reshape(-1, 3)
 
 
-def _background(window: Window, size: tuple[int, int], options: RenderOptions) -> Tensor:
+def _background(window: PixelRectangle, size: tuple[int, int], options: RenderOptions) -> Tensor:
     x, y = pixel_axes(window)
     wave = torch.sin(4.0 * x / size[0] + (2.5 * y / size[1])[:, None] + 0.5)
     return options.background * (1 + 0.2 * wave)
 
 
-def _blur(light: Tensor, sigma: float, radius: int) -> Tensor:
-    """Optics and pixel area: from four samples a pixel to pixels, `radius` of them fewer on every side."""
+def _blur_to_pixels(light: Tensor, sigma: float, radius: int) -> Tensor:
+    """Apply the optics and the pixel's area: four samples per pixel become one, `radius` fewer on every side."""
     # In half pixels. The samples are a little wider than the half pixels that make up a pixel's area.
     variance = max((2 * sigma) ** 2 - 0.0625, 1e-4)
     reach = 2 * radius

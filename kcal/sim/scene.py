@@ -1,7 +1,7 @@
 """A simulated site with known truth: a rig of two CCTV cameras, its boards, landmarks and far targets.
 
-Its lenses are ray-traced, so that no lens model of kcal is the truth. What the calibration can do and what the marks
-allow is in docs/measured/paper.md: with 0.05 px of noise in each image, marks alone leave 2 % of range at 5 km.
+Its lenses are ray-traced, so that no lens model of kcal is the truth. docs/measured/paper.md tells which accuracy the
+marks and the calibration allow: 0.05 px of noise in each image alone is 2 % of range at 5 km.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _LANDMARKS = (
     ("bridge", 1150.0, -8.0, -24.0),
     ("hill", 2100.0, 19.0, 120.0),
 )
-# Surveyed as well, and kept out of every solution.
+# Surveyed too, but used for checks only.
 _CHECKS = (
     ("stake", 200.0, 5.0, -13.0),
     ("trough", 300.0, 22.0, -10.0),
@@ -67,7 +67,7 @@ class NamedPoints(NamedTuple):
     enu: Tensor
 
 
-class Marks(NamedTuple):
+class SceneMarks(NamedTuple):
     """Pixels (N, 2) at which points were marked in both images, and where they truly are."""
 
     left: Tensor
@@ -98,7 +98,7 @@ class DemoView(NamedTuple):
 
 @functools.cache
 def demo_rig() -> TrueRig:
-    """Two CCTV cameras 10 m apart, 1920 x 1080, f 1600 px, wide glass lenses (72 degrees) fairly put together.
+    """Two CCTV cameras 10 m apart, 1920 x 1080, f 1600 px, wide glass lenses (72 degrees) of ordinary assembly.
 
     Example:
         >>> round(float(demo_rig().baseline), 3)
@@ -109,7 +109,7 @@ def demo_rig() -> TrueRig:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DemoScene:
-    """Everything the demonstration is made of; the same seed gives the same bytes.
+    """The site, cameras, boards and marks of the demonstration; the same seed gives the same bytes.
 
     Convention: the rig frame is the left camera's; ENU has its origin in the left camera's center. Rotations are in
     degrees here, as a site plan has them.
@@ -117,24 +117,24 @@ class DemoScene:
     Args:
         seed: of poses, noise and marks.
         rig: the true cameras.
-        lat: of the left camera's center, degrees (WGS 84); a salt flat without anything in the way.
+        lat: of the left camera's center, degrees (WGS 84); a salt flat.
         lon: degrees east.
         height: meters above the ellipsoid.
         heading_deg: azimuth of the left camera's axis, degrees clockwise from true north.
         pitch_deg: of that axis above the horizon, degrees.
         roll_deg: turn of the left camera about its axis, degrees, clockwise as seen from behind it.
-        near_board: for close views of one camera each, held at 0.7 to 1.6 m.
+        near_board: board for close views of one camera each, held at 0.7 to 1.6 m.
         near_views: how many per camera.
-        pair_board: for views of both cameras at once; every square is seen larger than 15 px.
+        pair_board: board for views of both cameras at once; every square is larger than 15 px in the image.
         pair_views: how many.
         pair_distance: nearest and farthest distance of that board, meters.
         render: how images look.
-        mark_sigma: noise of marks in pixels, for each axis and image.
+        mark_sigma: noise of marks in pixels along each axis in each image.
         survey_sigma: error of surveyed positions in meters, along each axis.
-        targets_at: what is to be located: name, distance in meters, bearing in degrees to the right of the heading,
-            height in meters.
-        landmarks_at: the same of what was surveyed to orient the rig.
-        checks_at: the same of what was surveyed to check it, and must not be used for anything else.
+        targets_at: points to locate: name, distance in meters, bearing in degrees to the right of the heading, height
+            in meters.
+        landmarks_at: points surveyed to orient the rig, likewise.
+        checks_at: points surveyed to check the rig, likewise; not used for anything else.
 
     Example:
         >>> scene = DemoScene(seed=1, near_views=4, pair_views=2)
@@ -198,23 +198,23 @@ class DemoScene:
         return self._points(self.checks_at)
 
     def surveyed(self, points: NamedPoints) -> NamedPoints:
-        """Points where a surveyor says they are."""
+        """Add the surveyor's errors to points."""
         stream = -20 - sum(map(ord, points.names[0]))
         error = torch.randn(points.enu.shape, dtype=torch.float64, generator=self.generator(stream))
         return NamedPoints(points.names, points.enu + self.survey_sigma * error)
 
     @property
-    def target_marks(self) -> Marks:
+    def target_marks(self) -> SceneMarks:
         """The targets marked in both images, with the scene's noise."""
         return self._marks(self.targets, -1)
 
     @property
-    def landmark_marks(self) -> Marks:
+    def landmark_marks(self) -> SceneMarks:
         """The landmarks marked in both images, with the scene's noise."""
         return self._marks(self.landmarks, -2)
 
     @property
-    def check_marks(self) -> Marks:
+    def check_marks(self) -> SceneMarks:
         """The check points marked in both images, with the scene's noise."""
         return self._marks(self.checks, -3)
 
@@ -223,10 +223,10 @@ class DemoScene:
         return points.enu @ self.enu_from_rig
 
     def generator(self, stream: int) -> torch.Generator:
-        """The random source of one part of the scene, so that no part depends on what was made before it."""
+        """Make the random source of one part of the scene, so that the parts do not depend on each other."""
         return torch.Generator().manual_seed((self.seed + 1) * 1_000_003 + stream)
 
-    def _marks(self, points: NamedPoints, stream: int) -> Marks:
+    def _marks(self, points: NamedPoints, stream: int) -> SceneMarks:
         return mark_points(self.rig, self.points_rig(points), self.mark_sigma, self.generator(stream))
 
     def _points(self, table: Places) -> NamedPoints:
@@ -238,7 +238,7 @@ class DemoScene:
         return NamedPoints(tuple(name for name, *_ in table), torch.tensor(rows, dtype=torch.float64))
 
 
-def mark_points(rig: RigLike, points_rig: Tensor, sigma: float, generator: torch.Generator) -> Marks:
+def mark_points(rig: RigLike, points_rig: Tensor, sigma: float, generator: torch.Generator) -> SceneMarks:
     """Mark points in both images with Gaussian noise.
 
     Args:
@@ -266,7 +266,7 @@ def mark_points(rig: RigLike, points_rig: Tensor, sigma: float, generator: torch
     if bool(unseen.any()):
         raise InputError(f"points_rig: point {int(unseen.nonzero()[0])} is not seen by both cameras")
     noise = sigma * torch.randn((2, *left.shape), dtype=torch.float64, generator=generator)
-    return Marks(left + noise[0], right + noise[1], left, right)
+    return SceneMarks(left + noise[0], right + noise[1], left, right)
 
 
 def render_demo(scene: DemoScene, progress: Callable[[str], None] | None = None) -> Iterator[DemoView]:
@@ -287,7 +287,7 @@ def render_demo(scene: DemoScene, progress: Callable[[str], None] | None = None)
         >>> view.kind, view.camera, view.name, tuple(view.image.shape), tuple(view.corners.shape)
         ('near', 'left', 'near-01', (1080, 1920), (54, 2))
     """
-    for index, (kind, side, name, pose) in enumerate(_views(scene)):
+    for index, (kind, side, name, pose) in enumerate(_scene_views(scene)):
         camera, board = getattr(scene.rig, side), scene.near_board if kind == "near" else scene.pair_board
         image = render_board(camera, pose, board, scene.render, scene.generator(index))
         corners, _ = project_board(camera, pose, board)
@@ -303,7 +303,7 @@ class _View(NamedTuple):
     pose: BoardPose
 
 
-def _views(scene: DemoScene) -> Iterator[_View]:
+def _scene_views(scene: DemoScene) -> Iterator[_View]:
     sides: tuple[Literal["left", "right"], ...] = ("left", "right")
     for stream, side in enumerate(sides):
         camera = getattr(scene.rig, side)

@@ -1,4 +1,4 @@
-"""Two true lenses, rigidly joined: what a simulated site is seen with."""
+"""Two ray-traced cameras, rigidly joined."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ class TrueRig:
 
 
 def drawn_rig(lens: str, strength: float, seed: int) -> TrueRig:
-    """Two cameras 10 m apart whose lenses are of one design and were put together apart.
+    """Draw two cameras 10 m apart whose lenses have one design and separate errors of assembly.
 
-    The right camera is toed in by 0.34 degrees, and turned by 0.17 in pitch and 0.46 in roll.
+    The right camera is toed in by 0.34 degrees, and turned by 0.17 degrees in pitch and 0.46 in roll.
 
     Args:
         lens: name of a prescription.

@@ -1,11 +1,11 @@
-"""`TruthLens`: a camera behind a ray-traced lens, for simulations in which no model of kcal may be the truth.
+"""`TruthLens`: a camera behind a ray-traced lens, for simulations whose truth is no lens model of kcal.
 
-Every pixel has its chief ray, and with it a line in front of the camera (`kcal.sim.chief`). These lines do not meet in
-one point: the entrance pupil wanders with the angle, as in any wide lens, and more where pieces of glass are
+Each pixel has a chief ray, and with it a line of sight in front of the camera (`kcal.sim.chief`). These lines do not
+meet in one point: the entrance pupil moves with the angle, as in any wide lens, and more if pieces of glass are
 decentered. The camera's origin is the point nearest to all lines. At infinity only their directions matter.
 
-The lines are kept as Chebyshev sums over the image and a margin, from which `unproject` reads and `project` solves by
-Newton's method; how far the sums are from direct tracing is measured when the lens is made (`table_error`).
+The lines are stored as Chebyshev sums over the image and a margin. `unproject` evaluates them, and `project` solves
+them by Newton's method. `table_error` is their difference from direct tracing, measured when the lens is built.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.sim.chebyshev import tabulate
-from kcal.sim.chief import ChiefRays, Lines, solve_2x2
+from kcal.sim.chief import ChiefRays, LinesOfSight, solve_2x2
 from kcal.sim.prescription import PRESCRIPTIONS, Prescription
 from kcal.sim.raytrace import Misalignment
-from kcal.sim.rectangle import Window
+from kcal.sim.rectangle import PixelRectangle
 
-_MARGIN = 64  # pixels around the image that are tabulated too: blurred images look past the edge
+_TABLE_MARGIN = 64  # pixels around the image that are tabulated too: blurred images look past the edge
 _DEGREES = (20, 28, 36, 48)
-_GOAL = 1e-8  # pixels
-_NEWTON = 12
-_SETTLED, _FOUND = 1e-9, 1e-7  # pixels
-_CHUNK = 1 << 14
+_TABLE_GOAL = 1e-8  # pixels
+_PROJECT_STEPS = 12
+_STEP_GOAL, _PROJECT_ERROR = 1e-9, 1e-7  # pixels
+_POINTS_AT_ONCE = 1 << 14
 
 
 class TruthLens:
@@ -38,24 +38,23 @@ class TruthLens:
     first pixel. All tensors are float64; nothing here is differentiable.
 
     Args:
-        prescription: a lens, by name or as it is.
-        focal: paraxial focal length in pixels; that of the prescription if left out. It scales the image, whatever
-            the lens's own size.
+        prescription: a lens, or its name.
+        focal: paraxial focal length in pixels; that of the prescription if left out.
         size: (width, height) in pixels.
         center: pixel in which the barrel's axis meets the sensor; the image's center if left out.
         misalignment: how the glass is decentered and tilted; shares of the focal length, and radians.
         sensor_tilt: turn of the sensor about x and y, radians.
-        focal_mm: focal length in millimeters. It says how large the lens is beside what it looks at, and with it how
-            much the wandering pupil matters at close range.
-        wander: share of the pupil's wander that is kept: 0 lets all lines meet, 1 is the whole of it. The default
-            stands for a board ten times as large and as far away; no model of kcal knows of a wandering pupil, and
-            with all of it the surveillance lens moves corners at 1 m by 0.09 px RMS against those at infinity.
+        focal_mm: focal length in millimeters, which sets the size of the lens and with it the effect of the moving
+            pupil at close range.
+        wander: share of the pupil's motion that is kept: with 0 all lines of sight meet, 1 is the real lens. The
+            default has the effect of a board ten times as large and as far away. With 1 the surveillance lens moves
+            corners at 1 m by 0.09 px RMS against those at infinity, which no lens model of kcal describes.
 
     Attributes:
         size: (width, height) in pixels.
         low: (2,) first pixel of the margin around the image for which the lens is known as well.
         high: (2,) the last one.
-        table_error: largest difference between the table and tracing, pixels, at 256 places that are no nodes.
+        table_error: largest difference between the table and tracing, pixels, at 256 places between the nodes.
 
     Raises:
         InputError: an unknown name, a value out of range, or a lens that does not reach the image's corners.
@@ -104,14 +103,16 @@ class TruthLens:
             sensor_tilt=sensor_tilt,
         )
         self._origin = self._chief.lines(self._probe(17)).nearest_point()
-        self._window = Window(-_MARGIN, -_MARGIN, self.size[0] + 2 * _MARGIN, self.size[1] + 2 * _MARGIN)
+        self._window = PixelRectangle(
+            -_TABLE_MARGIN, -_TABLE_MARGIN, self.size[0] + 2 * _TABLE_MARGIN, self.size[1] + 2 * _TABLE_MARGIN
+        )
         low = torch.tensor([self._window.left, self._window.top], dtype=torch.float64)
         extent = torch.tensor([self._window.width - 1, self._window.height - 1], dtype=torch.float64)
         self.low, self.high = low, low + extent
         for degree in _DEGREES:
             self._table = tabulate(lambda pixels: torch.cat(self.trace(pixels), -1), self._window, degree)
             self.table_error = self._measure()
-            if self.table_error < _GOAL:
+            if self.table_error < _TABLE_GOAL:
                 break
         self._start = self._fit_start()
 
@@ -122,7 +123,7 @@ class TruthLens:
 
     @property
     def pupil_wander(self) -> float:
-        """Largest distance of a line of sight from the origin, meters."""
+        """Largest distance of any line of sight from the origin, meters."""
         at, heading = self.lines(self._probe(33)).spatial()
         return float(torch.linalg.vector_norm(torch.linalg.cross(at, heading), dim=-1).max())
 
@@ -136,19 +137,19 @@ class TruthLens:
         pixels = as_points("pixels", pixels, 2)
         return ((pixels >= self.low) & (pixels <= self.high)).all(-1)
 
-    def trace(self, pixels: Tensor) -> Lines:
-        """Lines of sight of pixels (N, 2) by tracing, without the table; raises `InputError` where there are none."""
+    def trace(self, pixels: Tensor) -> LinesOfSight:
+        """Trace the lines of sight of pixels (N, 2) without the table; raise `InputError` where there are none."""
         lines = self._chief.lines(pixels)
         at = lines.origins + self._origin[2] * lines.slopes - self._origin[:2]
-        return Lines(self._wander * at, lines.slopes)
+        return LinesOfSight(self._wander * at, lines.slopes)
 
-    def lines(self, pixels: Tensor) -> Lines:
-        """Lines of sight of pixels (N, 2) that the lens covers."""
-        values = torch.cat([self._table.values(part) for part in pixels.split(_CHUNK)])
-        return Lines(values[:, :2], values[:, 2:])
+    def lines(self, pixels: Tensor) -> LinesOfSight:
+        """Read the lines of sight of pixels (N, 2) that the lens covers from the table."""
+        values = torch.cat([self._table.values(part) for part in pixels.split(_POINTS_AT_ONCE)])
+        return LinesOfSight(values[:, :2], values[:, 2:])
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Directions in which pixels (..., N, 2) look, at infinity: unit rays (..., N, 3), valid (..., N).
+        """Return the directions of pixels (..., N, 2) at infinity: unit rays (..., N, 3), valid (..., N).
 
         Pixels outside the image and its margin are not valid; their ray is the axis.
         """
@@ -159,15 +160,15 @@ class TruthLens:
         return torch.where(valid[..., None], rays, rays.new_tensor([0.0, 0.0, 1.0])), valid
 
     def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels at which points are seen: (..., N, 2) and valid (..., N), in front and within image and margin.
+        """Return the pixels (..., N, 2) of points, and valid (..., N): in front, and within the image or its margin.
 
-        A direction, a point at infinity, is given by scaling it up: at 1e9 m the pupil's wander is nothing.
-        Pixels that are not valid hold the axis.
+        For a point at infinity scale its direction up: at 1e9 m the pupil's motion has no effect. Pixels that are not
+        valid contain the axis.
         """
         points = as_points("points_cam", points_cam, 3)
         if points.numel() == 0:
             return points[..., :2], points[..., 0] > 0
-        parts = [self._project(part) for part in points.reshape(-1, 3).split(_CHUNK)]
+        parts = [self._project(part) for part in points.reshape(-1, 3).split(_POINTS_AT_ONCE)]
         pixels = torch.cat([part[0] for part in parts]).reshape(*points.shape[:-1], 2)
         return pixels, torch.cat([part[1] for part in parts]).reshape(points.shape[:-1])
 
@@ -176,19 +177,19 @@ class TruthLens:
         safe = torch.where(ahead[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
         nearness, target = 1.0 / safe[:, 2:], safe[:, :2] / safe[:, 2:]
         weights, scale = self._start
-        # Far outside the image the polynomial says nothing; clamped, its place is the image's edge.
+        # The polynomial is not valid far outside the image: clamped, it starts at the image's edge.
         pixels = (_monomials((target / scale).clamp(-1.2, 1.2)) @ weights).clamp(self.low, self.high)
-        for _ in range(_NEWTON):
+        for _ in range(_PROJECT_STEPS):
             sums = self._table.with_slopes(pixels)
             value, across, down = (part[:, 2:] + nearness * part[:, :2] for part in sums)
             error = value - target
             moved = (pixels - solve_2x2(across, down, error)).clamp(self.low, self.high)
-            settled = (moved - pixels).abs().amax() < _SETTLED
+            settled = (moved - pixels).abs().amax() < _STEP_GOAL
             pixels = moved
             if bool(settled):
                 break
-        # Whoever stopped at the edge of what is known does not see the point.
-        valid = ahead & (error.abs().amax(-1) * self._focal < _FOUND)
+        # Newton's method stops at the edge of the table for points that the lens does not see.
+        valid = ahead & (error.abs().amax(-1) * self._focal < _PROJECT_ERROR)
         return torch.where(valid[:, None], pixels, self._chief.axis), valid
 
     def _probe(self, count: int) -> Tensor:
@@ -199,12 +200,12 @@ class TruthLens:
     def _measure(self) -> float:
         share = torch.quasirandom.SobolEngine(2).draw(256, dtype=torch.float64)
         pixels = self.low + share * (self.high - self.low)
-        # Slopes and, as at a distance of one meter, places.
+        # Slopes, and origins as they count at a distance of one meter.
         off = self._table.values(pixels) - torch.cat(self.trace(pixels), -1)
         return float(off.abs().max() * self._focal)
 
     def _fit_start(self) -> tuple[Tensor, Tensor]:
-        """A polynomial from slopes to pixels, to begin Newton's method with, and the scale of its slopes."""
+        """Fit a polynomial from slopes to pixels, which starts Newton's method; return it and its scale of slopes."""
         share = torch.stack(torch.meshgrid(*(torch.linspace(0, 1, 33, dtype=torch.float64),) * 2, indexing="xy"), -1)
         pixels = self.low + share.reshape(-1, 2) * (self.high - self.low)
         slopes = self.lines(pixels).slopes

@@ -1,4 +1,4 @@
-"""The inverse of a lens at every pixel of a rectangle: exact on a grid, interpolated in between, never past a fold."""
+"""Invert a lens at every pixel of a rectangle: exactly on a grid, interpolated in between, never past a fold."""
 
 from __future__ import annotations
 
@@ -6,25 +6,24 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.sim.rectangle import Window, pixel_axes
+from kcal.sim.rectangle import PixelRectangle, pixel_axes
 from kcal.sim.truth import TruthLens
 
 AnyLens = Camera | TruthLens
 
-_STEP = 8  # pixels at most between the places where the lens is inverted; cubic interpolation between them
-_STEPS = 50  # at least so many of them in a focal length
+_NODE_SPACING = 8  # pixels at most between the places where the lens is inverted; cubic interpolation between them
+_NODES_PER_FOCAL = 50  # at least so many of them in a focal length
 _FOLD = 6  # steps around a place without inverse that are inverted pixel by pixel
-_CHUNK = 1 << 15  # pixels inverted at a time; more would leave the processor's cache
+_PIXELS_AT_ONCE = 1 << 15  # pixels inverted at a time; more would leave the processor's cache
 
 
 @torch.no_grad()
-def invert_window(lens: AnyLens, window: Window) -> tuple[Tensor, Tensor]:
-    """Where every pixel of a window looks.
+def invert_window(lens: AnyLens, window: PixelRectangle) -> tuple[Tensor, Tensor]:
+    """Find where every pixel of a window looks.
 
-    The lens is inverted at every eighth pixel (more densely if the focal length is below 400 px)
-    and interpolated by cubic Lagrange polynomials, which errs by 2e-6 px for the demonstration's lenses and by 5e-4 px
-    at most close to a fold (measured by projecting back); around places that the lens cannot have imaged, every pixel
-    is inverted.
+    The lens is inverted at every eighth pixel (more densely if the focal length is below 400 px) and interpolated by
+    cubic Lagrange polynomials. The error is 2e-6 px for the demonstration's lenses and at most 5e-4 px close to a fold
+    (measured by projecting back). Around pixels that have no inverse, every pixel is inverted.
 
     Returns:
         slopes x / z and y / z (height, width, 2), followed for a `TruthLens` by where the line of sight crosses the
@@ -32,11 +31,11 @@ def invert_window(lens: AnyLens, window: Window) -> tuple[Tensor, Tensor]:
 
     Example:
         >>> camera = Camera.build(focal=(400, 400), center=(159.5, 119.5), size=(320, 240))
-        >>> normalized, valid = invert_window(camera, Window(100, 50, 20, 10))
+        >>> normalized, valid = invert_window(camera, PixelRectangle(100, 50, 20, 10))
         >>> [round(value, 9) for value in normalized[0, 0].tolist()], bool(valid.all())
         ([-0.14875, -0.17375], True)
     """
-    step = min(_STEP, max(1, int(float(lens.focal.min()) / _STEPS)))
+    step = min(_NODE_SPACING, max(1, int(float(lens.focal.min()) / _NODES_PER_FOCAL)))
     across, nodes_x = _lagrange(window.left, window.width, step)
     down, nodes_y = _lagrange(window.top, window.height, step)
     node_y, node_x = torch.meshgrid(nodes_y, nodes_x, indexing="ij")
@@ -60,12 +59,12 @@ def _look(lens: AnyLens, pixels: Tensor) -> tuple[Tensor, Tensor]:
         valid = lens.covers(pixels)
         lines = lens.lines(pixels.clamp(lens.low, lens.high))
         return torch.cat([lines.slopes, lines.origins], -1), valid
-    parts = [lens.normalize(part) for part in pixels.split(_CHUNK)]
+    parts = [lens.normalize(part) for part in pixels.split(_PIXELS_AT_ONCE)]
     return torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
 
 
 def _lagrange(start: int, count: int, step: int) -> tuple[Tensor, Tensor]:
-    """Cubic interpolation at start, start + 1, ... from nodes `step` apart: weights (count, nodes), node positions."""
+    """Weights (count, nodes) of cubic interpolation at start, start + 1, ..., and positions of the nodes."""
     # As many nodes outside the window as a fold there could disturb.
     nodes = start + step * torch.arange(-_FOLD, (count - 1) // step + 2 + _FOLD, dtype=torch.float64)
     where = torch.arange(count)

@@ -1,4 +1,4 @@
-"""Dense least squares: any residual function, Jacobians by `torch.func`, batched."""
+"""Dense least squares for any residual function, batched, with Jacobians from `torch.func`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class DenseLinearization:
 
     def __init__(self, residuals: Tensor, jacobian: Tensor) -> None:
         norm = torch.linalg.vector_norm(jacobian, dim=-2)
-        # A column of zeros (a parameter that nothing depends on) keeps its place and never moves.
+        # A zero column belongs to a parameter without effect, which never moves.
         scale = torch.where(norm > 0, 1.0 / norm, 1.0)
         scaled = jacobian * scale[..., None, :]
         normal, gradient = scaled.transpose(-1, -2) @ scaled, (scaled * residuals[..., None]).sum(-2)
@@ -25,7 +25,7 @@ class DenseLinearization:
 
     @classmethod
     def of_rows(cls, rows: Tensor) -> DenseLinearization:
-        """From (..., P + 1, R): the derivatives by each parameter, and last the residuals, by one product."""
+        """From (..., P + 1, R), the derivatives by each parameter and last the residuals, with a single product."""
         self = cls.__new__(cls)
         gram = rows @ rows.transpose(-1, -2)
         normal = gram[..., :-1, :-1]

@@ -1,4 +1,4 @@
-"""Gradients through a solution, by the implicit function theorem instead of through the iterations."""
+"""Gradients through a solution by the implicit function theorem, not through the iterations."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ SteppedCost = Callable[..., Tensor]
 def attach_implicit_gradient(
     residual: Callable[..., Tensor], solution: Tensor, converged: Tensor, data: tuple[Tensor, ...]
 ) -> Tensor:
-    """The solution again, with its exact first derivatives by the data.
+    """Return the solution with its exact first derivatives by the data.
 
-    At a minimum the gradient of the cost vanishes: g(x, d) = Jᵀr = 0. Hence dx/dd = -H⁻¹ ∂g/∂d, with the full Hessian H
-    of the cost: Gauss and Newton's JᵀJ would be wrong wherever residuals remain. The derivative is that of one Newton
-    step from the solution, whose value is left out.
+    At a minimum the gradient of the cost vanishes: g(x, d) = Jᵀr = 0. Hence dx/dd = -H⁻¹ ∂g/∂d with the full Hessian H
+    of the cost; Gauss and Newton's JᵀJ would be wrong wherever residuals remain. The derivative is that of one Newton
+    step from the solution, without the value of that step.
 
     Args:
         residual: maps x (P,) and the data of one element to residuals (R,).
@@ -49,23 +49,20 @@ def attach_implicit_gradient(
 
 
 class Curvature(NamedTuple):
-    """The exact Hessian of a cost with many local blocks that meet only through shared parameters.
+    """The exact Hessian of a cost with many local blocks that are coupled only through shared parameters.
 
     Args:
         shared: (S, S).
         coupling: (V, L, S).
-        local: (V, L, L); local parameters of different views do not meet.
+        local: (V, L, L); local parameters of different views are not coupled.
     """
 
     shared: Tensor
     coupling: Tensor
     local: Tensor
 
-    def beside(self, shared: Tensor, local: Tensor) -> SchurLinearization:
-        """The system with this matrix and a right-hand side ((S,), (V, L)), whose undamped step is minus H⁻¹ times it.
-
-        The same elimination as that of Gauss and Newton's normal equations: only the blocks are others.
-        """
+    def system(self, shared: Tensor, local: Tensor) -> SchurLinearization:
+        """The linear system with a gradient ((S,), (V, L)); its undamped step is minus H⁻¹ times the gradient."""
         L, S = self.local.shape[-1], len(self.shared)
         gram = self.local.new_zeros(len(self.local), L + S + 1, L + S + 1)
         gram[:, :L, :L], gram[:, :L, L:-1], gram[:, :L, -1] = self.local, self.coupling, local
@@ -79,7 +76,7 @@ def curvature(cost: SteppedCost, shared: Tensor, local: Tensor) -> tuple[State, 
     Args:
         cost: maps steps ((S,), (V, L)) to a scalar, in operations that autograd differentiates twice; a sum over views,
             each of which depends on its own row of the local step alone.
-        shared: (S,) zeros, by which type and place are given.
+        shared: (S,) zeros of the right type and device.
         local: (V, L) likewise.
 
     Example:
@@ -102,10 +99,10 @@ def curvature(cost: SteppedCost, shared: Tensor, local: Tensor) -> tuple[State, 
 
 
 def implicit_step(cost: SteppedCost, found: Curvature, data: tuple[Tensor, ...]) -> State:
-    """Steps of zero from a minimum whose derivatives are those of the minimum by the data.
+    """Steps of zero from a minimum that carry the derivatives of the minimum by the data.
 
     As `attach_implicit_gradient`, with the exact Hessian in blocks: dx/dd = -H⁻¹ ∂g/∂d. Nothing is computed unless a
-    gradient is asked for; then it takes one solve by the Schur complement and two passes through the cost.
+    gradient is requested; that takes one solve by the Schur complement and two passes through the cost.
 
     Args:
         cost: as for `curvature`, with the data as further arguments.
@@ -113,7 +110,7 @@ def implicit_step(cost: SteppedCost, found: Curvature, data: tuple[Tensor, ...])
         data: what the cost depends on.
 
     Returns:
-        (S,) and (V, L) zeros; second derivatives are refused by autograd.
+        (S,) and (V, L) zeros; autograd refuses second derivatives.
     """
     out: State = _ImplicitStep.apply(cost, found, *data)
     return out
@@ -131,7 +128,7 @@ class _ImplicitStep(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, by_shared: Tensor, by_local: Tensor) -> tuple[Tensor | None, ...]:
-        weights, _ = ctx.found.beside(by_shared, by_local).step(by_shared.new_zeros(()))
+        weights, _ = ctx.found.system(by_shared, by_local).step(by_shared.new_zeros(()))
         with torch.enable_grad():
             data = tuple(tensor.detach().requires_grad_(True) for tensor in ctx.saved_tensors)
             steps = tuple(torch.zeros_like(weight).requires_grad_(True) for weight in weights)
@@ -143,7 +140,7 @@ class _ImplicitStep(torch.autograd.Function):
 def _gradient(
     value: Tensor, inputs: tuple[Tensor, ...], *, again: bool = False, twice: bool = False
 ) -> tuple[Tensor, ...]:
-    """Derivatives by inputs, zero by those that the value does not depend on; the graph is kept for more of them."""
+    """Derivatives by inputs, zero by those without effect; `again` keeps the graph, `twice` differentiates it too."""
     if not value.requires_grad:
         return tuple(torch.zeros_like(tensor) for tensor in inputs)
     return torch.autograd.grad(

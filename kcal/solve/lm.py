@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Generic, Literal
 
 import numpy as np
 import torch
@@ -15,17 +15,17 @@ from kcal.errors import InputError
 from kcal.solve.dense import DenseProblem
 from kcal.solve.implicit import attach_implicit_gradient
 from kcal.solve.problem import Problem
-from kcal.solve.result import Result, State, Status, blend
+from kcal.solve.result import Result, S, SolverStatus, blend, map_state, pick
 
 # Called after each trial step with (trial, cost (...)); returning True stops.
 Callback = Callable[[int, Tensor], bool | None]
 
+# Range of λ; below 1e-14 it is lost in rounding, above 1e10 a step no longer changes the state.
 _LOWEST_DAMPING, _HIGHEST_DAMPING = 1e-14, 1e10
+# Up to this λ a step is nearly that of Gauss and Newton, whose predicted decrease tells whether this is a minimum.
 _LITTLE_DAMPING = 1e-3
 # Trial steps over which `LMOptions.flatness` is judged.
 _PATIENCE = 20
-# Fewest elements of a batch from which on those that have stopped are left out of the work.
-_FEW = 4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class LMOptions:
     """Options of `minimize`.
 
     Args:
-        max_iterations: trial steps at the most, rejected ones counted.
+        max_iterations: maximum number of trial steps, rejected ones included.
         tolerance: stop when the next step is predicted to lower the cost by less than this fraction. 1e-12 of the
             cost is 5e-13 of the RMS.
         flatness: stop when 20 steps together have lowered the cost by less than this fraction; 0: never.
@@ -57,14 +57,14 @@ class LMOptions:
 
 
 def minimize(
-    problem: Problem,
-    start: State,
+    problem: Problem[S],
+    start: S,
     options: LMOptions | None = None,
     callback: Callback | None = None,
     *,
     unroll: bool = False,
-) -> Result:
-    """Minimize half the sum of squares by Levenberg and Marquardt's method.
+) -> Result[S]:
+    """Minimize half the sum of squares by the Levenberg-Marquardt method.
 
     θ_new = θ - (JᵀJ + λ D)⁻¹ Jᵀr, the paper's Eq. 6 with r = f(θ) - y and with D = diag(JᵀJ) in place of the
     identity, so that the units of the parameters do not matter. A step that raises the cost, or makes it NaN, is
@@ -72,8 +72,9 @@ def minimize(
     and its own reason for stopping.
 
     Args:
-        problem: see `kcal.solve.problem.Problem`.
-        start: the state to begin with.
+        problem: anything that follows `kcal.solve.problem.Problem`. Ready-made: `kcal.solve.dense.DenseProblem` for a
+            residual function, `kcal.calibrate.bundle.board_problem.BoardProblem` for views of a board (example there).
+        start: the state to begin with: a tuple of tensors, for a `BoardProblem` a `BoardState`.
         options: see `LMOptions`.
         callback: called after each trial with the trial's number and the best cost; return True to stop.
         unroll: record the accepted steps for autograd, as far as the problem's operations are differentiable. What
@@ -81,12 +82,18 @@ def minimize(
 
     Returns:
         The best state with its status. Nothing is raised for a failure to converge: read `status`.
+
+    Example:
+        >>> problem = DenseProblem(lambda x: torch.stack([x[0] - 3.0, x[0] * x[1] + 3.0]), batch=())
+        >>> result = minimize(problem, (torch.tensor([1.0, 1.0], dtype=torch.float64),))
+        >>> [round(float(value), 9) for value in result.state[0]], bool(result.converged)
+        ([3.0, -1.0], True)
     """
     with torch.set_grad_enabled(unroll and torch.is_grad_enabled()):
         return _minimize(problem, start, options or LMOptions(), callback)
 
 
-def _minimize(problem: Problem, start: State, options: LMOptions, callback: Callback | None) -> Result:
+def _minimize(problem: Problem[S], start: S, options: LMOptions, callback: Callback | None) -> Result[S]:
     state = start
     linear = problem.linearize(state)
     device = linear.cost.device
@@ -97,28 +104,30 @@ def _minimize(problem: Problem, start: State, options: LMOptions, callback: Call
     def on_device(values: np.ndarray) -> Tensor:
         return torch.from_numpy(np.asarray(values)).to(device)
 
-    # What decides is a handful of numbers for each element: numpy handles these several times faster than torch.
+    # Decisions need a handful of numbers per element; NumPy handles these several times faster than torch.
     cost = on_host(linear.cost)
     damping, growth = np.full_like(cost, options.initial_damping), np.full_like(cost, 2.0)
     iterations = np.zeros(cost.shape, np.int64)
-    status = np.where(np.isfinite(cost), int(Status.RUNNING), int(Status.BAD_START))
+    status = np.where(np.isfinite(cost), int(SolverStatus.RUNNING), int(SolverStatus.BAD_START))
     floor = 0.5 * problem.residual_count * options.residual_floor**2
-    status = np.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
+    status = np.where((status == 0) & (cost <= floor), int(SolverStatus.EXACT), status)
     history = [cost]
-    whole: _Whole | None = None
+    whole: _WholeBatch[S] | None = None
 
     for trial in range(1, options.max_iterations + 1):
-        running = status == Status.RUNNING
+        running = status == SolverStatus.RUNNING
         if not running.any():
             break
-        if _worth_leaving_out(running) and not torch.is_grad_enabled():
+        # Elements that have stopped are dropped once they are half of a batch of four or more.
+        few = running.ndim == 1 and len(running) >= 4 and 2 * running.sum() <= len(running)
+        if few and not torch.is_grad_enabled():
             kept = np.flatnonzero(running)
             smaller = problem.select(on_device(kept))
             if smaller is not None:
-                whole = whole or _Whole(state, status, iterations)
+                whole = whole or _WholeBatch(state, status, iterations)
                 whole.put(state, status, iterations)
                 whole.index, problem = whole.index[kept], smaller
-                state = tuple(tensor[on_device(kept)] for tensor in state)
+                state = pick(state, on_device(kept))
                 cost, damping, growth, status, iterations = (
                     values[kept] for values in (cost, damping, growth, status, iterations)
                 )
@@ -149,29 +158,29 @@ def _minimize(problem: Problem, start: State, options: LMOptions, callback: Call
         cost = np.where(accept, new_cost, cost)
         history.append(cost if whole is None else whole.costs(history[-1], cost))
 
-        status = np.where(flat, int(Status.CONVERGED), status)
-        status = np.where((status == 0) & (cost <= floor), int(Status.EXACT), status)
+        status = np.where(flat, int(SolverStatus.CONVERGED), status)
+        status = np.where((status == 0) & (cost <= floor), int(SolverStatus.EXACT), status)
         stalled = (status == 0) & ~accept & (damping > _HIGHEST_DAMPING)
         if stalled.any():
-            # Where the residual stays large and curved, steps need damping even at the minimum and end in rounding:
-            # whether it is one is told by the step that would be free of damping.
+            # Where the residual stays large and curved, steps need damping even at the minimum and end in rounding.
+            # The undamped step then tells whether this is a minimum.
             _, free = linear.step(on_device(np.full_like(damping, _LITTLE_DAMPING)))
             at_minimum = stalled & (on_host(free) <= options.tolerance * cost)
-            status = np.where(at_minimum, int(Status.CONVERGED), status)
-            status = np.where(stalled & ~at_minimum, int(Status.STALLED), status)
+            status = np.where(at_minimum, int(SolverStatus.CONVERGED), status)
+            status = np.where(stalled & ~at_minimum, int(SolverStatus.STALLED), status)
         if options.flatness and trial >= _PATIENCE:
             before = history[-1 - _PATIENCE]
             slow = (before if whole is None else before[whole.index]) - cost <= options.flatness * cost
-            status = np.where((status == 0) & slow, int(Status.FLAT), status)
+            status = np.where((status == 0) & slow, int(SolverStatus.FLAT), status)
         if callback is not None and callback(trial, on_device(history[-1])):
-            status = np.where(status == 0, int(Status.INTERRUPTED), status)
+            status = np.where(status == 0, int(SolverStatus.INTERRUPTED), status)
         if (accept & (status == 0)).any():
             if joint is None:
                 linear = problem.linearize(state)
             else:
                 linear = joint if accept.all() else linear.blend(on_device(accept), joint)
 
-    status = np.where(status == 0, int(Status.ITERATION_LIMIT), status)
+    status = np.where(status == 0, int(SolverStatus.ITERATION_LIMIT), status)
     if whole is not None:
         whole.put(state, status, iterations)
         state, status, iterations = whole.state, whole.status, whole.iterations
@@ -184,21 +193,16 @@ def _minimize(problem: Problem, start: State, options: LMOptions, callback: Call
     )
 
 
-def _worth_leaving_out(running: np.ndarray) -> bool:
-    """Whether so few elements of a batch are still running that a smaller problem saves work."""
-    return running.ndim == 1 and len(running) >= _FEW and 2 * int(running.sum()) <= len(running)
+class _WholeBatch(Generic[S]):
+    """All elements of a batch while only those of `index` are still being solved."""
 
-
-class _Whole:
-    """All elements of a batch while only those of `index` are being worked on."""
-
-    def __init__(self, state: State, status: np.ndarray, iterations: np.ndarray) -> None:
-        self.state = tuple(tensor.clone() for tensor in state)
+    def __init__(self, state: S, status: np.ndarray, iterations: np.ndarray) -> None:
+        self.state = map_state(torch.clone, state)
         self.status, self.iterations = status.copy(), iterations.copy()
         self.index = np.arange(len(status))
 
-    def put(self, state: State, status: np.ndarray, iterations: np.ndarray) -> None:
-        """Store what the elements of `index` have come to."""
+    def put(self, state: S, status: np.ndarray, iterations: np.ndarray) -> None:
+        """Store the present values of the elements of `index`."""
         place = torch.from_numpy(self.index).to(state[0].device)
         for tensor, part in zip(self.state, state, strict=True):
             tensor[place] = part
@@ -218,10 +222,9 @@ class LevenbergMarquardt(nn.Module):
         residual: maps x (P,) and the data of one element to residuals (R,), in operations that `torch.func` can
             differentiate.
         options: see `LMOptions`.
-
-        backward: where data require gradients, how the solution `x` gets them. "implicit": exact first derivatives by
-            the implicit function theorem, at the price of one Hessian; elements that did not converge carry none.
-            "unroll": autograd through the steps that were taken, also of a start that requires gradients; memory grows
+        backward: how the solution `x` gets gradients where data require them. "implicit": exact first derivatives by
+            the implicit function theorem, at the cost of one Hessian; elements that did not converge carry none.
+            "unroll": autograd through the steps that were taken, also for a start that requires gradients; memory grows
             with the steps, and the derivative lags one step behind the solution. "none": no gradients.
 
     Convention: float64 only, because squared condition numbers leave float32 nothing.

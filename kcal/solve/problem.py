@@ -1,4 +1,4 @@
-"""What the Levenberg-Marquardt loop asks of a problem. Nothing here knows cameras."""
+"""What the Levenberg-Marquardt loop needs from a problem. Nothing here knows cameras."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from typing import Any, Protocol, Self
 
 from torch import Tensor
 
-from kcal.solve.result import State
+from kcal.solve.result import S, State
 
 
 class Linearization(Protocol):
-    """A problem near one state: cost, and the damped Gauss-Newton step.
+    """A problem near one state: its cost, and the damped Gauss-Newton step.
 
-    Every column of the Jacobian is scaled to length one first (Marquardt's scaling), so that the damping has no
-    units and the answer does not depend on the units of the parameters.
+    Every column of the Jacobian is first scaled to length one (Marquardt's scaling). So the damping has no units, and
+    the solution does not depend on the units of the parameters.
     """
 
     @property
@@ -22,7 +22,7 @@ class Linearization(Protocol):
         ...
 
     def blend(self, mask: Tensor, other: Self) -> Self:
-        """This one, but where the mask (...) of the batch is true the other."""
+        """The other linearization where the mask (...) of the batch is true, else this one."""
         ...
 
     def step(self, damping: Tensor) -> tuple[State, Tensor]:
@@ -35,11 +35,11 @@ class Linearization(Protocol):
         ...
 
 
-class Problem(Protocol):
+class Problem(Protocol[S]):
     """A least-squares problem: residuals r(state), their Jacobian, and how a step is applied.
 
-    `batch` is the shape of independent problems solved side by side; () for one. Every tensor of a state and of a
-    step begins with it.
+    A state is a tuple of tensors, plain or named. `batch` is the shape of independent problems solved side by side,
+    () for one; every tensor of a state and of a step begins with it.
     """
 
     @property
@@ -57,21 +57,21 @@ class Problem(Protocol):
         """Number of scalar residuals of one element, for the rounding floor."""
         ...
 
-    def cost(self, state: State) -> Tensor:
+    def cost(self, state: S) -> Tensor:
         """Half the sum of squared residuals, (...)."""
         ...
 
-    def linearize(self, state: State) -> Any:
+    def linearize(self, state: S) -> Any:
         """The problem's linearization at `state`."""
         ...
 
-    def retract(self, state: State, step: State) -> State:
+    def retract(self, state: S, step: State) -> S:
         """Apply a step: plain addition, or a move on a manifold."""
         ...
 
-    def select(self, elements: Tensor) -> Problem | None:
-        """The problem of some elements (K,) of a batch of one dimension; None where it cannot be taken apart.
+    def select(self, elements: Tensor) -> Problem[S] | None:
+        """The problem of some elements (K,) of a batch with one dimension; None where that is not possible.
 
-        By it a solver leaves out what has converged.
+        The solver uses it to drop elements that have stopped.
         """
         ...

@@ -1,4 +1,4 @@
-"""Losses that grow slower than the square, so that a few wrong measurements cannot pull a solution away."""
+"""Losses that grow more slowly than the square, so that a few wrong measurements cannot spoil a solution."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ class RobustLoss:
     """ρ(‖r‖²) in place of the squared length of a residual vector.
 
     With s = ‖r‖² and the scale c: Huber s up to c², then 2 c √s - c²; Cauchy c² ln(1 + s / c²); Tukey
-    c² / 3 (1 - (1 - s / c²)³) up to c², then constant: what lies beyond has no influence at all, so it wants a start
-    near the solution. All equal s for small residuals. Least squares is solved with every residual multiplied by
-    √ρ'(s), which has the gradient of the robust cost and a Hessian without its negative part (iterated weights, as
-    Triggs, McLauchlan, Hartley and Fitzgibbon 2000 discuss them).
+    c² / 3 (1 - (1 - s / c²)³) up to c², then constant: residuals beyond have no influence at all, so the start must
+    be near the solution. All equal s for small residuals. Every residual is multiplied by √ρ'(s) before a least-squares
+    step, which has the gradient of the robust cost and its Hessian without the negative part (iteratively reweighted
+    least squares; Triggs, McLauchlan, Hartley and Fitzgibbon 2000).
 
     Args:
         kind: "huber", "cauchy" or "tukey".
-        scale: c, in the units of the residuals; some three times their noise.
+        scale: c, in the units of the residuals; about three times their noise.
 
     Example:
         >>> loss = RobustLoss(kind="huber", scale=1.0)
@@ -49,7 +49,7 @@ class RobustLoss:
         if self.kind == "cauchy":
             return c2 * torch.log1p(squared / c2)
         kept = 1.0 - squared / c2
-        # Not clamped: what is NaN must stay so.
+        # Not clamped, because NaN must stay NaN.
         return c2 / 3.0 * (1.0 - torch.where(kept < 0, 0.0, kept) ** 3)
 
     def weight(self, squared: Tensor) -> Tensor:

@@ -1,22 +1,23 @@
-"""Least squares with many small local blocks that meet only through shared parameters.
+"""Least squares with many small local blocks that are coupled only through shared parameters.
 
-A camera's board poses touch only their own view; intrinsics touch all. Eliminating the local blocks (the Schur
-complement) leaves a small system in the shared parameters, so that the work grows linearly with the views.
+A board pose affects only its own view, intrinsics affect all views. Eliminating the local blocks (the Schur complement)
+leaves a small system in the shared parameters, so that the work grows linearly with the views.
 """
 
 from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
+from typing import Generic
 
 import torch
 from torch import Tensor
 
-from kcal.solve.result import State, blend
+from kcal.solve.result import S, State, blend
 
 
 class SchurLinearization:
-    """Normal equations built from what each view contributes.
+    """Normal equations, built from one block per view.
 
     Args:
         local: (..., V, L, L) products of the derivatives by the local parameters.
@@ -64,9 +65,9 @@ class SchurLinearization:
         factor, info = torch.linalg.cholesky_ex(_damped(self._local, damping[..., None]))
         solved = torch.cholesky_solve(self._right, factor)
         # One product over all views at once: (S, V L) times (V L, S + 1).
-        folded = self._right[..., :-1].flatten(-3, -2).transpose(-1, -2) @ solved.flatten(-3, -2)
-        matrix = _damped(self._shared, damping) - folded[..., :-1]
-        return matrix, self._shared_gradient - folded[..., -1], solved, (info != 0).any(-1)
+        product = self._right[..., :-1].flatten(-3, -2).transpose(-1, -2) @ solved.flatten(-3, -2)
+        matrix = _damped(self._shared, damping) - product[..., :-1]
+        return matrix, self._shared_gradient - product[..., -1], solved, (info != 0).any(-1)
 
     def step(self, damping: Tensor) -> tuple[State, Tensor]:
         """See `Linearization.step`; the step is (shared (..., S), local (..., V, L))."""
@@ -89,14 +90,14 @@ class SchurLinearization:
         matrix, _, _, _ = self._reduce(torch.zeros_like(self.cost))
         return matrix, self._shared_scale
 
-    def answers(self) -> tuple[Tensor, Tensor]:
-        """How each view's local parameters follow the shared ones, and what is left of them when these are held.
+    def local_response(self) -> tuple[Tensor, Tensor]:
+        """How the best local parameters of each view depend on the shared ones.
 
         Returns:
-            A (..., V, L, S), by which a change of the shared parameters moves the best local ones, and the inverse
-            (..., V, L, L) of each local normal matrix; both in the parameters' own units. With Σ the covariance of
-            the shared parameters, that of the local ones of views v and w is A_v Σ A_wᵀ, plus that inverse times the
-            noise variance where v = w. A local block that is singular to rounding gives NaN.
+            Derivatives A (..., V, L, S) of the best local parameters by the shared ones, and the inverse (..., V, L, L)
+            of each local normal matrix, both in the parameters' own units. With Σ the covariance of the shared
+            parameters, that of the local ones of views v and w is A_v Σ A_wᵀ, plus that inverse times the noise
+            variance where v = w. A local block that is singular to rounding gives NaN.
         """
         factor, info = torch.linalg.cholesky_ex(self._local)
         factor = torch.where((info == 0)[..., None, None], factor, torch.nan)
@@ -107,7 +108,7 @@ class SchurLinearization:
 
 
 def _inverse_root(diagonal: Tensor) -> Tensor:
-    """Scale of each column; a column of zeros keeps its place and never moves."""
+    """Scale of each column; the parameter of a zero column never moves."""
     return torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
 
 
@@ -117,11 +118,11 @@ def _damped(matrix: Tensor, damping: Tensor) -> Tensor:
     return out
 
 
-class SchurProblem(ABC):
-    """Base of problems with a state (shared, local), `local` beginning with the views.
+class SchurProblem(ABC, Generic[S]):
+    """Base of problems with shared parameters, and local ones in each of V views.
 
-    Subclasses give `rows`, `residuals` and `retract`. With a robust loss the cost is not half the squared length of the
-    rows' residuals: they overwrite `view_cost` as well.
+    Subclasses define `rows`, `residuals` and `retract`. With a robust loss the cost is not half the squared length of
+    the rows' residuals, so that they override `view_cost` as well.
     """
 
     batch: tuple[int, ...]
@@ -130,11 +131,11 @@ class SchurProblem(ABC):
     joint = False
 
     @abstractmethod
-    def residuals(self, state: State) -> Tensor:
+    def residuals(self, state: S) -> Tensor:
         """(..., V, R) residuals."""
 
     @abstractmethod
-    def rows(self, state: State) -> Tensor:
+    def rows(self, state: S) -> Tensor:
         """(..., V, L + S + 1, R).
 
         For each view the derivatives of its R residuals by its L local parameters, by the S shared ones, and the
@@ -142,33 +143,33 @@ class SchurProblem(ABC):
         """
 
     @abstractmethod
-    def retract(self, state: State, step: State) -> State:
+    def retract(self, state: S, step: State) -> S:
         """Apply a step (shared (..., S), local (..., V, L))."""
 
-    def select(self, elements: Tensor) -> SchurProblem | None:
-        """See `Problem.select`; None unless a subclass knows how."""
+    def select(self, elements: Tensor) -> SchurProblem[S] | None:
+        """See `Problem.select`; None unless a subclass overrides it."""
         return None
 
-    def shared_rows(self, state: State) -> Tensor | None:
-        """(..., S + 1, Q), see `SchurLinearization`: priors and bounds; None where there are none."""
+    def shared_rows(self, state: S) -> Tensor | None:
+        """(..., S + 1, Q), see `SchurLinearization`: priors and barriers; None without any."""
         return None
 
-    def view_cost(self, state: State) -> Tensor:
-        """(..., V) what each view adds to the cost."""
+    def view_cost(self, state: S) -> Tensor:
+        """(..., V) the cost of each view."""
         residuals = self.residuals(state)
         return 0.5 * (residuals * residuals).sum(-1)
 
-    def cost(self, state: State) -> Tensor:
+    def cost(self, state: S) -> Tensor:
         """See `Problem.cost`."""
         cost = self.view_cost(state).sum(-1)
         shared = self.shared_rows(state)
         return cost if shared is None else cost + 0.5 * (shared[..., -1, :] ** 2).sum(-1)
 
-    def gram(self, state: State) -> Tensor:
+    def gram(self, state: S) -> Tensor:
         """(..., V, L + S + 1, L + S + 1) products of the rows of each view."""
         rows = self.rows(state)
         return rows @ rows.transpose(-1, -2)
 
-    def linearize(self, state: State) -> SchurLinearization:
+    def linearize(self, state: S) -> SchurLinearization:
         """See `Problem.linearize`."""
         return SchurLinearization.of_gram(self.gram(state), self.local_size, self.shared_rows(state))

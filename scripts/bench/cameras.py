@@ -17,10 +17,10 @@ import sys
 import time
 from typing import Any
 
-from scripts.bench.solver import COLUMNS, MODELS, NOISE, ROWS, SIZE, WEAK, observed, simulate
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.page import write_section
 from scripts.shared.timing import row, show
+from scripts.shared.views import COLUMNS, MODELS, NOISE, ROWS, SIZE, WEAK, observed, simulate
 
 FIRST_SEED = 40_000
 # RMS, relative: as far as the solver's tolerance goes.

@@ -34,70 +34,22 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from kcal.calibrate.bundle.poses import refine_poses
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.lensfit.hybrid import HybridOptions, calibrate_hybrid
-from kcal.calibrate.rig.board_consensus import Poses, pose_alone
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
+from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.residual import FieldGrid, FieldResidual
-from kcal.solve.lm import LMOptions
 from scripts.shared.page import write_section
 from scripts.shared.timing import ratios, row, show, spread, times
+from scripts.shared.wide_lens import folds, held_out, load, subset
 
 PARAMETRIC = ("opencv5", "opencv8", "opencv12", "opencv14", "ext18", "ext20", "ext24")
 HYBRID = ("hybrid", "hybrid-views")
 # Their fields alone, on the plain lens: nothing is compared.
 FIELD = ("field", "field-views")
 PEERS = ("SPLINED11x8", "SPLINED16x11")
-EXACT = LMOptions(max_iterations=60, tolerance=1e-12)
 Record = dict[str, Any]
-
-
-def load() -> tuple[Observations, np.ndarray]:
-    folder = os.environ.get("KCAL_DATA")
-    if not folder:
-        raise SystemExit("set KCAL_DATA to the folder that holds wide_lens_corners.npz")
-    with np.load(Path(folder, "wide_lens_corners.npz")) as data:
-        corners, weight, size = data["corners"], data["weight"], data["image_size"]
-        columns, rows = (int(n) for n in data["board_size"])
-        board = Board(columns=columns, rows=rows, square=float(data["square_m"]))
-    views = []
-    for i, (points, weights) in enumerate(zip(corners.tolist(), weight.tolist(), strict=True)):
-        pixels = tuple((p[0], p[1]) if w > 0 else None for p, w in zip(points, weights, strict=True))
-        covariance = tuple((1 / w**2, 0.0, 1 / w**2) if w > 0 else None for w in weights)
-        views.append(View(name=f"{i:03d}", pixels=pixels, covariance=covariance))
-    return Observations(board=board, image_size=(int(size[0]), int(size[1])), views=tuple(views)), np.maximum(
-        weight, 0.0
-    )
-
-
-def folds(split: str, views: int) -> list[np.ndarray]:
-    """Views held out, as in the peers' comparison."""
-    if split == "evenodd":
-        return [np.arange(0, views, 2), np.arange(1, views, 2)]
-    blocks = np.array_split(np.arange(views), int(split.removeprefix("blocks")))
-    order = np.random.default_rng(0).permutation(len(blocks))
-    return [np.sort(np.concatenate([blocks[i] for i in order[k::5]])) for k in range(5)]
-
-
-def held_out(camera: Camera, warp: torch.Tensor, seen: Observations, weight: np.ndarray) -> tuple[float, int]:
-    """Sum of w² |r|² over views whose poses are solved again, and how many corners."""
-    pixels = seen.pixels()
-    alone: Poses
-    alone, _ = pose_alone(seen.board.points, pixels, camera, LMOptions(max_iterations=50))
-    parameters = camera.params.detach()
-    none = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
-    state = (parameters, warp, *none, alone.rotation, alone.translation)
-    weights = torch.from_numpy(weight)[:, None, :, None, None] * torch.eye(2, dtype=torch.float64)
-    _, cost = refine_poses(seen.board.points, pixels[:, None], [camera.model], state, EXACT, [camera.field], weights)
-    return 2.0 * float(torch.nan_to_num(cost, nan=math.inf).sum()), int((weight > 0).sum())
-
-
-def subset(seen: Observations, index: np.ndarray) -> Observations:
-    return seen.subset([seen.names[i] for i in index])
 
 
 def measure(seen: Observations, weight: np.ndarray, split: str, fold: int, model: str) -> list[Record]:

@@ -28,7 +28,6 @@ from typing import Any
 
 import torch
 
-from kcal.calibrate.bundle.batching import alone
 from kcal.calibrate.bundle.board_problem import BoardProblem
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.solve import solve
@@ -118,11 +117,11 @@ def more_models(name: str, views: int, sigma: float, seed: int) -> list[Record]:
         out.failed("ext24", error, start)
     start = time.process_time()
     try:
-        solved = alone(solve(seen, CalibrationOptions(model="ext20"), lambda _: None))
-        camera = Camera(solved.result.state[0], size=seen.image_size, model="ext20")
+        solved = solve(seen, CalibrationOptions(model="ext20"), lambda _: None)
+        camera = Camera(solved.result.state.parameters, size=seen.image_size, model="ext20")
         residual = ResidualNet(camera)
         problem = BoardProblem(
-            BOARD.points, seen.pixels()[:, None], [camera.model], [residual.corrected], terms=solved.problem.terms
+            BOARD.points, seen.pixels(), camera.model, residual.corrected, terms=solved.problem.terms
         )
         train_residual(residual, problem, solved.result.state, REFIT)
         out.note("global", residual.camera(), lens, start)

@@ -15,13 +15,12 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.board_problem import BoardProblem
-from kcal.calibrate.bundle.parameters import Free
 from kcal.calibrate.camera.layer import CalibratedViews, calibrate_views
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.lens.model import LensModel
-from scripts.bench.solver import MODELS, NOISE, SIZE, simulate
 from scripts.shared.page import write_section
 from scripts.shared.timing import row, show
+from scripts.shared.views import MODELS, NOISE, SIZE, simulate
 
 VIEWS, REPEATS, STEP = (30, 200, 800), 3, 1e-3
 WEAK = {5: None, 14: 0.3}
@@ -39,8 +38,8 @@ def timed(call: Callable[[], object]) -> float:
 
 def linear_gradient(found: CalibratedViews, pixels: Tensor, board: Tensor, options: CalibrationOptions) -> Tensor:
     """What Gauss and Newton's matrix in place of the Hessian makes of the derivative of fx by the corners."""
-    free: Free = options.rules(found.size).parameters(found.model)
-    problem = BoardProblem(board, pixels[:, None], [found.model], [free])
+    free = options.constraints(found.size).free_parameters(found.model)
+    problem = BoardProblem(board, pixels, found.model, free)
     rows, size = problem.rows(found.state()), len(free)
     whole = rows.new_zeros(size + 6 * len(rows), len(rows), rows.shape[-1])
     whole[:size] = rows[:, 6:-1].transpose(0, 1)

@@ -25,8 +25,9 @@ import torch
 
 import kcal
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.rig.from_boards import RigOptions, calibrate_rig
+from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.pairs import pair_by_name
+from kcal.calibrate.rig.solve import RigOptions
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_images
 from kcal.corners.observations import Observations
@@ -195,16 +196,18 @@ def _rig(seen: dict[str, Observations], repeats: int) -> list[str]:
     cameras = (calibrate_camera(left).camera, calibrate_camera(right).camera)
     pairs = pair_by_name(left.names, right.names)
     for word, refine in (("fixed", False), ("refined jointly", True)):
+        options = RigOptions(intrinsics="free" if refine else "fixed", reject=False)
         ours, theirs, times = _in_turn(
-            partial(calibrate_rig, *cameras, left, right, pairs, RigOptions(refine_cameras=refine)),
+            partial(calibrate_rig, *cameras, left, right, pairs, options),
             partial(_opencv_stereo, left, right, cameras, refine),
             repeats,
         )
-        side = triangulated_sides(ours.rig, BOARD.columns, BOARD.rows, ours.pixels)
+        rig = ours.stereo()
+        side = triangulated_sides(rig, BOARD.columns, BOARD.rows, ours.pixels)
         rms, baseline, mean, spread = theirs
         lines += _show(
             [
-                f"| {word} | kcal | {1e3 * float(ours.rig.baseline):.5f} | {ours.rms:.7f} "
+                f"| {word} | kcal | {1e3 * float(rig.baseline):.5f} | {ours.rms:.7f} "
                 f"| {1e3 * side.mean:.4f} ± {1e3 * side.spread:.4f} | {_spread(times[0], 1e3)} |",
                 f"| {word} | OpenCV | {1e3 * baseline:.5f} | {rms:.7f} | {1e3 * mean:.4f} ± {1e3 * spread:.4f} "
                 f"| {_spread(times[1], 1e3)} |",

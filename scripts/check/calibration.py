@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.corners.board import Board
@@ -31,7 +31,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import minimize
-from kcal.solve.result import State, Status
+from kcal.solve.result import SolverStatus, State
 from scripts.shared.page import write_section
 from scripts.shared.timing import show
 
@@ -77,7 +77,7 @@ def ladder(sets: dict[str, Observations]) -> list[str]:
         cells, rises, before = [], [], np.inf
         for coefficients in LADDER:
             result = calibrate_camera(seen, options(coefficients))
-            mark = {Status.AT_BOUND: "ᵇ", Status.FLAT: "ᶠ"}.get(result.status, "")
+            mark = {SolverStatus.AT_BOUND: "ᵇ", SolverStatus.FLAT: "ᶠ"}.get(result.status, "")
             cells.append(f"{result.rms:.6f}{mark}")
             if result.rms > before * (1 + SAME_RMS):
                 rises.append(f"{coefficients}: {result.rms / before - 1:+.1e}")
@@ -91,13 +91,13 @@ class Rescaled(BoardProblem):
 
     units: Tensor
 
-    def rows(self, state: State, views: slice = slice(None)) -> Tensor:
+    def rows(self, state: BoardState, views: slice = slice(None)) -> Tensor:
         """Derivatives by θ' are those by θ times the unit."""
         out = super().rows(state, views)
         out[..., 6:-1, :] *= self.units[:, None]
         return out
 
-    def retract(self, state: State, step: State) -> State:
+    def retract(self, state: BoardState, step: State) -> BoardState:
         """A step in θ' is one in θ times the unit."""
         return super().retract(state, (step[0] * self.units, step[1]))
 
@@ -108,7 +108,7 @@ class End:
 
     rms: float
     residuals: Tensor
-    status: Status
+    status: SolverStatus
 
 
 def _public(seen: Observations, coefficients: int, focal: float | None, weak: float | None) -> End | None:
@@ -137,17 +137,15 @@ def _alone(
     turn = rotation_from_vector(torch.from_numpy(draw.normal(0, np.deg2rad(5), shape)))
     scale = torch.from_numpy(draw.normal(1, 0.05, shape)) * torch.tensor([1.0, 1.0, factor]).double()
     pose = turn @ solution.cam_from_board_rotation, solution.cam_from_board_translation * scale
-    none = torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
     kind = Rescaled if unit else BoardProblem
-    problem = kind(seen.board.points, seen.pixels()[:, None], [model], [free_parameters(model)])
+    problem = kind(seen.board.points, seen.pixels(), model, free_parameters(model))
     if isinstance(problem, Rescaled):
         problem.units = 10.0 ** torch.from_numpy(draw.uniform(-6, 6, problem.shared_size))
-    solved = minimize(problem, (parameters, torch.zeros(2).double(), *none, *pose), CalibrationOptions().solver)
+    solved = minimize(problem, BoardState.flat(parameters, *pose), CalibrationOptions().solver)
     if not bool(solved.cost.isfinite()):
         return None
-    errors = problem.pixel_errors(solved.state)[:, 0].transpose(-1, -2)
-    residuals = torch.where(problem.seen[:, 0, :, None], errors, torch.nan)
-    return End(float(torch.sqrt(4 * solved.cost / problem.residual_count)), residuals, Status(int(solved.status)))
+    residuals = problem.corner_residuals(solved.state)
+    return End(float(torch.sqrt(4 * solved.cost / problem.residual_count)), residuals, SolverStatus(int(solved.status)))
 
 
 def starts(sets: dict[str, Observations], count: int) -> list[str]:

@@ -22,16 +22,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.closed_form import homographies, intrinsics_candidates, poses_from_homographies
 from kcal.calibrate.bundle.views import free_parameters
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import State
-from scripts.bench.solver import COLUMNS, MODELS, NOISE, ROWS, SIZE, simulate
 from scripts.shared.page import DOCS, write_section
 from scripts.shared.timing import show
+from scripts.shared.views import COLUMNS, MODELS, NOISE, ROWS, SIZE, simulate
 
 VIEWS = 15
 RATES = [10.0**e for e in range(-8, 5)]
@@ -48,7 +47,7 @@ class Run(NamedTuple):
     rate: float | None = None
 
 
-def set_up(coefficients: int) -> tuple[BoardProblem, State]:
+def set_up(coefficients: int) -> tuple[BoardProblem, BoardState]:
     """The simulated views, and the start that all methods share."""
     data = simulate(VIEWS)
     board, pixels = torch.from_numpy(data["board"]), torch.from_numpy(data["pixels"])
@@ -57,17 +56,16 @@ def set_up(coefficients: int) -> tuple[BoardProblem, State]:
     intrinsics = intrinsics_candidates(homography, SIZE)[0]
     parameters = torch.zeros(len(INTRINSICS) + model.size, dtype=torch.float64)
     parameters[:4] = intrinsics
-    none = torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
     poses = poses_from_homographies(homography, intrinsics)
-    problem = BoardProblem(board, pixels[:, None], [model], [free_parameters(model)])
-    return problem, (parameters, torch.zeros(2).double(), *none, *poses)
+    problem = BoardProblem(board, pixels, model, free_parameters(model))
+    return problem, BoardState.flat(parameters, *poses)
 
 
 def rms_of(problem: BoardProblem, cost: Tensor) -> np.ndarray:
     return torch.sqrt(4.0 * cost / problem.residual_count).numpy()
 
 
-def levenberg_marquardt(problem: BoardProblem, start: State) -> Run:
+def levenberg_marquardt(problem: BoardProblem, start: BoardState) -> Run:
     clock, ticks = time.perf_counter(), [0.0]
 
     def tick(_: int, __: Tensor) -> None:
@@ -77,17 +75,17 @@ def levenberg_marquardt(problem: BoardProblem, start: State) -> Run:
     return Run(rms_of(problem, result.history), np.array(ticks))
 
 
-def units(problem: BoardProblem, start: State) -> tuple[Tensor, Tensor]:
+def units(problem: BoardProblem, start: BoardState) -> tuple[Tensor, Tensor]:
     """One over the length of each column of the Jacobian: of the shared parameters, and of each pose."""
     length = torch.linalg.vector_norm(problem.rows(start), dim=-1)
     shared = torch.linalg.vector_norm(length[:, 6:-1], dim=0)
     return 1.0 / shared.clamp_min(1e-12), 1.0 / length[:, :6]
 
 
-def descend(problem: BoardProblem, start: State, method: str, rate: float, scaled: bool, steps: int) -> Run:
+def descend(problem: BoardProblem, start: BoardState, method: str, rate: float, scaled: bool, steps: int) -> Run:
     """First-order steps of mean squared error; ends early where it is no longer finite."""
     shared = torch.zeros(problem.shared_size, dtype=torch.float64, requires_grad=True)
-    local = torch.zeros(len(start[-1]), 6, dtype=torch.float64, requires_grad=True)
+    local = torch.zeros(len(start.translation), 6, dtype=torch.float64, requires_grad=True)
     optimizer = METHODS[method]([shared, local], lr=rate)
     by_shared, by_local = units(problem, start) if scaled else (torch.ones(()).double(), torch.ones(()).double())
     costs, ticks, clock = [], [], time.perf_counter()
@@ -103,7 +101,7 @@ def descend(problem: BoardProblem, start: State, method: str, rate: float, scale
     return Run(rms_of(problem, torch.stack(costs)), np.array(ticks), rate)
 
 
-def best_descent(problem: BoardProblem, start: State, method: str, scaled: bool, steps: int) -> Run:
+def best_descent(problem: BoardProblem, start: BoardState, method: str, scaled: bool, steps: int) -> Run:
     """The learning rate whose short run ends lowest, run in full; divergence counts as infinite."""
     tried = [descend(problem, start, method, rate, scaled, max(1, int(TRIAL * steps))) for rate in RATES]
     ends = [float(np.nan_to_num(run.rms[-1], nan=np.inf)) for run in tried]

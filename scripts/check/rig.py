@@ -19,8 +19,8 @@ from torch import Tensor
 
 import kcal
 from kcal.calibrate.rig.drift import measure_drift
-from kcal.calibrate.rig.result import RigSolution
-from kcal.calibrate.rig.solve import JointOptions, solve_rig
+from kcal.calibrate.rig.result import RigResult
+from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, Features, Landmarks, MeasuredPosition, RigData
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import RigCovariance, StereoRig
@@ -28,7 +28,7 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import drift_effect
 from kcal.report.rig import save_rig_picture
-from scripts.bench.locate import ORIGIN, RANGES, rig
+from scripts.shared.long_range import ORIGIN, RANGES, rig
 from scripts.shared.page import CONCLUSIONS, DOCS
 from scripts.shared.timing import row, show
 
@@ -118,7 +118,7 @@ def data(kind: str, draw: torch.Generator) -> RigData:
     )
 
 
-def yaw_error(found: RigSolution) -> float:
+def yaw_error(found: RigResult) -> float:
     """Degrees by which the relative yaw is wrong."""
     relative = found.rotation[1] @ found.rotation[0].T @ TRUTH.right_from_left_rotation.T
     return math.degrees(float(vector_from_rotation(relative)[1]))
@@ -199,7 +199,7 @@ def wrong(draws: int) -> list[str]:
             out = {item.name for item in found.left_out}
             named += bad.landmarks.names[which] in out
             false += len(out - {bad.landmarks.names[which]})
-            errors[0].append(yaw_error(solve_rig(bad, JointOptions(reject=False))))
+            errors[0].append(yaw_error(solve_rig(bad, RigOptions(reject=False))))
             errors[1].append(yaw_error(found))
             errors[2].append(yaw_error(solve_rig(good)))
         rms = [math.sqrt(sum(e * e for e in each) / draws) for each in errors]

@@ -17,16 +17,16 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import Status
-from scripts.bench.solver import MODELS, SIZE, flipped_views, image_error, observed, simulate
+from kcal.solve.result import SolverStatus
 from scripts.shared.page import write_section
 from scripts.shared.timing import show
+from scripts.shared.views import MODELS, SIZE, flipped_views, image_error, observed, simulate
 
 SAME = 1e-6
 # Typical sizes of coefficients that may have either sign.
@@ -48,7 +48,7 @@ class Outcome(NamedTuple):
     flipped: int
     focal_error: float
     image_error: float
-    status: Status
+    status: SolverStatus
     seconds: float
 
     @property
@@ -83,10 +83,9 @@ def judge(seed: int, views: int, model: LensModel) -> Outcome:
     clock = time.process_time()
     result = calibrate_camera(seen, CalibrationOptions(model=model))
     seconds = time.process_time() - clock
-    problem = BoardProblem(seen.board.points, seen.pixels()[:, None], [model], [free_parameters(model)])
-    none = torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
+    problem = BoardProblem(seen.board.points, seen.pixels(), model, free_parameters(model))
     poses = torch.from_numpy(data["rotation"]), torch.from_numpy(data["translation"])
-    start = (truth.params.detach(), torch.zeros(2).double(), *none, *poses)
+    start = BoardState.flat(truth.params.detach(), *poses)
     best = minimize(problem, start, LMOptions(max_iterations=1000, tolerance=1e-12))
     sigma = result.sigma["fx"]
     return Outcome(
@@ -95,7 +94,7 @@ def judge(seed: int, views: int, model: LensModel) -> Outcome:
         noise=noise,
         rms=result.rms,
         yardstick=float(torch.sqrt(4.0 * best.cost / problem.residual_count)),
-        yardstick_folds=not bool(Camera(best.state[0], size=SIZE, model=model).covers_image()),
+        yardstick_folds=not bool(Camera(best.state.parameters, size=SIZE, model=model).covers_image()),
         flipped=int(flipped_views(result.cam_from_board_rotation.numpy(), data["rotation"]).sum()),
         focal_error=abs(float(result.camera.focal[0] - truth.focal[0])) / (np.inf if sigma is None else sigma),
         image_error=image_error(result.camera, truth),

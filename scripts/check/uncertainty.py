@@ -20,9 +20,9 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
-from scripts.bench.solver import COLUMNS, MODELS, NOISE, ROWS, SIZE, observed, simulate
 from scripts.shared.page import write_section
 from scripts.shared.timing import show
+from scripts.shared.views import COLUMNS, MODELS, NOISE, ROWS, SIZE, observed, simulate
 
 VIEWS = 30
 WEAK = 0.3

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.solve import JointOptions, solve_rig
+from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Landmarks, RigData
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
@@ -146,7 +146,7 @@ def by_kcal(scene: DemoScene, cameras: tuple[Camera, Camera]) -> Orient:
         )
         try:
             # Nothing is left out: a lens model that contradicts the landmarks is to show it.
-            solved = solve_rig(RigData(cameras=cameras, names=SIDES, landmarks=landmarks), JointOptions(reject=False))
+            solved = solve_rig(RigData(cameras=cameras, names=SIDES, landmarks=landmarks), RigOptions(reject=False))
         except (KcalError, RuntimeError):
             return lost
         rig = solved.stereo()

@@ -10,7 +10,7 @@ with A*, K* and the poses held: y3 are corners and y3* their projections, y1 pos
 inverse net, trained along with it, makes of the projections. Both residuals get that here, the global one of Eq. 11
 and a field as in Fig. 8, and both are also fitted jointly with warp and poses by Levenberg-Marquardt.
 
-Data, splits and measure are those of `scripts/bench/hybrid.py`: whole blocks of views held out, poses solved again.
+Data, splits and measure are those of `scripts/shared/wide_lens.py`: whole blocks of views held out, poses solved again.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.lensfit.hybrid import HybridOptions, calibrate_hybrid
 from kcal.corners.observations import Observations
@@ -38,10 +38,9 @@ from kcal.nets.inverse import InverseNet
 from kcal.nets.mlp import evaluate
 from kcal.nets.residual import ResidualNet, train_residual
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import State
-from scripts.bench.hybrid import folds, held_out, load, subset
 from scripts.shared.page import write_section
 from scripts.shared.timing import row, show
+from scripts.shared.wide_lens import folds, held_out, load, subset
 
 PAGE = "hybrid.md"
 MODEL = "ext20"
@@ -79,11 +78,6 @@ class Fitted(NamedTuple):
     seconds: float
 
 
-def board_state(parameters: Tensor, warp: Tensor, rotation: Tensor, translation: Tensor) -> State:
-    none = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
-    return (parameters, warp, *none, rotation, translation)
-
-
 def judged(fitted: Fitted, data: Data) -> tuple[float, float]:
     """Sum of w² |r|² over views whose poses are solved again, and how many corners."""
     total, count = held_out(fitted.camera, fitted.warp, data.seen, data.weight)
@@ -98,8 +92,8 @@ class Views(NamedTuple):
     weight: Tensor
 
 
-def views_of(data: Data, problem: BoardProblem, state: State) -> Views:
-    _, points = problem.points(problem.unpack(state))
+def views_of(data: Data, problem: BoardProblem, state: BoardState) -> Views:
+    _, points = problem.points(state)
     weight = torch.from_numpy(data.weight)
     seen = weight > 0
     return Views(points.transpose(-1, -2)[seen].T, data.seen.pixels()[seen].T, weight[seen])
@@ -145,26 +139,26 @@ def best_rate(train: Callable[[float, int], tuple[Tensor, float]], steps: int) -
     return RATES[int(np.argmin(ends))]
 
 
-def parametric(data: Data) -> tuple[Fitted, BoardProblem, State]:
+def parametric(data: Data) -> tuple[Fitted, BoardProblem, BoardState]:
     """20 coefficients, by the calibration and then to the end on the weights of the file alone."""
     clock = time.process_time()
     result = calibrate_camera(data.seen, CalibrationOptions(model=MODEL, board_warp=True))
     camera = result.camera
     free = ResidualNet(camera).corrected
     problem = BoardProblem(
-        data.seen.board.points, data.seen.pixels()[:, None], [camera.model], [free],
+        data.seen.board.points, data.seen.pixels(), camera.model, free,
         free_warp=True, whitening=data.whitening,
     )  # fmt: skip
     assert result.board_warp is not None
-    start = board_state(
+    start = BoardState(
         camera.params.detach(),
         result.board_warp,
         result.cam_from_board_rotation,
         result.cam_from_board_translation,
     )
     state = minimize(problem, start, REFIT).state
-    camera = Camera(state[0], size=camera.size, model=MODEL)
-    return Fitted(camera, state[1], time.process_time() - clock), problem, state
+    camera = Camera(state.parameters, size=camera.size, model=MODEL)
+    return Fitted(camera, state.warp, time.process_time() - clock), problem, state
 
 
 def fit_all(data: Data, steps: int, rates: dict[str, float]) -> dict[str, Fitted]:

@@ -32,9 +32,9 @@ from kcal.corners.observations import Observations, View
 from kcal.nets.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import State
-from scripts.bench.solver import COLUMNS, NOISE, ROWS, SIZE, simulate
 from scripts.shared.page import DOCS, write_section
 from scripts.shared.timing import row, show, spread
+from scripts.shared.views import COLUMNS, NOISE, ROWS, SIZE, simulate
 
 PAGE, PICTURE = "hybrid.md", "net-lens.png"
 VIEWS, HELD_OUT = 20, 20

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from kcal.cli.main import app, main
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
+from kcal.errors import DegenerateError
 from kcal.io.camera_file import CameraFile
 from kcal.io.rig_file import RigFile
 from kcal.lens.camera import Camera
@@ -316,7 +317,7 @@ class TestRig:
         assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, *more) == 0
         printed = capsys.readouterr()
         assert printed.out.startswith("source")
-        assert "turned by 180°: left01.png right01.png (right)" in printed.out
+        assert "turned by 180°: left01.png right01.png (right; the board" in printed.out
         assert (cameras / "rig.png").read_bytes().startswith(b"\x89PNG")
         file = RigFile.load(cameras / "joint.json")
         assert file.calibration is not None
@@ -324,6 +325,53 @@ class TestRig:
         assert file.calibration.baseline_m == pytest.approx(float(RIG.baseline), abs=0.001)
         assert file.mounting is None
         assert file.joint_covariance() is not None
+
+    @pytest.mark.parametrize("keep_all", [False, True])
+    @pytest.mark.parametrize("shift", [1.5, 40.0])
+    def test_pictures_change_nothing_and_all_can_be_kept(
+        self,
+        cameras: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+        shift: float,
+        keep_all: bool,
+    ) -> None:
+        """A board that moved between the two exposures."""
+        content = json.loads((cameras / "right.obs.json").read_text())
+        for pixel in content["views"][4]["pixels"]:
+            pixel[1] += shift
+        (cameras / "right.obs.json").write_text(json.dumps(content))
+        arguments = ["rig", "left.camera.json", "right.camera.json", *PAIRS, *(["--keep-all"] if keep_all else [])]
+        assert run(monkeypatch, *arguments, "-o", "plain.json") == 0
+        printed = capsys.readouterr()
+        assert run(monkeypatch, *arguments, "-o", "drawn.json", "--picture", "rig.png") == 0
+        drawn = capsys.readouterr()
+        assert drawn.err == printed.err
+        assert drawn.out.replace("drawn", "plain").replace("wrote rig.png\n", "") == printed.out
+        plain, picture = (RigFile.load(cameras / name) for name in ("plain.json", "drawn.json"))
+        assert plain.right_from_left == picture.right_from_left
+        assert plain.calibration is not None
+        assert plain.calibration.pairs == (6 if keep_all else 5)
+        assert ("warning: board left04.png right04.png: " in printed.err) == keep_all
+        assert ("left out: board left04.png right04.png: " in printed.err) != keep_all
+
+    def test_a_failure_leaves_no_file(
+        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        def fails(*_: object) -> None:
+            raise DegenerateError("no side of a square could be triangulated")
+
+        monkeypatch.setattr("kcal.locate.check.triangulated_sides", fails)
+        arguments = ["rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json"]
+        assert "no side of a square" in refuse(cameras, monkeypatch, capsys, *arguments)
+
+    def test_swapped_throughout(
+        self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """Cameras and observations agree; the right camera is on the left."""
+        pairs = ["--pairs", "right.obs.json", "left.obs.json"]
+        assert run(monkeypatch, "rig", "right.camera.json", "left.camera.json", *pairs, "-o", "rig.json") == 0
+        assert "to the left of the left camera: left and right are swapped" in capsys.readouterr().err
 
     def test_pairs_from_a_csv(
         self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -333,7 +381,9 @@ class TestRig:
         )
         arguments = ["left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json", "--match", "pairs.csv"]
         assert run(monkeypatch, "rig", *arguments, "--refine-cameras", "--board-warp") == 0
-        assert "3 of 3 pairs used, 6 views without partner" in capsys.readouterr().out
+        printed = capsys.readouterr().out
+        assert "3 of 3 pairs used, 6 views without partner" in printed
+        assert "mm along its rows" in printed
         (cameras / "pairs.csv").write_text("left,right\nleft01.png,right77.png\n")
         (cameras / "rig.json").unlink()
         text = refuse(cameras, monkeypatch, capsys, "rig", *arguments)
@@ -349,8 +399,8 @@ class TestRig:
         (cameras / "right.obs.json").write_text(json.dumps(content))
         assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json") == 0
         printed = capsys.readouterr()
-        assert "turned by 180°: left01.png, right01.png" in printed.out
-        assert "left out: left04.png, right04.png: " in printed.err
+        assert "turned by 180°: left01.png right01.png (right; the board" in printed.out
+        assert "left out: board left04.png right04.png: " in printed.err
         record = RigFile.load(cameras / "rig.json").calibration
         assert record is not None
         assert record.flipped == ("left01.png right01.png",)
@@ -369,6 +419,10 @@ class TestRig:
             (["right.camera.json", "left.camera.json", *PAIRS], "swapped"),
             (["left.camera.json", "right.camera.json", "--pairs", "right.obs.json", "left.obs.json"], "swapped"),
             (["left.camera.json", "right.camera.json", *PAIRS, "--match", "none.csv"], "none.csv: cannot read"),
+            (["left.camera.json", "left.camera.json", *PAIRS], "the same camera twice"),
+            (["left.camera.json", "left.camera.json", "--pairs", "left.obs.json", "left.obs.json"], "camera twice"),
+            (["left.camera.json", "right.camera.json", "--pairs", "left.obs.json", "left.obs.json"], "camera twice"),
+            (["left.camera.json", "right.camera.json", *PAIRS, "--refine-cameras", "--intrinsics", "prior"], "choose"),
         ],
     )
     def test_refusals(

@@ -108,7 +108,7 @@ def test_from_survey_to_positions(
     assert run(monkeypatch, *SOLVE, *more, "-o", "rig.json") == 0
     printed = capsys.readouterr()
     assert "surveyed, but not marked: tree" in printed.err
-    assert "left out: landmarks post4: its marks are off the surveyed place by" in printed.err
+    assert "left out: landmark post4: its marks are off the surveyed place by" in printed.err
     assert (site / "rig.png").read_bytes().startswith(b"\x89PNG")
     file = RigFile.load(site / "rig.json")
     assert file.calibration is not None
@@ -195,7 +195,7 @@ def test_check_by_landmarks(site: Path, monkeypatch: pytest.MonkeyPatch, capsys:
         (["--features", "far.csv", "--baseline", "10"], "write LENGTH±SIGMA in meters"),
         (["--features", "far.csv"], "nothing tells where right stands"),
         (["--landmarks", "survey.csv", "--marks", "then.csv"], "names must be the same in both files"),
-        (["--landmarks", "survey.csv", "--marks", "marks.csv", "--refine-cameras"], "are for boards only"),
+        (["--landmarks", "survey.csv", "--marks", "marks.csv", "--board-warp"], "cannot be estimated without boards"),
         (["--landmarks", "survey.csv", "--marks", "marks.csv", "--intrinsics", "prior"], "no standard deviations"),
         (["--landmarks", "survey.csv", "--marks", "marks.csv", "--picture", "a.jpg"], "end with .png"),
     ],

@@ -175,7 +175,7 @@ class TestOrientation:
             app, ["detect", str(tmp_path), "--board", "6x5", "--square", "20mm", "-o", str(output), *pictures]
         )
         assert result.exit_code == 0
-        assert "1 images ask to be turned (EXIF)" in result.output
+        assert "1 images have an EXIF rotation" in result.output
         seen = Observations.load(output)
         assert seen.image_size == SIZE
         torch.testing.assert_close(seen.pixels()[0], seen.pixels()[1], rtol=0, atol=0)

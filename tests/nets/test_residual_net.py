@@ -7,16 +7,15 @@ import torch
 from calibrate_scenes import BOARD, camera, motions, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.nets.mlp import initial_weights
 from kcal.nets.residual import ResidualNet, ResidualProblem, train_residual
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import State
 
 
-def scene(model: str = "opencv5", free_warp: bool = True) -> tuple[BoardProblem, State, Camera]:
+def scene(model: str = "opencv5", free_warp: bool = True) -> tuple[BoardProblem, BoardState, Camera]:
     """A noisy capture, the state at the true poses, and a camera that is some pixels wrong: A* and K*."""
     truth = camera(model)
     poses = motions(truth, 12, 5)
@@ -26,9 +25,8 @@ def scene(model: str = "opencv5", free_warp: bool = True) -> tuple[BoardProblem,
     start[5] += 0.01
     wrong = Camera(start, size=truth.size, model=model)
     residual = ResidualNet(wrong)
-    problem = BoardProblem(BOARD.points, pixels[:, None], [truth.model], [residual.corrected], free_warp=free_warp)
-    none = torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
-    return problem, (start, torch.zeros(2).double(), *none, *poses), wrong
+    problem = BoardProblem(BOARD.points, pixels, truth.model, residual.corrected, free_warp=free_warp)
+    return problem, BoardState.flat(start, *poses), wrong
 
 
 def random_weights(residual: ResidualNet, seed: int) -> Tensor:
@@ -92,7 +90,7 @@ def test_it_ends_where_the_parameters_end(model: str) -> None:
         result = train_residual(residual, problem, state, exact)
         assert float(result.cost) == pytest.approx(float(plain.cost), rel=1e-9)
         assert torch.equal(residual.weights, result.state[0])
-        fitted = Camera(plain.state[0], size=start.size, model=model)
+        fitted = Camera(plain.state.parameters, size=start.size, model=model)
         rays, _ = fitted.unproject(fitted.grid(9, 7).reshape(-1, 2))
         # 1e-3 px: corners of 0.1 px determine the camera to some hundredths of a pixel.
         torch.testing.assert_close(residual.camera().project(rays)[0], fitted.project(rays)[0], rtol=0, atol=1e-3)
@@ -104,10 +102,14 @@ def test_derivatives_of_the_problem_are_numeric_ones() -> None:
     residual.weights.copy_(random_weights(residual, 3) * 0.1)
     whole = ResidualProblem(problem, residual)
     at = whole.start(state)
-    count, views = residual.weights.numel() + 2, len(state[-1])
+    count, views = residual.weights.numel() + 2, len(state.translation)
 
     def cost(step: Tensor) -> Tensor:
         return whole.cost(whole.retract(at, (step[:count], step[count:].reshape(views, 6))))
+
+    rows = whole.rows(at)
+    assert rows.shape[-2] == 6 + count + 1
+    torch.testing.assert_close(whole.gram(at), rows @ rows.transpose(-1, -2), rtol=1e-9, atol=1e-9)
 
     generator = torch.Generator().manual_seed(8)
     linear = whole.linearize(at)

@@ -8,7 +8,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardPose, BoardSize, board_points, project_board
-from kcal.sim.rectangle import Window, pixel_axes
+from kcal.sim.rectangle import PixelRectangle, pixel_axes
 from kcal.sim.render import RenderOptions, render_board, render_light
 from kcal.sim.truth import TruthLens
 from kcal.sim.window import invert_window
@@ -145,8 +145,8 @@ def test_gray_levels_are_the_blurred_scene_averaged_over_the_pixels():
 
 def test_inverse_is_interpolated_below_a_thousandth_of_a_pixel():
     camera = camera_of(LENS)
-    normalized, valid = invert_window(camera, Window(-7, 300, 160, 97))
-    x, y = pixel_axes(Window(-7, 300, 160, 97))
+    normalized, valid = invert_window(camera, PixelRectangle(-7, 300, 160, 97))
+    x, y = pixel_axes(PixelRectangle(-7, 300, 160, 97))
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
     exact, valid_exact = camera.normalize(pixels.reshape(-1, 2))
     assert valid.all()
@@ -158,7 +158,7 @@ def test_inverse_is_interpolated_below_a_thousandth_of_a_pixel():
 def test_nothing_is_painted_beyond_the_fold():
     # r - 0.5 r³ folds at r = 0.816, which is 0.544 after distortion: 272 px from the center of a 640 x 480 image.
     camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.5])
-    window = Window(0, 0, 640, 480)
+    window = PixelRectangle(0, 0, 640, 480)
     normalized, valid = invert_window(camera, window)
     x, y = pixel_axes(window)
     radius = torch.hypot(x - 319.5, (y - 239.5)[:, None])

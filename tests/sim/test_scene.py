@@ -7,7 +7,7 @@ import torch
 from kcal.errors import InputError
 from kcal.locate.geodesy import enu_from_cam
 from kcal.sim.board import board_points, project_board
-from kcal.sim.scene import DemoScene, _views, demo_rig, mark_points, render_demo
+from kcal.sim.scene import DemoScene, _scene_views, demo_rig, mark_points, render_demo
 
 SMALL = {"near_views": 2, "pair_views": 2}
 
@@ -70,7 +70,7 @@ def test_squares_are_large_enough_to_be_found():
     """15 px and more, also far away, tilted and pressed together by the distortion at the image's edge."""
     scene = DemoScene(seed=5)
     smallest = {"near": math.inf, "pair": math.inf}
-    for view in _views(scene):
+    for view in _scene_views(scene):
         board = scene.near_board if view.kind == "near" else scene.pair_board
         pixels, visible = project_board(getattr(scene.rig, view.camera), view.pose, board)
         assert visible.all()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.solve.lm import LevenbergMarquardt, LMOptions
-from kcal.solve.result import Status
+from kcal.solve.result import SolverStatus
 
 
 def vector(*values: float) -> Tensor:
@@ -30,7 +30,7 @@ class TestKnownMinima:
     def test_minimum(self, known: Known, start: tuple[float, ...], solver: str) -> None:
         x, result = SOLVERS[solver](known.residual, vector(*start))
         assert bool(result.converged)
-        assert (int(result.status) == Status.EXACT) == (known.sum_of_squares == 0)
+        assert (int(result.status) == SolverStatus.EXACT) == (known.sum_of_squares == 0)
         torch.testing.assert_close(2.0 * result.cost, torch.tensor(known.sum_of_squares, dtype=torch.float64), **COST)
         if known.x is not None:
             expected = vector(*known.x)
@@ -85,14 +85,14 @@ class TestHoles:
             return torch.stack([torch.log(x[0]) - 1.0, x[1] * torch.sqrt(x[0]) - 2.0])
 
         x, result = SOLVERS[solver](residual, vector(30.0, 1.0))
-        assert int(result.status) == Status.EXACT
+        assert int(result.status) == SolverStatus.EXACT
         assert bool(torch.isfinite(result.history).all())
         assert bool((result.history[1:] == result.history[:-1]).any()), "no step was rejected"
         torch.testing.assert_close(x, vector(math.e, 2.0 / math.sqrt(math.e)), rtol=0, atol=1e-11)
 
     def test_start_outside(self, solver: str) -> None:
         x, result = SOLVERS[solver](torch.log, vector(-1.0, 1.0))
-        assert int(result.status) == Status.BAD_START
+        assert int(result.status) == SolverStatus.BAD_START
         assert not bool(result.converged)
         assert int(result.iterations) == 0
         assert torch.equal(x, vector(-1.0, 1.0))
@@ -101,24 +101,24 @@ class TestHoles:
     def test_kink_stalls(self, solver: str) -> None:
         """|x| + 1 promises a decrease at its kink that no step gives."""
         x, result = SOLVERS[solver](lambda x: torch.cat([x[:1].abs() + 1.0, x[1:] - 4.0]), vector(0.3, 1.0))
-        assert int(result.status) == Status.STALLED
+        assert int(result.status) == SolverStatus.STALLED
         assert not bool(result.converged)
         assert float(x[0].abs()) < 1e-4
         assert "stalled" in result.message
 
     def test_limit(self, solver: str) -> None:
         _, result = SOLVERS[solver](rosenbrock, vector(-1.2, 1.0), LMOptions(max_iterations=5))
-        assert int(result.status) == Status.ITERATION_LIMIT
+        assert int(result.status) == SolverStatus.ITERATION_LIMIT
         assert int(result.iterations) == 5
         assert len(result.history) == 6
         assert "iteration limit" in result.message
 
     def test_start_at_the_minimum(self, solver: str) -> None:
         _, result = SOLVERS[solver](rosenbrock, vector(1.0, 1.0))
-        assert int(result.status) == Status.EXACT
+        assert int(result.status) == SolverStatus.EXACT
         assert int(result.iterations) == 0
         _, result = SOLVERS[solver](lambda x: torch.cat([x - 1.0, torch.ones(1).double()]), vector(1.0, 1.0))
-        assert int(result.status) == Status.CONVERGED
+        assert int(result.status) == SolverStatus.CONVERGED
         assert int(result.iterations) == 1
 
     def test_residual_floor_is_per_residual(self, solver: str) -> None:
@@ -127,7 +127,7 @@ class TestHoles:
         def constant(x: Tensor) -> Tensor:
             return torch.cat([x - 1.0, 1e-6 * torch.ones(200).double()])
 
-        for floor, status in ((1.1e-6, Status.EXACT), (0.9e-6, Status.CONVERGED)):
+        for floor, status in ((1.1e-6, SolverStatus.EXACT), (0.9e-6, SolverStatus.CONVERGED)):
             _, result = SOLVERS[solver](constant, vector(3.0, 3.0), LMOptions(residual_floor=floor))
             assert int(result.status) == status
 
@@ -166,7 +166,7 @@ class TestBatch:
         starts = torch.tensor([[[-1.2, 1.0], [2.0, 2.0], [0.0, 3.0]], [[5.0, -1.0], [1.0, 1.0], [-3.0, -4.0]]])
         result = LevenbergMarquardt(rosenbrock)(starts.double())
         assert result.cost.shape == result.status.shape == result.iterations.shape == (2, 3)
-        assert bool((result.status == Status.EXACT).all())
+        assert bool((result.status == SolverStatus.EXACT).all())
         torch.testing.assert_close(result.x, torch.ones(2, 3, 2, dtype=torch.float64), rtol=0, atol=1e-10)
         assert int(result.iterations[1, 1]) == 0
 
@@ -175,7 +175,7 @@ class TestBatch:
         units = vector(1.0, 10.0, 1e-3)
         starts = torch.stack([vector(500.0 * unit, 1e-4) for unit in units.tolist()])
         result = LevenbergMarquardt(decay)(starts, MISRA_X.expand(3, -1), units[:, None] * MISRA_Y)
-        assert bool((result.status == Status.CONVERGED).all())
+        assert bool((result.status == SolverStatus.CONVERGED).all())
         torch.testing.assert_close(result.x[:, 0] / units, vector(*[2.3894212918e2] * 3), rtol=1e-8, atol=0)
         torch.testing.assert_close(result.x[:, 1], vector(*[5.5015643181e-4] * 3), rtol=1e-8, atol=0)
         alone = LevenbergMarquardt(misra1a)(vector(500.0, 1e-4))
@@ -183,7 +183,7 @@ class TestBatch:
 
     def test_a_bad_element_leaves_the_others_alone(self) -> None:
         result = LevenbergMarquardt(torch.log)(torch.tensor([[2.0, 3.0], [-1.0, 1.0], [0.5, 9.0]], dtype=torch.float64))
-        assert result.status.tolist() == [Status.EXACT, Status.BAD_START, Status.EXACT]
+        assert result.status.tolist() == [SolverStatus.EXACT, SolverStatus.BAD_START, SolverStatus.EXACT]
         assert result.converged.tolist() == [True, False, True]
         torch.testing.assert_close(result.x[[0, 2]], torch.ones(2, 2, dtype=torch.float64), rtol=0, atol=1e-11)
         assert result.message == (
@@ -204,7 +204,7 @@ class TestCallback:
 
     def test_stops(self) -> None:
         result = LevenbergMarquardt(rosenbrock)(vector(-1.2, 1.0), callback=lambda trial, _: trial == 7)
-        assert int(result.status) == Status.INTERRUPTED
+        assert int(result.status) == SolverStatus.INTERRUPTED
         assert int(result.iterations) == 7
         assert "best state so far" in result.message
         torch.testing.assert_close(0.5 * (rosenbrock(result.x) ** 2).sum(), result.cost, rtol=1e-14, atol=0)
@@ -213,7 +213,7 @@ class TestCallback:
     def test_a_finished_element_is_not_called_interrupted(self) -> None:
         starts = torch.tensor([[1.0, 1.0], [-1.2, 1.0]], dtype=torch.float64)
         result = LevenbergMarquardt(rosenbrock)(starts, callback=lambda trial, _: trial == 2)
-        assert result.status.tolist() == [Status.EXACT, Status.INTERRUPTED]
+        assert result.status.tolist() == [SolverStatus.EXACT, SolverStatus.INTERRUPTED]
 
 
 def test_a_flat_valley_is_left_and_called_so() -> None:
@@ -223,11 +223,11 @@ def test_a_flat_valley_is_left_and_called_so() -> None:
         return torch.stack([x[0] ** 2, 1e-3 + 0.0 * x[0]])
 
     left = LevenbergMarquardt(valley, LMOptions(tolerance=0.0, flatness=0.5))(vector(3.0))
-    assert int(left.status) == Status.FLAT
+    assert int(left.status) == SolverStatus.FLAT
     assert not bool(left.converged)
     # The first step after twenty that gained less than half of what is left.
     assert float(left.history[-21]) <= 1.5 * float(left.cost) < float(left.history[-22])
-    assert int(LevenbergMarquardt(valley, LMOptions(tolerance=0.0))(vector(3.0)).status) != Status.FLAT
+    assert int(LevenbergMarquardt(valley, LMOptions(tolerance=0.0))(vector(3.0)).status) != SolverStatus.FLAT
 
 
 class TestRefusals:
@@ -296,4 +296,4 @@ def test_start_and_data_are_left_as_they_were_and_only_the_solution_has_a_gradie
 
 
 def test_every_status_has_a_sentence_of_its_own() -> None:
-    assert len({status.message for status in Status}) == len(Status)
+    assert len({status.message for status in SolverStatus}) == len(SolverStatus)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from kcal.solve.dense import DenseLinearization
 from kcal.solve.lm import LevenbergMarquardt, minimize
-from kcal.solve.result import State, Status
+from kcal.solve.result import SolverStatus, State
 from kcal.solve.schur import SchurLinearization, SchurProblem
 
 # (batch, views, local, shared, residuals a view)
@@ -189,7 +189,7 @@ def test_same_minimum_as_one_dense_solve() -> None:
     state = (start[:2].clone(), start[2:].reshape(6, 2).clone())
     kept = tuple(tensor.clone() for tensor in state)
     schur = minimize(problem, state)
-    assert int(schur.status) == int(dense.status) == Status.CONVERGED
+    assert int(schur.status) == int(dense.status) == SolverStatus.CONVERGED
     torch.testing.assert_close(schur.cost, dense.cost, rtol=1e-11, atol=0)
     # Same steps, so that even the path is the same.
     torch.testing.assert_close(schur.history[:6], dense.history[:6], rtol=1e-10, atol=0)

@@ -1,4 +1,4 @@
-"""Closed-form starts for calibration: Zhang's steps 1 to 4 (Algorithm 1 of the paper)."""
+"""Closed-form initial values for calibration: Zhang's steps 1 to 4 (Algorithm 1 of the paper)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from kornia.geometry.homography import find_homography_dlt
 from torch import Tensor
 
 from kcal.lens.pose import nearest_rotation
-from kcal.solve.result import State
 
 
 def homographies(board_points: Tensor, pixels: Tensor) -> Tensor:
@@ -15,7 +14,7 @@ def homographies(board_points: Tensor, pixels: Tensor) -> Tensor:
 
     Args:
         board_points: (N, 3), z = 0.
-        pixels: (V, N, 2), NaN where not seen; at least four corners a view.
+        pixels: (V, N, 2), NaN where not seen; at least four corners per view.
 
     Returns:
         (V, 3, 3), scaled so that the last element is 1.
@@ -71,11 +70,11 @@ def _rows(h: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def intrinsics_candidates(homography: Tensor, size: tuple[int, int]) -> list[Tensor]:
-    """Starts for (fx, fy, cx, cy), best first (Algorithm 1, step 2).
+    """Initial values for (fx, fy, cx, cy), best first (Algorithm 1, step 2).
 
-    First the closed form with the principal point in the image's center, which two tilted views determine and noise
-    hardly upsets; then Zhang's with the principal point free (skew 0), where it is real; then fixed fields of view,
-    for data on which the closed forms fail.
+    First the closed form with the principal point in the image's center, which two tilted views determine and which is
+    robust to noise; then Zhang's with a free principal point (skew 0), where it is real; then fixed fields of view, for
+    data on which the closed forms fail.
 
     Args:
         homography: (V, 3, 3) board → image.
@@ -83,7 +82,7 @@ def intrinsics_candidates(homography: Tensor, size: tuple[int, int]) -> list[Ten
     """
     width, height = size
     center = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
-    # Work in units of the image's half width, so that the rows of both equations compare.
+    # In units of the image's half width, so that the rows of both equations have similar scales.
     unit = width / 2
     normalize = torch.tensor([[1 / unit, 0, -center[0] / unit], [0, 1 / unit, -center[1] / unit], [0, 0, 1]])
     h = normalize.to(torch.float64) @ homography
@@ -149,26 +148,26 @@ def radial_start(
     return solution[:, 0]
 
 
-def flipped_poses(board_points: Tensor, state: State) -> State:
-    """The other pose that explains a small or distant plane almost as well, for every view.
+def flipped_poses(board_points: Tensor, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+    """The other pose of each view that explains a small or distant plane almost as well.
 
-    Seen along the direction d to the board's center, a plane tilted by +φ and one tilted by -φ look alike but for
-    perspective. In a frame whose z axis is d, the other pose is D R D with D = diag(1, 1, -1), about the board's
-    center (Schweighofer and Pinz 2006; Collins and Bartoli 2014).
+    Seen along the direction d to the board's center, planes tilted by +φ and by -φ differ only in perspective. In a
+    frame whose z axis is d, the other pose is D R D with D = diag(1, 1, -1), about the board's center (Schweighofer and
+    Pinz 2006; Collins and Bartoli 2014).
 
     Args:
         board_points: (N, 3) meters.
-        state: as `BoardState.pack` gives it.
+        rotation: (V, 3, 3) cam_from_board.
+        translation: (V, 3) meters.
 
     Returns:
-        the state with every board pose replaced by its twin.
+        rotation and translation of the flipped poses.
     """
-    *shared, rotation, translation = state
     middle = board_points.mean(0)
     center = rotation @ middle + translation
     d = center / torch.linalg.vector_norm(center, dim=-1, keepdim=True)
-    # In any frame: D ↦ M = 1 - 2 d dᵀ on the left; D itself on the right.
+    # In any frame: D becomes M = 1 - 2 d dᵀ on the left, and stays D on the right.
     mirror = torch.eye(3, dtype=d.dtype) - 2.0 * d[:, :, None] * d[:, None, :]
     flip = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=d.dtype))
     turned = mirror @ rotation @ flip
-    return (*shared, turned, center - turned @ middle)
+    return turned, center - turned @ middle

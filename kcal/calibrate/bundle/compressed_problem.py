@@ -1,11 +1,10 @@
-"""The lens problem alone: all views folded into a few hundred numbers, whose size does not grow with the views.
+"""The lens problem alone: all views compressed into one quadratic form, whose size does not grow with the views.
 
-Near a solution a change of the lens moves corners by a smooth field over the image, and each board pose answers
-linearly. Both can be used once and for all: the field is written in a basis of smooth functions, the poses are
-eliminated, and what is left of V views is one quadratic form in the field's coefficients. The lens, whose parameters
-are what makes calibration ill-conditioned and multi-modal, stays fully nonlinear. So a search over its many minima
-costs the same for ten views and for a thousand. What it finds is exact but for the curvature of the poses and the
-basis; a few steps on the whole problem remove both.
+Near a solution a change of the lens moves corners by a smooth field over the image, and each board pose responds
+linearly. So the field is written in a basis of smooth functions and the poses are eliminated, which turns V views into
+one quadratic form in the field's coefficients. The lens, whose parameters make calibration ill-conditioned and
+multi-modal, stays fully nonlinear. A search over its many minima costs the same for ten views and for a thousand. The
+result is exact except for the curvature of the poses and the basis; a few steps on the whole problem remove both.
 """
 
 from __future__ import annotations
@@ -13,38 +12,40 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Hashable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.numpy_rows import node_rows, on_host
-from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.bundle.padding import joined_terms, lengthened, part_of
+from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.priors import Term
 from kcal.calibrate.bundle.twist import apply_twist
 from kcal.lens.model import LensModel
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from kcal.solve.dense import DenseLinearization
-from kcal.solve.result import State
+from kcal.solve.result import Result, State, map_state
 
-# The basis: products of a polynomial in the radius and a wave of the polar angle (Zernike's scheme), by the highest
-# degree and the highest number of periods. A lens of few tilted and decentered terms has only slow waves.
+# The basis: products of a polynomial in the radius and a wave of the polar angle (Zernike's scheme), up to a degree and
+# a number of periods. A lens with few tilted and decentered terms has only slow waves.
 _DEGREE, _PERIODS = 14, 4
 _RADII, _ANGLES = 20, 9
-# Poses answer as if each had been measured with this share of the information that the corners give about it along
-# each of its six axes: the tilt of a board that is seen face-on would leave the range of its linear answer otherwise.
+# Share of each pose's own information that is added as a prior along its six axes: the tilt of a board that is seen
+# face-on would otherwise leave the range of the linear response.
 _DAMPING = 1e-3
-# Relative to the largest diagonal element: directions of the field that no corner sees stay free of noise.
+# Relative to the largest diagonal element, for directions of the field that no corner sees.
 _JITTER = 1e-13
-# Corners that are looked at for where corners are.
+# Largest number of corners used to estimate where corners are.
 _SAMPLE = 3000
 
 
 def angle_coordinates(points: Tensor) -> Tensor:
     """Points (..., 3, N) of the camera frame to (..., 2, N): the angle off the axis, in the direction of (X, Y).
 
-    Of all simple coordinates these make the difference between two lenses smoothest, narrow or wide.
+    In these coordinates the difference between two lenses is smooth for narrow and wide lenses alike.
     """
     across = points[..., :2, :]
     distance = torch.linalg.vector_norm(across, dim=-2, keepdim=True)
@@ -52,7 +53,7 @@ def angle_coordinates(points: Tensor) -> Tensor:
     return across * (angle / distance.clamp_min(1e-12))
 
 
-def field_basis(place: Tensor) -> Tensor:
+def disc_basis(place: Tensor) -> Tensor:
     """Smooth functions on the unit disc at points (..., 2, N): (..., F, N)."""
     x, y = place[..., 0, :], place[..., 1, :]
     s = x * x + y * y
@@ -82,59 +83,56 @@ def _nodes() -> Tensor:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CompressedViews:
-    """All views at one state, folded: the squared residuals after the poses have answered are ‖A c + offset‖².
+    """All views at one state: with optimal poses their squared residuals are ‖A c + offset‖².
 
-    c are the shifts (pixels) of the nodes' images, then the change of the board's warp.
-
-    Those of several cameras (`kcal.calibrate.bundle.padding`) have leading dimensions (C, 1), `matrix` (C,); such a one
-    is only searched, not unfolded.
+    c are the shifts (pixels) of the nodes' images, then the change of the board's warp. Those of several cameras
+    (`CompressedProblem.joined`) have leading dimensions (C, 1), `matrix` (C,), and cannot be expanded.
 
     Args:
-        state: where the views were folded.
+        state: at which the views were compressed.
         warp: (2,) of this state.
         points: (3, K) directions of the nodes.
         pixels: (2, K) images of the nodes at `state`.
         matrix: (2 K + W, R), A transposed.
         offset: (R,).
-        answer: (V 6, 2 K + W + 1): what the poses see of c and of the present residuals.
+        response: (V 6, 2 K + W + 1): the projections of c and of the present residuals on the poses.
         factor: (V, 6, 6) of the poses' damped normal matrices.
     """
 
-    state: State
+    state: BoardState
     warp: Tensor
     points: Tensor
     pixels: Tensor
     matrix: Tensor
     offset: Tensor
-    answer: Tensor
+    response: Tensor
     factor: Tensor
 
 
-def fold(problem: BoardProblem, state: State, radius: float) -> CompressedViews:
-    """Fold the views of one camera.
+def compress(problem: BoardProblem, state: BoardState, radius: float) -> CompressedViews:
+    """Compress the views of one camera.
 
     Args:
-        problem: of one camera, none of whose parameters is free but the warp, if it is to be estimated.
+        problem: without free camera parameters; the warp is free if it is to be estimated.
         state: of this problem.
         radius: largest radius on the plane z = 1 at which a corner is seen.
     """
-    s = problem.unpack(state)
     rows = problem.rows(state)
     views = len(rows)
     top = math.atan(radius)
-    points = angle_coordinates(problem.points(s)[1])
-    basis = field_basis(points / top) * problem.seen[:, 0, None]
+    points = angle_coordinates(problem.points(state)[1])
+    basis = disc_basis(points / top) * problem.seen[:, None]
     size = basis.shape[-2]
     disc = _nodes()
     nodes = _directions(disc, top)
-    coefficients = torch.linalg.pinv(field_basis(disc).T)  # (F, K)
+    coefficients = torch.linalg.pinv(disc_basis(disc).T)  # (F, K)
 
     by_pose, others = rows[:, :6], rows[:, 6:]
     gram = by_pose @ by_pose.transpose(-1, -2)
     gram = gram + torch.diag_embed(_DAMPING * gram.diagonal(dim1=-2, dim2=-1))
     factor = torch.linalg.cholesky(gram)
     across = torch.linalg.solve_triangular(factor, by_pose, upper=False)
-    # What the poses see of the field, u and v, and of the warp and the residuals.
+    # Projections of the field (u and v), the warp and the residuals on the poses.
     field = across.unflatten(-1, (2, -1)).flatten(1, 2) @ basis.transpose(-1, -2)
     seen = torch.cat([field.reshape(views, 6, 2 * size), across @ others.transpose(-1, -2)], -1).flatten(0, 1)
     flat = basis.transpose(0, 1).reshape(size, -1)
@@ -156,17 +154,17 @@ def fold(problem: BoardProblem, state: State, radius: float) -> CompressedViews:
     left = (constant - (offset * offset).sum()).clamp_min(0.0).sqrt()
     to_field = torch.block_diag(coefficients, coefficients, torch.eye(len(normal) - 2 * size, dtype=flat.dtype))
     matrix = to_field.T @ root
-    rough = _roughness(disc, coefficients, points / top, problem.seen[:, 0])
+    rough = _roughness(disc, coefficients, points / top, problem.seen)
     rough = torch.cat([rough, rough.new_zeros(len(matrix) - len(rough), rough.shape[1])])
     zero = matrix.new_zeros(len(matrix), 1)
     return CompressedViews(
         state=state,
-        warp=s.warp,
+        warp=state.warp,
         points=nodes,
-        pixels=project_components(nodes, s.parameters[0], problem.models[0]).pixels,
+        pixels=project_components(nodes, state.parameters, problem.model).pixels,
         matrix=torch.cat([matrix, zero, rough], 1),
         offset=torch.cat([offset[:, 0], left[None], offset.new_zeros(rough.shape[1])]),
-        answer=torch.cat([seen[:, :-1] @ to_field, seen[:, -1:]], 1),
+        response=torch.cat([seen[:, :-1] @ to_field, seen[:, -1:]], 1),
         factor=factor,
     )
 
@@ -180,9 +178,9 @@ def _directions(disc: Tensor, top: float) -> Tensor:
 def _roughness(disc: Tensor, coefficients: Tensor, points: Tensor, seen: Tensor) -> Tensor:
     """What the basis cannot express, ring by ring, as residuals (2 K, Q) of the shifts of the nodes.
 
-    A lens whose numerator and denominator nearly cancel has a bump that is narrower than the basis resolves. Left out
-    it would cost nothing. It is a shift along the radius, the same at all angles; what is left of it after the basis
-    counts as often as there are corners around its ring.
+    A lens whose numerator and denominator nearly cancel has a bump that is narrower than the basis resolves, and would
+    have no cost. The bump is a shift along the radius, the same at all angles. What the basis leaves of it counts once
+    per corner near its ring.
     """
     radius = torch.linalg.vector_norm(disc, dim=0)
     outward = (disc / radius).unflatten(-1, (_RADII, _ANGLES))
@@ -193,21 +191,35 @@ def _roughness(disc: Tensor, coefficients: Tensor, points: Tensor, seen: Tensor)
     some = corners[:: 1 + len(corners) // _SAMPLE]
     nearest = (some[:, None] - radius[::_ANGLES]).abs().argmin(1)
     count = torch.bincount(nearest, minlength=_RADII).to(disc.dtype) * (len(corners) / len(some))
-    left = torch.eye(disc.shape[1], dtype=disc.dtype) - coefficients.T @ field_basis(disc)
+    left = torch.eye(disc.shape[1], dtype=disc.dtype) - coefficients.T @ disc_basis(disc)
     return (left @ (mean.flatten(1, 2) * count.sqrt())).flatten(0, 1)
 
 
-class CompressedProblem:
-    """The lens and the warp on folded views, a batch of states at once.
+class LensState(NamedTuple):
+    """What a `CompressedProblem` is solved for; all tensors may have leading batch dimensions.
 
-    A state is (parameters (..., 5 + P), warp (..., 2), rotation (..., 3, 3)). The rotation turns all boards about the
-    camera's center: with it a lens may shift its axis far, which is what rich models do, and no pose has to answer.
+    The rotation turns all boards about the camera's center. With it a lens may shift its axis far, as rich models do,
+    without any response of the poses.
 
     Args:
-        folded: see `fold`.
-        model: the lens model; need not be the one of `folded`.
+        parameters: (..., 5 + P).
+        warp: (..., 2) meters.
+        rotation: (..., 3, 3).
+    """
+
+    parameters: Tensor
+    warp: Tensor
+    rotation: Tensor
+
+
+class CompressedProblem:
+    """The lens and the warp on compressed views, for a batch of states at once.
+
+    Args:
+        compressed: see `compress`.
+        model: the lens model; need not be the one of `compressed`.
         free: indices of its free parameters.
-        terms: priors and bounds.
+        terms: priors and barriers.
         batch: leading shape of the states.
     """
 
@@ -215,17 +227,18 @@ class CompressedProblem:
 
     def __init__(
         self,
-        folded: CompressedViews,
+        compressed: CompressedViews,
         model: LensModel,
-        free: Sequence[int] | Free,
+        free: Sequence[int] | FreeParameters,
         terms: Sequence[Term] = (),
         batch: tuple[int, ...] = (),
     ) -> None:
         self.batch = batch
-        self.residual_count = folded.offset.shape[-1]
-        self.folded, self.model, self.free, self.terms = folded, model, Free.of(free), tuple(terms)
-        self._nodes = 2 * folded.points.shape[-1]
-        self._warps = folded.matrix.shape[-2] - self._nodes
+        self.residual_count = compressed.offset.shape[-1]
+        self.compressed, self.model, self.terms = compressed, model, tuple(terms)
+        self.free = FreeParameters.of(free)
+        self._nodes = 2 * compressed.points.shape[-1]
+        self._warps = compressed.matrix.shape[-2] - self._nodes
 
     @property
     def elements(self) -> int:
@@ -234,12 +247,12 @@ class CompressedProblem:
 
     @property
     def corner_slots(self) -> int:
-        """Places for corners in each of them; here of nodes, and of their share in the quadratic form."""
+        """As for `BoardProblem`; here nodes, and their share in the quadratic form."""
         return 2 * self._nodes
 
     @property
     def alike(self) -> Hashable:
-        """Problems that agree in this can be joined into one of a batch."""
+        """Problems for which this is equal can be joined into one batch."""
         return self.model, self.free, self._warps, len(self.batch), tuple(term.alike for term in self.terms)
 
     def select(self, elements: Tensor) -> CompressedProblem | None:
@@ -247,31 +260,60 @@ class CompressedProblem:
         if len(self.batch) != 1:
             return None
         terms = [term.select(elements) for term in self.terms]
-        return CompressedProblem(self.folded, self.model, self.free, terms, (len(elements),))
+        return CompressedProblem(self.compressed, self.model, self.free, terms, (len(elements),))
 
-    def start(self, parameters: Tensor) -> State:
-        """The state of folding with other parameters (..., 5 + P)."""
+    @classmethod
+    def joined(
+        cls, problems: Sequence[CompressedProblem], starts: Sequence[LensState], device: torch.device
+    ) -> tuple[CompressedProblem, LensState]:
+        """One batch (cameras, starts) of problems that are `alike`; those with fewer starts repeat their last one."""
+        first, most = problems[0], max(problem.elements for problem in problems)
+
+        def of_all(tensors: Sequence[Tensor]) -> Tensor:
+            return torch.stack(list(tensors)).to(device)
+
+        parts = [problem.compressed for problem in problems]
+        compressed = dataclasses.replace(
+            first.compressed,
+            warp=of_all([part.warp for part in parts])[:, None],
+            points=of_all([part.points for part in parts])[:, None],
+            pixels=of_all([part.pixels for part in parts])[:, None],
+            matrix=of_all([part.matrix for part in parts]),
+            offset=of_all([part.offset for part in parts])[:, None],
+        )
+        terms = joined_terms([problem.terms for problem in problems], [1] * len(problems), (len(problems), 1))
+        batch = len(problems), most
+        joined = cls(compressed, first.model, first.free, [term.to(device) for term in terms], batch)
+        return joined, map_state(lambda *tensors: of_all([lengthened(t, most, 0) for t in tensors]), *starts)
+
+    @staticmethod
+    def split(result: Result[LensState], problems: Sequence[CompressedProblem]) -> list[Result[LensState]]:
+        """The result of each problem of a batch made by `joined`, on the CPU."""
+        return [part_of(part_of(result, i), slice(problem.elements)) for i, problem in enumerate(problems)]
+
+    def start(self, parameters: Tensor) -> LensState:
+        """The state at which the views were compressed, with other parameters (..., 5 + P)."""
         shape = parameters.shape[:-1]
         identity = torch.eye(3, dtype=parameters.dtype, device=parameters.device)
-        return parameters, self.folded.warp.expand(*shape, 2), identity.expand(*shape, 3, 3)
+        return LensState(parameters, self.compressed.warp.expand(*shape, 2), identity.expand(*shape, 3, 3))
 
-    def cost(self, state: State) -> Tensor:
+    def cost(self, state: LensState) -> Tensor:
         """See `Problem.cost`."""
         return self.linearize(state).cost
 
-    def linearize(self, state: State) -> DenseLinearization:
+    def linearize(self, state: LensState) -> DenseLinearization:
         """See `Problem.linearize`."""
         parameters, warp, rotation = state
-        folded = self.folded
-        points = rotation @ folded.points
-        matrix = folded.matrix[..., : self._nodes, :]
+        compressed = self.compressed
+        points = rotation @ compressed.points
+        matrix = compressed.matrix[..., : self._nodes, :]
         rows = self._rows(points, parameters).flatten(-2)
         # The starts of a camera share its matrix: one product for all.
         rows = rows @ matrix if matrix.ndim == 2 else (rows.flatten(-3, -2) @ matrix).unflatten(-2, rows.shape[-3:-1])
-        rows[..., -1, :] += folded.offset
+        rows[..., -1, :] += compressed.offset
         if self._warps:
-            by_warp = folded.matrix[..., self._nodes :, :]
-            rows[..., -1, :] += (warp - folded.warp) @ by_warp
+            by_warp = compressed.matrix[..., self._nodes :, :]
+            rows[..., -1, :] += (warp - compressed.warp) @ by_warp
             by_warp = by_warp[:, None] if matrix.ndim > 2 else by_warp
             by_warp = by_warp.expand(*self.batch, -1, -1)
             rows = torch.cat([rows[..., :-1, :], by_warp, rows[..., -1:, :]], -2)
@@ -290,34 +332,30 @@ class CompressedProblem:
 
     def _rows(self, points: Tensor, parameters: Tensor) -> Tensor:
         """(..., U + 3 + 1, 2, K): the shifts of the nodes' images, last, and their derivatives by lens and rotation."""
-        if on_host((self.model,), points, parameters):
-            return node_rows(points, parameters, self.model, self.free, self.folded.pixels)
+        if on_host(self.model, points, parameters):
+            return node_rows(points, parameters, self.model, self.free, self.compressed.pixels)
         seen = project_components(points, parameters, self.model, self.free.indices)
         turn = step_rows(seen.by_point, points)[..., :3, :, :]
-        shift = torch.where(seen.regular[..., None, :], seen.pixels - self.folded.pixels, torch.nan)
+        shift = torch.where(seen.regular[..., None, :], seen.pixels - self.compressed.pixels, torch.nan)
         return torch.cat([self.free.collapse(seen.by_camera, -3), turn, shift[..., None, :, :]], -3)
 
-    def retract(self, state: State, step: State) -> State:
+    def retract(self, state: LensState, step: State) -> LensState:
         """See `Problem.retract`."""
         parameters, warp, rotation = state
         lens, turn, bend = step[0].split([len(self.free), 3, self._warps], -1)
         parameters = parameters.clone()
         parameters[..., list(self.free)] += self.free.expand(lens)
         rotation, _ = apply_twist(rotation, torch.zeros_like(turn), torch.cat([turn, torch.zeros_like(turn)], -1))
-        return parameters, warp + bend if self._warps else warp, rotation
+        return LensState(parameters, warp + bend if self._warps else warp, rotation)
 
-    def unfold(self, state: State) -> State:
-        """One solution (no batch) with the poses that answer it, as a state of `BoardProblem`."""
+    def expand(self, state: LensState) -> BoardState:
+        """One solution (no batch), with the poses that respond to it, as a state of `BoardProblem`."""
         parameters, warp, rotation = state
-        folded = self.folded
-        pixels = project_components(rotation @ folded.points, parameters, self.model).pixels
-        change = [
-            (pixels - folded.pixels).flatten(),
-            (warp - folded.warp)[: self._warps],
-            torch.ones_like(warp[:1]),
-        ]
-        seen = (folded.answer @ torch.cat(change)).unflatten(0, (-1, 6))
-        answer = -torch.linalg.solve_triangular(folded.factor.transpose(-1, -2), seen[..., None], upper=True)[..., 0]
-        board_rotation, board_translation = apply_twist(folded.state[-2], folded.state[-1], answer)
-        board = (rotation @ board_rotation, (rotation @ board_translation[..., None])[..., 0])
-        return (parameters, warp, *folded.state[2:-2], *board)
+        compressed = self.compressed
+        pixels = project_components(rotation @ compressed.points, parameters, self.model).pixels
+        shifts, bend = (pixels - compressed.pixels).flatten(), (warp - compressed.warp)[: self._warps]
+        change = torch.cat([shifts, bend, torch.ones_like(warp[:1])])
+        seen = (compressed.response @ change).unflatten(0, (-1, 6))
+        step = -torch.linalg.solve_triangular(compressed.factor.transpose(-1, -2), seen[..., None], upper=True)[..., 0]
+        board = apply_twist(compressed.state.rotation, compressed.state.translation, step)
+        return BoardState(parameters, warp, rotation @ board[0], (rotation @ board[1][..., None])[..., 0])

@@ -1,4 +1,4 @@
-"""How well the data determine what was estimated: covariances, and the directions nobody measured."""
+"""Covariances of a solution, and which parameters the data do not determine."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.solve.schur import SchurLinearization
 
-# Eigenvalues of the scaled information below this share of the largest are rounding, not information.
+# Eigenvalues of the scaled information below this share of the largest are rounding errors.
 _RANK_TOLERANCE = 1e-13
-# A parameter whose square has this share in a lost direction is lost with it.
-_LOST_SHARE = 1e-2
+# A parameter with this squared component in an undetermined direction counts as undetermined.
+_UNDETERMINED_SHARE = 1e-2
 
 
 class Uncertainty(NamedTuple):
     """Covariance of the shared parameters (S, S), and whether the data determine each (S,).
 
-    Where a linearization is not finite, because a corner lies on a fold of the lens, the covariance is NaN and nothing
-    counts as determined.
+    Where the linearization is not finite, because a corner lies on a fold of the lens, the covariance is NaN and no
+    parameter counts as determined.
     """
 
     covariance: Tensor
@@ -31,7 +31,7 @@ class Uncertainty(NamedTuple):
 
     @property
     def computed(self) -> bool:
-        """Whether there is a covariance at all."""
+        """Whether the covariance is finite."""
         return bool(torch.isfinite(self.covariance).all())
 
     @property
@@ -43,33 +43,32 @@ class Uncertainty(NamedTuple):
 class Covariance(NamedTuple):
     """Covariance of all parameters of a least-squares solution with poses, in blocks.
 
-    That of all S + 6 V parameters at once is never formed; `block` gives any part of it.
+    The matrix of all S + 6 V parameters is never formed; `block` returns any part of it.
 
     Args:
         shared: (S, S) of the shared parameters (free intrinsics and lens coefficients, then the warp).
-        determined: (S,) whether the data determine each. What they leave open has a large variance, which rounding
-            alone limits.
-        answer: (V, 6, S): how the step of each pose follows a change of the shared parameters.
+        determined: (S,) whether the data determine each. Others have a large variance that only rounding limits.
+        response: (V, 6, S) derivatives of each pose's step by the shared parameters.
         own: (V, 6, 6) of each pose's step if the shared parameters were known.
     """
 
     shared: Tensor
     determined: Tensor
-    answer: Tensor
+    response: Tensor
     own: Tensor
 
     @property
     def poses(self) -> Tensor:
         """(V, 6, 6) of the step (ω, v) of each pose (`kcal.calibrate.bundle.twist.apply_twist`), radians and meters."""
-        return self.own + self.answer @ self.shared @ self.answer.transpose(-1, -2)
+        return self.own + self.response @ self.shared @ self.response.transpose(-1, -2)
 
     def block(self, view: int, other: int | None = None) -> Tensor:
         """(6, S) of a view's pose with the shared parameters, or (6, 6) with another view's pose."""
-        across = self.answer[view] @ self.shared
+        across = self.response[view] @ self.shared
         if other is None:
             return across
         alone = self.own[view] if view == other else torch.zeros_like(self.own[view])
-        return across @ self.answer[other].T + alone
+        return across @ self.response[other].T + alone
 
 
 def uncertainty_of(linear: SchurLinearization, residual_count: int, parameter_count: int) -> Uncertainty:
@@ -106,8 +105,8 @@ def covariance(linear: SchurLinearization, residual_count: int, parameter_count:
         ([[0.5]], 3.0)
     """
     shared, determined = uncertainty_of(linear, residual_count, parameter_count)
-    answer, own = linear.answers()
-    return Covariance(shared, determined, answer, own * _noise(linear, residual_count, parameter_count))
+    response, own = linear.local_response()
+    return Covariance(shared, determined, response, own * _noise(linear, residual_count, parameter_count))
 
 
 def projection_covariance(
@@ -115,9 +114,9 @@ def projection_covariance(
 ) -> Tensor:
     """Covariance in pixels of where points of the camera's frame are seen, by first-order propagation.
 
-    J Σ Jᵀ with J the derivatives of the projection by the free parameters: how much the image of a fixed direction
-    would scatter if the calibration were repeated. The camera's frame itself is that of its intrinsics: what a shift
-    of cx and a turn of all poses do alike counts as uncertainty here.
+    J Σ Jᵀ with J the derivatives of the projection by the free parameters: the scatter of the image of a fixed
+    direction if the calibration were repeated. A shift of cx that a rotation of all poses would compensate counts as
+    uncertainty here.
 
     Args:
         shared: (S, S) covariance whose first rows are the free parameters, as `Covariance.shared`.
@@ -154,16 +153,16 @@ def projection_covariance(
 
 
 def _invert(linear: SchurLinearization) -> tuple[Tensor, Tensor, Tensor]:
-    """The inverse of the scaled information (S, S), the scale of each parameter, and whether it is determined."""
+    """The inverse of the scaled information (S, S), the scale of each parameter, and whether each is determined."""
     information, scale = linear.information()
     if not bool(torch.isfinite(information).all() & torch.isfinite(linear.cost)):
         return torch.full_like(information, torch.nan), scale, torch.zeros_like(scale, dtype=torch.bool)
     eigenvalues, vectors = torch.linalg.eigh(information)
     floor = _RANK_TOLERANCE * eigenvalues[-1]
-    lost = (vectors[:, eigenvalues <= floor] ** 2).sum(-1)
-    # What rounding hides is at least as uncertain as the floor says.
+    undetermined = (vectors[:, eigenvalues <= floor] ** 2).sum(-1)
+    # Below the floor an eigenvalue is unknown; the floor gives the smallest possible variance.
     inverse = (vectors / eigenvalues.clamp_min(floor)) @ vectors.T
-    return inverse, scale, lost < _LOST_SHARE
+    return inverse, scale, undetermined < _UNDETERMINED_SHARE
 
 
 def _noise(linear: SchurLinearization, residual_count: int, parameter_count: int) -> Tensor:

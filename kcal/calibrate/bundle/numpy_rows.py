@@ -1,4 +1,4 @@
-"""The rows of `BoardProblem` and `CompressedProblem` for one camera on the CPU, where autograd has no part."""
+"""The rows of `BoardProblem` and `CompressedProblem` by NumPy: on the CPU, where nothing is differentiated."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.lens.model import LensModel
 from kcal.lens.projection_numpy import fill_rows
 from kcal.lens.tracing import plain_on_host
@@ -15,12 +15,14 @@ from kcal.lens.tracing import plain_on_host
 Array = npt.NDArray[np.float64]
 
 
-def on_host(models: tuple[LensModel, ...], *tensors: Tensor) -> bool:
+def on_host(model: LensModel, *tensors: Tensor) -> bool:
     """Whether the functions of this module may be used."""
-    return len(models) == 1 and not models[0].wide and plain_on_host(*tensors)
+    return not model.wide and plain_on_host(*tensors)
 
 
-def camera_rows(points: Array, parameters: Array, model: LensModel, free: Free, out: Array, extra: int) -> Array:
+def camera_rows(
+    points: Array, parameters: Array, model: LensModel, free: FreeParameters, out: Array, extra: int
+) -> Array:
     """Write derivatives by the free parameters of a camera into `out`, and return the pixels.
 
     Args:
@@ -53,28 +55,35 @@ def camera_rows(points: Array, parameters: Array, model: LensModel, free: Free, 
 
 
 def board_rows(
-    points: tuple[Tensor, Tensor], parameters: Tensor, model: LensModel, free: Free, target: Tensor, bend: Tensor | None
+    rotated: Tensor,
+    points: Tensor,
+    parameters: Tensor,
+    model: LensModel,
+    free: FreeParameters,
+    target: Tensor,
+    bend: Tensor | None,
 ) -> Tensor:
     """`BoardProblem.rows` before anything is masked or weighted.
 
     Args:
-        points: rotated board points (..., V, 3, N), and these in the camera's frame.
+        rotated: (..., V, 3, N) board points, rotated only.
+        points: (..., V, 3, N) in the camera's frame.
         parameters: (..., 5 + P).
         model: the lens model.
         free: the unknowns.
         target: (..., V, 2, N) observed corners.
-        bend: (..., V, 2, 3, N): by how much each point moves with the warp, or None.
+        bend: (..., V, 2, 3, N) derivatives of each point by the warp, or None.
 
     Returns:
         (..., V, 6 + S + 1, 2, N).
     """
-    rotated, moved = points[0].numpy(), points[1].numpy()
+    moved = points.numpy()
     warps = 0 if bend is None else 2
     out = np.empty((*moved.shape[:-2], 6 + len(free) + warps + 1, 2, moved.shape[-1]))
     values = parameters.numpy() if parameters.ndim == 1 else parameters[..., None, :].numpy()
     pixels = camera_rows(moved, values, model, free, out[..., 3:, :, :], warps + 1)
     by_point = out[..., 3:6, :, :]
-    _turn_rows(by_point, rotated, out[..., :3, :, :])
+    _turn_rows(by_point, rotated.numpy(), out[..., :3, :, :])
     if bend is not None:
         moves = bend.numpy()
         for w in range(2):
@@ -85,20 +94,20 @@ def board_rows(
     return torch.from_numpy(out)
 
 
-def node_rows(points: Tensor, parameters: Tensor, model: LensModel, free: Free, pixels: Tensor) -> Tensor:
-    """The rows of `CompressedProblem`: derivatives by the unknowns, by a turn of the points, and the shifts.
+def node_rows(points: Tensor, parameters: Tensor, model: LensModel, free: FreeParameters, pixels: Tensor) -> Tensor:
+    """The rows of `CompressedProblem`: derivatives by the unknowns and by a rotation of the points, and the shifts.
 
     Args:
         points: (..., 3, K).
         parameters: (..., 5 + P).
         model: the lens model.
         free: the unknowns.
-        pixels: (..., 2, K) from which shifts are counted.
+        pixels: (..., 2, K) images before the shifts.
     """
     moved, before = points.numpy(), pixels.numpy()
     out = np.empty((*moved.shape[:-2], 3 + len(free) + 4, 2, moved.shape[-1]))
     values = parameters.numpy() if parameters.ndim == 1 else parameters[..., None, :].numpy()
-    # A dimension for what `fill_rows` takes as views.
+    # `fill_rows` expects a dimension of views.
     if parameters.ndim > 1:
         found = camera_rows(moved[..., None, :, :], values, model, free, out[..., None, :, :, :], 4)[..., 0, :]
     else:
@@ -110,7 +119,7 @@ def node_rows(points: Tensor, parameters: Tensor, model: LensModel, free: Free, 
 
 
 def _turn_rows(by_point: Array, rotated: Array, out: Array) -> None:
-    """The first half of `kcal.lens.pose.step_rows`, written in place: derivatives by ω, point × derivative."""
+    """The first half of `kcal.lens.pose.step_rows`, written in place: derivatives by ω, as point × derivative."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         row = out[..., i, :, :]

@@ -1,4 +1,4 @@
-"""Which parameters of a camera are free, fixed, tied or known beforehand, by name."""
+"""Which parameters of a camera are free, fixed, tied or have priors, by name."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior
-from kcal.calibrate.bundle.priors import Prior, Term
+from kcal.calibrate.bundle.priors import GaussianPrior, Term
 from kcal.errors import InputError
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
 
 
 @dataclasses.dataclass(frozen=True)
-class Free:
-    """Free parameters of a camera, some of which move together.
+class FreeParameters:
+    """Free parameters of a camera, some of which may be tied.
 
     Args:
-        indices: of the parameters that move, ascending.
-        slots: for each of them the number of the unknown that it follows.
+        indices: of the free parameters, ascending.
+        slots: for each of them the number of its unknown; tied parameters share one.
     """
 
     indices: tuple[int, ...]
     slots: tuple[int, ...]
 
     @classmethod
-    def of(cls, free: Free | Sequence[int]) -> Free:
-        """Indices, each an unknown of its own."""
-        return free if isinstance(free, Free) else cls(tuple(free), tuple(range(len(free))))
+    def of(cls, free: FreeParameters | Sequence[int]) -> FreeParameters:
+        """From indices, each with an unknown of its own."""
+        return free if isinstance(free, FreeParameters) else cls(tuple(free), tuple(range(len(free))))
 
     def __len__(self) -> int:
         """How many unknowns there are."""
@@ -42,7 +42,7 @@ class Free:
         return iter(self.indices)
 
     def collapse(self, columns: Tensor, dim: int) -> Tensor:
-        """Derivatives by each parameter (along `dim`) to derivatives by each unknown: those tied are added."""
+        """Derivatives by each unknown, from those by each parameter along `dim`: tied ones are added."""
         if len(self) == len(self.indices):
             return columns
         shape = list(columns.shape)
@@ -55,30 +55,30 @@ class Free:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Rules:
-    """What the user says of a camera's parameters; skew is held at 0 unless it is named.
+class ParameterConstraints:
+    """What the user knows about a camera's parameters; skew is held at 0 unless it is named.
 
     Args:
         fixed: name -> value.
         tied: groups of names that are equal.
         free: names that are estimated although they are held by default.
         priors: name -> (mean, standard deviation), both in the parameter's units.
-        mild: a prior on all coefficients that have none of their own, or None.
+        coefficient_prior: a prior on all coefficients without one of their own, or None.
     """
 
     fixed: Mapping[str, float] = dataclasses.field(default_factory=dict)
     tied: tuple[tuple[str, ...], ...] = ()
     free: tuple[str, ...] = ()
     priors: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
-    mild: CoefficientPrior | None = None
+    coefficient_prior: CoefficientPrior | None = None
 
     @property
-    def informed(self) -> bool:
-        """Whether anything is known beside the corners."""
-        return bool(self.priors) or self.mild is not None
+    def has_priors(self) -> bool:
+        """Whether there is any prior."""
+        return bool(self.priors) or self.coefficient_prior is not None
 
     def check(self, model: LensModel) -> None:
-        """Raise `InputError` for names that do not exist, for contradictions and for values that are none."""
+        """Raise `InputError` for unknown names, contradictions, and values that are not finite or not positive."""
         tied = [name for group in self.tied for name in group]
         for name in (*self.fixed, *tied, *self.free, *self.priors):
             if name not in parameter_names(model):
@@ -94,28 +94,28 @@ class Rules:
                 raise InputError(f"parameter {name} cannot be fixed at {value}")
             for other, names in (("tied", tied), ("freed", self.free), ("given a prior", self.priors)):
                 if name in names:
-                    raise InputError(f"parameter {name} is fixed and {other}: choose one")
+                    raise InputError(f"parameter {name} is fixed and {other}: choose one of the two")
         for name in (*tied, *self.priors):
             if name in held:
-                raise InputError(f"parameter {name} is held at 0: free it before it is tied or given a prior")
+                raise InputError(f"parameter {name} is held at 0: free it to tie it or to give it a prior")
         for group in self.tied:
             if len(group) < 2:
-                raise InputError(f"a tie needs two parameters at least, got {', '.join(group) or 'none'}")
+                raise InputError(f"a tie needs at least two parameters, got {', '.join(group) or 'none'}")
         twice = {name for name in tied if tied.count(name) > 1}
         if twice:
-            raise InputError(f"parameter {min(twice)} is tied twice: write one tie of all that are equal")
+            raise InputError(f"parameter {min(twice)} is tied twice: write one tie with all parameters that are equal")
         for name, (mean, sigma) in self.priors.items():
             if not (math.isfinite(mean) and math.isfinite(sigma) and sigma > 0):
-                raise InputError(f"prior of {name}: a value and a positive standard deviation, got {mean} ± {sigma}")
+                raise InputError(f"prior of {name} is {mean} ± {sigma}; it needs a positive standard deviation")
 
     def allows(self, model: LensModel) -> bool:
-        """Whether a smaller model keeps the rules with the coefficients it lacks at zero."""
+        """Whether a smaller model, its missing coefficients taken as zero, satisfies the constraints."""
         names = parameter_names(model)
         if any(name not in names and value != 0 for name, value in self.fixed.items()):
             return False
         return all(len({name in names for name in group}) == 1 for group in self.tied)
 
-    def parameters(self, model: LensModel) -> Free:
+    def free_parameters(self, model: LensModel) -> FreeParameters:
         """The free parameters of a model."""
         names = parameter_names(model)
         held = ({"skew"} - set(self.free)) | set(self.fixed)
@@ -123,10 +123,10 @@ class Rules:
         indices = [i for i, name in enumerate(names) if name not in held]
         order: dict[str, int] = {}
         slots = [order.setdefault(leader.get(names[i], names[i]), len(order)) for i in indices]
-        return Free(tuple(indices), tuple(slots))
+        return FreeParameters(tuple(indices), tuple(slots))
 
     def impose(self, parameters: Tensor, model: LensModel) -> Tensor:
-        """Parameters (..., 5 + P) that keep the rules: fixed ones at their values, tied ones at their mean."""
+        """Parameters (..., 5 + P) that satisfy the constraints: fixed ones at their values, tied ones at their mean."""
         names, out = parameter_names(model), parameters.clone()
         for name, value in self.fixed.items():
             if name in names:
@@ -138,20 +138,20 @@ class Rules:
         return out
 
     def terms(self, model: LensModel, noise: float) -> tuple[Term, ...]:
-        """The priors as residuals beside corners of `noise` pixels."""
+        """The priors as residuals, in proportion to corners with `noise` pixels."""
         names = parameter_names(model)
         known = {name: prior for name, prior in self.priors.items() if name in names}
         found: list[Term] = []
         if known:
             mean, sigma = torch.tensor(list(known.values()), dtype=torch.float64).unbind(-1)
-            found.append(Prior(torch.tensor([names.index(name) for name in known]), mean, noise / sigma))
-        if self.mild is not None:
-            found.append(self.mild.prior(model, noise, {*self.fixed, *self.priors}))
+            found.append(GaussianPrior(torch.tensor([names.index(name) for name in known]), mean, noise / sigma))
+        if self.coefficient_prior is not None:
+            found.append(self.coefficient_prior.term(model, noise, {*self.fixed, *self.priors}))
         return tuple(found)
 
 
 def natural_value(name: str, size: tuple[int, int]) -> float:
-    """Where a parameter is fixed that is given no value: the image's center, and 0 for skew and coefficients."""
+    """The value at which a parameter is fixed by name alone: the image's center, and 0 for skew and coefficients."""
     if name in INTRINSICS[:2]:
-        raise InputError(f"parameter {name} has no natural value: say at which it is fixed")
+        raise InputError(f"parameter {name} has no natural value: give the value at which it is fixed")
     return {"cx": (size[0] - 1) / 2, "cy": (size[1] - 1) / 2}.get(name, 0.0)

@@ -1,4 +1,4 @@
-"""Least-squares terms on the shared parameters alone: bounds that keep folds and poles away, and Gaussian priors."""
+"""Residuals of the shared parameters alone: Gaussian priors, and barriers before folds and poles of a lens."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.tracing import plain_on_host
 
-# d ln r_D / d ln r is 1 for a pinhole, 0 where a lens folds and large before a pole. Between these bounds a lens costs
-# nothing; a fisheye lens of 80 degrees off the axis still has 0.15.
+# d ln r_D / d ln r is 1 for a pinhole, 0 where a lens folds, and large before a pole. Between these bounds there is no
+# cost; a fisheye lens at 80 degrees off the axis still has 0.15.
 _LOWEST_SLOPE, _HIGHEST_SLOPE = 0.1, 8.0
-# A denominator or numerator whose coefficient of r^2j is above this to the power j, r in units of the radius, bends the
-# lens within a fifth of the radius: nearer to the axis than corners can tell.
+# A coefficient of r^2j above this to the power j, with r in units of the radius, bends the lens within a fifth of the
+# radius, where few corners are.
 _SHARPEST = 30.0
-# Radii at which the slope is looked at: closer together than a pole and a zero that all but cancel.
+# Radii at which the slope is checked: denser than a pole and a zero that nearly cancel.
 _KNOTS = 96
 
 
@@ -36,18 +36,18 @@ class Term(Protocol):
             values: (..., 5 + P + 2), the camera's parameters and the two numbers of the warp.
 
         Returns:
-            (..., 5 + P + 2 + 1, Q): derivatives of Q residuals by each value; last the residuals, NaN where there is
-            no lens at all. Q may be 0 at values that no term minds.
+            (..., 5 + P + 2 + 1, Q): derivatives of Q residuals by each value; last the residuals, NaN where the
+            values are not a lens. Q may be 0 where there is no cost.
         """
         ...
 
     @property
     def alike(self) -> Hashable:
-        """Terms of different problems that agree in this can be joined into one of a batch."""
+        """Terms of different problems for which this is equal can be joined into one of a batch."""
         ...
 
     def joined(self, others: Sequence[Any], shape: tuple[int, ...]) -> Term:
-        """The term of a batch of some shape whose elements have these terms, all alike; `self` is one of them."""
+        """The term of a batch of some shape whose elements have these terms, all alike."""
         ...
 
     def to(self, device: torch.device) -> Term:
@@ -60,13 +60,13 @@ class Term(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Prior:
-    """Gaussian knowledge of some values: residuals (value - mean) · weight.
+class GaussianPrior:
+    """A Gaussian prior on some values: residuals (value - mean) · weight.
 
     Args:
         index: which values, (Q,).
         mean: (Q,).
-        weight: (Q,), or (B, Q) of a batch: noise of a corner (pixels) over the prior's standard deviation.
+        weight: (Q,), or (B, Q) of a batch: noise of a corner (pixels) over the standard deviation of the prior.
     """
 
     index: Tensor
@@ -85,33 +85,33 @@ class Prior:
         """See `Term.alike`."""
         return "prior", tuple(self.index.tolist()), tuple(self.mean.tolist())
 
-    def joined(self, others: Sequence[Prior], shape: tuple[int, ...]) -> Prior:
+    def joined(self, others: Sequence[GaussianPrior], shape: tuple[int, ...]) -> GaussianPrior:
         """See `Term.joined`."""
         weight = torch.stack([other.weight for other in others])
         return dataclasses.replace(self, weight=weight.reshape(*shape, -1))
 
-    def to(self, device: torch.device) -> Prior:
+    def to(self, device: torch.device) -> GaussianPrior:
         """See `Term.to`."""
-        return Prior(self.index.to(device), self.mean.to(device), self.weight.to(device))
+        return GaussianPrior(self.index.to(device), self.mean.to(device), self.weight.to(device))
 
-    def select(self, elements: Tensor) -> Prior:
+    def select(self, elements: Tensor) -> GaussianPrior:
         """See `Term.select`."""
         return self if self.weight.ndim == 1 else dataclasses.replace(self, weight=self.weight[elements])
 
 
 class FoldBarrier:
-    """A smooth wall before a lens whose radial term folds or meets a pole within a radius.
+    """A smooth barrier before lenses whose radial term folds or meets a pole within a radius.
 
     With q = d ln r_D / d ln r the residuals are weight · ln(q₀ / q) below q₀, weight · ln(q / q₁) above q₁, and zero
-    between: lenses that are regular by a margin are not changed at all, and no lens beyond the wall has a cost. It is
-    low and wide, because a solver that runs into a hard wall rejects half its steps and hardly converges. A second wall
-    stands before coefficients so large that they only shape the lens next to its axis, where there is next to no data:
-    these run away without it, and take the focal length with them.
+    between. So lenses that are regular by a margin are not changed at all, and lenses beyond the barrier have no cost
+    (NaN). The barrier is low and wide, because at a steep one a solver rejects half its steps and hardly converges.
+    Further residuals limit coefficients so large that they shape the lens only next to its axis, where there are hardly
+    any data: without them these diverge together with the focal length.
 
     Args:
         model: the lens model.
-        radius: up to which radius on the plane of `kcal.lens.plane` the lens must be regular; of a batch (B,).
-        weight: pixels; a third of the noise of a corner does; of a batch (B,).
+        radius: up to which the lens must be regular, on the plane of `kcal.lens.plane`; for a batch (B,).
+        weight: pixels; a third of a corner's noise is enough; for a batch (B,).
     """
 
     def __init__(self, model: LensModel, radius: float | Tensor, weight: float | Tensor) -> None:
@@ -122,12 +122,10 @@ class FoldBarrier:
         self._radius = torch.as_tensor(radius, dtype=torch.float64)
         self._weight = torch.as_tensor(weight, dtype=torch.float64)[..., None]
         device = self._radius.device
-        s = (
-            torch.linspace(0.0, 1.0, _KNOTS + 1, dtype=torch.float64, device=device)[1:] * self._radius[..., None]
-        ) ** 2
-        orders = torch.arange(1, max(model.numerator, model.denominator) + 1, dtype=torch.float64, device=device)[
-            :, None
-        ]
+        shares = torch.linspace(0.0, 1.0, _KNOTS + 1, dtype=torch.float64, device=device)[1:]
+        s = (shares * self._radius[..., None]) ** 2
+        highest = max(model.numerator, model.denominator)
+        orders = torch.arange(1, highest + 1, dtype=torch.float64, device=device)[:, None]
         self._powers = s[..., None, :] ** orders
         self._sharpness = (self._radius[..., None] ** 2 / _SHARPEST) ** orders[:, 0]
         # s d/ds of the same.
@@ -136,7 +134,7 @@ class FoldBarrier:
     @property
     def alike(self) -> Hashable:
         """See `Term.alike`."""
-        return "radial bound", self._model
+        return "fold barrier", self._model
 
     def joined(self, others: Sequence[FoldBarrier], shape: tuple[int, ...]) -> FoldBarrier:
         """See `Term.joined`."""
@@ -156,7 +154,7 @@ class FoldBarrier:
     def rows(self, values: Tensor) -> Tensor:
         """See `Term.rows`."""
         host = plain_on_host(values)
-        if host and self._is_gentle(values.numpy()):
+        if host and self._is_zero(values.numpy()):
             return values.new_zeros((*values.shape[:-1], values.shape[-1] + 1, 0))
         count, over = len(self._top), len(self._bottom)
         top, bottom = self._powers[..., :count, :], self._powers[..., :over, :]
@@ -168,12 +166,12 @@ class FoldBarrier:
         scale = torch.cat([self._sharpness[..., :count], self._sharpness[..., :over]], -1)
         sharp = torch.cat([a, b], -1)[..., 0, :] * scale
         lens = (n > 0) & (d > 0) & (q > 0)
-        gentle = (lens & (q >= _LOWEST_SLOPE) & (q <= _HIGHEST_SLOPE)).all() & (sharp.abs() <= 1.0).all()
-        if not host and bool(gentle):
+        zero = (lens & (q >= _LOWEST_SLOPE) & (q <= _HIGHEST_SLOPE)).all() & (sharp.abs() <= 1.0).all()
+        if not host and bool(zero):
             return values.new_zeros((*values.shape[:-1], values.shape[-1] + 1, 0))
         low = q < 1.0
         excess = torch.where(low, math.log(_LOWEST_SLOPE) - torch.log(q), torch.log(q) - math.log(_HIGHEST_SLOPE))
-        wall = torch.where(lens, self._weight * excess.clamp_min(0.0), torch.nan)
+        barrier = torch.where(lens, self._weight * excess.clamp_min(0.0), torch.nan)
         rate = torch.where(excess > 0, 2.0 * self._weight / q, 0.0) * torch.where(low, -1.0, 1.0)
         radial = [*self._top, *self._bottom]
         out = values.new_zeros((*values.shape[:-1], values.shape[-1] + 1, _KNOTS + len(radial)))
@@ -183,12 +181,12 @@ class FoldBarrier:
         beyond = (sharp.abs() - 1.0).clamp_min(0.0)
         slope = self._weight * torch.where(beyond > 0, scale * torch.sign(sharp), 0.0)
         out[..., radial, list(range(_KNOTS, _KNOTS + len(radial)))] = slope
-        out[..., -1, :_KNOTS] = wall
+        out[..., -1, :_KNOTS] = barrier
         out[..., -1, _KNOTS:] = self._weight * beyond
         return out
 
-    def _is_gentle(self, values: npt.NDArray[np.float64]) -> bool:
-        """Whether none of these lenses is near the wall: nearly always, and told by NumPy in little time."""
+    def _is_zero(self, values: npt.NDArray[np.float64]) -> bool:
+        """Whether all residuals of all these lenses are zero, which is the usual case; NumPy finds out quickly."""
         count, over = len(self._top), len(self._bottom)
         powers, orders = self._powers.numpy(), np.arange(1, 1 + max(count, over))
         a, b = values[..., None, self._top], values[..., None, self._bottom]
@@ -198,7 +196,5 @@ class FoldBarrier:
             q = 1.0 + 2.0 * (turn_n - ((b * orders[:over]) @ powers[..., :over, :]) / d)
             inside = (n > 0) & (d > 0) & (q >= _LOWEST_SLOPE) & (q <= _HIGHEST_SLOPE)
             sharpness = self._sharpness.numpy()[..., None, :]
-            sharp = (np.abs(a) * sharpness[..., :count] <= 1.0).all() and (
-                np.abs(b) * sharpness[..., :over] <= 1.0
-            ).all()
-        return bool(inside.all() and sharp)
+            limited = np.abs(a) * sharpness[..., :count] <= 1.0, np.abs(b) * sharpness[..., :over] <= 1.0
+        return bool(inside.all() and all(part.all() for part in limited))

@@ -1,4 +1,4 @@
-"""How a pose takes a step: along a twist, so that long steps of a whole rig of boards stay true to the linear model."""
+"""How a pose takes a step: along a twist, so that long steps of many boards stay close to the linear model."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _LEVI_CIVITA = np.array([
 def apply_twist(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
     """Move rigid motions by the twist whose first-order effect is that of `kcal.lens.pose.step_rows`.
 
-    A step is (ω, v): the moved points turn by ω about the origin of their own frame, which itself moves by v. Applied
-    separately, R ← exp([ω]×) R and t ← t + v, a turn about any other center leaves its arc by |ω|² |t| / 2. The
-    exponential of the twist (ω, v - ω × t) keeps to it, whatever the center: boards can follow a turn of the camera's
-    axis, which is the long valley of rich lens models, in few long steps.
+    A step is (ω, v): points turn by ω about the origin of their own frame, which itself moves by v. Applied
+    separately, R ← exp([ω]×) R and t ← t + v, a rotation about any other center deviates from its arc by |ω|² |t| / 2.
+    The exponential of the twist (ω, v - ω × t) follows the arc for any center. So boards can follow a rotation of the
+    camera's axis, which rich lens models hardly determine, in a few long steps.
 
     Args:
         rotation: (..., 3, 3).
@@ -62,7 +62,7 @@ def apply_twist(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Te
 
 
 def _apply_twist_on_host(rotation: Array, translation: Array, step: Array) -> Array:
-    """The same by NumPy, whose operations begin faster: (..., 3, 4), rotation and translation."""
+    """The same by NumPy, which has less overhead per operation: (..., 3, 4), rotation and translation."""
     turn, shift = step[..., :3], step[..., 3:]
     square = (turn * turn).sum(-1)[..., None, None]
     near = square < 1e-4

@@ -1,120 +1,162 @@
-"""The views of one camera, and what a lens model may claim on them."""
+"""Views of a board by one camera: their least-squares problems, and where the lens must be regular."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Self
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
-from kcal.calibrate.bundle.parameters import Free, Rules
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
+from kcal.calibrate.bundle.parameters import FreeParameters, ParameterConstraints
 from kcal.calibrate.bundle.priors import Term
 from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names, project_components
-from kcal.solve.result import State
+from kcal.lens.residual import Field
+from kcal.solve.robust import RobustLoss
 
-# How far beyond the outermost point a lens must be regular; the image's corners move a little with the lens.
+# Noise of a corner (pixels) that is assumed at least, where data are exact.
+LEAST_NOISE = 1e-3
+# A lens must be regular this far beyond the outermost point; the image's corners move a little with the lens.
 _MARGIN = 1.05
-# Where `Views.trouble` looks: directions of the disc, points of each side of the image, steps from the axis outward.
+# Where `CameraViews.fold_penalty` looks: directions of the disc, points per side of the image, steps from the axis.
 _DIRECTIONS, _SIDE, _STEPS = 16, 8, 250
+# Stretches in which the image's border is unprojected: Newton's method from afar may leave a strongly distorting lens.
 _SHARES = (0.5, 0.8, 1.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Views:
-    """What a ladder is climbed on.
+    """Views of a board by one camera.
 
     Args:
         board_points: (N, 3) meters.
-        pixels: (V, 1, N, 2) of one camera, NaN where not seen.
-        size: (width, height) of the image.
+        pixels: (..., V, N, 2), NaN where not seen.
+        whitening: (..., V, N, 2, 2) weights of the corners, or None: all count alike.
+        loss: a robust loss, or None.
         free_warp: whether the board's warp is estimated.
-        rules: what is known of the camera's parameters.
-        prior_noise: pixels of a corner's noise, against which priors count.
     """
 
     board_points: Tensor
     pixels: Tensor
-    size: tuple[int, int]
-    free_warp: bool
-    rules: Rules = dataclasses.field(default_factory=Rules)
-    prior_noise: float = 0.3
+    whitening: Tensor | None = None
+    loss: RobustLoss | None = None
+    free_warp: bool = False
 
     def problem(
-        self, model: LensModel, batch: tuple[int, ...] = (), terms: Sequence[Term] = (), *, poses_only: bool = False
+        self,
+        model: LensModel,
+        free: Sequence[int] | FreeParameters = (),
+        *,
+        terms: Sequence[Term] = (),
+        field: Field | None = None,
+        batch: tuple[int, ...] = (),
     ) -> BoardProblem:
-        """The least-squares problem of one lens model, or of the poses (and the warp) under a given lens."""
-        free = Free((), ()) if poses_only else self.rules.parameters(model)
-        terms = (*terms, *self.rules.terms(model, self.prior_noise))
+        """The least-squares problem of these views; without free parameters, of the poses (and the warp) alone."""
         return BoardProblem(
-            self.board_points, self.pixels, [model], [free], free_warp=self.free_warp, terms=terms, batch=batch
+            self.board_points,
+            self.pixels,
+            model,
+            free,
+            free_warp=self.free_warp,
+            whitening=self.whitening,
+            loss=self.loss,
+            terms=terms,
+            field=field,
+            batch=batch,
         )
 
-    def seen_radius(self, state: State) -> float:
-        """Radius on the plane z = 1 around all corners that were seen, with a margin."""
-        return _MARGIN * float(self.observed_radius(state))
-
-    def regular_radius(self, state: State, model: LensModel) -> float:
-        """Likewise around the whole image, if the lens reaches it."""
-        rim = _rim(state[0], model, self.size)
-        return self.seen_radius(state) if rim is None else max(self.seen_radius(state), _MARGIN * rim)
-
-    def noise(self, state: State, model: LensModel) -> float:
-        """Standard deviation (pixels) of the residuals along an axis."""
-        problem = BoardProblem(self.board_points, self.pixels, [model], [()])
-        return math.sqrt(2.0 * float(problem.cost(state)) / problem.residual_count)
+    def some(self, chosen: Sequence[int] | Tensor) -> Self:
+        """Some of the views, in that order."""
+        weights = None if self.whitening is None else self.whitening[chosen]
+        return dataclasses.replace(self, pixels=self.pixels[chosen], whitening=weights)
 
     @property
     def corner_count(self) -> int:
         """How many corners were seen."""
         return int(torch.isfinite(self.pixels).all(-1).sum())
 
-    def rms(self, state: State, model: LensModel) -> float:
-        """Root mean square distance (pixels) between corners and their projections."""
+    def noise(self, state: BoardState, model: LensModel) -> float:
+        """Standard deviation (pixels) of the residuals along an axis."""
         problem = self.problem(model)
+        return math.sqrt(2.0 * float(problem.cost(state)) / problem.residual_count)
+
+    def observed_radius(self, state: BoardState) -> float:
+        """Largest undistorted radius at which a corner was seen."""
+        points = self.board_points @ state.rotation.transpose(-1, -2) + state.translation[..., None, :]
+        radius = torch.linalg.vector_norm(points[..., :2] / points[..., 2:], dim=-1)
+        return float(torch.where(torch.isfinite(self.pixels).all(-1), radius, 0.0).max())
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CameraViews(Views):
+    """Views with what is known about the camera, for the search of its lens.
+
+    Args:
+        size: (width, height) of the image.
+        constraints: what is known about the camera's parameters.
+        prior_noise: pixels of a corner's noise, in proportion to which priors count.
+    """
+
+    size: tuple[int, int]
+    constraints: ParameterConstraints = dataclasses.field(default_factory=ParameterConstraints)
+    prior_noise: float = 0.3
+
+    def lens_problem(self, model: LensModel, batch: tuple[int, ...] = (), terms: Sequence[Term] = ()) -> BoardProblem:
+        """The least-squares problem of a lens model under the constraints, with their priors."""
+        terms = (*terms, *self.prior_terms(model))
+        return self.problem(model, self.constraints.free_parameters(model), terms=terms, batch=batch)
+
+    def prior_terms(self, model: LensModel) -> tuple[Term, ...]:
+        """The priors of the constraints."""
+        return self.constraints.terms(model, self.prior_noise)
+
+    def with_noise_of(self, state: BoardState, model: LensModel) -> CameraViews:
+        """The same with priors in proportion to the noise of a solution."""
+        return dataclasses.replace(self, prior_noise=max(self.noise(state, model), LEAST_NOISE))
+
+    def rms(self, state: BoardState, model: LensModel) -> float:
+        """Root mean square distance (pixels) between corners and their projections, priors included."""
+        problem = self.lens_problem(model)
         return math.sqrt(4.0 * float(problem.cost(state)) / problem.residual_count)
 
-    def observed_radius(self, state: State) -> Tensor:
-        """Largest undistorted radius at which a corner was seen."""
-        *_, rotation, translation = state
-        points = self.board_points @ rotation.transpose(-1, -2) + translation[..., None, :]
-        radius = torch.linalg.vector_norm(points[..., :2] / points[..., 2:], dim=-1)
-        seen = torch.isfinite(self.pixels[:, 0]).all(-1)
-        return torch.where(seen, radius, 0.0).max()
+    def seen_radius(self, state: BoardState) -> float:
+        """Radius on the plane z = 1 around all corners that were seen, with a margin."""
+        return _MARGIN * self.observed_radius(state)
 
-    def trouble(self, state: State, model: LensModel) -> float:
+    def regular_radius(self, state: BoardState, model: LensModel) -> float:
+        """Likewise around the whole image, if the lens reaches it."""
+        border = _border(state.parameters, model, self.size)
+        seen = self.seen_radius(state)
+        return seen if border is None else max(seen, _MARGIN * float(torch.hypot(*border).max()))
+
+    def fold_penalty(self, state: BoardState, model: LensModel) -> float:
         """0 for a lens that is regular in the whole image, 1 if it folds outside the observed radius, else infinity.
 
-        Looked at along some directions, in small steps: candidates of a search are many, and the one that is chosen
-        is measured (`kcal.lens.region`) when its camera is made.
+        Checked along some directions, in small steps, because a search has many candidates. The chosen lens is checked
+        in full (`kcal.lens.region`) when its camera is made.
         """
         angle = torch.arange(_DIRECTIONS, dtype=torch.float64) * (2.0 * math.pi / _DIRECTIONS)
-        disc = float(self.observed_radius(state)) * torch.stack([torch.cos(angle), torch.sin(angle)])
-        if not _regular_up_to(disc, state[0], model):
+        disc = self.observed_radius(state) * torch.stack([torch.cos(angle), torch.sin(angle)])
+        if not _regular_up_to(disc, state.parameters, model):
             return math.inf
-        border = _border(state[0], model, self.size)
-        return 0.0 if border is not None and _regular_up_to(border, state[0], model) else 1.0
+        border = _border(state.parameters, model, self.size)
+        return 0.0 if border is not None and _regular_up_to(border, state.parameters, model) else 1.0
 
 
 def _regular_up_to(ends: Tensor, parameters: Tensor, model: LensModel) -> bool:
-    """Whether a lens is regular on the straight ways from the axis to points (2, K) of the plane z = 1."""
+    """Whether a lens is regular on the straight lines from the axis to points (2, K) of the plane z = 1."""
     steps = torch.linspace(0.0, 1.0, _STEPS + 1, dtype=torch.float64)[1:]
     places = (ends[..., None] * steps).flatten(1)
     points = torch.cat([places, torch.ones_like(places[:1])])
     return bool(project_components(points, parameters, model).regular.all())
 
 
-def _rim(parameters: Tensor, model: LensModel, size: tuple[int, int]) -> float | None:
-    """Largest radius on the plane z = 1 that the image's border shows; None where the lens does not reach it."""
-    border = _border(parameters, model, size)
-    return None if border is None else float(torch.hypot(*border).max())
-
-
 def _border(parameters: Tensor, model: LensModel, size: tuple[int, int]) -> Tensor | None:
-    """Places (2, K) on the plane z = 1 that the image's border shows; None where the lens does not reach all of it."""
+    """Points (2, K) on the plane z = 1 that the image's border shows; None where the lens does not reach all of it."""
     t = torch.linspace(0.0, 1.0, _SIDE + 1, dtype=torch.float64)[:-1]
     zero, one = torch.zeros_like(t), torch.ones_like(t)
     u, v = torch.cat([t, one, 1.0 - t, zero]), torch.cat([zero, t, one, 1.0 - t])
@@ -122,7 +164,6 @@ def _border(parameters: Tensor, model: LensModel, size: tuple[int, int]) -> Tens
     center = torch.stack([parameters[2], parameters[3]])[:, None]
     x, y = _SHARES[0] * (border - center) / torch.stack([parameters[0], parameters[1]])[:, None]
     for share in _SHARES:
-        # Outward in stretches, because Newton's steps from afar may leave a strongly distorting lens.
         wanted = center + share * (border - center)
         for _ in range(12):
             seen = project_components(torch.stack([x, y, torch.ones_like(x)]), parameters, model, ())

@@ -1,4 +1,4 @@
-"""From the covariances of corners to the weights of their residuals."""
+"""Weights of residuals, from the covariances of corners."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from torch import Tensor
 def whitening(covariances: Tensor, variance: float) -> Tensor:
     """Matrices that make residuals of unequal corners equally uncertain.
 
-    What is left after a calibration is more than the noise of the corners: boards are not flat and lenses not exactly
-    their models. So the same variance is added to every corner, as much as the residuals have beyond what their
-    covariances predict: where corners are the smaller error, all count nearly alike. Scaled to a mean information of
-    one, so that weighted residuals remain pixels.
+    Residuals of a calibration contain more than the noise of the corners: boards are not flat and lenses differ from
+    their models. So the same variance is added to every corner, as much as the residuals have beyond what the
+    covariances predict; where the corners' noise is the smaller error, all count nearly alike. The scale is chosen for
+    a mean information of one, so that weighted residuals remain pixels.
 
     Args:
         covariances: (..., N, 2, 2) px²; NaN where a corner was not seen.

@@ -1,4 +1,4 @@
-"""Calibration as a layer of a network: corners in, a camera out, and gradients through the solution."""
+"""Calibration as a layer of a network: from corners to a camera, with gradients through the solution."""
 
 from __future__ import annotations
 
@@ -9,26 +9,25 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from kcal.calibrate.bundle.batching import alone
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior, is_overparameterized
-from kcal.calibrate.bundle.priors import Prior, Term
+from kcal.calibrate.bundle.priors import GaussianPrior, Term
 from kcal.calibrate.bundle.views import Views
-from kcal.calibrate.camera.exact_minimum import RecordedProblem, settle
+from kcal.calibrate.camera.exact_minimum import exact_minimum
 from kcal.calibrate.camera.options import CalibrationOptions
-from kcal.calibrate.camera.solve import solve
+from kcal.calibrate.camera.solve import solve_corners
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names, project_components
 from kcal.solve.implicit import implicit_step
-from kcal.solve.result import State
+from kcal.solve.result import map_state
 
 Backward = Literal["implicit", "unroll", "none"]
 
 # Steps that are recorded by backward="unroll"; each multiplies the error of the derivative by the share of the
-# curvature that Gauss and Newton leave out.
+# curvature that the Gauss-Newton approximation omits.
 _UNROLLED = 8
 
 
@@ -70,35 +69,10 @@ class CalibratedViews:
         """The camera, out of the graph."""
         return Camera(self.parameters.detach(), size=self.size, model=self.model)
 
-    def state(self) -> State:
-        """As the solver's tuple, out of the graph."""
-        none = self.parameters.new_zeros(0, 3, 3), self.parameters.new_zeros(0, 3)
+    def state(self) -> BoardState:
+        """As a state of `BoardProblem`, out of the graph."""
         pose = self.cam_from_board_rotation, self.cam_from_board_translation
-        return tuple(tensor.detach() for tensor in (self.parameters, self.board_warp, *none, *pose))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Board:
-    points: Tensor
-
-
-@dataclasses.dataclass(frozen=True)
-class _Corners:
-    """What `kcal.calibrate.camera.solve.solve` asks of observations."""
-
-    board: _Board
-    image_size: tuple[int, int]
-    corners: Tensor
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(f"view {i}" for i in range(len(self.corners)))
-
-    def pixels(self) -> Tensor:
-        return self.corners
-
-    def covariances(self) -> Tensor | None:
-        return None
+        return map_state(torch.detach, BoardState(self.parameters, self.board_warp, *pose))
 
 
 def calibrate_views(
@@ -118,32 +92,31 @@ def calibrate_views(
     The solution x minimizes c(x) = ½ Σ ρ(‖projected - observed‖²) + ½ Σ (corner_sigma / σ_k)² (x_k - mean_k)², where
     all corners count alike; a weak prior adds such terms for the coefficients, for the outermost corner that the search
     found. "implicit" differentiates the condition ∂c/∂x = 0: dx/dd = -H⁻¹ ∂²c/∂x∂d with the exact Hessian H of c,
-    residuals' curvature and robust loss counted, in the blocks of the Schur complement (work and memory grow linearly
-    with the views; nothing is computed before a gradient is asked for). "unroll" records eight steps of Gauss and
-    Newton at the solution: the same derivatives but for what such steps leave, and of any order. "none" carries no
-    gradient.
+    which includes the curvature of residuals and of the robust loss, in the blocks of the Schur complement. Work and
+    memory grow linearly with the views, and nothing is computed before a gradient is requested. "unroll" records eight
+    Gauss-Newton steps at the solution: nearly the same derivatives, and of any order. "none" carries no gradient.
 
     Args:
         pixels: (V, N, 2) corners; NaN where not seen.
         board_points: (N, 3) meters, in the order of the corners, near the plane z = 0. A board's warp is as wide as
             its outermost corners; where several tie, they share the derivative of that width.
         size: (width, height) of the image in pixels.
-        options: as for `calibrate_camera`; `reject` is refused, because what is left out is no continuous choice.
+        options: as for `calibrate_camera`; `reject` is refused, because leaving out corners is not continuous.
         mask: (V, N) bool, which corners count; None: those that are finite.
         prior_means: (Q,) in the order of `options.priors`, in place of their means.
         corner_sigma: pixels of a corner's noise along an axis, against which priors count. Given, not measured, so
             that the cost is a function of the data alone.
-        start: an earlier solution of nearly the same data, in place of the search: for training loops. It stays in that
-            solution's minimum.
+        start: an earlier solution of nearly the same data, in place of the search, for training loops. The result is
+            the minimum next to it.
         backward: see above.
 
     Returns:
-        The camera and the poses. Values do not depend on `backward`, but for rounding.
+        The camera and the poses. Apart from rounding, values do not depend on `backward`.
 
     Raises:
         InputError: wrong shapes or values.
-        DegenerateError: too few views, or data that do not determine a parameter, for which no derivative exists: a
-            flat valley, a saddle, a bound. Fix parameters, choose a smaller model, or add priors.
+        DegenerateError: too few views, or no derivative, because the data do not determine a parameter, or because the
+            solution is a saddle or at a barrier. Fix parameters, choose a smaller model, or add priors.
 
     Example:
         >>> from kcal.corners.board import Board
@@ -161,44 +134,37 @@ def calibrate_views(
     """
     options = options or CalibrationOptions()
     pixels, board_points, means = _checked(pixels, board_points, options, mask, prior_means, corner_sigma, backward)
-    rules = options.rules(size)
+    constraints = options.constraints(size)
     known = [parameter_names(options.lens).index(name) for name in options.priors]
     weights = torch.tensor([corner_sigma / sigma for _, sigma in options.priors.values()], dtype=torch.float64)
 
-    def problem_of(values: Sequence[Tensor], kind: type[BoardProblem] = BoardProblem) -> BoardProblem:
+    def problem_of(values: Sequence[Tensor]) -> BoardProblem:
         corners, board, mean = values
-        terms: list[Term] = [Prior(torch.tensor(known), mean, weights)] if known else []
+        terms: list[Term] = [GaussianPrior(torch.tensor(known), mean, weights)] if known else []
         if options.weak_prior is not None and options.camera is None and is_overparameterized(options.lens):
-            mild = CoefficientPrior(options.weak_prior, reach)
-            terms.append(mild.prior(options.lens, corner_sigma, {*options.fixed, *options.priors}))
-        return kind(
-            board,
-            corners[:, None],
-            [options.lens],
-            [rules.parameters(options.lens)],
-            free_warp=options.board_warp,
-            loss=options.loss,
-            terms=terms,
-        )
+            prior = CoefficientPrior(options.weak_prior, reach)
+            terms.append(prior.term(options.lens, corner_sigma, {*options.fixed, *options.priors}))
+        views = Views(board_points=board, pixels=corners, loss=options.loss, free_warp=options.board_warp)
+        return views.problem(options.lens, constraints.free_parameters(options.lens), terms=terms)
 
     data = (pixels, board_points, means)
     fixed = tuple(tensor.detach() for tensor in data)
     if start is None:
-        corners = _Corners(_Board(fixed[1]), size, fixed[0])
         priors = {n: (float(m), s) for (n, (_, s)), m in zip(options.priors.items(), fixed[2], strict=True)}
-        begin = alone(solve(corners, dataclasses.replace(options, priors=priors), lambda _: None)).result.state
-        reach = _reach(begin, fixed[1], fixed[0])
+        changed = dataclasses.replace(options, priors=priors)
+        begin = solve_corners(fixed[1], fixed[0], size, changed, lambda _: None).result.state
+        reach = Views(board_points=fixed[1], pixels=fixed[0]).observed_radius(begin)
     else:
         begin, reach = start.state(), start.reach
-        if start.model != options.lens or len(begin[-1]) != len(pixels):
+        if start.model != options.lens or len(begin.translation) != len(pixels):
             raise InputError("calibrate_views: the start is of another lens model or another number of views")
     problem = problem_of(fixed)
-    state, found = settle(problem, problem.tidy(begin))
+    state, found = exact_minimum(problem, problem.tidy(begin))
 
     if backward == "unroll":
-        recorded = problem_of(data, RecordedProblem)
+        recorded = problem_of(data)
         for _ in range(_UNROLLED):
-            step, _ = recorded.linearize(state).step(state[0].new_zeros(()))
+            step, _ = recorded.linearize(state).step(state.parameters.new_zeros(()))
             state = recorded.retract(state, step)
     elif backward == "implicit" and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in data):
         here = state
@@ -209,11 +175,11 @@ def calibrate_views(
         state = problem.retract(state, implicit_step(cost, found, data))
     at = problem if backward == "none" else problem_of(data)
     return CalibratedViews(
-        parameters=state[0],
-        board_warp=state[1],
-        cam_from_board_rotation=state[-2],
-        cam_from_board_translation=state[-1],
-        residuals=at.pixel_errors(state)[:, 0].transpose(-1, -2),
+        parameters=state.parameters,
+        board_warp=state.warp,
+        cam_from_board_rotation=state.rotation,
+        cam_from_board_translation=state.translation,
+        residuals=at.pixel_errors(state).transpose(-1, -2),
         model=options.lens,
         size=size,
         reach=reach,
@@ -280,12 +246,6 @@ class CalibrationLayer(nn.Module):
         return f"size={self.size}, model={self.options.lens}, backward={self.backward}"
 
 
-def _reach(state: State, board_points: Tensor, pixels: Tensor) -> float:
-    """Largest undistorted radius at which a corner was seen."""
-    no_rules = Views(board_points=board_points, pixels=pixels[:, None], size=(1, 1), free_warp=False)
-    return float(no_rules.observed_radius(state))
-
-
 def _checked(
     pixels: Tensor,
     board_points: Tensor,
@@ -295,11 +255,11 @@ def _checked(
     corner_sigma: float,
     backward: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Corners (NaN where they do not count), board points and means of priors as float64."""
+    """Corners (NaN where they do not count), board points and prior means as float64."""
     if backward not in ("implicit", "unroll", "none"):
         raise InputError(f"calibrate_views: backward must be implicit, unroll or none, got {backward!r}")
     if options.reject is not None:
-        raise InputError("calibrate_views: leaving corners out is no continuous choice; use a robust loss, or a mask")
+        raise InputError("calibrate_views: `reject` is not continuous; use a robust loss or a mask")
     if not 0 < corner_sigma < float("inf"):
         raise InputError(f"calibrate_views: corner_sigma must be positive pixels, got {corner_sigma}")
     pixels, board_points = as_points("pixels", pixels, 2), as_points("board_points", board_points, 3)
@@ -313,7 +273,7 @@ def _checked(
         if mask.shape != pixels.shape[:-1] or mask.dtype != torch.bool:
             raise InputError(f"calibrate_views: the mask must be bool {tuple(pixels.shape[:-1])}")
         if not bool(torch.isfinite(pixels[mask]).all()):
-            raise InputError("calibrate_views: the mask lets corners count that are not finite")
+            raise InputError("calibrate_views: the mask includes corners that are not finite")
         pixels = torch.where(mask[..., None], pixels, torch.nan)
     if prior_means is None:
         prior_means = torch.tensor([mean for mean, _ in options.priors.values()], dtype=torch.float64)

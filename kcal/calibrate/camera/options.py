@@ -1,4 +1,4 @@
-"""What the calibration of a camera is asked for, and what it answers."""
+"""Options of a camera's calibration."""
 
 from __future__ import annotations
 
@@ -6,17 +6,28 @@ import dataclasses
 import math
 from collections.abc import Mapping
 
-import torch
-from torch import Tensor
-
-from kcal.calibrate.bundle.parameters import Rules, natural_value
-from kcal.calibrate.camera.outliers import OutlierRejection, RejectedCorner, RejectedView
+from kcal.calibrate.bundle.parameters import ParameterConstraints, natural_value
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Status
 from kcal.solve.robust import RobustLoss
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OutlierRejection:
+    """Leave out corners and views that noise cannot explain.
+
+    Args:
+        limit: greatest share of all corners that may be left out, those of left-out views included. Beyond it the
+            calibration is refused, because the data or the model are wrong as a whole.
+    """
+
+    limit: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not 0 < self.limit < 0.5:
+            raise InputError(f"OutlierRejection: limit must be between 0 and 0.5, got {self.limit}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,32 +37,29 @@ class CalibrationOptions:
     Args:
         model: lens model, by name or as a `LensModel`.
         board_warp: estimate how the board bends (two more parameters).
-        weighted: let corners count by their covariances where all views have them (`kcal.calibrate.bundle.weights`);
+        weighted: weight corners by their covariances where all views have them (`kcal.calibrate.bundle.weights`);
             False minimizes the plain RMS, as OpenCV does.
         loss: a robust loss of each corner's residual in pixels, for data with wrong corners, or None. It is used after
-            a plain solution has been found; a scale of some three times the noise is good.
+            a plain solution has been found; choose a scale of about three times the noise.
         reject: leave out corners, then views, that noise cannot explain (`kcal.calibrate.camera.outliers`), and list
-            them; or None, the default: every corner counts, because a calibration that quietly picks its data reports
-            an RMS that cannot be compared with any other, and because what stands out is often the model's fault. A
-            warning then tells that corners stand out.
+            them. None, the default: every corner counts, and a warning reports outliers. A calibration that quietly
+            selects its data has an RMS that cannot be compared with others, and outliers are often the model's fault.
         focal: roughly known focal length in pixels (from EXIF or the field of view), tried first as a start, or None.
         field_of_view: likewise as the image's horizontal field of view in degrees, below 180.
         fixed: parameters held at a value, by name; None as the value means the image's center for cx and cy, and 0 for
             skew and coefficients.
         tied: groups of names whose values are kept equal, as (("fx", "fy"),).
         free: names that are estimated although they are held by default: "skew".
-        priors: Gaussian knowledge by name, as {"fx": (1600, 5)}: mean and standard deviation. It counts against the
-            corners by their noise, which is taken from the residuals.
-        weak_prior: how far a rich lens (with a denominator, prism or tilt) is expected to be from a pinhole: every
-            coefficient gets the mean zero and the standard deviation with which its term would shift the outermost
-            corner by this share of its radius (by a thirtieth of it for decentering, prism and tilt;
-            `kcal.calibrate.bundle.coefficient_prior`). 0.3 hardly changes what the views tell, and keeps rich models
-            from what they do not
-            tell: one minimum, found fast, with a σ that holds (docs/measured/solver.md has figures). None, the default:
-                the
-            corners alone decide, as in OpenCV, and their minima are searched for the lowest.
-        camera: a known camera: all its parameters are held but those that `free` names, and only the board's poses (and
-            its warp) are found, from one view on. Its lens model takes the place of `model`.
+        priors: Gaussian priors by name, as {"fx": (1600, 5)}: mean and standard deviation. They count in proportion to
+            the corners' noise, which is estimated from the residuals.
+        weak_prior: how far a rich lens (with a denominator, prism or tilt) is expected to be from a pinhole. Every
+            coefficient gets a prior with mean zero, and with the standard deviation at which its term would shift the
+            outermost corner by this share of its radius (a thirtieth of it for decentering, prism and tilt;
+            `kcal.calibrate.bundle.coefficient_prior`). 0.3 hardly changes what the views determine, and leaves rich
+            models a single minimum, found quickly, with a reliable σ (docs/measured/solver.md has figures). None, the
+            default: the corners alone decide, as in OpenCV, and the lowest of their minima is searched for.
+        camera: a known camera, whose parameters are held except those that `free` names. Only the board's poses (and
+            its warp) are found; one view is enough. Its lens model takes the place of `model`.
         solver: options of the Levenberg-Marquardt solver.
     """
 
@@ -78,15 +86,17 @@ class CalibrationOptions:
         if self.field_of_view is not None and not 0 < self.field_of_view < 180:
             raise InputError(f"CalibrationOptions: field_of_view must be in (0, 180) degrees, got {self.field_of_view}")
         if self.focal is not None and self.field_of_view is not None:
-            raise InputError("CalibrationOptions: focal and field_of_view say the same; give one")
+            raise InputError("CalibrationOptions: focal and field_of_view are alternatives; give one")
         if self.weak_prior is not None and not 0 < self.weak_prior < float("inf"):
             raise InputError(f"CalibrationOptions: weak_prior must be positive, got {self.weak_prior}")
         if self.camera is not None and self.camera.field is not None:
             raise InputError("CalibrationOptions: a known camera must be parametric, this one has a residual field")
         if self.camera is not None and (self.fixed or self.focal is not None or self.field_of_view is not None):
-            raise InputError("CalibrationOptions: a known camera fixes all parameters; name those to free instead")
+            raise InputError(
+                "CalibrationOptions: a known camera fixes all parameters; name those to estimate in `free` instead"
+            )
         fixed = self._of_camera() or {name: 1.0 if value is None else value for name, value in self.fixed.items()}
-        Rules(fixed=fixed, tied=self.tied, free=self.free, priors=self.priors).check(self.lens)
+        self._constraints(fixed).check(self.lens)
 
     @property
     def lens(self) -> LensModel:
@@ -94,77 +104,24 @@ class CalibrationOptions:
         return LensModel.named(self.model) if self.camera is None else self.camera.model
 
     def _of_camera(self) -> dict[str, float]:
-        """What the known camera fixes."""
+        """The parameters that the known camera fixes."""
         if self.camera is None:
             return {}
         values = self.camera.params.detach().tolist()
         return {n: value for n, value in zip(self.camera.names, values, strict=True) if n not in self.free}
 
-    def rules(self, size: tuple[int, int]) -> Rules:
-        """What is said of the parameters, for an image of (width, height)."""
-        values = self._of_camera() or {
-            n: natural_value(n, size) if value is None else float(value) for n, value in self.fixed.items()
-        }
-        return Rules(fixed=values, tied=self.tied, free=self.free, priors=self.priors)
+    def _constraints(self, fixed: Mapping[str, float]) -> ParameterConstraints:
+        return ParameterConstraints(fixed=fixed, tied=self.tied, free=self.free, priors=self.priors)
+
+    def constraints(self, size: tuple[int, int]) -> ParameterConstraints:
+        """What is known about the parameters, for an image of (width, height)."""
+        return self._constraints(
+            self._of_camera()
+            or {n: natural_value(n, size) if value is None else float(value) for n, value in self.fixed.items()}
+        )
 
     def start_focal(self, size: tuple[int, int]) -> float | None:
-        """The focal length to begin with, if one is hinted at."""
+        """The focal length to begin with, if one is given."""
         if self.field_of_view is None:
             return self.focal
         return 0.5 * size[0] / math.tan(0.5 * math.radians(self.field_of_view))
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CameraCalibrationResult:
-    """A calibrated camera and what it rests on.
-
-    Args:
-        camera: the camera.
-        rms: sqrt(mean ‖r‖²) over all corners, pixels (Eq. 5), plain also where the corners were weighted.
-        weighted_rms: likewise of what was minimized, by the corners' weights and under the robust loss; None where all
-            corners counted alike.
-        per_view_rms: (V,) likewise for each view, in the order of the observations; NaN for a view that was left out.
-        residuals: (V, N, 2) projected minus observed, pixels; NaN where a corner was not seen or was left out.
-        cam_from_board_rotation: (V, 3, 3); NaN for a view that was left out.
-        cam_from_board_translation: (V, 3) meters; likewise.
-        board_warp: (2,) meters of bend along x and y, or None if not estimated.
-        sigma: name -> standard deviation of each parameter, priors counted; None where the data do not determine it and
-            where it was fixed; all None, with a warning, where it cannot be computed. Skew is listed only if the
-            options name it.
-        covariance: (5 + P, 5 + P) of all parameters in the order of `Camera.names`, poses free: of σ, the square in its
-            diagonal. Zero for what was held; what the data leave open has a large variance, which rounding alone limits
-            (σ is None there). NaN, but for what was held, where it cannot be computed.
-        status: why the solver stopped.
-        iterations: trial steps of the solver, all starts and models together.
-        warnings: sentences about what the user should doubt.
-        fixed: names of the parameters that the options held.
-        led_by_prior: names of the parameters of which a prior knows more than the views do: without it their σ would be
-            more than 1.4 times as large.
-        rejected_corners: corners of the views that were used, left out by `CalibrationOptions.reject`.
-        rejected_views: views left out likewise.
-    """
-
-    camera: Camera
-    rms: float
-    weighted_rms: float | None
-    per_view_rms: Tensor
-    residuals: Tensor
-    cam_from_board_rotation: Tensor
-    cam_from_board_translation: Tensor
-    board_warp: Tensor | None
-    sigma: dict[str, float | None]
-    covariance: Tensor
-    status: Status
-    iterations: int
-    warnings: tuple[str, ...]
-    fixed: tuple[str, ...] = ()
-    led_by_prior: tuple[str, ...] = ()
-    rejected_corners: tuple[RejectedCorner, ...] = ()
-    rejected_views: tuple[RejectedView, ...] = ()
-
-    @property
-    def rejected_share(self) -> float:
-        """Share of all corners that was left out, those of left-out views counted."""
-        gone = len(self.rejected_corners) + sum(view.corners for view in self.rejected_views)
-        used = int(torch.isfinite(self.residuals).all(-1).sum())
-        return gone / (gone + used)

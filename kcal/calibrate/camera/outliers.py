@@ -1,4 +1,4 @@
-"""Corners and views that noise cannot explain: found, listed, and left out where the user asks for it."""
+"""Find corners and views that noise cannot explain, and solve without them."""
 
 from __future__ import annotations
 
@@ -9,70 +9,155 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kcal.calibrate.bundle.batching import minimize
 from kcal.calibrate.bundle.closed_form import spread_out
+from kcal.calibrate.bundle.views import LEAST_NOISE
+from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection
+from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
+from kcal.calibrate.camera.solve import Solution, solve
+from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
+from kcal.solve.lm import LMOptions
+from kcal.solve.result import SolverStatus
+from kcal.solve.robust import RobustLoss
 
-# How many good corners of a whole calibration may be expected beyond the limit, were their noise normal.
+# Expected number of good corners beyond the limit in a whole calibration, for normal noise.
 _FALSE_CORNERS = 0.01
 # The median of |x| of a normal variable is its standard deviation over this.
 _MAD = 1.4826
-# Pixels; where data are exact, a thousandth of a pixel counts as their noise.
-_LEAST_NOISE = 1e-3
-# A view stands out by this many times the typical RMS, and by this many robust standard deviations of all views' RMS.
+# An outlying view has this many times the typical RMS, and is this many robust standard deviations above it.
 _TIMES_TYPICAL, _VIEW_DEVIATIONS = 3.0, 5.0
-_MINIMUM_CORNERS = 6
-_MINIMUM_KEPT = 0.5
+# A view is left out whole if fewer of its corners are kept, as a number or as a share.
+_MINIMUM_CORNERS, _MINIMUM_KEPT = 6, 0.5
+# To tell which corners are wrong: a loss that a few of them cannot spoil, its scale in units of the noise.
+_ROUGH = LMOptions(max_iterations=40, tolerance=1e-8)
+_CAUCHY_SCALE, _CAUCHY_ROUNDS = 3.0, 4
+# Largest number of calibrations; two are the rule.
+_ROUNDS = 5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class OutlierRejection:
-    """How much `calibrate_camera` may leave out when it is asked to leave out what noise cannot explain.
+class Inliers:
+    """What is left of observations, and its solution.
 
     Args:
-        limit: greatest share of all corners, those of left-out views counted. Beyond it nothing is left out: the
-            calibration is refused, because data or model are wrong as a whole.
+        observations: without outliers.
+        solution: of these.
+        views: indices of the views that are left.
+        rejected_corners: of these views.
+        rejected_views: the others.
     """
 
-    limit: float = 0.1
+    observations: Observations
+    solution: Solution
+    views: list[int]
+    rejected_corners: tuple[RejectedCorner, ...]
+    rejected_views: tuple[RejectedView, ...]
 
-    def __post_init__(self) -> None:
-        if not 0 < self.limit < 0.5:
-            raise InputError(f"OutlierRejection: limit must be between 0 and 0.5, got {self.limit}")
+    def complete(self, result: CameraCalibrationResult, observations: Observations) -> CameraCalibrationResult:
+        """A result for these views as one for all observations: NaN for views left out, all rejections listed."""
+
+        def of_all(values: Tensor) -> Tensor:
+            out = values.new_full((len(observations.views), *values.shape[1:]), torch.nan)
+            out[self.views] = values
+            return out
+
+        return dataclasses.replace(
+            result,
+            observations=observations,
+            per_view_rms=of_all(result.per_view_rms),
+            residuals=of_all(result.residuals),
+            cam_from_board_rotation=of_all(result.cam_from_board_rotation),
+            cam_from_board_translation=of_all(result.cam_from_board_translation),
+            rejected_corners=self.rejected_corners,
+            rejected_views=self.rejected_views,
+        )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RejectedCorner:
-    """A corner that was left out.
+def solve_without_outliers(
+    observations: Observations, options: CalibrationOptions, rejection: OutlierRejection, progress: Progress
+) -> Inliers:
+    """Solve, leave out outliers, and solve again until nothing changes.
 
-    Args:
-        view: name of its view.
-        corner: its index on the board.
-        residual: pixels between it and its projection by the camera that was calibrated without it.
-        reason: one sentence.
+    Corners of the remaining views are tested anew in every round, so that one that was rejected beside a worse one can
+    come back. The solution is that of `solve` for what is left.
     """
+    total = int(torch.isfinite(observations.pixels()).all(-1).sum())
+    left = list(range(len(observations.views)))
+    rejected = torch.zeros(len(left), observations.board.corners, dtype=torch.bool)
+    gone: list[RejectedView] = []
+    spent = 0
+    for last in (*[False] * (_ROUNDS - 1), True):
+        used = without(observations, left, rejected)
+        solution = solve(used, options, progress)
+        spent += solution.spent
+        every = without(observations, left, torch.zeros_like(rejected))
+        if last:
+            break
+        residuals, steps = _robust_residuals(every, solution)
+        spent += steps
+        beyond = corners_beyond(residuals)
+        views = views_beyond(observations.board.points, residuals, every.pixels(), beyond)
+        if not views and bool((beyond == rejected).all()):
+            break
+        seen, rms = torch.isfinite(every.pixels()).all(-1), view_rms(residuals, beyond)
+        for i, reason in views.items():
+            corners = int(seen[i].sum())
+            gone.append(RejectedView(view=every.names[i], corners=corners, residual=float(rms[i]), reason=reason))
+        kept = [i for i in range(len(left)) if i not in views]
+        left, rejected = [left[i] for i in kept], beyond[kept]
+        check_share(int(rejected.sum()) + sum(view.corners for view in gone), total, gone, rejection.limit)
+        progress(f"{int(rejected.sum())} corners and {len(gone)} views left out")
+    return Inliers(
+        observations=used,
+        solution=dataclasses.replace(solution, spent=spent),
+        views=left,
+        rejected_corners=_rejected_corners(every, solution, rejected),
+        rejected_views=tuple(gone),
+    )
 
-    view: str
-    corner: int
-    residual: float
-    reason: str
+
+def _rejected_corners(every: Observations, solution: Solution, rejected: Tensor) -> tuple[RejectedCorner, ...]:
+    """Rejected corners (V, N), with their residuals at a solution without them."""
+    problem, state = solution.problem_for(every.pixels(), every.covariances()), solution.result.state
+    plain = problem.pixel_errors(state).norm(dim=-2)
+    weighted = problem.corner_residuals(state, weighted=True)
+    limits = corner_limits(torch.where(rejected[..., None], torch.nan, weighted))
+    return tuple(
+        RejectedCorner(
+            view=every.names[i],
+            corner=n,
+            residual=float(plain[i, n]),
+            reason=f"{float(weighted[i, n].norm()):.2f} px off, noise explains {float(limits[i]):.2f} px"
+            if bool(torch.isfinite(plain[i, n]))
+            else "the lens model does not reach it",
+        )
+        for i, n in rejected.nonzero().tolist()
+    )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RejectedView:
-    """A view that was left out.
+def _robust_residuals(observations: Observations, solution: Solution) -> tuple[Tensor, int]:
+    """Weighted residuals (V, N, 2) of all corners at a solution robust to a few wrong ones, and its trial steps.
 
-    Args:
-        view: its name.
-        corners: how many corners it had.
-        residual: its RMS in pixels when it was last part of the calibration, without corners left out before.
-        reason: one sentence.
+    Infinite where the lens does not reach a corner at all.
     """
-
-    view: str
-    corners: int
-    residual: float
-    reason: str
+    state, spent = solution.result.state, 0
+    whole = solution.problem_for(observations.pixels(), observations.covariances())
+    for _ in range(_CAUCHY_ROUNDS):
+        residuals = whole.corner_residuals(state, weighted=True)
+        reached = torch.isfinite(residuals).all(-1)
+        some = without(observations, range(len(observations.views)), whole.seen & ~reached)
+        scale = max(_CAUCHY_SCALE * float(noise_scale(residuals.flatten(0, 1))), LEAST_NOISE)
+        loss = RobustLoss(kind="cauchy", scale=scale)
+        result = minimize(solution.problem_for(some.pixels(), some.covariances(), loss), state, _ROUGH)
+        spent += int(result.iterations)
+        if result.status == SolverStatus.BAD_START:
+            break
+        state = result.state
+    residuals = whole.corner_residuals(state, weighted=True)
+    unreached = whole.seen & ~torch.isfinite(residuals).all(-1)
+    return torch.where(unreached[..., None], torch.inf, residuals), spent
 
 
 def noise_scale(residuals: Tensor) -> Tensor:
@@ -88,14 +173,14 @@ def noise_scale(residuals: Tensor) -> Tensor:
 
 
 def corner_limits(residuals: Tensor) -> Tensor:
-    """Beyond which length residuals (V, N, 2) of each view stand out: (V,) in their units.
+    """The length (V,) beyond which residuals (V, N, 2) of each view are outliers.
 
     Two normal components of standard deviation σ are longer than t σ with probability exp(-t² / 2). With
-    t = √(2 ln(n / 0.01)) of n corners a hundredth is expected beyond the limit, at any n. σ is 1.4826 times the median
-    of |residual|, of the view or of all views, whichever is larger: views of unequal sharpness keep their corners.
+    t = √(2 ln(n / 0.01)), 0.01 of n corners are expected beyond the limit, for any n. σ is 1.4826 times the median of
+    |residual| of the view or of all views, whichever is larger, so that blurred views keep their corners.
     """
     count = max(int(torch.isfinite(residuals).all(-1).sum()), 1)
-    scale = torch.maximum(noise_scale(residuals), noise_scale(residuals.flatten(0, 1))).clamp_min(_LEAST_NOISE)
+    scale = torch.maximum(noise_scale(residuals), noise_scale(residuals.flatten(0, 1))).clamp_min(LEAST_NOISE)
     return scale * math.sqrt(2.0 * math.log(count / _FALSE_CORNERS))
 
 
@@ -105,7 +190,7 @@ def corners_beyond(residuals: Tensor, times: float = 1.0) -> Tensor:
 
 
 def views_beyond(board_points: Tensor, residuals: Tensor, pixels: Tensor, rejected: Tensor) -> dict[int, str]:
-    """Which views stand out, with the reason.
+    """Which views are outliers, with the reason.
 
     Args:
         board_points: (N, 3).
@@ -119,7 +204,7 @@ def views_beyond(board_points: Tensor, residuals: Tensor, pixels: Tensor, reject
     rms = view_rms(residuals, rejected)
     middle = rms.nanmedian()
     spread = _MAD * (rms - middle).abs().nanmedian()
-    limit = float(torch.maximum(_TIMES_TYPICAL * middle, middle + _VIEW_DEVIATIONS * spread).clamp_min(_LEAST_NOISE))
+    limit = float(torch.maximum(_TIMES_TYPICAL * middle, middle + _VIEW_DEVIATIONS * spread).clamp_min(LEAST_NOISE))
     plane = spread_out(board_points, torch.where(kept[..., None], pixels, torch.nan))
     found: dict[int, str] = {}
     for i in range(len(pixels)):
@@ -128,7 +213,7 @@ def views_beyond(board_points: Tensor, residuals: Tensor, pixels: Tensor, reject
         elif not bool(plane[i]):
             found[i] = "the corners that agree with the other views lie on one line"
         elif float(rms[i]) > limit:
-            found[i] = f"its RMS {float(rms[i]):.2f} px stands out: {float(middle):.2f} px is typical"
+            found[i] = f"its RMS is {float(rms[i]):.2f} px, typical are {float(middle):.2f} px"
     return found
 
 
@@ -165,6 +250,6 @@ def check_share(gone: int, total: int, views: Sequence[RejectedView], limit: flo
     raise InputError(
         f"{gone} of {total} corners ({100 * gone / total:.0f} %)"
         + (f", with the whole views {names}," if views else "")
-        + f" do not agree with the rest, more than the {100 * limit:.0f} % that may be left out: the board, its size, "
-        "the corners' order or the lens model is wrong, or these images are bad; nothing was left out"
+        + f" do not agree with the rest, more than the {100 * limit:.0f} % that may be left out. Check the board, its "
+        "size, the corners' order, the lens model, and these images"
     )

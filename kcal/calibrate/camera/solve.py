@@ -1,210 +1,193 @@
-"""One camera's minimum: closed forms, first model, ladder, weights. What to think of it is told elsewhere."""
+"""Find one camera's minimum: initial model, richer models, priors, weights. `assess` tells how good it is."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.batching import Solve, Steps
-from kcal.calibrate.bundle.board_problem import BoardProblem
-from kcal.calibrate.bundle.closed_form import (
-    spread_out,
-)
+from kcal.calibrate.bundle.batching import minimize
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
+from kcal.calibrate.bundle.closed_form import spread_out
 from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior, is_overparameterized
-from kcal.calibrate.bundle.poses import unflipping
-from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.bundle.poses import unflip
+from kcal.calibrate.bundle.priors import Term
+from kcal.calibrate.bundle.views import CameraViews
 from kcal.calibrate.bundle.weights import whitening
-from kcal.calibrate.camera.initial_model import first_model, posed
+from kcal.calibrate.camera.initial_model import first_model, poses_under
 from kcal.calibrate.camera.options import CalibrationOptions
-from kcal.calibrate.search.direct_solve import step
-from kcal.calibrate.search.model_ladder import LEAST_NOISE, Minimum, Progress, climb, steps_to
+from kcal.calibrate.search.direct_solve import solve_directly
+from kcal.calibrate.search.model_ladder import Minimum, Progress, nested_models, solve_ladder
+from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
+from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Result, Status
+from kcal.solve.result import Result, SolverStatus
 from kcal.solve.robust import RobustLoss
 
 _MINIMUM_VIEWS = 3
 _MINIMUM_CORNERS = 6
-# RMS distance in pixels of a view's corners from the line that fits them best, below which they show no plane.
+# RMS distance in pixels of a view's corners from the best line, below which they do not span a plane.
 _MINIMUM_WIDTH = 0.5
-
-# How often what priors refer to is measured anew, and its relative change from which on that is worth it: of the
-# solution it moves less than 1e-4 standard deviations.
+# Maximum number of times the noise level that weights the priors is re-estimated, and the smallest relative change that
+# is worth it: it moves the solution by less than 1e-4 standard deviations.
 _PRIOR_ROUNDS, _SAME = 5, 1e-4
-# Of a solve that begins next to its solution.
+# For a solve that begins next to its solution.
 _NEAR_DAMPING = 1e-8
-# For a first model from which the last one is reached in one step.
+# For a first model from which the last one is reached directly.
 _ROUGH = LMOptions(max_iterations=100, tolerance=1e-5)
 
 
-class BoardPoints(Protocol):
-    """A board: where its corners lie."""
-
-    @property
-    def points(self) -> Tensor:
-        """(N, 3) meters."""
-        ...
-
-
-class Corners(Protocol):
-    """What is calibrated from: `kcal.corners.observations.Observations`, or tensors."""
-
-    @property
-    def board(self) -> BoardPoints:
-        """The board that was shown."""
-        ...
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """(width, height) pixels."""
-        ...
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the views."""
-        ...
-
-    def pixels(self) -> Tensor:
-        """(V, N, 2), NaN where not seen."""
-        ...
-
-    def covariances(self) -> Tensor | None:
-        """(V, N, 2, 2) px², or None."""
-        ...
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Solved:
-    """A solution for one set of corners, before it is judged."""
+class Solution:
+    """The minimum for one set of corners.
 
-    views: Views
+    Args:
+        views: the corners, all counting alike, and what is known about the camera.
+        problem: the final problem, with weights, loss, priors and barriers.
+        result: its result.
+        minimum: of the search, all corners counting alike.
+        plain_cost: with all corners counting alike.
+        spent: trial steps.
+        variance: of the residuals along an axis when all corners count alike, px²; None where they do.
+    """
+
+    views: CameraViews
     problem: BoardProblem
-    result: Result
+    result: Result[BoardState]
     minimum: Minimum
     plain_cost: float
     spent: int
     variance: float | None
 
+    def problem_for(
+        self,
+        pixels: Tensor,
+        covariances: Tensor | None,
+        loss: RobustLoss | None = None,
+        terms: Sequence[Term] | None = None,
+    ) -> BoardProblem:
+        """The problem of any corners of this camera, with their weights and by default with this solution's terms."""
+        weights = None if covariances is None or self.variance is None else whitening(covariances, self.variance)
+        views = dataclasses.replace(self.views, pixels=pixels, whitening=weights, loss=loss)
+        return views.problem(
+            self.problem.model, self.problem.free, terms=self.minimum.terms if terms is None else terms
+        )
 
-def solve(observations: Corners, options: CalibrationOptions, progress: Progress) -> Steps[Solved]:
-    """Find the minimum for all corners given, as `calibrate_camera` describes it; its errors are raised here."""
-    model = options.lens
-    board = observations.board.points
-    pixels = observations.pixels()
-    rules = options.rules(observations.image_size)
-    fewest = _MINIMUM_VIEWS if options.camera is None else 1
-    _check(observations, pixels, len(rules.parameters(model)), options.board_warp, fewest)
 
-    solver = options.solver
-    mild = options.weak_prior is not None and options.camera is None and is_overparameterized(model)
-    ladder = [lens for lens in steps_to(model) if rules.allows(lens)] if options.camera is None else [model]
-    if options.camera is None:
-        rough = _ROUGH if mild and len(ladder) > 1 else solver
-        first, cold, spent = yield from first_model(board, pixels, observations.image_size, ladder[0], options, rough)
-    else:
-        if options.camera.size != observations.image_size:
-            raise InputError(
-                f"the known camera is of {options.camera.size} px, the observations of {observations.image_size} px"
-            )
-        first = cold = yield from posed(board, pixels, observations.names, options.camera)
-        spent = 0
-    progress(f"start ({ladder[0]})")
-    seen = pixels[:, None]
-    views = Views(
-        board_points=board,
-        pixels=seen,
-        size=observations.image_size,
-        free_warp=options.board_warp,
-        rules=rules,
+def solve(observations: Observations, options: CalibrationOptions, progress: Progress) -> Solution:
+    """Find the minimum for all corners given, as `calibrate_camera` describes it and with its errors."""
+    return solve_corners(
+        observations.board.points,
+        observations.pixels(),
+        observations.image_size,
+        options,
+        progress,
+        covariances=observations.covariances(),
+        names=observations.names,
     )
-    reach = float(views.observed_radius(first))
-    if mild and options.weak_prior is not None:
-        rules = dataclasses.replace(rules, mild=CoefficientPrior(options.weak_prior, reach))
-        views = dataclasses.replace(views, rules=rules)
-    if rules.informed:
-        views = dataclasses.replace(views, prior_noise=max(views.noise(first, ladder[0]), LEAST_NOISE))
+
+
+def solve_corners(
+    board_points: Tensor,
+    pixels: Tensor,
+    size: tuple[int, int],
+    options: CalibrationOptions,
+    progress: Progress,
+    covariances: Tensor | None = None,
+    names: Sequence[str] = (),
+) -> Solution:
+    """As `solve`, for tensors: board points (N, 3), pixels (V, N, 2), covariances (V, N, 2, 2), names of the views."""
+    model, solver = options.lens, options.solver
+    names = names or [f"view {i}" for i in range(len(pixels))]
+    constraints, warp = options.constraints(size), options.board_warp
+    views = CameraViews(board_points=board_points, pixels=pixels, free_warp=warp, size=size, constraints=constraints)
+    _check(views, names, len(constraints.free_parameters(model)), _MINIMUM_VIEWS if options.camera is None else 1)
+
+    weak_prior = options.weak_prior if options.camera is None and is_overparameterized(model) else None
+    if options.camera is None:
+        models = [lens for lens in nested_models(model) if constraints.allows(lens)]
+        rough = _ROUGH if weak_prior is not None and len(models) > 1 else solver
+        first, undistorted, spent = first_model(views, models[0], options.start_focal(size), rough)
+    else:
+        models = [model]
+        first = undistorted = poses_under(options.camera, views, names)
+        spent = 0
+    progress(f"start ({models[0]})")
+    if weak_prior is not None:
+        views = _with_prior(views, CoefficientPrior(weak_prior, views.observed_radius(first)))
+    if views.constraints.has_priors:
+        views = views.with_noise_of(first, models[0])
     minimum = None
-    if rules.mild is not None and len(ladder) > 1:
-        minimum = yield from step(views, first, ladder[0], model, progress)
+    if weak_prior is not None and len(models) > 1:
+        minimum = solve_directly(views, first, models[0], model, progress)
     if minimum is None:
-        minimum = yield from climb(views, first, cold, ladder, solver, progress)
+        minimum = solve_ladder(views, first, undistorted, models, solver, progress)
     spent += minimum.iterations
 
-    # The first model's poses were looked at; look once more under another lens.
     result = minimum.result
-    if result.status == Status.BAD_START:
+    if result.status == SolverStatus.BAD_START:
         raise InputError(
             "the lens cannot show all corners where they are: are all views of this board and this camera?"
         )
-    problem = views.problem(model, terms=minimum.terms)
-    if len(ladder) > 1:
-        state, flipped = yield from unflipping(board, seen, [model], result.state)
+    problem = views.lens_problem(model, terms=minimum.terms)
+    if len(models) > 1:
+        # Under the first model poses were checked already; under another lens they are checked once more.
+        state, flipped = unflip(views, model, result.state)
         if flipped:
-            result = yield Solve(problem, state, solver)
+            result = minimize(problem, state, solver)
             spent += int(result.iterations)
-    if rules.informed:
-        # The noise, against which priors count, is that of this solution, and so is the outermost corner.
-        for turn in range(_PRIOR_ROUNDS):
-            noise = max(views.noise(result.state, model), LEAST_NOISE)
-            reach = float(views.observed_radius(result.state))
-            known = rules.mild is None or abs(reach - rules.mild.reach) <= _SAME * reach
-            if turn and known and abs(noise - views.prior_noise) <= _SAME * noise:
-                break
-            if rules.mild is not None:
-                rules = dataclasses.replace(rules, mild=dataclasses.replace(rules.mild, reach=reach))
-            views = dataclasses.replace(views, prior_noise=noise, rules=rules)
-            problem = views.problem(model, terms=minimum.terms)
-            result = yield Solve(problem, result.state, dataclasses.replace(solver, initial_damping=_NEAR_DAMPING))
-            spent += int(result.iterations)
-        rivals = tuple((float(views.problem(model).cost(state)), state) for _, state in minimum.rivals)
-        terms = (*minimum.terms, *rules.terms(model, views.prior_noise))
-        minimum = dataclasses.replace(minimum, rivals=rivals, terms=terms)
-    plain_cost = float(result.cost)
-    covariances = observations.covariances() if options.weighted else None
-    # The residuals of the plain solution tell how much there is beyond the corners' own noise.
-    variance = None if covariances is None else 2.0 * plain_cost / problem.residual_count
-    if variance is not None or options.loss is not None:
-        problem = corner_problem(observations, options, minimum, variance, options.loss)
-        result = yield Solve(problem, result.state, solver)
-        spent += int(result.iterations)
-    return Solved(
+    if views.constraints.has_priors:
+        views, result, steps = _reweight_priors(views, model, minimum, result, solver)
+        spent += steps
+        problem = views.lens_problem(model, terms=minimum.terms)
+        rivals = tuple((float(views.lens_problem(model).cost(state)), state) for _, state in minimum.rivals)
+        minimum = dataclasses.replace(minimum, rivals=rivals, terms=problem.terms)
+    covariances = covariances if options.weighted else None
+    solution = Solution(
         views=views,
         problem=problem,
         result=result,
         minimum=minimum,
-        plain_cost=plain_cost,
+        plain_cost=float(result.cost),
         spent=spent,
-        variance=variance,
+        # The residuals of the plain solution tell how much there is beyond the corners' own noise.
+        variance=None if covariances is None else 2.0 * float(result.cost) / problem.residual_count,
     )
+    if covariances is None and options.loss is None:
+        return solution
+    problem = solution.problem_for(pixels, covariances, options.loss)
+    result = minimize(problem, result.state, solver)
+    return dataclasses.replace(solution, problem=problem, result=result, spent=spent + int(result.iterations))
 
 
-def corner_problem(
-    observations: Corners,
-    options: CalibrationOptions,
-    minimum: Minimum,
-    variance: float | None,
-    loss: RobustLoss | None,
-) -> BoardProblem:
-    """All corners with their weights, and a robust loss."""
-    model = options.lens
-    covariances = None if variance is None else observations.covariances()
-    weights = None if covariances is None or variance is None else whitening(covariances, variance)[:, None]
-    return BoardProblem(
-        observations.board.points,
-        observations.pixels()[:, None],
-        [model],
-        [options.rules(observations.image_size).parameters(model)],
-        free_warp=options.board_warp,
-        whitening=weights,
-        loss=loss,
-        terms=minimum.terms,
-    )
+def _with_prior(views: CameraViews, prior: CoefficientPrior) -> CameraViews:
+    return dataclasses.replace(views, constraints=dataclasses.replace(views.constraints, coefficient_prior=prior))
 
 
-def _check(observations: Corners, pixels: Tensor, count: int, warp: bool, fewest: int) -> None:
+def _reweight_priors(
+    views: CameraViews, model: LensModel, minimum: Minimum, result: Result[BoardState], solver: LMOptions
+) -> tuple[CameraViews, Result[BoardState], int]:
+    """Solve again with priors for the noise and the outermost corner of the solution, until these stay the same."""
+    near, spent = dataclasses.replace(solver, initial_damping=_NEAR_DAMPING), 0
+    for number in range(_PRIOR_ROUNDS):
+        after = views.with_noise_of(result.state, model)
+        reach = views.observed_radius(result.state)
+        prior = views.constraints.coefficient_prior
+        known = prior is None or abs(reach - prior.reach) <= _SAME * reach
+        if number and known and abs(after.prior_noise - views.prior_noise) <= _SAME * after.prior_noise:
+            break
+        views = after if prior is None else _with_prior(after, dataclasses.replace(prior, reach=reach))
+        result = minimize(views.lens_problem(model, terms=minimum.terms), result.state, near)
+        spent += int(result.iterations)
+    return views, result, spent
+
+
+def _check(views: CameraViews, names: Sequence[str], parameters: int, fewest: int) -> None:
+    """Raise where there are too few views or corners, or where a view does not determine a pose."""
+    pixels = views.pixels
     seen = torch.isfinite(pixels).all(-1).sum(-1)
     if len(pixels) < fewest:
         raise DegenerateError(
@@ -213,23 +196,21 @@ def _check(observations: Corners, pixels: Tensor, count: int, warp: bool, fewest
     poor = (seen < _MINIMUM_CORNERS).nonzero()[:, 0].tolist()
     if poor:
         raise InputError(
-            f"view {observations.names[poor[0]]!r} has {int(seen[poor[0]])} corners; at least {_MINIMUM_CORNERS} are "
-            "needed: remove the view"
+            f"view {names[poor[0]]!r} has {int(seen[poor[0]])} corners; at least {_MINIMUM_CORNERS} are needed: remove "
+            "the view"
         )
-    on_line = (~spread_out(observations.board.points, pixels)).nonzero()[:, 0].tolist()
+    on_line = (~spread_out(views.board_points, pixels)).nonzero()[:, 0].tolist()
     if on_line:
         raise InputError(
-            f"view {observations.names[on_line[0]]!r}: all its corners, or all but one, lie on one line: that leaves "
-            "the board's pose open; remove the view"
+            f"view {names[on_line[0]]!r}: all its corners, or all but one, lie on one line, which leaves the board's "
+            "pose open; remove the view"
         )
     centered = torch.nan_to_num(pixels - pixels.nanmean(1, keepdim=True))
     width = torch.linalg.svdvals(centered)[:, 1] / seen.sqrt()
     thin = (width < _MINIMUM_WIDTH).nonzero()[:, 0].tolist()
     if thin:
-        raise InputError(
-            f"view {observations.names[thin[0]]!r}: its corners coincide or the board is seen edge-on; remove the view"
-        )
-    unknowns = count + 2 * warp + 6 * len(pixels)
+        raise InputError(f"view {names[thin[0]]!r}: its corners coincide or the board is seen edge-on; remove the view")
+    unknowns = parameters + 2 * views.free_warp + 6 * len(pixels)
     if 2 * int(seen.sum()) <= unknowns:
         raise DegenerateError(
             f"{int(seen.sum())} corners cannot determine {unknowns} parameters: add views or choose a smaller model"

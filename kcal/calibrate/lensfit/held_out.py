@@ -1,4 +1,4 @@
-"""Views in groups that are held out together, and how well a model predicts groups that it has not seen."""
+"""Groups of views that are held out together, and how well a model predicts groups to which it was not fitted."""
 
 from __future__ import annotations
 
@@ -10,74 +10,54 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.poses import refine_poses
 from kcal.calibrate.bundle.priors import Term
-from kcal.calibrate.bundle.views import free_parameters
-from kcal.calibrate.camera.solve import Solved
+from kcal.calibrate.bundle.views import Views, free_parameters
+from kcal.calibrate.camera.solve import Solution
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.model import LensModel
 from kcal.lens.residual import Field
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import State
 
-# Into so many parts the groups are dealt, each held out once.
+# The groups are divided into this many parts, each held out once.
 PARTS = 5
-# Of poses under a lens that is held, and of a fit to a part of the views from that to all of them.
+# For poses under a lens that is held, and for a fit to some views that starts at the fit to all of them.
 _POSES = LMOptions(max_iterations=30, tolerance=1e-10)
 REFIT = LMOptions(max_iterations=100, tolerance=1e-9, flatness=1e-6)
 _LARGEST_GROUPS, _FEWEST_GROUPS, _RUN = 20, 5, 5
-# Of a view's corners so many are left inside the border, at least; fewer would hardly hold its pose.
+# Smallest share and number of a view's corners inside the border; fewer would hardly determine its pose.
 _SHARE, _FEWEST_LEFT = 0.4, 12
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GroupedViews:
-    """All views of one camera, with the weights by which every model is judged.
+    """All views of one camera, with the weights with which all models are compared.
 
     Args:
-        board_points: (N, 3) meters.
-        pixels: (V, 1, N, 2), NaN where not seen.
-        inner: (V, 1, N, 2) likewise without the corners next to the border, see `without_border`.
-        weights: (V, 1, N, 2, 2) whitening of the corners, or None: all count alike.
+        every: the views.
+        inner: (V, N, 2) their pixels without the corners next to the border, see `without_border`.
         groups: indices of the views of each group.
-        free_warp: whether the board's warp is estimated.
     """
 
-    board_points: Tensor
-    pixels: Tensor
+    every: Views
     inner: Tensor
-    weights: Tensor | None
     groups: list[list[int]]
-    free_warp: bool
 
     def problem(
         self, model: LensModel, views: Sequence[int], field: Field | None = None, terms: Sequence[Term] = ()
     ) -> BoardProblem:
         """The least-squares problem of some views, in that order."""
-        chosen = list(views)
-        return BoardProblem(
-            self.board_points,
-            self.pixels[chosen],
-            [model],
-            [free_parameters(model)],
-            free_warp=self.free_warp,
-            whitening=None if self.weights is None else self.weights[chosen],
-            terms=terms,
-            fields=[field],
-        )
+        return self.every.some(list(views)).problem(model, free_parameters(model), terms=terms, field=field)
 
-    def held_out(self, model: LensModel, state: State, field: Field | None, views: Sequence[int]) -> Tensor:
-        """(V,) squared residuals of views whose poses are solved again, all else held; infinite without a lens."""
+    def held_out_cost(self, model: LensModel, state: BoardState, field: Field | None, views: Sequence[int]) -> Tensor:
+        """(V,) squared residuals of views with their poses solved again, all else held; infinite without an image."""
         chosen = list(views)
-        weights = None if self.weights is None else self.weights[chosen]
-        _, cost = refine_poses(
-            self.board_points, self.pixels[chosen], [model], some_views(state, chosen), _POSES, [field], weights
-        )
+        _, cost = refine_poses(self.every.some(chosen), model, state.views(chosen), _POSES, field)
         return torch.nan_to_num(2.0 * cost, nan=math.inf)
 
-    def judge(self, parts: Sequence[Tensor], fit: Fit) -> Tensor:
+    def cross_validate(self, parts: Sequence[Tensor], fit: Fit) -> Tensor:
         """(G,) squared residuals (pixels²) of each group under what was fitted without its part.
 
         Args:
@@ -88,7 +68,7 @@ class GroupedViews:
         for part in parts:
             held = torch.zeros(len(self.groups), dtype=torch.bool)
             held[part] = True
-            out[held] = self._by_group(self.held_out(*fit(~held), self.views(held)), held)
+            out[held] = self._by_group(self.held_out_cost(*fit(~held), self.views(held)), held)
         return out
 
     def views(self, chosen: Tensor) -> list[int]:
@@ -101,27 +81,21 @@ class GroupedViews:
         return torch.stack([own.sum() for own in values.split(sizes)])
 
     @property
-    def count(self) -> int:
-        """Corners seen."""
-        return int(torch.isfinite(self.pixels).all(-1).sum())
-
-    @property
     def within(self) -> GroupedViews:
         """The same without the corners next to the border."""
-        return dataclasses.replace(self, pixels=self.inner)
+        return dataclasses.replace(self, every=dataclasses.replace(self.every, pixels=self.inner))
 
 
-# From a mask (G,) of the groups to fit to: the lens, a state with the poses of all views, from which those held out are
-# solved, and the field.
-Fit = Callable[[Tensor], tuple[LensModel, State, Field | None]]
+# From a mask (G,) of the groups to fit to: the lens, a state with initial poses of all views, and the field.
+Fit = Callable[[Tensor], tuple[LensModel, BoardState, Field | None]]
 
 
 def without_border(pixels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Corners (..., V, N, 2) without those next to the border of what was seen, which become NaN.
+    """Corners (..., V, N, 2) without those next to the border of the area with corners, which become NaN.
 
-    That border lies within the image's, as no board is seen in part. What is taken away is as deep as what nobody saw,
-    on each side, so that predicting it is like predicting the image's edge. Views of which too little would be left
-    stay whole.
+    That border lies within the image's, as boards must be seen whole. On each side a margin as wide as the area without
+    corners is removed, so that predicting it is like predicting the image's edge. Views that would lose too many
+    corners stay whole.
     """
     seen = torch.isfinite(pixels).all(-1)
     corners = pixels[seen]
@@ -133,16 +107,10 @@ def without_border(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.where((inside | ~enough)[..., None], pixels, torch.nan)
 
 
-def some_views(state: State, views: Sequence[int]) -> State:
-    """The state of some views only."""
-    *shared, rotation, translation = state
-    return (*shared, rotation[list(views)], translation[list(views)])
-
-
 def group_views(observations: Observations, groups: Literal["blocks", "views"] | Sequence[Hashable]) -> list[list[int]]:
     """Indices of the views that are held out together, see `kcal.calibrate.lensfit.options.HybridOptions.groups`.
 
-    At most twenty groups; runs of five views or more where there are views enough.
+    At most twenty groups, and runs of at least five views where there are enough.
 
     Raises:
         InputError: labels that do not fit the views.
@@ -165,23 +133,25 @@ def group_views(observations: Observations, groups: Literal["blocks", "views"] |
     return found
 
 
-def judge_parametric(setting: GroupedViews, model: LensModel, solved: Solved, parts: Sequence[Tensor]) -> Tensor:
+def cross_validate_parametric(
+    grouped: GroupedViews, model: LensModel, solution: Solution, parts: Sequence[Tensor]
+) -> Tensor:
     """(G,) squared residuals (pixels²) of each group under a parametric model that was fitted without its part.
 
     Every fit starts from the solution for all views, which can only favor the model.
 
     Args:
-        setting: the views.
+        grouped: the views.
         model: the lens model.
-        solved: its solution for all views.
+        solution: for all views.
         parts: numbers of the groups of each part.
     """
-    start = solved.result.state
+    start = solution.result.state
 
-    def fit(chosen: Tensor) -> tuple[LensModel, State, None]:
-        train = setting.views(chosen)
-        problem = setting.problem(model, train, terms=solved.minimum.terms)
-        *shared, _, _ = minimize(problem, some_views(start, train), REFIT).state
-        return model, (*shared, *start[-2:]), None
+    def fit(chosen: Tensor) -> tuple[LensModel, BoardState, None]:
+        train = grouped.views(chosen)
+        problem = grouped.problem(model, train, terms=solution.minimum.terms)
+        found = minimize(problem, start.views(train), REFIT).state
+        return model, start._replace(parameters=found.parameters, warp=found.warp), None
 
-    return setting.judge(parts, fit)
+    return grouped.cross_validate(parts, fit)

@@ -1,4 +1,4 @@
-"""Calibrating a camera whose lens is corrected by a residual field, where held-out views say that this is better."""
+"""Calibrate a camera with a residual field, where that is better on held-out views."""
 
 from __future__ import annotations
 
@@ -7,18 +7,25 @@ from collections.abc import Sequence
 
 import torch
 
-from kcal.calibrate.bundle.batching import alone
+from kcal.calibrate.bundle.views import Views, free_parameters
 from kcal.calibrate.bundle.weights import whitening
-from kcal.calibrate.camera.calibrate import judged
-from kcal.calibrate.camera.options import CameraCalibrationResult
-from kcal.calibrate.camera.record import camera_calibration
-from kcal.calibrate.camera.solve import Solved, solve
-from kcal.calibrate.lensfit.field_fit import SEEN, FieldFit, Settled, field_covariance, fit_field, focal_of, settle
+from kcal.calibrate.camera.assess import assess
+from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.solve import Solution, solve
+from kcal.calibrate.lensfit.field_fit import (
+    LISTED,
+    ConvergedField,
+    FieldFit,
+    field_covariance,
+    fit_field,
+    fit_to_convergence,
+    focal_of,
+)
 from kcal.calibrate.lensfit.held_out import (
     PARTS,
     GroupedViews,
+    cross_validate_parametric,
     group_views,
-    judge_parametric,
     without_border,
 )
 from kcal.calibrate.lensfit.model_choice import Contender, choose, surely_worse
@@ -29,33 +36,33 @@ from kcal.corners.observations import Observations
 from kcal.lens.hybrid import HybridCamera
 from kcal.lens.model import LensModel
 from kcal.lens.residual import FieldResidual
-from kcal.solve.result import Status
+from kcal.solve.result import SolverStatus
 
-# A field of fewer weights in effect is what chance leaves of none.
+# A field with fewer effective weights is no more than chance.
 _LEAST = 3.0
 
 
 def calibrate_hybrid(
     observations: Observations, options: HybridOptions | None = None, progress: Progress = lambda _: None
 ) -> HybridResult:
-    """Calibrate a camera with a residual field, and keep the field only where held-out views say so.
+    """Calibrate a camera with a residual field, and keep the field only where it is better on held-out views.
 
-    From the parametric solution, the lens, the board's warp, all poses and the weights of a field of several widths
-    are fitted jointly under Gaussian priors of the weights: what the intrinsics or the lens can carry, they do.
-    Fits under thirteen priors, from no field to an almost free one, are averaged so that the average does best on
-    held-out groups of views, and on the corners next to the border, held out in all of them, which tell how a field is
-    extrapolated. The same, done again without each fifth of the groups, is compared on that fifth with parametric
-    models. Of these, and likewise of the lenses under a field, the first is chosen that is not surely worse than the
-    best one (`kcal.calibrate.lensfit.model_choice`). The hybrid is returned where it is better than that parametric
-    model; by more than one standard error, if its lens does not contain that model.
+    Starting at the parametric solution, the lens, the board's warp, all poses and the weights of a field with several
+    widths are fitted jointly, under Gaussian priors on the weights. Fits under thirteen priors, from no field to an
+    almost free one, are averaged. Their weights minimize the cost of held-out groups of views and of the corners next
+    to the border, which show how a field extrapolates. All of this is repeated without each fifth of the groups, and
+    compared on that fifth with parametric models. Of these, and of the lenses under a field, the first one is chosen
+    that is not significantly worse than the best one (`kcal.calibrate.lensfit.model_choice`). The hybrid is returned
+    where it is better than that parametric model; by more than one standard error, if its lens does not contain that
+    model.
 
     Args:
         observations: the views of one camera.
         options: see `HybridOptions`.
-        progress: told what has just been finished.
+        progress: called with what has just been finished.
 
     Returns:
-        the camera with the evidence.
+        the camera with the reasons for the choice.
 
     Raises:
         DegenerateError: as `calibrate_camera`, and with too few groups of views.
@@ -78,7 +85,7 @@ def calibrate_hybrid(
         >>> seen = Observations(board=board, image_size=(640, 480), views=views)
         >>> options = HybridOptions(models=("opencv5",), rivals=("opencv4",), widths=(1.0,), groups="views")
         >>> result = calibrate_hybrid(seen, options)
-        >>> result.kept, type(result.calibration.camera).__name__  # the lens is parametric, and so is the answer
+        >>> result.kept, type(result.calibration.camera).__name__  # the true lens is parametric
         (False, 'Camera')
     """
     options = options or HybridOptions()
@@ -89,135 +96,133 @@ def calibrate_hybrid(
     covariances = observations.covariances() if options.weighted else None
     weights = None
     if covariances is not None and first.variance is not None:
-        weights = whitening(covariances, first.variance)[:, None]
-    setting = GroupedViews(
+        weights = whitening(covariances, first.variance)
+    views = Views(
         board_points=observations.board.points,
-        pixels=observations.pixels()[:, None],
-        inner=without_border(observations.pixels(), observations.image_size)[:, None],
-        weights=weights,
-        groups=groups,
+        pixels=observations.pixels(),
+        whitening=weights,
         free_warp=options.board_warp,
     )
+    grouped = GroupedViews(every=views, inner=without_border(views.pixels, observations.image_size), groups=groups)
     # A single hybrid is compared with nothing.
     parts = deal(len(groups), PARTS) if len(models) > 1 or options.rivals else []
     bases = []
     for model in models:
-        bases.append(fit_field(setting, observations.image_size, model, solutions[model], options.widths, parts))
-        progress(f"{model} with a field judged")
+        bases.append(fit_field(grouped, observations.image_size, model, solutions[model], options.widths, parts))
+        progress(f"{model} with a field compared")
     rivals = []
     for model in dict.fromkeys(LensModel.named(r) for r in options.rivals):
-        costs = judge_parametric(setting, model, solutions[model], parts)
+        costs = cross_validate_parametric(grouped, model, solutions[model], parts)
         rivals.append(Contender(name=str(model), costs=costs))
-        progress(f"{model} judged")
+        progress(f"{model} compared")
 
-    settled = None
+    converged = None
     for base in _by_preference(bases):
-        settled = settle(setting, base)
-        if settled is not None:
+        converged = fit_to_convergence(grouped, base)
+        if converged is not None:
             break
     else:
         base = bases[0]
     rival = choose(rivals) if rivals else None
-    # How much of a field to believe was settled by held-out views, with none at all among the candidates: beside a lens
-    # within its own it need not be surely better, but better it has to be. Beside another lens it is another model.
+    # No field at all was among the candidates of the average. So a hybrid whose lens contains the rival must be better,
+    # but not significantly; against another lens it is another model.
     better = rival is None or (
         base.effective >= _LEAST
         and (
-            base.judged.total < rival.total
+            base.held_out.total < rival.total
             if base.model.contains(LensModel.named(rival.name))
-            else surely_worse(rival, base.judged, errors=1.0)
+            else surely_worse(rival, base.held_out, errors=1.0)
         )
     )
-    wins = settled is not None and better
-    kept = settled is not None and (wins or not options.gate)
-    if settled is not None and kept:
-        calibration = _result(setting, observations.image_size, base, settled)
+    wins = converged is not None and better
+    kept = converged is not None and (wins or not options.gate)
+    corners = views.corner_count
+    if converged is not None and kept:
+        calibration = _hybrid_calibration(views, observations, base, converged)
     else:
         model = base.model if rival is None else LensModel.named(rival.name)
-        calibration = judged(observations, solutions[model], options.parametric(model))
-    calibration.camera.calibration = camera_calibration(calibration, observations)
+        calibration = assess(observations, solutions[model], options.parametric(model))
     return HybridResult(
         calibration=calibration,
         kept=kept,
-        reason=_reason(base, rival, wins, settled is not None, setting.count),
+        reason=_reason(base, rival, wins, converged is not None, corners),
         choice="hybrid" if wins else str(base.model) if rival is None else rival.name,
-        held_out={one.name: math.sqrt(one.total / setting.count) for one in (base.judged, *rivals) if parts},
+        held_out={one.name: math.sqrt(one.total / corners) for one in (base.held_out, *rivals) if parts},
         model=base.model,
         groups=len(groups),
         shares=tuple(
-            (prior, share) for prior, share in zip(CANDIDATES, base.shares.tolist(), strict=True) if share > SEEN
+            (prior, share) for prior, share in zip(CANDIDATES, base.shares.tolist(), strict=True) if share > LISTED
         ),
         effective=base.effective,
         units=base.grid.count,
         largest=math.nan
-        if settled is None
-        else FieldResidual(base.grid, settled.field.weights).bounds()[0] * focal_of(settled.state),
+        if converged is None
+        else FieldResidual(base.grid, converged.field.weights).bounds()[0] * focal_of(converged.state),
     )
 
 
-class _Solutions(dict[LensModel, Solved]):
-    """Parametric solutions, each found when it is first asked for."""
+class _Solutions(dict[LensModel, Solution]):
+    """Parametric solutions, each found when it is first used."""
 
     def __init__(self, observations: Observations, options: HybridOptions) -> None:
         super().__init__()
-        self._ask = observations, options
+        self._arguments = observations, options
 
-    def __missing__(self, model: LensModel) -> Solved:
-        observations, options = self._ask
-        self[model] = alone(solve(observations, options.parametric(model), lambda _: None))
+    def __missing__(self, model: LensModel) -> Solution:
+        observations, options = self._arguments
+        self[model] = solve(observations, options.parametric(model), lambda _: None)
         return self[model]
 
 
 def _by_preference(bases: Sequence[FieldFit]) -> list[FieldFit]:
-    """The one that held-out views choose, and then the others, the best first."""
-    first = choose([base.judged for base in bases])
-    return sorted(bases, key=lambda base: (base.judged is not first, base.judged.total))
+    """The one chosen on held-out views, and then the others, the best first."""
+    first = choose([base.held_out for base in bases])
+    return sorted(bases, key=lambda base: (base.held_out is not first, base.held_out.total))
 
 
-def _reason(base: FieldFit, rival: Contender | None, wins: bool, settled: bool, count: int) -> str:
-    if not settled:
+def _reason(base: FieldFit, rival: Contender | None, wins: bool, converged: bool, count: int) -> str:
+    if not converged:
         return "no step of the field was possible: the parametric camera is returned"
     if rival is None:
-        return "no parametric model was asked to compare with"
-    own, other = (math.sqrt(one.total / count) for one in (base.judged, rival))
-    found = (
-        f"on held-out views the hybrid has {own:.4f} px, {rival.name}, the parametric model to choose, {other:.4f} px"
-    )
+        return "there was no parametric model to compare with"
+    own, other = (math.sqrt(one.total / count) for one in (base.held_out, rival))
+    found = f"held-out RMS {own:.4f} px against {other:.4f} px of {rival.name}, the best parametric choice"
     if not wins:
         return f"no better than a parametric model: {found}"
-    sure = "by more than chance explains" if surely_worse(rival, base.judged) else "if within chance"
+    sure = "by more than chance explains" if surely_worse(rival, base.held_out) else "though within chance"
     return f"better than a parametric model, {sure}: {found}"
 
 
-def _result(setting: GroupedViews, size: tuple[int, int], base: FieldFit, settled: Settled) -> CameraCalibrationResult:
-    field, covariance = settled.field, field_covariance(base, settled.forms)
-    problem = setting.problem(base.model, range(len(setting.pixels)), field)
-    state = problem.tidy(settled.state)
-    s = problem.unpack(state)
-    camera = HybridCamera(
-        s.parameters[0], size=size, model=base.model, residual=FieldResidual(field.grid, field.weights)
-    )
-    residuals = problem.pixel_errors(state)[:, 0].transpose(-1, -2)
-    seen = problem.seen[:, 0]
-    squared = (residuals**2).sum(-1)
-    free = list(problem.free[0])
+def _hybrid_calibration(
+    views: Views, observations: Observations, base: FieldFit, converged: ConvergedField
+) -> CameraCalibrationResult:
+    field, covariance = converged.field, field_covariance(base, converged.forms)
+    free = free_parameters(base.model)
+    problem = views.problem(base.model, free, field=field)
+    state = problem.tidy(converged.state)
+    residual = FieldResidual(field.grid, field.weights)
+    camera = HybridCamera(state.parameters, size=observations.image_size, model=base.model, residual=residual)
+    squared, seen = problem.pixel_errors(state).square().sum(-2), problem.seen
     of_all = covariance.new_zeros(len(camera.names), len(camera.names))
     of_all[torch.tensor(free)[:, None], torch.tensor(free)] = covariance[: len(free), : len(free)]
     return CameraCalibrationResult(
+        observations=observations,
         camera=camera,
         rms=float(torch.sqrt(squared.sum() / seen.sum())),
-        weighted_rms=math.sqrt(2.0 * float(problem.cost(state)) / setting.count) if problem.whitened else None,
+        weighted_rms=None
+        if views.whitening is None
+        else math.sqrt(2.0 * float(problem.cost(state)) / views.corner_count),
         per_view_rms=torch.sqrt(squared.sum(-1) / seen.sum(-1)),
-        residuals=torch.where(seen[..., None], residuals, torch.nan),
-        cam_from_board_rotation=s.first_from_board_rotation,
-        cam_from_board_translation=s.first_from_board_translation,
-        board_warp=s.warp if problem.free_warp else None,
+        residuals=problem.corner_residuals(state),
+        cam_from_board_rotation=state.rotation,
+        cam_from_board_translation=state.translation,
+        board_warp=state.warp if problem.free_warp else None,
         sigma={
             camera.names[i]: float(of_all[i, i].sqrt()) if bool(torch.isfinite(of_all[i, i])) else None for i in free
         },
         covariance=of_all,
-        status=Status.CONVERGED,
-        iterations=base.solved.spent,
+        status=SolverStatus.CONVERGED,
+        iterations=base.solution.spent,
         warnings=(),
     )
 

@@ -1,10 +1,10 @@
-"""Which of several models to keep, by what each costs on groups of views that it was not fitted to.
+"""Choose between models by their costs on held-out groups of views.
 
-The lowest sum is the best guess, but a sum over some tens of groups is noisy. Two models are compared by paired
-differences: both are judged on the same groups, so that what these have in common cancels, and the differences say how
-sure their sum is (as the one-standard-error rule of Breiman et al. 1984 does for unpaired sums). A difference within
-two standard errors is no evidence: then the model that one would rather have is kept, which is the simpler of two lens
-models as a rule, as the richer one errs more where no view has looked.
+The model with the lowest sum is the best guess, but a sum over some tens of groups is noisy. So two models are compared
+by paired differences: both are evaluated on the same groups, so that common errors cancel, and the scatter of the
+differences gives the standard error of their sum (as the one-standard-error rule of Breiman et al. 1984 for unpaired
+sums). A difference within two standard errors is no evidence. Then the preferred model is kept, as a rule the simpler
+one, because a richer one has larger errors where there are no corners.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Contender:
 
     Args:
         name: of the model.
-        costs: (G,) squared residuals of each group held out; infinite where the model could not show a corner.
+        costs: (G,) squared residuals of each group held out; infinite where a corner has no image under the model.
     """
 
     name: str
@@ -36,20 +36,20 @@ class Contender:
         return float(self.costs.sum())
 
 
-def excess(one: Contender, other: Contender) -> tuple[float, float]:
-    """By how much one costs more than another over all groups, and the standard error of that.
+def paired_difference(one: Contender, other: Contender) -> tuple[float, float]:
+    """The cost of one minus that of another over all groups, and its standard error.
 
-    Infinite with an error of zero where one of them fails to show corners in more groups than the other: that is no
-    matter of chance. Otherwise groups that either cannot show count for nothing.
+    Infinite with an error of zero where one of them fails in more groups than the other, which is no matter of chance.
+    Otherwise groups in which either fails are ignored.
 
     Example:
         >>> import torch
         >>> a = Contender(name="a", costs=torch.tensor([1.0, 2.0, 3.0, 2.0]))
         >>> b = Contender(name="b", costs=torch.tensor([1.5, 2.0, 3.5, 3.0]))
-        >>> [round(value, 3) for value in excess(b, a)]
+        >>> [round(value, 3) for value in paired_difference(b, a)]
         [2.0, 0.816]
         >>> c = Contender(name="c", costs=torch.tensor([1.0, 2.0, 3.0, math.inf]))
-        >>> excess(c, a), excess(a, c)
+        >>> paired_difference(c, a), paired_difference(a, c)
         ((inf, 0.0), (-inf, 0.0))
     """
     lost, won = int(one.costs.isinf().sum()), int(other.costs.isinf().sum())
@@ -63,7 +63,7 @@ def excess(one: Contender, other: Contender) -> tuple[float, float]:
 
 def surely_worse(one: Contender, other: Contender, errors: float = _SURE) -> bool:
     """Whether one costs more than another by more than some standard errors."""
-    more, error = excess(one, other)
+    more, error = paired_difference(one, other)
     return more > 0 and more > errors * error
 
 

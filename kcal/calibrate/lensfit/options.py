@@ -1,13 +1,15 @@
-"""What the calibration of a hybrid camera is asked for, and what it answers."""
+"""Options of a hybrid camera's calibration, and its result."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Hashable, Sequence
+from pathlib import Path
 from typing import Literal
 
-from kcal.calibrate.camera.options import CalibrationOptions, CameraCalibrationResult
-from kcal.calibrate.lensfit.stacking import Prior
+from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.lensfit.stacking import FieldPrior
 from kcal.errors import InputError
 from kcal.lens.model import LensModel
 
@@ -17,21 +19,20 @@ class HybridOptions:
     """Options of `calibrate_hybrid`.
 
     Args:
-        models: lens models for the field to correct, in order of preference: the first whose hybrid is not surely worse
-            on what was held out than the best one. A plain lens leaves the field a clear task where the data are few or
-            noisy or the lens is very wide, a rich one leaves it little where the lens is far from any plain formula.
-        rivals: the parametric models that it is compared with, in order of preference likewise. With none and a single
-            model nothing is compared, which takes half the time.
+        models: lens models for the field to correct, in order of preference. The first one is used whose hybrid is not
+            significantly worse on held-out views than the best one. A simple model suits few or noisy data and very
+            wide lenses; a rich one leaves less to the field where the lens is far from any simple formula.
+        rivals: parametric models to compare with, in order of preference. With none and a single model nothing is
+            compared, which takes half the time.
         board_warp: estimate how the board bends.
         weighted: as in `CalibrationOptions`.
         groups: which views are held out together. "blocks": runs of views in the order of the observations, for
-            videos and captures in which neighbors are alike; "views": every view for itself; or a label for each view.
-            The claim that a hybrid is better holds for new data that differ from the calibration's as the groups
-            differ from each other.
-        widths: of the field's units, in half widths of the image. The narrowest says what detail the field can show
-            and most of what it costs: units grow with its inverse square.
-        gate: keep the hybrid only where it is better on held-out views; False returns it in any case, with the same
-            figures.
+            videos and captures with similar neighbors; "views": each view for itself; or a label for each view. That a
+            hybrid is better is shown for new data that differ from the calibration's as the groups differ from each
+            other.
+        widths: of the field's units, in half widths of the image. The narrowest determines the detail of the field and
+            most of the run time: the number of units grows with its inverse square.
+        gate: keep the hybrid only where it is better on held-out views; False always returns it, with the same figures.
         focal: as in `CalibrationOptions`.
         field_of_view: likewise.
     """
@@ -53,7 +54,7 @@ class HybridOptions:
             raise InputError(f"HybridOptions: widths from 0.02 to 10 half widths of the image, got {self.widths}")
 
     def parametric(self, model: LensModel | str) -> CalibrationOptions:
-        """What a parametric model is calibrated with."""
+        """Options for calibrating a parametric model."""
         return CalibrationOptions(
             model=model,
             board_warp=self.board_warp,
@@ -65,23 +66,23 @@ class HybridOptions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HybridResult:
-    """What `calibrate_hybrid` found, and why it returns what it returns.
+    """The camera that `calibrate_hybrid` chose, and why.
 
     Args:
         calibration: of the camera that is returned, a `HybridCamera` or the best parametric `Camera`. A hybrid's σ
-            counts what the averaged fits disagree about.
+            includes the differences between the averaged fits.
         kept: whether the hybrid is returned.
-        reason: one sentence that says why.
-        choice: "hybrid", or the name of the parametric model that held-out views prefer.
-        held_out: name -> RMS (pixels, by the corners' weights) on views that were held out in groups, their poses
-            solved again: of each parametric model and of "hybrid". Infinite where a model could not show a corner.
-            Empty where one model was given and no rival.
-        model: the lens model that the field corrects: chosen likewise.
-        groups: how many groups of views there were.
-        shares: how much each prior counts in the average that makes the field.
-        effective: how many of the field's weights the data determine, in effect; `units` x 2 there are.
-        units: of the field.
-        largest: the most that the field moves a point, pixels.
+        reason: why, in one sentence.
+        choice: "hybrid", or the name of the parametric model that is best on held-out views.
+        held_out: name -> RMS (pixels, with the corners' weights) on views that were held out in groups, with their
+            poses solved again, for each parametric model and for "hybrid". Infinite where a corner has no image.
+            Empty with a single model and no rival.
+        model: the lens model that the field corrects, chosen likewise.
+        groups: number of groups of views.
+        shares: the weight of each prior in the average that makes the field.
+        effective: effective number of the field's weights that the data determine, of `units` x 2.
+        units: number of units of the field.
+        largest: the largest shift of a point by the field, pixels.
     """
 
     calibration: CameraCalibrationResult
@@ -91,7 +92,11 @@ class HybridResult:
     held_out: dict[str, float]
     model: LensModel
     groups: int
-    shares: tuple[tuple[Prior, float], ...]
+    shares: tuple[tuple[FieldPrior, float], ...]
     effective: float
     units: int
     largest: float
+
+    def save(self, path: str | Path, *, name: str = "", source: str | None = None) -> Path:
+        """Write the file of the camera that is returned; see `CameraCalibrationResult.save`."""
+        return self.calibration.save(path, name=name, source=source)

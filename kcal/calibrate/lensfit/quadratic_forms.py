@@ -1,9 +1,8 @@
-"""Views as quadratic forms in a lens, a board's warp and a residual field: fits and held-out costs without the views.
+"""Views as quadratic forms in a lens, a board's warp and a residual field, for fits and held-out costs without corners.
 
-Near a solution each view's board pose answers linearly. With it eliminated, the squared residuals of a group of views
-are one quadratic form in what the views share. Leaving groups out, another prior, the cost of the groups left out with
-their poses solved again: all of that is small linear algebra then, so that hundreds of fits cost less than one look at
-the corners.
+Near a solution each view's board pose responds linearly. With the poses eliminated, the squared residuals of a group of
+views are one quadratic form in the shared parameters. Leaving groups out, other priors, and the cost of held-out groups
+with their poses solved again are then small linear algebra: hundreds of fits cost less than one pass over the corners.
 """
 
 from __future__ import annotations
@@ -14,15 +13,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.lens.distortion import distort_components
 from kcal.lens.plane import plane_from_points
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.residual import Field, field_basis
-from kcal.solve.result import State
 
-# Relative to the scaled normal matrix, whose diagonal is one: keeps its factors apart from rounding. The first that
-# does: a lens whose coefficients nearly cancel needs more.
+# Added to the diagonal (one) of the scaled normal matrix: the first of these with which Cholesky's factorization
+# succeeds. Lenses whose coefficients nearly cancel need more.
 _JITTERS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)
 
 
@@ -54,16 +52,16 @@ class QuadraticForms:
     def inside(self, chosen: Tensor) -> Tensor:
         """Likewise without the corners next to the border.
 
-        `total` minus this is what predicting those costs, with the poses given by the others.
+        `total` minus this is the cost of predicting those, with poses from the others.
         """
         return _sum(self.inner, chosen)
 
     def fit(self, form: Tensor, precision: Tensor) -> Tensor:
         """The best step (S + 1,), with a last 1, under Gaussian priors on the weights alone.
 
-        Lens and warp have no prior. So what they can carry as well as the field (shift, scale, the lens's own terms)
-        they do carry: at the minimum the weights are orthogonal, in the prior's metric, to every change of weights that
-        intrinsics and lens could undo.
+        Lens and warp have no prior, so that they take everything that they can represent (shift, scale, the lens's own
+        terms): at the minimum the weights are orthogonal, in the prior's metric, to every change of weights that
+        intrinsics and lens could compensate.
 
         Args:
             form: (S + 1, S + 1), see `total`.
@@ -73,7 +71,7 @@ class QuadraticForms:
         step = torch.cat([torch.zeros(self.lens, dtype=form.dtype), -self.weights, torch.ones(1, dtype=form.dtype)])
         own = used[self.lens :] - self.lens
         step[used] = 0.0
-        # Weights that stay at zero go there first, and the others answer.
+        # Weights that are held at zero go there first, and the others respond.
         gradient = (form @ step)[used]
         # All of them is the usual case, and needs no gathering.
         matrix = form[:-1, :-1].clone() if len(used) == len(form) - 1 else form[used][:, used]
@@ -94,12 +92,12 @@ class QuadraticForms:
         return inverse[: self.lens] * scale[: self.lens, None] * scale[: self.lens]
 
     def freedom(self, form: Tensor, precision: Tensor) -> float:
-        """The effective number of weights that a prior leaves free: the trace of what maps data to fitted weights."""
+        """The effective number of free weights under a prior: the trace of the map from data to fitted weights."""
         own = torch.isfinite(precision).nonzero()[:, 0]
         if not len(own):
             return 0.0
         lens, across = form[: self.lens, : self.lens], form[: self.lens, self.lens + own]
-        # What is left for the field once lens and warp have answered.
+        # The field's information after eliminating lens and warp.
         field = form[self.lens + own][:, self.lens + own] - across.T @ torch.linalg.lstsq(lens, across).solution
         return float(torch.linalg.solve(field + torch.diag(precision[own]), field).diagonal().sum())
 
@@ -110,7 +108,7 @@ def _sum(groups: Tensor, chosen: Tensor) -> Tensor:
 
 
 def _factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Cholesky's factor of a normal matrix once it is scaled, and the scale of each unknown."""
+    """Cholesky's factor of the scaled normal matrix, and the scale of each unknown."""
     scale = matrix.diagonal().clamp_min(1e-300).rsqrt()
     scaled = matrix * scale[:, None] * scale
     before = 0.0
@@ -121,30 +119,29 @@ def _factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
         if not bool(failed):
             break
     else:
-        # NaN says so to whoever compares.
+        # A candidate with NaN loses every comparison.
         factor = torch.full_like(factor, torch.nan)
     return factor, scale
 
 
 def linearize_views(
-    problem: BoardProblem, state: State, field: Field, sizes: Sequence[int], inner: BoardProblem | None = None
+    problem: BoardProblem, state: BoardState, field: Field, sizes: Sequence[int], inner: BoardProblem | None = None
 ) -> QuadraticForms:
-    """Fold views into forms.
+    """Compute the quadratic forms of views.
 
     Args:
-        problem: of one camera, its `fields` the field at the state.
+        problem: with the field at the state.
         state: of this problem.
-        field: at the state, the same.
-        sizes: how many views each group has; the views are in the order of the groups.
+        field: the same field.
+        sizes: number of views of each group; the views are in the order of the groups.
         inner: the same problem without the corners next to the border; None: none is next to it.
     """
-    s = problem.unpack(state)
-    parameters, model = s.parameters[0], problem.models[0]
+    parameters, model = state.parameters, problem.model
     unit = float(parameters[:2].log().mean().exp())
-    _, points = problem.points(s)
+    _, points = problem.points(state)
     x, y = plane_from_points(points[:, 0], points[:, 1], points[:, 2], model)
     lens = distort_components(x, y, parameters[len(INTRINSICS) :], model, slopes=False)
-    seen = problem.seen[:, 0]
+    seen = problem.seen
     x, y = torch.where(seen, lens.x, 0.0), torch.where(seen, lens.y, 0.0)
     fx, fy, _, _, skew = parameters[: len(INTRINSICS)]
     zero = torch.zeros_like(fx)
@@ -156,10 +153,10 @@ def linearize_views(
         chosen = slice(start, start + size)
         start += size
         basis = field_basis(x[chosen], y[chosen], field.grid)
-        rows = problem.rows(_some(state, chosen), chosen).unflatten(-1, (2, -1))
+        rows = problem.rows(state.views(chosen), chosen).unflatten(-1, (2, -1))
         moved = problem.whiten(along[:, :, None].expand(size, 2, 2, x.shape[-1]), chosen)
         groups.append(_eliminated(rows, moved, basis, seen[chosen]))
-        left = seen[chosen] if inner is None else inner.seen[chosen, 0]
+        left = seen[chosen] if inner is None else inner.seen[chosen]
         same = torch.equal(left, seen[chosen])
         inside.append(groups[-1] if same else _eliminated(rows, moved, basis, left))
         counts.append(int(seen[chosen].sum()))
@@ -173,11 +170,11 @@ def linearize_views(
 
 
 def _eliminated(rows: Tensor, moved: Tensor, basis: Tensor, seen: Tensor) -> Tensor:
-    """The quadratic form of some views, their poses eliminated.
+    """The quadratic form of some views with their poses eliminated.
 
     Args:
         rows: (V, 6 + L + 1, 2, N) derivatives by pose, lens and warp, and last the residuals.
-        moved: (V, 2, 2, N) what a shift along x and one along y move, u and v of each corner.
+        moved: (V, 2, 2, N) derivatives of u and v of each corner by a shift along x and one along y.
         basis: (V, K, N) units of the field at each corner.
         seen: (V, N) corners that count.
     """
@@ -185,20 +182,20 @@ def _eliminated(rows: Tensor, moved: Tensor, basis: Tensor, seen: Tensor) -> Ten
     pose, others = rows[:, :6], rows[:, 6:]
     factor = torch.linalg.cholesky(pose @ pose.transpose(-1, -2))
     across = torch.linalg.solve_triangular(factor, pose, upper=False)
-    # Lens and residuals with the pose taken out row by row: a difference of products would leave little of them.
+    # The pose is eliminated from the rows, because a difference of products would lose digits.
     others = others - (others @ across.transpose(-1, -2)) @ across
-    # (K, V N): the field's columns are these, weighed, and the same for x and y.
+    # (K, V N): weighted, these are the field's columns, the same for x and y.
     units = (basis * seen[:, None]).transpose(0, 1).flatten(1)
 
-    def weighed(values: Tensor) -> Tensor:
+    def weighted(values: Tensor) -> Tensor:
         """(V, P, 2, N): rows (V, P, R) along x and y at each corner."""
         return torch.einsum("vpun,vqun->vpqn", values.unflatten(-1, (2, -1)), moved)
 
     field = _weighed_products(units, torch.einsum("vqun,vwun->qwvn", moved, moved).flatten(-2))
-    answered = (weighed(across) @ basis.transpose(-1, -2)[:, None]).flatten(0, 1).flatten(1)
-    field = field - answered.T @ answered
+    response = (weighted(across) @ basis.transpose(-1, -2)[:, None]).flatten(0, 1).flatten(1)
+    field = field - response.T @ response
     flat = others.transpose(0, 1).flatten(1)
-    small, mixed = flat @ flat.T, (weighed(others).permute(1, 2, 0, 3).flatten(-2) @ units.T).flatten(1)
+    small, mixed = flat @ flat.T, (weighted(others).permute(1, 2, 0, 3).flatten(-2) @ units.T).flatten(1)
     top = torch.cat([small[:-1, :-1], mixed[:-1], small[:-1, -1:]], 1)
     middle = torch.cat([mixed[:-1].T, field, mixed[-1:].T], 1)
     bottom = torch.cat([small[-1:, :-1], mixed[-1:], small[-1:, -1:]], 1)
@@ -212,15 +209,9 @@ def _weighed_products(units: Tensor, weights: Tensor) -> Tensor:
         return (units * values) @ units.T
 
     along_x = product(weights[0, 0])
-    # Corners that count alike in all directions need one product for both axes.
+    # Corners with isotropic weights need one product for both axes.
     ratio = float(weights[1, 1].sum() / weights[0, 0].sum().clamp_min(1e-300))
     alike = torch.allclose(weights[1, 1], ratio * weights[0, 0], rtol=1e-12, atol=0.0)
     along_y = ratio * along_x if alike else product(weights[1, 1])
     both = product(weights[0, 1]) if bool(weights[0, 1].any()) else torch.zeros_like(along_x)
     return torch.cat([torch.cat([along_x, both], 1), torch.cat([both, along_y], 1)])
-
-
-def _some(state: State, views: slice) -> State:
-    """The state of some views only."""
-    *shared, rotation, translation = state
-    return (*shared, rotation[views], translation[views])

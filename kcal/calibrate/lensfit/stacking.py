@@ -1,9 +1,9 @@
-"""Choosing priors by views that were held out: fits under many priors, mixed so that what was held out fits best.
+"""Average fits under many priors, with weights for the lowest cost on held-out views.
 
-A prior's strength decides how much of a field is believed. The strength that is best on held-out groups of views is
-known only roughly from some tens of groups, and choosing a single one throws away what the others know. So the fits
-under all candidates are averaged with the weights that would have been best for the average's held-out cost (stacking:
-Wolpert 1992; Breiman 1996). As fits are steps in the same unknowns, their average is a fit again.
+A prior's strength decides how much detail a field has. Some tens of groups of views determine the best strength only
+roughly, and a single choice discards what the other fits contain. So the fits under all candidates are averaged, with
+the weights that minimize the held-out cost of the average (stacking: Wolpert 1992; Breiman 1996). As fits are steps in
+the same unknowns, their average is a fit again.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from torch import Tensor
 from kcal.calibrate.lensfit.quadratic_forms import QuadraticForms
 from kcal.lens.residual import FieldGrid
 
-# A unit's precision is strength · (reference / width)^(2 · smoothness); beyond this some hundred corners could not
-# tell it from zero, and it is left out.
+# A unit's precision is strength · (reference / width)^(2 · smoothness). Above 1e5 hundreds of corners could not
+# distinguish it from zero, and it is left out.
 _REFERENCE, _OFF = 0.8, 1e5
 _SMOOTHNESS = (1, 6)
 _STRENGTHS = (0.003, 0.03, 0.3, 3.0, 30.0, 300.0)
@@ -30,20 +30,20 @@ _HOPELESS = 4.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Prior:
+class FieldPrior:
     """A Gaussian prior of a field's weights, independent and zero in the mean.
 
     Args:
-        strength: precision of units as wide as 0.8 half widths of the image, in units of 1 / noise²; infinity: no
+        strength: precision of units as wide as 0.8 half widths of the image, in units of 1 / noise²; infinite: no
             field at all.
-        smoothness: how fast narrower units are believed less: precision grows as width^(-2 · smoothness).
+        smoothness: the precision of narrower units grows as width^(-2 · smoothness).
     """
 
     strength: float
     smoothness: float = 1.0
 
     def precision(self, grid: FieldGrid, half: float) -> Tensor:
-        """(2 K,) of all weights, infinite where they are zero; `half` the image is so wide in the units of the grid."""
+        """(2 K,) of all weights, infinite where they are zero; `half` is half the image's width in grid units."""
         values = [self.strength * (_REFERENCE * half / s.width) ** (2 * self.smoothness) for s in grid.scales]
         each = [
             torch.full((s.count,), value if value < _OFF else math.inf, dtype=torch.float64)
@@ -52,12 +52,12 @@ class Prior:
         return torch.cat([*each, *each])
 
 
-# From no field at all to one that only the data bound, for rough and for smooth lenses.
-CANDIDATES = (Prior(math.inf), *(Prior(a, b) for b in _SMOOTHNESS for a in _STRENGTHS))
+# From no field at all to one that only the data limit, for rough and for smooth lenses.
+CANDIDATES = (FieldPrior(math.inf), *(FieldPrior(a, b) for b in _SMOOTHNESS for a in _STRENGTHS))
 
 
 def deal(count: int, parts: int) -> list[Tensor]:
-    """Indices 0 ... count - 1 dealt like cards after a shuffle with a fixed seed."""
+    """Indices 0 ... count - 1, shuffled with a fixed seed and divided into parts."""
     order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
     return [order[i::parts] for i in range(min(parts, count))]
 
@@ -65,15 +65,15 @@ def deal(count: int, parts: int) -> list[Tensor]:
 def stack_weights(forms: QuadraticForms, chosen: Tensor, precisions: Sequence[Tensor]) -> Tensor:
     """The weights (C,) with which fits under candidate priors are averaged, from some groups (G,) of the forms.
 
-    The groups are held out in five parts, and of all of them the corners next to the border. The average's held-out
-    cost is quadratic in the weights, which are not negative and sum to one.
+    The groups are held out in five parts, and then the corners of all groups next to the border. The held-out cost of
+    the average is quadratic in the weights, which are not negative and sum to one.
     """
     inside = chosen.nonzero()[:, 0]
     cost = torch.zeros(len(precisions), len(precisions), dtype=forms.groups.dtype)
     for part in deal(len(inside), _INNER):
         out = torch.zeros_like(chosen)
         out[inside[part]] = True
-        # A sum, not a difference: next to a pole one corner can outweigh all others.
+        # A sum, not a difference of sums: next to a pole one corner can outweigh all others.
         left, held = forms.total(chosen & ~out), forms.total(out)
         fits = torch.stack([forms.fit(left, precision) for precision in precisions])
         cost += fits @ held @ fits.T
@@ -87,7 +87,7 @@ def stack_weights(forms: QuadraticForms, chosen: Tensor, precisions: Sequence[Te
     if bool(own.isinf().all()):
         weights[0] = 1.0
         return weights
-    # What is far worse on its own has no share; left in, its size would only slow the minimum down.
+    # Candidates that are far worse on their own get no weight; they would only slow down the minimization.
     near = own <= _HOPELESS * own.min()
     weights[near] = simplex_minimum(cost[near][:, near])
     return weights
@@ -102,9 +102,9 @@ def simplex_minimum(matrix: Tensor) -> Tensor:
         [0.75, 0.25, 0.0]
     """
     values = (matrix / matrix.diagonal().min()).numpy()
-    # Steps along the simplex alone count: what all candidates have in common does not change there.
+    # Only steps within the simplex count, where common parts of all candidates do not change.
     curved = values - values.mean(0) - values.mean(1, keepdims=True) + values.mean()
-    # A single candidate, or candidates alike, have no curvature.
+    # A single candidate, or equal ones, have no curvature.
     rate = 1.0 / max(float(np.linalg.eigvalsh(0.5 * (curved + curved.T))[-1]), 1e-9)
     weights = np.full(len(values), 1.0 / len(values))
     ahead, momentum = weights, 1.0

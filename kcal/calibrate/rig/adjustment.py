@@ -1,4 +1,4 @@
-"""The joint adjustment with some items in and others out: building problems, and what each item's residual says."""
+"""The state of a joint adjustment in which some items take part and others do not, and how well each item fits."""
 
 from __future__ import annotations
 
@@ -10,25 +10,20 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.views import free_parameters
-from kcal.calibrate.rig.blocks import BoardGroup, FeatureGroup, Group, LandmarkGroup
+from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, Kind, LandmarkBlock, PerKind, RigState
 from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.problem import DistanceTerm, ParameterTerm, PlaceTerm, RigProblem, SharedTerm
-from kcal.calibrate.rig.sources import Boards, Features, Landmarks, RigData
+from kcal.calibrate.rig.sources import Features, Landmarks, RigData
 from kcal.errors import InputError
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import Result, State
+from kcal.solve.result import Result
 from kcal.solve.robust import RobustLoss
 
 Intrinsics = Literal["fixed", "prior", "free"]
-Source = Literal["boards", "landmarks", "features", "baselines", "positions"]
-# px; of a corner.
+# px, of a corner: noise-free corners would otherwise weigh infinitely much.
 _LEAST_SIGMA = 1e-3
-# The kinds of items, in the order of masks.
-KINDS: tuple[Source, ...] = ("boards", "landmarks", "features")
-# Tensors of each group's local state: boards, landmarks, features.
-TENSORS = (2, 1, 2)
 
 
 def chi2_quantile(dof: Tensor, probability: float) -> Tensor:
@@ -43,14 +38,15 @@ def chi2_quantile(dof: Tensor, probability: float) -> Tensor:
 
 
 class Adjustment:
-    """Data, and the state of everything in it; `masks` say which boards, landmarks and features take part.
+    """Data, and the state of everything in it; masks say which boards, landmarks and features take part.
 
     Args:
         data: what is known.
         start: poses to begin with.
         intrinsics: whether parameters are held, solved with priors, or free.
-        sigma_corner: of a board's corner, px.
-        turning: which cameras' rotations are unknown; all but one that holds the frame if left out.
+        sigma_corner: of a board's corner along an axis, px.
+        board_warp: whether the board's warp is estimated.
+        turning: which cameras' rotations are unknown; left out: all, but the one that is the frame.
         moving: likewise their centers.
     """
 
@@ -61,82 +57,106 @@ class Adjustment:
         intrinsics: Intrinsics,
         sigma_corner: float,
         *,
+        board_warp: bool = False,
         turning: Sequence[bool] | None = None,
         moving: Sequence[bool] | None = None,
     ) -> None:
-        self.data, self.sigma_corner = data, sigma_corner
+        self.data, self.sigma_corner, self._board_warp = data, sigma_corner, board_warp
         loose = [data.absolute or c > 0 for c in range(len(data.cameras))]
         self._turning, self._moving = turning or loose, moving or loose
         self.anchor = start.center.mean(0)
         self.free = [_free(data, c, intrinsics) for c in range(len(data.cameras))]
-        self.terms = _terms(data, self.free if intrinsics == "prior" else None)
-        self.state: State = (
-            torch.cat([camera.params.detach() for camera in data.cameras]),
-            start.rotation,
-            start.center,
-            start.board_rotation,
-            start.board_translation,
-            data.landmarks.points if data.landmarks else torch.empty(0, 3, dtype=torch.float64),
-            *_feature_start(data, start, self.anchor),
+        self._terms = _terms(data, self.free if intrinsics == "prior" else None)
+        direction, inverse_range = _feature_start(data, start, self.anchor)
+        self.state = RigState(
+            parameters=torch.cat([camera.params.detach() for camera in data.cameras]),
+            rotation=start.rotation,
+            center=start.center,
+            warp=torch.zeros(2, dtype=torch.float64),
+            board_rotation=start.board_rotation,
+            board_translation=start.board_translation,
+            points=data.landmarks.points if data.landmarks else torch.empty(0, 3, dtype=torch.float64),
+            direction=direction,
+            inverse_range=inverse_range,
         )
-        self._groups = _groups(data, self.anchor)
 
-    def problem(self, masks: Sequence[Tensor], loss: RobustLoss | None = None, *, held: bool = False) -> RigProblem:
-        """The problem of the items in the masks; `held`: of these alone, with the cameras as they are."""
-        groups = [
-            (build(mask, self.sigma_corner), count)
-            for build, mask, count in zip(self._groups, masks, TENSORS, strict=True)
-        ]
-        count = len(self.data.cameras)
-        free = [Free((), ())] * count if held else self.free
+    def problem(self, masks: PerKind, loss: RobustLoss | None = None, *, held: bool = False) -> RigProblem:
+        """The problem of the items in the masks; `held`: of these alone, with the cameras and the warp as they are."""
+        cameras = self.data.cameras
+        free = [FreeParameters((), ())] * len(cameras) if held else self.free
         turning, moving = ([not held and one for one in each] for each in (self._turning, self._moving))
-        models, fields = [c.model for c in self.data.cameras], [c.field for c in self.data.cameras]
-        return RigProblem(models, fields, groups, () if held else self.terms, free, turning, moving, loss)
+        blocks = self._blocks(masks, free_warp=self._board_warp and not held)
+        return RigProblem(cameras, blocks, () if held else self._terms, free, turning, moving, loss)
 
-    def part(self, masks: Sequence[Tensor]) -> State:
+    def _blocks(self, masks: PerKind, *, free_warp: bool) -> list[Block]:
+        """A block of each kind that has items in the masks."""
+        data, found = self.data, list[Block]()
+        if data.boards and masks.boards.any():
+            pixels, white = (value[masks.boards] for value in (data.boards.pixels, self.corner_whitening()))
+            found.append(BoardBlock(pixels, white, data.boards.board.points, free_warp=free_warp))
+        if data.landmarks and masks.landmarks.any():
+            surveyed = data.landmarks.points[masks.landmarks], data.landmarks.sigma[masks.landmarks]
+            found.append(LandmarkBlock(*_weighted(data.landmarks, masks.landmarks), *surveyed))
+        if data.features and masks.features.any():
+            known = data.features.inverse_range[masks.features], data.features.inverse_range_sigma[masks.features]
+            found.append(FeatureBlock(*_weighted(data.features, masks.features), *known, self.anchor))
+        return found
+
+    def names(self, kind: Kind) -> tuple[str, ...]:
+        """Names of all items of a kind."""
+        source = getattr(self.data, kind)
+        return () if source is None else source.names
+
+    def corner_whitening(self) -> Tensor:
+        """(V, C, N, 2, 2) of all boards, at the present sigma of a corner."""
+        assert self.data.boards is not None
+        return self.data.boards.whitening(self.sigma_corner)
+
+    def none(self) -> PerKind:
+        """Masks without any item."""
+        counts = len(self.state.board_rotation), len(self.state.points), len(self.state.direction)
+        return PerKind(*(torch.zeros(count, dtype=torch.bool) for count in counts))
+
+    def part(self, masks: PerKind) -> RigState:
         """The state of the cameras and of the items in the masks."""
-        out, start = list(self.state[:3]), 3
-        for mask, count in zip(masks, TENSORS, strict=True):
-            out += [tensor[mask] for tensor in self.state[start : start + count]]
-            start += count
-        return tuple(out)
+        index = _masks_of_fields(masks)
+        return RigState(*(t if mask is None else t[mask] for t, mask in zip(self.state, index, strict=True)))
 
-    def put(self, state: State, masks: Sequence[Tensor]) -> None:
+    def put(self, state: RigState, masks: PerKind) -> None:
         """Keep a part's new state."""
-        whole, start = [*state[:3], *(tensor.clone() for tensor in self.state[3:])], 3
-        for mask, count in zip(masks, TENSORS, strict=True):
-            for i in range(start, start + count):
-                whole[i][mask] = state[i]
-            start += count
-        self.state = tuple(whole)
+        index = _masks_of_fields(masks)
+        self.state = RigState(*(
+            new if mask is None else old.index_put((mask,), new)
+            for old, new, mask in zip(self.state, state, index, strict=True)
+        ))  # fmt: skip
 
     def solve(
-        self, masks: Sequence[Tensor], solver: LMOptions, loss: RobustLoss | None = None, *, held: bool = False
+        self, masks: PerKind, solver: LMOptions, loss: RobustLoss | None = None, *, held: bool = False
     ) -> tuple[RigProblem, Result]:
-        """Minimize from where things are, and keep the result."""
+        """Minimize from the present state, and keep the result."""
         problem = self.problem(masks, loss, held=held)
         result = minimize(problem, self.part(masks), solver)
         self.put(problem.tidy(result.state), masks)
         return problem, result
 
-    def squares(self, masks: Sequence[Tensor]) -> list[Tensor]:
-        """χ² of every item as things stand; NaN for items outside the masks and infinite for what cannot be seen."""
-        return _of_all(masks, self.problem(masks).block_squares(self.part(masks)))
+    def squares(self, masks: PerKind) -> PerKind:
+        """χ² of every item at the present state; NaN outside the masks, infinite for what cannot be seen."""
+        problem = self.problem(masks)
+        return _of_all(masks, problem, problem.item_squares(self.part(masks)))
 
-    def deletions(self, masks: Sequence[Tensor]) -> list[Tensor]:
+    def deletions(self, masks: PerKind) -> PerKind:
         """By how much χ² would fall without each item (`RigProblem.deletions`); NaN outside the masks."""
-        return _of_all(masks, self.problem(masks).deletions(self.part(masks)))
+        problem = self.problem(masks)
+        return _of_all(masks, problem, problem.deletions(self.part(masks)))
 
-    def freedom(self, masks: Sequence[Tensor]) -> list[Tensor]:
+    def freedom(self, masks: PerKind) -> PerKind:
         """Degrees of freedom of every item beyond its own unknowns; 0 outside the masks."""
-        found = []
-        for mask, group in zip(masks, self.problem(masks).groups, strict=True):
-            whole = torch.zeros(mask.shape, dtype=torch.int64)
-            whole[mask] = group.counts - group.size
-            found.append(whole)
+        found = PerKind(*(torch.zeros(mask.shape, dtype=torch.int64) for mask in masks))
+        for block in self.problem(masks).blocks:
+            getattr(found, block.kind)[getattr(masks, block.kind)] = block.counts - block.size
         return found
 
-    def fit_corners(self, masks: Sequence[Tensor], *, robust: bool = False) -> None:
+    def fit_corners(self, masks: PerKind, *, robust: bool = False) -> None:
         """Set the corners' sigma from the boards' residuals, unless it was given.
 
         Args:
@@ -144,27 +164,44 @@ class Adjustment:
             robust: by the median board, so that some wrong ones do not matter.
         """
         boards = self.data.boards
-        if boards is None or boards.sigma is not None or not bool(masks[0].any()):
+        if boards is None or boards.sigma is not None or not bool(masks.boards.any()):
             return
-        squares, freedom = self.squares(masks)[0][masks[0]], self.freedom(masks)[0][masks[0]]
+        squares, freedom = self.squares(masks).boards[masks.boards], self.freedom(masks).boards[masks.boards]
         dof = int(freedom.sum())
-        excess = typical_excess(squares, freedom) if robust else float(squares.sum()) / max(dof, 1)
-        if dof > 0 and 0 < excess < math.inf:
-            # Noise-free corners would otherwise weigh infinitely much.
-            self.sigma_corner = max(self.sigma_corner * math.sqrt(excess), _LEAST_SIGMA)
+        if dof <= 0:
+            return
+        if robust:
+            ratio = typical_ratio(squares, freedom)
+        else:
+            problem = self.problem(masks)
+            # Where there is nothing but boards, they determine the shared unknowns too.
+            alone = len(problem.blocks) == 1 and not self._terms
+            ratio = float(squares.sum()) / max(dof - alone * problem.shared_size, 1)
+        if 0 < ratio < math.inf:
+            self.sigma_corner = max(self.sigma_corner * math.sqrt(ratio), _LEAST_SIGMA)
 
 
-def _of_all(masks: Sequence[Tensor], values: Sequence[Tensor]) -> list[Tensor]:
-    """Values of the items inside the masks put among all items: NaN for the others, infinite where there is none."""
-    found = []
-    for mask, part in zip(masks, values, strict=True):
-        whole = torch.full(mask.shape, math.nan, dtype=torch.float64)
-        whole[mask] = part.nan_to_num(math.inf, math.inf)
-        found.append(whole)
+def _masks_of_fields(masks: PerKind) -> RigState:
+    """For each tensor of a state the mask of its items; None for what all items share."""
+    boards, landmarks, features = masks
+    return RigState(None, None, None, None, boards, boards, landmarks, features, features)  # type: ignore[arg-type]
+
+
+def _weighted(source: Landmarks | Features, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels and whitening of marks whose noise is the same along both axes."""
+    pixels = source.pixels[mask]
+    return pixels, (torch.eye(2, dtype=torch.float64) / source.pixel_sigma).expand(*pixels.shape, 2)
+
+
+def _of_all(masks: PerKind, problem: RigProblem, values: Sequence[Tensor]) -> PerKind:
+    """Values of each block's items put among all items: NaN for the others, infinite where a value is not finite."""
+    found = PerKind(*(torch.full(mask.shape, math.nan, dtype=torch.float64) for mask in masks))
+    for block, part in zip(problem.blocks, values, strict=True):
+        getattr(found, block.kind)[getattr(masks, block.kind)] = part.nan_to_num(math.inf, math.inf)
     return found
 
 
-def typical_excess(squares: Tensor, freedom: Tensor) -> float:
+def typical_ratio(squares: Tensor, freedom: Tensor) -> float:
     """Median of χ² over what its median should be; 1 for fewer than four items."""
     known = (freedom > 0) & torch.isfinite(squares)
     if int(known.sum()) < 4:
@@ -172,12 +209,12 @@ def typical_excess(squares: Tensor, freedom: Tensor) -> float:
     return float((squares[known] / chi2_quantile(freedom[known].double(), 0.5)).median())
 
 
-def _free(data: RigData, camera: int, intrinsics: Intrinsics) -> Free:
+def _free(data: RigData, camera: int, intrinsics: Intrinsics) -> FreeParameters:
     model = data.cameras[camera].model
     if intrinsics == "fixed":
-        return Free((), ())
+        return FreeParameters((), ())
     if intrinsics == "free":
-        return Free.of(free_parameters(model))
+        return FreeParameters.of(free_parameters(model))
     covariance = None if data.covariances is None else data.covariances[camera]
     if covariance is None:
         raise InputError(f"{data.names[camera]}: a prior needs the covariance of the camera's parameters")
@@ -188,10 +225,10 @@ def _free(data: RigData, camera: int, intrinsics: Intrinsics) -> Free:
         )
     if not bool(torch.isfinite(covariance).all()):
         raise InputError(f"{data.names[camera]}: the covariance of its parameters is not finite; calibrate it anew")
-    return Free.of((covariance.diagonal() > 0).nonzero()[:, 0].tolist())
+    return FreeParameters.of((covariance.diagonal() > 0).nonzero()[:, 0].tolist())
 
 
-def _terms(data: RigData, priors: list[Free] | None) -> list[SharedTerm]:
+def _terms(data: RigData, priors: list[FreeParameters] | None) -> list[SharedTerm]:
     terms: list[SharedTerm] = [DistanceTerm(b.first, b.second, b.length, b.sigma) for b in data.baselines]
     terms += [PlaceTerm(p.camera, p.point, p.sigma) for p in data.positions]
     for c, free in enumerate(priors or ()):
@@ -224,37 +261,3 @@ def _feature_start(data: RigData, start: Start, anchor: Tensor) -> tuple[Tensor,
         towards = rays @ start.rotation[c] - inverse[:, None] * (anchor - start.center[c])
         direction = torch.where(valid[:, None], towards, direction)
     return direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True), inverse
-
-
-def _groups(data: RigData, anchor: Tensor) -> list:
-    """For boards, landmarks and features a function of a mask and the corners' sigma that makes the group."""
-    count = len(data.cameras)
-    none = torch.empty(0, count, 1, 2, dtype=torch.float64)
-
-    def marks(pixels: Tensor, sigma: float) -> Tensor:
-        return (torch.eye(2, dtype=torch.float64) / sigma).expand(*pixels.shape, 2)
-
-    def of_boards(mask: Tensor, sigma: float) -> Group:
-        boards: Boards | None = data.boards
-        if boards is None:
-            return BoardGroup(none, marks(none, 1.0), torch.zeros(1, 3, dtype=torch.float64))
-        return BoardGroup(boards.pixels[mask], boards.whitening(sigma)[mask], boards.board.points)
-
-    def of_landmarks(mask: Tensor, sigma: float) -> Group:
-        found: Landmarks | None = data.landmarks
-        if found is None:
-            empty = torch.empty(0, 3, dtype=torch.float64)
-            return LandmarkGroup(none[:, :, 0], marks(none[:, :, 0], 1.0), empty, empty)
-        pixels = found.pixels[mask]
-        return LandmarkGroup(pixels, marks(pixels, found.pixel_sigma), found.points[mask], found.sigma[mask])
-
-    def of_features(mask: Tensor, sigma: float) -> Group:
-        found: Features | None = data.features
-        if found is None:
-            empty = torch.empty(0, dtype=torch.float64)
-            return FeatureGroup(none[:, :, 0], marks(none[:, :, 0], 1.0), empty, empty, anchor)
-        pixels = found.pixels[mask]
-        known = found.inverse_range[mask], found.inverse_range_sigma[mask]
-        return FeatureGroup(pixels, marks(pixels, found.pixel_sigma), *known, anchor)
-
-    return [of_boards, of_landmarks, of_features]

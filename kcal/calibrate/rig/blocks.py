@@ -1,57 +1,93 @@
-"""What the cameras of a rig look at, as blocks of least squares: boards, landmarks, features of unknown place.
+"""What the cameras of a rig see, as blocks of least squares: boards, landmarks, and features of unknown position.
 
-A camera with rotation R and center c sees the pixel of R q, q = y - w c. For points w = 1 and y is the point. A feature
-in direction d at inverse range ρ from a place a near the rig has y = d + ρ a and w = ρ, so that q = d + ρ (a - c) is as
-regular at infinity as anywhere (Civera, Davison, Montiel 2008).
+A camera with rotation R and center c sees the pixel of R q, q = y - w c. For points, w = 1 and y is the point. A
+feature in direction d at inverse range ρ from a place a near the rig has y = d + ρ a and w = ρ, so that
+q = d + ρ (a - c) is as regular at infinity as anywhere (Civera, Davison, Montiel 2008).
 
-Residuals are divided by their standard deviations: squares add up to χ².
+Residuals are divided by their standard deviations: their squares add up to χ².
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.bundle.board_problem import warp_shape
+from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.twist import apply_twist
-from kcal.lens.model import LensModel
+from kcal.lens.camera import Camera
 from kcal.lens.pose import side_axes, step_rows
-from kcal.lens.projection import project_components
-from kcal.lens.residual import Field
-from kcal.solve.result import State
+from kcal.lens.projection import Projection, project_components
 
+Kind = Literal["boards", "landmarks", "features"]
+KINDS: tuple[Kind, ...] = ("boards", "landmarks", "features")
 # Unknowns of the largest block, a board's pose.
 LOCAL_SIZE = 6
 
 
-class Sight(NamedTuple):
-    """A camera in the midst of a solve, and where its unknowns stand in a step (None: held)."""
+class PerKind(NamedTuple):
+    """One tensor (V,) for each kind of item: a mask, say, or each item's χ²; empty where there are none."""
+
+    boards: Tensor
+    landmarks: Tensor
+    features: Tensor
+
+
+class RigState(NamedTuple):
+    """Everything that a rig's adjustment estimates, and the parameters that it holds.
+
+    Attributes:
+        parameters: of all cameras, one after the other.
+        rotation: (C, 3, 3) cam_from_world.
+        center: (C, 3) meters, in the world.
+        warp: (2,) meters, of the board; see `kcal.calibrate.bundle.board_problem.warp_shape`.
+        board_rotation: (V, 3, 3) world_from_board.
+        board_translation: (V, 3) meters.
+        points: (L, 3) meters, adjusted positions of landmarks.
+        direction: (F, 3) unit vectors towards features.
+        inverse_range: (F,) 1/m, of features from the block's anchor.
+    """
 
     parameters: Tensor
-    model: LensModel
-    field: Field | None
     rotation: Tensor
     center: Tensor
-    free: Free
+    warp: Tensor
+    board_rotation: Tensor
+    board_translation: Tensor
+    points: Tensor
+    direction: Tensor
+    inverse_range: Tensor
+
+
+class PosedCamera(NamedTuple):
+    """A camera as it stands during a solve, and where its unknowns are in a step (None: held)."""
+
+    camera: Camera
+    parameters: Tensor
+    rotation: Tensor
+    center: Tensor
+    free: FreeParameters
     inner: slice
     turn: slice | None
     shift: slice | None
 
 
-class Group(ABC):
-    """V blocks of one kind, each with its own unknowns that no other block shares.
+class Block(ABC):
+    """V items of one kind, each with its own unknowns that no other item shares.
 
     Args:
         pixels: (V, C, N, 2), NaN where not seen.
         whitening: (V, C, N, 2, 2) by which pixel residuals are multiplied.
     """
 
-    name: str
+    kind: Kind
     size: int
+    # Whether the last two shared unknowns are the board's warp.
+    free_warp = False
 
     def __init__(self, pixels: Tensor, whitening: Tensor) -> None:
         self.seen = torch.isfinite(pixels).all(-1)
@@ -59,72 +95,80 @@ class Group(ABC):
         self.whitening = torch.where(self.seen[..., None, None], whitening, 0.0).movedim(-3, -1).contiguous()
 
     def __len__(self) -> int:
-        """How many blocks there are."""
+        """How many items there are."""
         return len(self.target)
 
     @property
     def counts(self) -> Tensor:
-        """(V,) residuals of each block."""
-        return 2 * self.seen.sum((-2, -1)) + self.prior_count()
+        """(V,) residuals of each item."""
+        return 2 * self.seen.sum((-2, -1)) + self._prior_count()
 
-    def prior_count(self) -> Tensor:
+    def _prior_count(self) -> Tensor:
         """(V,) residuals besides the pixels."""
         return torch.zeros(len(self), dtype=torch.int64)
 
     @abstractmethod
-    def place(self, local: State) -> tuple[Tensor, Tensor]:
+    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         """Y (V, 3, N) and w (V, 1, 1)."""
 
     @abstractmethod
-    def by_local(self, local: State, by_q: Tensor, center: Tensor) -> Tensor:
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
         """Derivatives (V, L, 2, N) of pixels by the unknowns, from those by q (V, 3, 2, N)."""
 
     @abstractmethod
-    def retract(self, local: State, step: Tensor) -> State:
-        """Apply a step (V, L)."""
+    def retract(self, state: RigState, step: Tensor) -> RigState:
+        """Apply a step (V, L) to this block's part of the state."""
 
-    def prior(self, local: State) -> Tensor | None:
-        """(V, L + 1, Q): derivatives of Q residuals of what is known beforehand, and last these."""
+    def _by_warp(self, state: RigState, by_q: Tensor) -> Tensor:
+        """Derivatives (V, 2, 2, N) of pixels by the board's warp, where that is free."""
+        raise NotImplementedError
+
+    def _prior(self, state: RigState) -> Tensor | None:
+        """(V, L + 1, Q): derivatives of Q residuals of what is known beforehand; the last row holds the residuals."""
         return None
 
-    def _projected(self, sights: Sequence[Sight], local: State, derivatives: bool) -> Iterator[tuple]:
-        y, w = self.place(local)
-        for c, sight in enumerate(sights):
-            q = sight.rotation @ (y - w * sight.center[:, None])
-            wanted = sight.free.indices if derivatives else None
-            found = project_components(q, sight.parameters, sight.model, wanted, sight.field)
-            # As an error of a seen point, so that a pose behind which it lies is no candidate.
+    def _projected(
+        self, cameras: Sequence[PosedCamera], state: RigState, derivatives: bool
+    ) -> Iterator[tuple[int, PosedCamera, Tensor, Tensor, Projection, Tensor]]:
+        y, w = self._place(state)
+        for c, posed in enumerate(cameras):
+            q = posed.rotation @ (y - w * posed.center[:, None])
+            wanted = posed.free.indices if derivatives else None
+            found = project_components(q, posed.parameters, posed.camera.model, wanted, posed.camera.field)
+            # NaN where a seen point has no projection, so that such a pose is never accepted.
             bad = torch.where(found.regular, 0.0, torch.nan)[..., None, :]
             error = torch.where(self.seen[:, c, None, :], found.pixels - self.target[:, c] + bad, 0.0)
-            yield c, sight, q, w, found, error
+            yield c, posed, q, w, found, error
 
-    def errors(self, sights: Sequence[Sight], local: State) -> Tensor:
+    def errors(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
         """(V, C, 2, N) projected minus seen, pixels; 0 where not seen."""
-        return torch.stack([error for *_, error in self._projected(sights, local, False)], 1)
+        return torch.stack([error for *_, error in self._projected(cameras, state, False)], 1)
 
-    def residuals(self, sights: Sequence[Sight], local: State) -> Tensor:
+    def residuals(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
         """(V, R) whitened residuals, pixels first."""
-        white = torch.einsum("vcuwn,vcwn->vcun", self.whitening, self.errors(sights, local)).flatten(1)
-        prior = self.prior(local)
+        white = torch.einsum("vcuwn,vcwn->vcun", self.whitening, self.errors(cameras, state)).flatten(1)
+        prior = self._prior(state)
         return white if prior is None else torch.cat([white, prior[:, -1]], -1)
 
-    def rows(self, sights: Sequence[Sight], local: State, shared_size: int) -> Tensor:
-        """(V, L + S + 1, R) derivatives of the whitened residuals by local and shared unknowns, and last these."""
+    def rows(self, cameras: Sequence[PosedCamera], state: RigState, shared_size: int) -> Tensor:
+        """(V, L + S + 1, R) derivatives of whitened residuals by local and shared unknowns; last the residuals."""
         out = []
-        for c, sight, q, w, found, error in self._projected(sights, local, True):
+        for c, posed, q, w, found, error in self._projected(cameras, state, True):
             rows = q.new_zeros((len(self), self.size + shared_size + 1, 2, q.shape[-1]))
-            by_q = torch.einsum("vkun,kj->vjun", found.by_point, sight.rotation)
-            rows[:, : self.size] = self.by_local(local, by_q, sight.center)
+            by_q = torch.einsum("vkun,kj->vjun", found.by_point, posed.rotation)
+            rows[:, : self.size] = self._by_local(state, by_q, posed.center)
             shared = rows[:, self.size : -1]
-            shared[:, sight.inner] = sight.free.collapse(found.by_camera, -3)
-            if sight.turn is not None:
-                shared[:, sight.turn] = step_rows(found.by_point, q)[:, :3]
-            if sight.shift is not None:
-                shared[:, sight.shift] = -w[..., None] * by_q
+            shared[:, posed.inner] = posed.free.collapse(found.by_camera, -3)
+            if posed.turn is not None:
+                shared[:, posed.turn] = step_rows(found.by_point, q)[:, :3]
+            if posed.shift is not None:
+                shared[:, posed.shift] = -w[..., None] * by_q
+            if self.free_warp:
+                shared[:, -2:] = self._by_warp(state, by_q)
             rows[:, -1] = error
             rows = torch.where(self.seen[:, c, None, None, :], rows, 0.0)
             out.append(torch.einsum("vuwn,vpwn->vpun", self.whitening[:, c], rows).flatten(-2))
-        prior = self.prior(local)
+        prior = self._prior(state)
         if prior is not None:
             rows = prior.new_zeros((len(self), self.size + shared_size + 1, prior.shape[-1]))
             rows[:, : self.size], rows[:, -1] = prior[:, :-1], prior[:, -1]
@@ -132,94 +176,100 @@ class Group(ABC):
         return torch.cat(out, -1)
 
 
-class BoardGroup(Group):
-    """Boards: local state is (V, 3, 3) and (V, 3), where they stand in the rig's frame."""
+class BoardBlock(Block):
+    """Boards, of which each has a pose of its own; all have the same warp, which is a shared unknown if it is free."""
 
-    name, size = "boards", 6
+    kind: Kind = "boards"
+    size = 6
 
-    def __init__(self, pixels: Tensor, whitening: Tensor, board_points: Tensor) -> None:
+    def __init__(self, pixels: Tensor, whitening: Tensor, board_points: Tensor, *, free_warp: bool = False) -> None:
         super().__init__(pixels, whitening)
-        self._board = board_points.T.contiguous()
+        self._board, self._shape, self.free_warp = board_points.T.contiguous(), warp_shape(board_points), free_warp
 
-    def place(self, local: State) -> tuple[Tensor, Tensor]:
-        """See `Group.place`."""
-        rotation, translation = local
-        return rotation @ self._board + translation[..., None], translation.new_ones(len(self), 1, 1)
+    def _bent(self, state: RigState) -> Tensor:
+        return torch.cat([self._board[:2], self._board[2:] + state.warp @ self._shape])
 
-    def by_local(self, local: State, by_q: Tensor, center: Tensor) -> Tensor:
-        """See `Group.by_local`: by ω through ω × (R x), then by v."""
-        return step_rows(by_q, local[0] @ self._board)
+    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
+        points = state.board_rotation @ self._bent(state) + state.board_translation[..., None]
+        return points, points.new_ones(len(self), 1, 1)
 
-    def retract(self, local: State, step: Tensor) -> State:
-        """See `Group.retract`."""
-        return apply_twist(local[0], local[1], step)
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
+        # By ω through ω × (R x), then by v.
+        return step_rows(by_q, state.board_rotation @ self._bent(state))
+
+    def _by_warp(self, state: RigState, by_q: Tensor) -> Tensor:
+        # Along the board's normal.
+        along = torch.einsum("vkun,vk->vun", by_q, state.board_rotation[..., 2])
+        return along[:, None] * self._shape[:, None]
+
+    def retract(self, state: RigState, step: Tensor) -> RigState:
+        """See `Block.retract`."""
+        rotation, translation = apply_twist(state.board_rotation, state.board_translation, step)
+        return state._replace(board_rotation=rotation, board_translation=translation)
 
 
-class LandmarkGroup(Group):
-    """Surveyed points: local state is (V, 3), their adjusted positions."""
+class LandmarkBlock(Block):
+    """Surveyed points, whose adjusted positions are the unknowns."""
 
-    name, size = "landmarks", 3
+    kind: Kind = "landmarks"
+    size = 3
 
     def __init__(self, pixels: Tensor, whitening: Tensor, points: Tensor, sigma: Tensor) -> None:
         super().__init__(pixels[:, :, None], whitening[:, :, None])
-        self.points, self.sigma = points, sigma
+        self._surveyed, self._sigma = points, sigma
 
-    def prior_count(self) -> Tensor:
-        """See `Group.prior_count`."""
+    def _prior_count(self) -> Tensor:
         return torch.full((len(self),), 3)
 
-    def place(self, local: State) -> tuple[Tensor, Tensor]:
-        """See `Group.place`."""
-        return local[0][..., None], local[0].new_ones(len(self), 1, 1)
+    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
+        return state.points[..., None], state.points.new_ones(len(self), 1, 1)
 
-    def by_local(self, local: State, by_q: Tensor, center: Tensor) -> Tensor:
-        """See `Group.by_local`."""
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
         return by_q
 
-    def prior(self, local: State) -> Tensor | None:
-        """See `Group.prior`: the survey."""
-        error = (local[0] - self.points) / self.sigma
-        return torch.cat([torch.diag_embed(1.0 / self.sigma), error[:, None]], 1)
+    def _prior(self, state: RigState) -> Tensor | None:
+        # The survey.
+        error = (state.points - self._surveyed) / self._sigma
+        return torch.cat([torch.diag_embed(1.0 / self._sigma), error[:, None]], 1)
 
-    def retract(self, local: State, step: Tensor) -> State:
-        """See `Group.retract`."""
-        return (local[0] + step,)
+    def retract(self, state: RigState, step: Tensor) -> RigState:
+        """See `Block.retract`."""
+        return state._replace(points=state.points + step)
 
 
-class FeatureGroup(Group):
-    """Things of unknown place: local state is (V, 3), unit directions, and (V,), inverse ranges from `anchor`."""
+class FeatureBlock(Block):
+    """Things of unknown position: a direction and an inverse range from `anchor` each."""
 
-    name, size = "features", 3
+    kind: Kind = "features"
+    size = 3
 
     def __init__(self, pixels: Tensor, whitening: Tensor, inverse_range: Tensor, sigma: Tensor, anchor: Tensor) -> None:
         super().__init__(pixels[:, :, None], whitening[:, :, None])
         self._mean, self._weight = inverse_range, torch.where(torch.isfinite(sigma), 1.0 / sigma, 0.0)
         self._anchor = anchor
 
-    def prior_count(self) -> Tensor:
-        """See `Group.prior_count`."""
+    def _prior_count(self) -> Tensor:
         return (self._weight > 0).long()
 
-    def place(self, local: State) -> tuple[Tensor, Tensor]:
-        """See `Group.place`."""
-        direction, inverse = local
-        return (direction + inverse[:, None] * self._anchor)[..., None], inverse[:, None, None]
+    def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
+        inverse = state.inverse_range[:, None]
+        return (state.direction + inverse * self._anchor)[..., None], inverse[..., None]
 
-    def by_local(self, local: State, by_q: Tensor, center: Tensor) -> Tensor:
-        """See `Group.by_local`: by two steps across the direction, then by ρ."""
-        along = self._anchor - center
-        moves = torch.stack([*side_axes(local[0]), along.expand_as(local[0])], 1)
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
+        # By two steps across the direction, then by ρ.
+        along = (self._anchor - center).expand_as(state.direction)
+        moves = torch.stack([*side_axes(state.direction), along], 1)
         return torch.einsum("vjun,vlj->vlun", by_q, moves)
 
-    def prior(self, local: State) -> Tensor | None:
-        """See `Group.prior`: what is known of the range."""
+    def _prior(self, state: RigState) -> Tensor | None:
+        # What is known of the range.
         zero = torch.zeros_like(self._weight)
-        error = (local[1] - self._mean) * self._weight
+        error = (state.inverse_range - self._mean) * self._weight
         return torch.stack([zero, zero, self._weight, error], 1)[..., None]
 
-    def retract(self, local: State, step: Tensor) -> State:
-        """See `Group.retract`."""
-        direction, inverse = local
-        first, second = side_axes(direction)
-        moved = direction + step[:, :1] * first + step[:, 1:2] * second
-        return moved / torch.linalg.vector_norm(moved, dim=-1, keepdim=True), inverse + step[:, 2]
+    def retract(self, state: RigState, step: Tensor) -> RigState:
+        """See `Block.retract`."""
+        first, second = side_axes(state.direction)
+        moved = state.direction + step[:, :1] * first + step[:, 1:2] * second
+        direction = moved / torch.linalg.vector_norm(moved, dim=-1, keepdim=True)
+        return state._replace(direction=direction, inverse_range=state.inverse_range + step[:, 2])

@@ -1,24 +1,29 @@
-"""Which relative pose do pairs of views agree on, before anything is refined jointly?"""
+"""Find the relative pose that pairs of board views agree on, before anything is refined jointly."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardState
 from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
 from kcal.calibrate.bundle.poses import refine_poses, unflip
+from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import State
 
 MINIMUM_CORNERS = 6
 # A camera that leaves its own boards this far off (pixels) is not the camera that took them.
 _FOREIGN_RMS = 5.0
+# Cameras are swapped only if each fits the other's boards with less than this share of its own RMS.
+_CLEARLY = 0.9
 # A turned order of corners is believed only if it leaves less than this share of the error.
 _TURNED = 0.2
 
@@ -29,6 +34,16 @@ class Poses:
 
     rotation: Tensor
     translation: Tensor
+
+    @classmethod
+    def at(cls, rotation: Tensor, center: Tensor) -> Poses:
+        """World to camera, of a camera whose center is in the world."""
+        return cls(rotation, -(rotation @ center))
+
+    @property
+    def center(self) -> Tensor:
+        """The point that is moved to the origin."""
+        return self.inverse().translation
 
     def after(self, other: Poses) -> Poses:
         """This motion applied after another."""
@@ -53,56 +68,68 @@ def pose_alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions)
     normalized = torch.where(valid[..., None], normalized, torch.nan)
     if int(valid.sum(-1).min()) < MINIMUM_CORNERS:
         return Poses(torch.empty(0), torch.empty(0)), math.inf
-    homography = homographies(board, normalized)
     pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    rotation, translation = poses_from_homographies(homography, pinhole)
-    nothing = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
-    parameters = camera.params.detach()
-    state: State = (parameters, torch.zeros(2, dtype=torch.float64), *nothing, rotation, translation)
-    view = pixels[:, None]
-    state, _ = refine_poses(board, view, [camera.model], state, solver, [camera.field])
-    state, flipped = unflip(board, view, [camera.model], state, [camera.field])
+    poses = poses_from_homographies(homographies(board, normalized), pinhole)
+    state = BoardState.flat(camera.params.detach(), *poses)
+    views = Views(board_points=board, pixels=pixels)
+    state, _ = refine_poses(views, camera.model, state, solver, camera.field)
+    state, flipped = unflip(views, camera.model, state, camera.field)
     if flipped:
-        state, _ = refine_poses(board, view, [camera.model], state, solver, [camera.field])
-    problem = BoardProblem(board, pixels[:, None], [camera.model], [()], fields=[camera.field])
-    rms = float(pair_rms(problem, state, pixels[:, None]).median())
-    return Poses(state[-2], state[-1]), rms if math.isfinite(rms) else math.inf
+        state, _ = refine_poses(views, camera.model, state, solver, camera.field)
+    problem = views.problem(camera.model, field=camera.field)
+    corners = torch.isfinite(pixels).all(-1).sum(-1)
+    rms = float((2.0 * problem.view_cost(state) / corners).sqrt().median())
+    return Poses(state.rotation, state.translation), rms if math.isfinite(rms) else math.inf
 
 
-def check_fit(
-    board: Tensor, pixels: Tensor, cameras: tuple[Camera, Camera], alone: tuple[float, ...], solver: LMOptions
-) -> None:
-    """Refuse cameras that do not fit their observations, or that fit each other's clearly better."""
-    for c, word in enumerate(("left", "right")):
-        if not alone[c] <= _FOREIGN_RMS:
+def check_cameras(data: RigData, good: Tensor, rms: Sequence[float], solver: LMOptions) -> None:
+    """Refuse cameras that do not fit their boards, or that fit each other's boards clearly better.
+
+    Args:
+        data: with boards.
+        good: (V, C) which boards each camera sees well.
+        rms: of each camera alone on these (`pose_alone`).
+        solver: options of the solver.
+    """
+    boards = data.boards
+    assert boards is not None
+    for name, own in zip(data.names, rms, strict=True):
+        if not own <= _FOREIGN_RMS:
             raise InputError(
-                f"the {word} observations do not fit the {word} camera (RMS {alone[c]:.1f} px): are cameras or "
+                f"the {name} observations do not fit the {name} camera (RMS {own:.1f} px): are cameras or "
                 "observations swapped?"
             )
-    if cameras[0].size == cameras[1].size:
-        swapped = [pose_alone(board, pixels[:, c], cameras[1 - c], solver)[1] for c in (0, 1)]
-        if all(other < 0.9 * own for other, own in zip(swapped, alone, strict=True)):
+    for pair in itertools.combinations(range(len(data.cameras)), 2):
+        one, other = pair
+        if data.cameras[one].size != data.cameras[other].size or not bool(good[:, pair].any(0).all()):
+            continue
+        points = boards.board.points
+        swapped = [
+            pose_alone(points, boards.pixels[good[:, a], a], data.cameras[b], solver)[1] for a, b in (pair, pair[::-1])
+        ]
+        if swapped[0] < _CLEARLY * rms[one] and swapped[1] < _CLEARLY * rms[other]:
+            first, second = data.names[one], data.names[other]
             raise InputError(
-                f"the left observations fit the right camera better (RMS {swapped[0]:.2f} against {alone[0]:.2f} px), "
-                "and the right ones the left camera: the cameras are swapped"
+                f"the {first} observations fit the {second} camera better (RMS {swapped[0]:.2f} against "
+                f"{rms[one]:.2f} px), and the {second} ones the {first} camera: the cameras are swapped"
             )
 
 
-def pair_rms(problem: BoardProblem, state: State, pixels: Tensor) -> Tensor:
-    """RMS (V,) in pixels of each view, over all cameras."""
-    residuals = problem.residuals(state)
-    count = torch.isfinite(pixels).all(-1).sum((-2, -1))
-    return torch.sqrt((residuals**2).sum(-1) / count)
+def half_turn(board: Tensor) -> Poses:
+    """From a board (N, 3) to the same board read from its other end: half a turn about its middle."""
+    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+    return Poses(turn, board.amin(0) + board.amax(0))
 
 
 def consensus(
     board: Tensor, pixels: Tensor, cameras: tuple[Camera, Camera], left: Poses, right: Poses
 ) -> tuple[Poses, Tensor, Tensor]:
-    """The relative pose that most pairs agree with, which pairs are turned under it, and each pair's error (px)."""
-    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
-    turn = Poses(half_turn, board.amin(0) + board.amax(0))
+    """Find the relative pose that most pairs agree with, which pairs are turned under it, and each pair's error (px).
+
+    Every pair proposes a relative pose, with the corners as read and with the second camera's order turned by 180°.
+    """
     proposals = [right[i].after(left[i].inverse()) for i in range(len(pixels))]
-    proposals += [right[i].after(turn).after(left[i].inverse()) for i in range(len(pixels))]
+    proposals += [right[i].after(half_turn(board)).after(left[i].inverse()) for i in range(len(pixels))]
     as_read, other_end = pixels[:, 1], pixels[:, 1].flip(-2)
     points_left = board @ left.rotation.transpose(-1, -2) + left.translation[:, None]
     best: tuple[float, Poses, Tensor, Tensor] | None = None

@@ -1,4 +1,4 @@
-"""Has a rig turned since it was solved? The monitor behind `kcal rig check`: attitudes from what does not move.
+"""Measure how the cameras of a rig have turned since it was solved, from things that do not move (`kcal rig check`).
 
 Masts bend in the sun and mounts settle: the cameras stay where they are and turn by thousandths of a degree, which at
 long range is all that matters (0.01° of relative yaw is 436 m at 5 km with 10 m of baseline). Only rotations are
@@ -14,12 +14,13 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import Adjustment, chi2_quantile
+from kcal.calibrate.rig.blocks import KINDS, PerKind
 from kcal.calibrate.rig.initial_poses import Start
-from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, reject_wrong
+from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, without_wrong
 from kcal.calibrate.rig.records import item_records
 from kcal.calibrate.rig.result import ItemResidual
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
-from kcal.calibrate.rig.uncertainty import SharedSpread, relative_rows
+from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, relative_rows, turn_rows
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import vector_from_rotation
@@ -126,12 +127,9 @@ def measure_drift(
     rotation, center = as_points("pose rotation", rotation, 3), as_points("pose center", center, 3)
     right = rig.right_from_left_rotation @ rotation
     right_center = center - rotation.T @ rig.right_from_left_rotation.T @ rig.right_from_left_translation
-    nothing = torch.empty(0, 3, 3, dtype=torch.float64), torch.empty(0, 3, dtype=torch.float64)
     start = Start(
         rotation=torch.stack([rotation, right, rotation, right]),
         center=torch.stack([center, right_center, center, right_center]),
-        board_rotation=nothing[0],
-        board_translation=nothing[1],
     )
     if landmarks is not None:
         unseen = torch.full_like(landmarks.pixels, math.nan)
@@ -139,42 +137,32 @@ def measure_drift(
     cameras = (rig.left, rig.right, rig.left, rig.right)
     data = RigData(cameras=cameras, names=_NAMES, features=features, landmarks=landmarks)
     work = Adjustment(data, start, "fixed", 1.0, turning=[False, False, loose, True], moving=[False] * 4)
-    masks = _masks(data)
-    reasons: list[dict[int, str]] = [
-        dict.fromkeys((~mask).nonzero()[:, 0].tolist(), "too few of the images have a mark of it") for mask in masks
-    ]
+    masks = _telling(data)
+    few = "too few of the images have a mark of it"
+    reasons = {
+        kind: dict.fromkeys((~mask).nonzero()[:, 0].tolist(), few) for kind, mask in zip(KINDS, masks, strict=True)
+    }
     if sum(int(mask.sum()) for mask in masks) < 2:
         raise DegenerateError("drift: two features or landmarks at least are needed; more let wrong ones be found")
     work.solve(masks, ROUGHLY, LOSS)
-    reject_wrong(work, masks, reasons, _SOLVER)
+    masks = without_wrong(work, masks, _SOLVER)
     problem, _ = work.solve(masks, _SOLVER)
     state = work.part(masks)
-    cost = 2.0 * float(problem.cost(state))
-    freedom = int(sum(int(f.sum()) for f in work.freedom(masks))) - problem.shared_size
-    large = freedom > 0 and cost > float(chi2_quantile(torch.tensor(float(freedom)), 0.999))
-    variance = cost / freedom if large else 1.0
-    spread = SharedSpread(problem, state, variance)
-    rows = relative_rows(problem, state, 2, 3)
-    covariance, determined = spread.of(rows)
+    fit = goodness_of_fit(problem, state)
+    known = SharedCovariance(problem, state, fit.variance)
+    covariance, determined = known.of(relative_rows(problem, state, 2, 3))
     if not bool(determined[:3].all()):
-        left_open = "; ".join(spread.open_directions(_NAMES, absolute=True))
+        left_open = "; ".join(known.open_directions(_NAMES, absolute=True))
         raise DegenerateError(f"drift: what was seen does not determine how the cameras have turned ({left_open})")
-    turned, places = state[1], state[2]
+    turned, places = state.rotation, state.center
     relative = turned[3] @ turned[2].T
     drift = vector_from_rotation(relative @ rig.right_from_left_rotation.T)
     own = [vector_from_rotation(turned[c + 2] @ turned[c].T) for c in (0, 1)]
-    alone = []
-    for c in (2, 3):
-        slot = problem.turn[c]
-        unit = torch.zeros(3, problem.shared_size, dtype=torch.float64)
-        if slot is not None:
-            unit[:, slot] = torch.eye(3, dtype=torch.float64)
-        alone.append(spread.of(unit)[0])
+    alone = [known.of(turn_rows(problem, c))[0] for c in (2, 3)]
     compared = covariance[:3, :3]
     if before is not None and not history:
-        turn = relative
         compared = compared + before[0]
-        alone = [alone[0] + before[1], alone[1] + before[0] + turn @ before[1] @ turn.T]
+        alone = [alone[0] + before[1], alone[1] + before[0] + relative @ before[1] @ relative.T]
     return Drift(
         left=own[0] if loose else None,
         right=own[1] if loose else None,
@@ -187,20 +175,18 @@ def measure_drift(
         pose_covariance=covariance,
         cam_from_local=turned[2] if pose is not None else None,
         items=item_records(work, masks, reasons),
-        variance=variance,
+        variance=fit.variance,
     )
 
 
-def _masks(data: RigData) -> list[Tensor]:
-    """What says anything: landmarks with a mark now, features seen by both cameras now or by one then and now."""
-    none = torch.zeros(0, dtype=torch.bool)
-    marked = none
-    if data.landmarks is not None:
-        marked = torch.isfinite(data.landmarks.pixels).all(-1).any(-1)
-    matched = none
+def _telling(data: RigData) -> PerKind:
+    """Landmarks with a mark now; features seen by both cameras now, or by one then and now."""
+    nothing = torch.zeros(0, dtype=torch.bool)
+    marked = nothing if data.landmarks is None else torch.isfinite(data.landmarks.pixels).all(-1).any(-1)
+    matched = nothing
     if data.features is not None:
         seen = torch.isfinite(data.features.pixels).all(-1)
         known = torch.isfinite(data.features.inverse_range_sigma)
         past = seen[:, :2].any(-1)
         matched = seen[:, 2:].any(-1) & (past | (known & seen[:, 2:].all(-1)))
-    return [none, marked, matched]
+    return PerKind(nothing, marked, matched)

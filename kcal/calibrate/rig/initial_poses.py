@@ -1,23 +1,25 @@
-"""Where the cameras of a rig stand, roughly, before everything is adjusted together."""
+"""Find roughly where the cameras and boards of a rig stand, before everything is adjusted together."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.closed_form import spread_out
-from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, Poses, consensus, pose_alone
+from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, Poses, check_cameras, consensus, half_turn, pose_alone
 from kcal.calibrate.rig.resection import consensus_pose, consensus_rotation, rotation_between
 from kcal.calibrate.rig.sources import Boards, RigData
 from kcal.errors import DegenerateError
 from kcal.solve.lm import LMOptions
 
-# A board farther from where the other boards put it (pixels, and times the median) does not belong.
-_ROUGH = (10.0, 10.0)
-# Weight of "cameras are held upright" where measured positions leave a turn open.
+# A board that is farther from where the other boards put it than both (pixels, and times the median) does not belong.
+_FOREIGN_PX, _FOREIGN_TIMES = 10.0, 10.0
+# Weight of "cameras are held upright" where measured positions leave a turn open: enough to decide, without effect on
+# what the positions tell.
 _LEVEL = 1e-3
 
 
@@ -34,8 +36,15 @@ class Start:
 
     rotation: Tensor
     center: Tensor
-    board_rotation: Tensor
-    board_translation: Tensor
+    board_rotation: Tensor = dataclasses.field(default_factory=lambda: torch.empty(0, 3, 3, dtype=torch.float64))
+    board_translation: Tensor = dataclasses.field(default_factory=lambda: torch.empty(0, 3, dtype=torch.float64))
+
+
+class TurnedBoard(NamedTuple):
+    """A board that one camera had read from its other end, by the names of both."""
+
+    board: str
+    camera: str
 
 
 @dataclasses.dataclass(kw_only=True, eq=False)
@@ -44,71 +53,50 @@ class InitialPoses:
 
     Args:
         data: with boards turned where they had been read from the other end.
-        starts: rivals; the best solution decides.
+        starts: possible starts; the one with the best solution is used.
         flipped: boards that were turned.
-        foreign: boards that do not belong, with the reason.
-        usable: (V,) boards that two cameras at least see well.
+        foreign: indices of boards that do not belong, with the reason.
+        usable: (V,) boards that at least two cameras see well.
     """
 
     data: RigData
     starts: list[Start]
-    flipped: list[str]
+    flipped: list[TurnedBoard]
     foreign: dict[int, str]
     usable: Tensor
 
 
-class _Known:
-    """Poses found so far; None where a camera still has none."""
-
-    def __init__(self, count: int) -> None:
-        self.rotation: list[Tensor | None] = [None] * count
-        self.center: list[Tensor | None] = [None] * count
-
-    def poses(self, camera: int) -> Poses:
-        rotation, center = self.rotation[camera], self.center[camera]
-        assert rotation is not None
-        assert center is not None
-        return Poses(rotation, -(rotation @ center))
-
-    def put(self, camera: int, rotation: Tensor, center: Tensor) -> None:
-        self.rotation[camera], self.center[camera] = rotation, center
-
-    @property
-    def ready(self) -> list[int]:
-        return [c for c, rotation in enumerate(self.rotation) if rotation is not None]
+# The cameras whose poses (cam_from_world) were found so far.
+_Known = dict[int, Poses]
 
 
 def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
     """Find a pose for every camera and board, from landmarks, then boards, then features and measured positions.
 
     Raises:
-        DegenerateError: nothing ties a camera to the others; it is named.
+        DegenerateError: nothing connects a camera with the others; it is named.
     """
-    count = len(data.cameras)
-    known, views = _Known(count), _BoardViews(data, solver)
-    if data.landmarks is not None:
-        for c in range(count):
-            _from_landmarks(data, c, known)
-    placed = bool(known.ready)
-    if not placed:
-        known.put(0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    open_ends: list[int] = []
-    headings = None if placed else _measured_starts(data)
-    while headings is None and len(known.ready) < count:
-        waiting = [c for c in range(count) if c not in known.ready]
-        if views.link(known, waiting):
-            continue
-        if not any(_from_features(data, c, known, open_ends, placed) for c in waiting):
-            names = ", ".join(data.names[c] for c in waiting)
-            raise DegenerateError(
-                f"nothing tells where {names} stands: it needs boards seen together with another camera, three or "
-                "better four landmarks, or features together with its position or the baseline"
-            )
-    views.settle(known)
-    starts = headings or _starts(data, known, open_ends)
-    if data.absolute and not placed and headings is None:
-        for start in starts:
-            _into_frame(data, start)
+    known, views = _from_landmarks(data), _BoardViews(data, solver)
+    placed = bool(known)
+    starts = None if placed else _level_starts(data)
+    if starts is None:
+        if not placed:
+            known[0] = _at_origin()
+        tried: list[int] = []
+        while waiting := [c for c in range(len(data.cameras)) if c not in known]:
+            if views.link(known, waiting):
+                continue
+            if not any(_from_features(data, c, known, tried, placed=placed) for c in waiting):
+                raise DegenerateError(
+                    f"nothing tells where {', '.join(data.names[c] for c in waiting)} stands: it needs boards seen "
+                    "together with another camera, three or better four landmarks, or features together with its "
+                    "position or the baseline"
+                )
+        starts = _starts(known, tried)
+        if data.absolute and not placed:
+            for start in starts:
+                _into_frame(data, start)
+    views.turn_all()
     for start in starts:
         start.board_rotation, start.board_translation = views.world(start)
     return InitialPoses(
@@ -116,31 +104,32 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
     )
 
 
-def _measured_starts(data: RigData) -> list[Start] | None:
-    """Starts for cameras whose positions are all measured and that only features tie: level, in eight headings."""
-    if (
-        data.features is None
-        or data.boards is not None
-        or {p.camera for p in data.positions} != {*range(len(data.cameras))}
-    ):
+def _at_origin() -> Poses:
+    return Poses(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+
+
+def _stacked(known: _Known) -> tuple[Tensor, Tensor]:
+    poses = [known[c] for c in sorted(known)]
+    return torch.stack([pose.rotation for pose in poses]), torch.stack([pose.center for pose in poses])
+
+
+def _level_starts(data: RigData) -> list[Start] | None:
+    """Starts for cameras whose positions are all measured and that only features connect: level, in eight headings."""
+    places = {p.camera: p.point for p in reversed(data.positions)}
+    if data.features is None or data.boards is not None or len(places) < len(data.cameras):
         return None
-    known = _Known(len(data.cameras))
-    known.put(0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    known = {0: _at_origin()}
     for _ in data.cameras:
         for camera in range(len(data.cameras)):
-            if camera not in known.ready:
-                _from_features(data, camera, known, [], False)
-    if len(known.ready) < len(data.cameras):
+            if camera not in known:
+                _from_features(data, camera, known, [], placed=False)
+    if len(known) < len(data.cameras):
         return None
-    relative = torch.stack([known.poses(c).rotation for c in range(len(data.cameras))])
-    center = torch.stack([place for c in range(len(data.cameras)) if (place := _position(data, c)) is not None])
-    nothing, starts = torch.empty(0, dtype=torch.float64), []
+    center, starts = torch.stack([places[c] for c in sorted(places)]), []
     for eighth in range(8):
         sine, cosine = math.sin(math.pi * eighth / 4), math.cos(math.pi * eighth / 4)
         level = torch.tensor([[cosine, -sine, 0.0], [0.0, 0.0, -1.0], [sine, cosine, 0.0]], dtype=torch.float64)
-        starts.append(
-            Start(rotation=relative @ level, center=center, board_rotation=nothing, board_translation=nothing)
-        )
+        starts.append(Start(rotation=_stacked(known)[0] @ level, center=center))
     return starts
 
 
@@ -148,40 +137,39 @@ def _position(data: RigData, camera: int) -> Tensor | None:
     return next((p.point for p in data.positions if p.camera == camera), None)
 
 
-def _from_landmarks(data: RigData, camera: int, known: _Known) -> None:
-    landmarks = data.landmarks
-    assert landmarks is not None
-    rays, valid = data.cameras[camera].unproject(landmarks.pixels[:, camera])
-    found = consensus_pose(rays[valid], landmarks.points[valid], _position(data, camera))
-    if found is not None:
-        known.put(camera, found[0], found[1])
+def _from_landmarks(data: RigData) -> _Known:
+    known: _Known = {}
+    for c, camera in enumerate(data.cameras if data.landmarks else ()):
+        assert data.landmarks is not None
+        rays, valid = camera.unproject(data.landmarks.pixels[:, c])
+        found = consensus_pose(rays[valid], data.landmarks.points[valid], _position(data, c))
+        if found is not None:
+            known[c] = Poses.at(found[0], found[1])
+    return known
 
 
-def _from_features(data: RigData, camera: int, known: _Known, open_ends: list[int], placed: bool) -> bool:
-    """Rotation from features shared with a camera that is known; the center from its position or a baseline."""
+def _from_features(data: RigData, camera: int, known: _Known, tried: list[int], *, placed: bool) -> bool:
+    """Rotation from features shared with a known camera; the center from its position, or at a distance to be tried."""
     if data.features is None:
         return False
-    features, center = data.features, _position(data, camera) if placed else None
-    for other in known.ready:
-        both = torch.isfinite(features.pixels[:, [camera, other]]).all(-1).all(-1)
-        rays, valid = data.cameras[camera].unproject(features.pixels[:, camera])
-        far, seen = data.cameras[other].unproject(features.pixels[:, other])
-        use = both & valid & seen
+    # Until landmarks have placed a camera, the frame is that of the first camera, not of measured positions.
+    center = _position(data, camera) if placed else None
+    pixels = data.features.pixels
+    for other in sorted(known):
+        rays, valid = data.cameras[camera].unproject(pixels[:, camera])
+        far, seen = data.cameras[other].unproject(pixels[:, other])
+        use = torch.isfinite(pixels[:, [camera, other]]).all(-1).all(-1) & valid & seen
         if int(use.sum()) < 2:
             continue
-        pose = known.poses(other)
-        back = known.center[other]
-        assert back is not None
-        directions = far[use] @ pose.rotation
-        rotation, _ = consensus_rotation(rays[use], directions)
+        rotation, _ = consensus_rotation(rays[use], far[use] @ known[other].rotation)
         if center is None:
             length = _baseline(data, camera, other)
             if length is None:
                 continue
-            # Along which axis the camera stands is tried below.
-            center = back + length * pose.rotation[0]
-            open_ends.append(camera)
-        known.put(camera, rotation, center)
+            # In which direction the camera stands is tried later.
+            center = known[other].center + length * known[other].rotation[0]
+            tried.append(camera)
+        known[camera] = Poses.at(rotation, center)
         return True
     return False
 
@@ -196,12 +184,11 @@ def _baseline(data: RigData, one: int, other: int) -> float | None:
     return float(torch.linalg.vector_norm(places[0] - places[1]))
 
 
-def _starts(data: RigData, known: _Known, open_ends: list[int]) -> list[Start]:
-    rotation = torch.stack([known.poses(c).rotation for c in range(len(data.cameras))])
-    center = torch.stack([place for place in known.center if place is not None])
-    nothing = torch.empty(0, dtype=torch.float64)
-    starts = [Start(rotation=rotation, center=center, board_rotation=nothing, board_translation=nothing)]
-    for camera in open_ends:
+def _starts(known: _Known, tried: list[int]) -> list[Start]:
+    """The known poses, with each camera of `tried` in all six directions from another one."""
+    rotation, center = _stacked(known)
+    starts = [Start(rotation=rotation, center=center)]
+    for camera in tried:
         other = 0 if camera != 0 else 1
         length = float(torch.linalg.vector_norm(center[camera] - center[other]))
         axes = torch.cat([rotation[other], -rotation[other]])
@@ -214,7 +201,7 @@ def _starts(data: RigData, known: _Known, open_ends: list[int]) -> list[Start]:
 
 
 def _into_frame(data: RigData, start: Start) -> None:
-    """Turn and shift a rig that stands in its first camera's frame to where its cameras were measured."""
+    """Move a rig from its first camera's frame to where its cameras were measured."""
     index = [p.camera for p in data.positions]
     there = torch.stack([p.point for p in data.positions])
     here = start.center[index]
@@ -228,13 +215,14 @@ def _into_frame(data: RigData, start: Start) -> None:
 
 
 class _BoardViews:
-    """Each camera's boards, found by it alone, and what they say of two cameras that saw the same ones."""
+    """Board poses from each camera alone, and the relative poses of cameras that saw the same boards."""
 
     def __init__(self, data: RigData, solver: LMOptions) -> None:
         self.data = data
-        self.flipped: list[str] = []
+        self.flipped: list[TurnedBoard] = []
         self.foreign: dict[int, str] = {}
         self._alone: list[Poses] = []
+        rms: list[float] = []
         self._good = torch.zeros(0, len(data.cameras), dtype=torch.bool)
         boards = data.boards
         if boards is None:
@@ -247,27 +235,27 @@ class _BoardViews:
             rotation = torch.full((len(enough), 3, 3), math.nan, dtype=torch.float64)
             translation = torch.full((len(enough), 3), math.nan, dtype=torch.float64)
             if bool(enough.any()):
-                found, _ = pose_alone(points, boards.pixels[enough, c], camera, solver)
+                found, own = pose_alone(points, boards.pixels[enough, c], camera, solver)
+                rms.append(own)
                 rotation[enough], translation[enough] = found.rotation, found.translation
+            else:
+                rms.append(0.0)
             self._alone.append(Poses(rotation, translation))
             good.append(enough)
         self._good = torch.stack(good, -1)
+        check_cameras(data, self._good, rms, solver)
 
     def link(self, known: _Known, waiting: list[int]) -> bool:
-        """Place the waiting camera that shares most boards with one that is placed."""
-        shared = [(int((self._good[:, c] & self._good[:, o]).sum()), c, o) for c in waiting for o in known.ready]
+        """Place the waiting camera that shares the most boards with one that is placed."""
+        shared = [(int((self._good[:, c] & self._good[:, o]).sum()), c, o) for c in waiting for o in known]
         number, camera, other = max(shared)
-        if number == 0:
-            return False
-        relative = self._relative(other, camera)
-        pose = relative.after(known.poses(other))
-        known.put(camera, pose.rotation, -(pose.rotation.T @ pose.translation))
-        return True
+        if number > 0:
+            known[camera] = self._relative(other, camera).after(known[other])
+        return number > 0
 
-    def settle(self, known: _Known) -> None:
+    def turn_all(self) -> None:
         """Turn boards that were read from the other end also for cameras that landmarks have placed."""
-        boards = self.data.boards
-        if boards is None:
+        if self.data.boards is None:
             return
         for camera in range(1, len(self.data.cameras)):
             if bool((self._good[:, 0] & self._good[:, camera]).any()):
@@ -283,9 +271,10 @@ class _BoardViews:
         relative, turned, error = consensus(boards.board.points, pixels, cameras, one, two)
         if bool(turned.any()):
             self._turn(boards, both[turned], second)
-        limit = max(_ROUGH[0] * float(error.median()), _ROUGH[1])
+        limit = max(_FOREIGN_TIMES * float(error.median()), _FOREIGN_PX)
         for i in (error > limit).nonzero()[:, 0].tolist():
-            self.foreign[int(both[i])] = f"its board is {float(error[i]):.0f} px away from where the others put it"
+            reason = f"its board is {float(error[i]):.0f} px away from where the other boards put it"
+            self.foreign[int(both[i])] = reason
         return relative
 
     def _turn(self, boards: Boards, views: Tensor, camera: int) -> None:
@@ -298,16 +287,13 @@ class _BoardViews:
         self.data = dataclasses.replace(
             self.data, boards=dataclasses.replace(boards, pixels=pixels, covariance=covariance)
         )
-        # The pose of a board that is read from its other end: half a turn about its middle.
-        half = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
-        turn = Poses(half, boards.board.points.amin(0) + boards.board.points.amax(0))
         alone = self._alone[camera]
-        new = Poses(alone.rotation[views], alone.translation[views]).after(turn)
+        new = Poses(alone.rotation[views], alone.translation[views]).after(half_turn(boards.board.points))
         alone.rotation[views], alone.translation[views] = new.rotation, new.translation
-        self.flipped += [f"{boards.names[i]} ({self.data.names[camera]})" for i in views.tolist()]
+        self.flipped += [TurnedBoard(boards.names[i], self.data.names[camera]) for i in views.tolist()]
 
     def world(self, start: Start) -> tuple[Tensor, Tensor]:
-        """world_from_board by the first camera that sees each board well; where none does, any pose."""
+        """world_from_board from the first camera that sees each board well; where none does, an arbitrary pose."""
         count = len(self._good)
         rotation = torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
         translation = torch.zeros(count, 3, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Which view of the left camera was taken together with which view of the right one."""
+"""Pair the views of two cameras that were taken at the same moment."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import torch
+
+from kcal.calibrate.rig.sources import Boards
+from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError
+from kcal.lens.camera import Camera
 
 Pair = tuple[str, str]
 _SIDE = re.compile(r"(?<![a-z])(left|right|l|r|cam(?:era)?[ _-]?[0-9]+)(?![a-z])", re.IGNORECASE)
@@ -107,3 +112,32 @@ def read_pairs(path: str | Path, left: Sequence[str], right: Sequence[str]) -> l
     if not pairs:
         raise FileError(f"{path}: no pair below the header")
     return pairs
+
+
+def paired_boards(
+    cameras: tuple[Camera, Camera], observations: tuple[Observations, Observations], pairs: Sequence[Pair]
+) -> Boards:
+    """Boards seen by the left and the right camera at the same moments, each named after its two views.
+
+    Raises:
+        InputError: boards or image sizes that differ, a name that is not among the views, no pair.
+    """
+    boards = [seen.board for seen in observations]
+    if boards[0] != boards[1]:
+        raise InputError(f"the cameras saw different boards: {boards[0]} and {boards[1]}")
+    for word, camera, seen in zip(("left", "right"), cameras, observations, strict=True):
+        if camera.size != tuple(seen.image_size):
+            raise InputError(
+                f"the {word} camera has images of {camera.size[0]}x{camera.size[1]}, its observations of "
+                f"{seen.image_size[0]}x{seen.image_size[1]}: are the files mixed up?"
+            )
+    if not pairs:
+        raise InputError("no pair of views")
+    sides = [seen.subset([pair[side] for pair in pairs]) for side, seen in enumerate(observations)]
+    known = [covariance for side in sides if (covariance := side.covariances()) is not None]
+    return Boards(
+        board=boards[0],
+        pixels=torch.stack([side.pixels() for side in sides], 1),
+        names=tuple(" ".join(dict.fromkeys(pair)) for pair in pairs),
+        covariance=torch.stack(known, 1) if len(known) == 2 else None,
+    )

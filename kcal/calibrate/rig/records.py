@@ -1,133 +1,133 @@
-"""What is told of a solved rig: residuals of every item and of every source, in pixels, meters and sigmas."""
+"""Report a solved rig: residuals of every item and of every source, in pixels, meters and sigmas."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import get_args
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import KINDS, Adjustment, Source
-from kcal.calibrate.rig.result import ItemResidual, SourceResidual
+from kcal.calibrate.rig.adjustment import Adjustment
+from kcal.calibrate.rig.blocks import KINDS, Kind, PerKind
+from kcal.calibrate.rig.limits import over_limit
+from kcal.calibrate.rig.result import ItemResidual, Source, SourceResidual
 from kcal.solve.lm import LMOptions
 
-# One over meters: features are drawn no farther away.
-_FARTHEST = 1e-5
+# Reasons for leaving items out, by their indices.
+Reasons = Mapping[Kind, Mapping[int, str]]
+# Marks that an item needs, so that its residuals say anything.
+_MARKS: Mapping[Kind, int] = {"boards": 4, "landmarks": 1, "features": 2}
+# 1/m: features are drawn no farther away than 100 km.
+_LEAST_INVERSE_RANGE = 1e-5
 
 
-def item_records(
-    work: Adjustment, masks: Sequence[Tensor], reasons: Sequence[dict[int, str]]
-) -> tuple[ItemResidual, ...]:
+def item_records(work: Adjustment, masks: PerKind, reasons: Reasons) -> tuple[ItemResidual, ...]:
     """One record for each board, landmark, feature, baseline and position.
 
     What was left out is compared with where the others put it: a landmark at its surveyed place, a board or feature at
     the place that suits it best.
     """
     items: list[ItemResidual] = []
-    outside = [~mask & _seen(work, kind, mask) for kind, mask in zip(KINDS, masks, strict=True)]
+    outside = PerKind(*(~mask & _marked(work, kind, mask) for kind, mask in zip(KINDS, masks, strict=True)))
     if any(bool(mask.any()) for mask in outside):
         work.solve(outside, LMOptions(residual_floor=1e-8), held=True)
-    for used, chosen in ((True, list(masks)), (False, outside)):
-        squares, freedom = work.squares(chosen), work.freedom(chosen)
-        pixels = _pixels(work, chosen, surveyed=not used)
+    for used, chosen in ((True, masks), (False, outside)):
+        squares, freedom, pixels = work.squares(chosen), work.freedom(chosen), _rms_by_camera(work, chosen, used)
+        over = over_limit(work, chosen, work.deletions(chosen)) if used else over_limit(work, chosen, squares, 0.999)
         for k, kind in enumerate(KINDS):
-            names = () if len(chosen[k]) == 0 else getattr(work.data, kind).names
             for i in chosen[k].nonzero()[:, 0].tolist():
                 sigmas = math.sqrt(float(squares[k][i]) / max(int(freedom[k][i]), 1))
+                why = "" if used else reasons[kind].get(i) or _contradiction(work, kind, pixels[kind][i], sigmas)
                 items.append(
                     ItemResidual(
                         source=kind,
-                        name=names[i],
-                        pixels=pixels[k][i],
-                        meters=_moved(work, i) if kind == "landmarks" else None,
+                        name=work.names(kind)[i],
+                        pixels=pixels[kind][i],
+                        meters=_off_survey(work, i) if kind == "landmarks" else None,
                         sigmas=sigmas,
+                        over_limit=float(over[k][i]),
                         used=used,
-                        reason="" if used else reasons[k].get(i) or _reason(work, kind, pixels[k][i], sigmas),
+                        reason=why,
                     )
                 )
-    for k, kind in enumerate(KINDS):
-        for i in (~masks[k] & ~outside[k]).nonzero()[:, 0].tolist():
-            name = getattr(work.data, kind).names[i]
-            items.append(ItemResidual(source=kind, name=name, sigmas=math.inf, used=False, reason=reasons[k][i]))
-    items += _measured(work)
+    for kind, mask, marked in zip(KINDS, masks, outside, strict=True):
+        for i in (~mask & ~marked).nonzero()[:, 0].tolist():
+            name, why = work.names(kind)[i], reasons[kind][i]
+            items.append(
+                ItemResidual(source=kind, name=name, sigmas=math.inf, over_limit=math.inf, used=False, reason=why)
+            )
+    items += _measurement_records(work)
     order = list(get_args(Source))
     return tuple(sorted(items, key=lambda item: (order.index(item.source), not item.used)))
 
 
-def source_records(
-    work: Adjustment, masks: Sequence[Tensor], items: Sequence[ItemResidual]
-) -> tuple[SourceResidual, ...]:
+def source_records(work: Adjustment, masks: PerKind, items: Sequence[ItemResidual]) -> tuple[SourceResidual, ...]:
     """Each source that there is."""
-    squares, freedom = work.squares(masks), work.freedom(masks)
+    squares, freedom, found = work.squares(masks), work.freedom(masks), list[SourceResidual]()
     problem, state = work.problem(masks), work.part(masks)
-    sights, found = problem.sights(state), []
-    for k, (kind, group, local) in enumerate(zip(KINDS, problem.groups, problem.locals(state), strict=True)):
-        own = [item for item in items if item.source == kind]
+    rms_px = {
+        block.kind: math.sqrt(float(block.errors(problem.posed(state), state).square().sum()) / int(block.seen.sum()))
+        for block in problem.blocks
+    }
+    for source in get_args(Source):
+        own = [item for item in items if item.source == source]
         if not own:
             continue
-        errors, count = group.errors(sights, local), int(group.seen.sum())
+        sigmas = _root_mean_square([item.sigmas for item in own])
+        if source in KINDS:
+            k = KINDS.index(source)
+            total, dof = float(squares[k].nansum()), int(freedom[k].sum())
+            sigmas = math.sqrt(total / dof) if dof > 0 else math.nan
         meters = [item.meters for item in own if item.used and item.meters is not None]
-        total, dof = float(squares[k][masks[k]].sum()), int(freedom[k].sum())
         found.append(
             SourceResidual(
-                source=kind,
+                source=source,
                 used=sum(item.used for item in own),
                 left_out=sum(not item.used for item in own),
-                rms_px=math.sqrt(float(errors.square().sum()) / count) if count else None,
-                rms_m=_rms(meters),
-                sigmas=math.sqrt(total / dof) if dof > 0 else math.nan,
+                rms_px=rms_px.get(source),
+                rms_m=_root_mean_square(meters) if meters else None,
+                sigmas=sigmas,
             )
         )
-    for kind in ("baselines", "positions"):
-        own = [item for item in items if item.source == kind]
-        if own:
-            meters = [item.meters for item in own if item.meters is not None]
-            sigmas = _rms([item.sigmas for item in own]) or 0.0
-            found.append(
-                SourceResidual(
-                    source=own[0].source, used=len(own), left_out=0, rms_px=None, rms_m=_rms(meters), sigmas=sigmas
-                )
-            )
     return tuple(found)
 
 
-def _rms(values: Sequence[float]) -> float | None:
-    return math.sqrt(sum(value**2 for value in values) / len(values)) if values else None
+def _root_mean_square(values: Sequence[float]) -> float:
+    return math.sqrt(sum(value**2 for value in values) / len(values))
 
 
-def _seen(work: Adjustment, kind: Source, mask: Tensor) -> Tensor:
+def _marked(work: Adjustment, kind: Kind, mask: Tensor) -> Tensor:
     source = getattr(work.data, kind)
     if source is None:
         return mask.clone()
-    marks = torch.isfinite(source.pixels).all(-1).flatten(1).sum(-1)
-    return marks >= {"boards": 4, "landmarks": 1, "features": 2}[kind]
+    return torch.isfinite(source.pixels).all(-1).flatten(1).sum(-1) >= _MARKS[kind]
 
 
-def _pixels(work: Adjustment, masks: Sequence[Tensor], *, surveyed: bool) -> list[dict[int, tuple[float | None, ...]]]:
-    """RMS distance of each item in each camera; landmarks from their surveyed place if asked."""
+def _rms_by_camera(work: Adjustment, masks: PerKind, used: bool) -> dict[Kind, dict[int, tuple[float | None, ...]]]:
+    """RMS distance in pixels of each item in each camera; of landmarks that are not used, from their surveyed place."""
     problem, state = work.problem(masks), work.part(masks)
-    sights, found = problem.sights(state), []
-    for kind, mask, group, local in zip(KINDS, masks, problem.groups, problem.locals(state), strict=True):
-        if surveyed and kind == "landmarks" and work.data.landmarks is not None:
-            local = (work.data.landmarks.points[mask],)
-        squared, count = group.errors(sights, local).square().sum((2, 3)), group.seen.sum(-1)
+    if not used and work.data.landmarks is not None:
+        state = state._replace(points=work.data.landmarks.points[masks.landmarks])
+    found: dict[Kind, dict[int, tuple[float | None, ...]]] = {}
+    for block in problem.blocks:
+        squared, count = block.errors(problem.posed(state), state).square().sum((2, 3)), block.seen.sum(-1)
         rms = (squared / count.clamp_min(1)).sqrt().nan_to_num(math.inf)
         rows = [
             tuple(value if n else None for value, n in zip(values, ns, strict=True))
             for values, ns in zip(rms.tolist(), count.tolist(), strict=True)
         ]
-        found.append(dict(zip(mask.nonzero()[:, 0].tolist(), rows, strict=True)))
+        found[block.kind] = dict(zip(getattr(masks, block.kind).nonzero()[:, 0].tolist(), rows, strict=True))
     return found
 
 
-def _moved(work: Adjustment, index: int) -> float:
+def _off_survey(work: Adjustment, index: int) -> float:
     assert work.data.landmarks is not None
-    return float(torch.linalg.vector_norm(work.state[5][index] - work.data.landmarks.points[index]))
+    return float(torch.linalg.vector_norm(work.state.points[index] - work.data.landmarks.points[index]))
 
 
-def _reason(work: Adjustment, kind: Source, pixels: Sequence[float | None], sigmas: float) -> str:
+def _contradiction(work: Adjustment, kind: Kind, pixels: Sequence[float | None], sigmas: float) -> str:
     seen = [(value, name) for value, name in zip(pixels, work.data.names, strict=True) if value is not None]
     text = ", ".join(
         f"{value:.2g} px in {name}" if math.isfinite(value) else f"not seen by {name}" for value, name in seen
@@ -136,34 +136,34 @@ def _reason(work: Adjustment, kind: Source, pixels: Sequence[float | None], sigm
         return f"its marks are off the surveyed place by {text} ({sigmas:.0f} sigma): a wrong mark or survey"
     if kind == "features":
         return f"its marks do not meet: off by {text} ({sigmas:.0f} sigma): not the same thing, or it moved"
-    why = "not taken at the same moment, or where a lens is not its model?"
-    return f"it does not fit the other boards: {text} ({sigmas:.1f} times typical): {why}"
+    why = "it moved between the views, or a lens differs from its model"
+    return f"it does not fit the other boards: off by {text} ({sigmas:.1f} sigma): {why}"
 
 
-def _measured(work: Adjustment) -> list[ItemResidual]:
-    data, center, out = work.data, work.state[2], []
+def _measurement_records(work: Adjustment) -> list[ItemResidual]:
+    data, center, out = work.data, work.state.center, []
     for b in data.baselines:
         error = float(torch.linalg.vector_norm(center[b.first] - center[b.second])) - b.length
         name = f"{data.names[b.first]} to {data.names[b.second]}"
         out.append(ItemResidual(source="baselines", name=name, meters=error, sigmas=abs(error) / b.sigma))
     for p in data.positions:
-        error3 = center[p.camera] - p.point
-        sigmas = math.sqrt(float((error3 / p.sigma).square().mean()))
-        length = float(torch.linalg.vector_norm(error3))
-        out.append(ItemResidual(source="positions", name=data.names[p.camera], meters=length, sigmas=sigmas))
+        off = center[p.camera] - p.point
+        sigmas = math.sqrt(float((off / p.sigma).square().mean()))
+        meters = float(torch.linalg.vector_norm(off))
+        out.append(ItemResidual(source="positions", name=data.names[p.camera], meters=meters, sigmas=sigmas))
     return out
 
 
-def places(work: Adjustment) -> dict[Source, tuple[tuple[str, ...], Tensor]]:
-    """Names and positions (N, 3) of boards (their middle), landmarks and features in the local frame."""
-    found: dict[Source, tuple[tuple[str, ...], Tensor]] = {}
-    _, _, _, rotation, translation, points, direction, inverse = work.state
-    if work.data.boards is not None:
-        middle = work.data.boards.board.points.mean(0)
-        found["boards"] = work.data.boards.names, rotation @ middle + translation
-    if work.data.landmarks is not None:
-        found["landmarks"] = work.data.landmarks.names, points
-    if work.data.features is not None:
-        far = direction / inverse.clamp_min(_FARTHEST)[:, None]
-        found["features"] = work.data.features.names, work.anchor + far
+def places(work: Adjustment) -> dict[Source, dict[str, Tensor]]:
+    """Positions (3,) of boards (their middle), landmarks and features in the local frame, by name."""
+    data, state, found = work.data, work.state, dict[Source, dict[str, Tensor]]()
+    if data.boards is not None:
+        middle = data.boards.board.points.mean(0)
+        where = state.board_rotation @ middle + state.board_translation
+        found["boards"] = dict(zip(data.boards.names, where, strict=True))
+    if data.landmarks is not None:
+        found["landmarks"] = dict(zip(data.landmarks.names, state.points, strict=True))
+    if data.features is not None:
+        far = work.anchor + state.direction / state.inverse_range.clamp_min(_LEAST_INVERSE_RANGE)[:, None]
+        found["features"] = dict(zip(data.features.names, far, strict=True))
     return found

@@ -1,4 +1,4 @@
-"""Where a camera stands and looks, from rays and known points alone: a start for the adjustment that follows.
+"""Find a camera's pose from rays and known points alone, as a start for an adjustment.
 
 Every pose from three points (or, where the position is known, from two directions) is tried, and the one that the
 other points agree with best is taken, so that wrong points do no harm while they are the minority.
@@ -14,9 +14,9 @@ from torch import Tensor
 
 from kcal.lens.pose import nearest_rotation
 
-# Samples tried at most.
+# Most subsets that are tried.
 _SAMPLES = 400
-# Radians: a ray farther off than this counts as wrong, however far.
+# Radians: all rays that are farther off than this count alike.
 _GROSS = 5e-3
 
 

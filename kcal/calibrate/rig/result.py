@@ -1,19 +1,27 @@
-"""A solved rig: cameras, residuals by source and by item, what was left out and why, joint covariances."""
+"""The result of solving a rig: cameras, residuals by source and by item, what was left out and why, covariances."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import Source
+from kcal.calibrate.rig.blocks import RigState
+from kcal.calibrate.rig.initial_poses import TurnedBoard
 from kcal.calibrate.rig.problem import RigProblem
-from kcal.calibrate.rig.uncertainty import SharedSpread, mounting_rows, parameter_rows, relative_rows
-from kcal.errors import DegenerateError
+from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, parameter_rows, relative_rows
+from kcal.io.rig_file import save_rig
+from kcal.lens.calibration import Exclusion, RigCalibration, RigSource
 from kcal.lens.camera import Camera
-from kcal.lens.rig import StereoRig
-from kcal.solve.result import State, Status
+from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.solve.result import SolverStatus
+
+Source = Literal["boards", "landmarks", "features", "baselines", "positions"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -28,6 +36,8 @@ class ItemResidual:
         meters: of a landmark between survey and adjusted position, of a measured position between measured and solved,
             of a baseline its error; None for the others.
         sigmas: root of χ² over its degrees of freedom; 1 is typical.
+        over_limit: by how much χ² falls without it, over the most that noise and lenses explain
+            (`kcal.calibrate.rig.limits`): above 1, it contradicts the rest. 0 for baselines and positions.
         used: whether it is part of the solution.
         reason: why it was left out.
     """
@@ -37,8 +47,14 @@ class ItemResidual:
     pixels: tuple[float | None, ...] = ()
     meters: float | None = None
     sigmas: float
+    over_limit: float = 0.0
     used: bool = True
     reason: str = ""
+
+    @property
+    def label(self) -> str:
+        """Kind and name: `landmark post 4`."""
+        return f"{self.source.removesuffix('s')} {self.name}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,85 +79,176 @@ class SourceResidual:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class RigSolution:
-    """What `solve_rig` found.
+class RigResult:
+    """What `solve_rig` and `calibrate_rig` found.
 
     Convention: `cam_from_local` of camera c is p = rotation[c] (x - center[c]); the local frame is east-north-up of the
     data's origin if `absolute`, otherwise the first camera's.
 
     Args:
+        data: what the rig was solved from, with boards turned where they had been read from the other end and pixels
+            without ray as NaN.
         cameras: as solved; the same as given where intrinsics are fixed.
-        names: of the cameras.
         rotation: (C, 3, 3).
         center: (C, 3) meters.
-        absolute: see above.
+        board_warp: (2,) meters along rows and columns, if it was estimated
+            (`kcal.calibrate.bundle.board_problem.warp_shape`).
         sources: residuals by source.
         items: residuals by item, those left out included.
         flipped: boards that had been read from the other end and were turned.
-        rms_px: sqrt(mean ‖r‖²) over the pixels of each camera; NaN for a camera with none.
+        rms: sqrt(mean ‖r‖²) over the pixels of all cameras.
+        rms_px: likewise of each camera; NaN for a camera with none.
         chi2: sum of squares of all residuals over their sigmas.
         freedom: degrees of freedom.
         variance: by which covariances are multiplied, because residuals are larger than their sigmas say; 1 if not.
         sigma_corner: of a board's corner along an axis, px, as used; None without boards.
         undetermined: what the data leave open, in words; none of it concerns the cameras' relative poses.
         status: why the solver stopped.
-        warnings: sentences about what the user should doubt.
+        warnings: one sentence for each thing that the user should doubt.
     """
 
+    data: RigData
     cameras: tuple[Camera, ...]
-    names: tuple[str, ...]
     rotation: Tensor
     center: Tensor
-    absolute: bool
+    board_warp: Tensor | None
     sources: tuple[SourceResidual, ...]
     items: tuple[ItemResidual, ...]
-    flipped: tuple[str, ...]
+    flipped: tuple[TurnedBoard, ...]
+    rms: float
     rms_px: tuple[float, ...]
     chi2: float
     freedom: int
     variance: float
     sigma_corner: float | None
     undetermined: tuple[str, ...]
-    status: Status
+    status: SolverStatus
     warnings: tuple[str, ...]
     _problem: RigProblem
-    _state: State
-    _spread: SharedSpread
-    _places: dict[Source, tuple[tuple[str, ...], Tensor]]
+    _state: RigState
+    _covariance: SharedCovariance
+    _places: dict[Source, dict[str, Tensor]]
+    _provenance: dict[str, Any]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return self.data.names
+
+    @property
+    def absolute(self) -> bool:
+        """Whether the local frame is that of landmarks or measured positions; otherwise it is the first camera's."""
+        return self.data.absolute
 
     @property
     def left_out(self) -> tuple[ItemResidual, ...]:
         """What is not part of the solution."""
         return tuple(item for item in self.items if not item.used)
 
+    @property
+    def _boards_used(self) -> tuple[ItemResidual, ...]:
+        return tuple(item for item in self.items if item.source == "boards" and item.used)
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """Names of the boards used, P of them."""
+        return tuple(item.name for item in self._boards_used)
+
+    @property
+    def pixels(self) -> Tensor:
+        """(P, C, N, 2) corners of the boards used, turned where `flipped`; NaN where not seen."""
+        boards = self.data.boards
+        if boards is None:
+            return torch.empty(0, len(self.cameras), 0, 2, dtype=torch.float64)
+        return boards.pixels[[boards.names.index(name) for name in self.pairs]]
+
+    @property
+    def pair_rms(self) -> Tensor:
+        """(P,) sqrt(mean ‖r‖²) of each board used, over the corners of all cameras, pixels."""
+        count = torch.isfinite(self.pixels).all(-1).sum(-1)
+        rms = torch.tensor([value or 0.0 for item in self._boards_used for value in item.pixels], dtype=torch.float64)
+        return ((count * rms.reshape(count.shape).square()).sum(-1) / count.sum(-1)).sqrt()
+
+    @property
+    def sigma_rotation(self) -> Tensor:
+        """(3,) radians, of second_from_first about the second camera's x (pitch), y (yaw) and z (roll)."""
+        return self.relative_covariance().diagonal()[:3].sqrt()
+
+    @property
+    def sigma_translation(self) -> Tensor:
+        """(3,) meters, of second_from_first along the second camera's axes."""
+        return self.relative_covariance().diagonal()[3:].sqrt()
+
+    @property
+    def sigma_baseline(self) -> float:
+        """Standard deviation of the distance between the first two cameras, meters."""
+        shift = self.rotation[1] @ (self.center[0] - self.center[1])
+        along = shift / torch.linalg.vector_norm(shift)
+        return math.sqrt(float(along @ self.relative_covariance()[3:, 3:] @ along))
+
     def stereo(self, first: int = 0, second: int = 1) -> StereoRig:
-        """Two of the cameras as a rig."""
+        """Two of the cameras as a rig, with its covariance and with how it was solved.
+
+        `kcal.placed_rig` adds where it stands on the Earth. The covariance is left out where the data do not determine
+        all parameters of the cameras.
+        """
         rotation = self.rotation[second] @ self.rotation[first].T
         translation = self.rotation[second] @ (self.center[first] - self.center[second])
-        return StereoRig(self.cameras[first], self.cameras[second], rotation, translation)
+        rig = StereoRig(self.cameras[first], self.cameras[second], rotation, translation)
+        joint = self.joint_covariance(first, second)
+        if bool(torch.isfinite(joint).all()):
+            rig.covariance = RigCovariance(matrix=joint)
+        rms = [0.0 if math.isnan(self.rms_px[camera]) else self.rms_px[camera] for camera in (first, second)]
+        rig.calibration = RigCalibration(
+            rms=self.rms,
+            rms_left=rms[0],
+            rms_right=rms[1],
+            pairs=len(self.pairs),
+            per_pair_rms=dict(zip(self.pairs, self.pair_rms.tolist(), strict=True)),
+            flipped=tuple(dict.fromkeys(turned.board for turned in self.flipped)),
+            # Boards by their names alone, as in `per_pair_rms`.
+            excluded=tuple(
+                Exclusion(f"{item.source} {item.name}".removeprefix("boards "), item.reason) for item in self.left_out
+            ),
+            sources=tuple(
+                RigSource(
+                    name=source.source,
+                    used=source.used,
+                    left_out=source.left_out,
+                    rms_px=source.rms_px,
+                    rms_m=source.rms_m,
+                    sigmas=None if math.isnan(source.sigmas) else source.sigmas,
+                )
+                for source in self.sources
+            ),
+            baseline_m=float(rig.baseline),
+            **self._provenance,
+        )
+        return rig
+
+    def save(self, path: str | Path) -> Path:
+        """Write the rig of the first two cameras as `stereo` gives it; see `kcal.save_rig`."""
+        return save_rig(self.stereo(), path)
 
     def places(self) -> dict[Source, dict[str, Tensor]]:
-        """Where boards (their middle), landmarks and features stand: (3,) meters in the local frame, by name.
+        """Where boards (their middle), landmarks and features are: (3,) meters in the local frame, by name.
 
         Features as far away as their inverse range says, at most 100 km.
         """
-        return {source: dict(zip(names, points, strict=True)) for source, (names, points) in self._places.items()}
+        return self._places
 
     def relative_covariance(self, first: int = 0, second: int = 1) -> Tensor:
         """(6, 6) of second_from_first: rotation vector about the second camera's axes, translation along them."""
-        return self._spread.of(relative_rows(self._problem, self._state, first, second))[0]
+        return self._covariance.of(relative_rows(self._problem, self._state, first, second))[0]
 
     def joint_covariance(self, first: int = 0, second: int = 1) -> Tensor:
-        """Of both cameras' parameters and their relative pose, ordered as in `RigCovariance`."""
-        rows = [parameter_rows(self._problem, first), parameter_rows(self._problem, second)]
-        return self._spread.of(torch.cat([*rows, relative_rows(self._problem, self._state, first, second)]))[0]
+        """Of both cameras' parameters (zeros where held) and their relative pose, in the order of `RigCovariance`."""
+        return self._covariance.of(self._joint_rows(first, second))[0]
 
     def mounting_link(self, first: int = 0, second: int = 1) -> Tensor:
         """(P, 6) covariance of `joint_covariance`'s P quantities with the mounting of the first camera."""
-        rows = [parameter_rows(self._problem, first), parameter_rows(self._problem, second)]
-        rows.append(relative_rows(self._problem, self._state, first, second))
-        rows.append(mounting_rows(self._problem, self._state, first))
-        return self._spread.of(torch.cat(rows))[0][:-6, -6:]
+        rows = [self._joint_rows(first, second), mounting_rows(self._problem, self._state, first)]
+        return self._covariance.of(torch.cat(rows))[0][:-6, -6:]
 
     def mounting_covariance(self, camera: int = 0) -> Tensor:
         """(6, 6) of a camera's center (meters) and of small turns of it (radians), both about the local frame's axes.
@@ -149,19 +256,8 @@ class RigSolution:
         Infinite variances where the data leave something open; zeros for the first camera of a rig that is not
         `absolute`.
         """
-        return self._spread.of(mounting_rows(self._problem, self._state, camera))[0]
+        return self._covariance.of(mounting_rows(self._problem, self._state, camera))[0]
 
-
-def check_determined(
-    spread: SharedSpread, problem: RigProblem, state: State, names: tuple[str, ...], open_: tuple[str, ...]
-) -> None:
-    """Raise `DegenerateError` if a relative pose is open; what is open is named."""
-    for second in range(1, len(names)):
-        _, determined = spread.of(relative_rows(problem, state, 0, second))
-        if not bool(determined.all()):
-            what = "; ".join(open_[:3]) + (" and more" if len(open_) > 3 else "")
-            raise DegenerateError(
-                f"the data do not determine how {names[second]} stands from {names[0]}: {what} "
-                "could be anything; add boards seen by both, surveyed landmarks, far features of known range, a "
-                "measured baseline or measured positions"
-            )
+    def _joint_rows(self, first: int, second: int) -> Tensor:
+        rows = [parameter_rows(self._problem, camera) for camera in (first, second)]
+        return torch.cat([*rows, relative_rows(self._problem, self._state, first, second)])

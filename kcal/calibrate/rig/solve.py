@@ -1,43 +1,54 @@
-"""`solve_rig`: one joint adjustment of a rig from boards, landmarks, far features, baselines and measured positions."""
+"""Solve a rig in one joint adjustment of boards, landmarks, far features, baselines and measured positions."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
-from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import KINDS, Adjustment, Intrinsics, chi2_quantile
+from kcal.calibrate.rig.adjustment import Adjustment, Intrinsics
+from kcal.calibrate.rig.blocks import KINDS, PerKind
+from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
-from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, reject_wrong
-from kcal.calibrate.rig.problem import RigProblem
-from kcal.calibrate.rig.records import item_records, places, source_records
-from kcal.calibrate.rig.result import RigSolution, check_determined
+from kcal.calibrate.rig.mixups import cost_of_features_behind, refuse_same_camera, swap_warnings
+from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible, without_wrong
+from kcal.calibrate.rig.records import Reasons, item_records, places, source_records
+from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import SharedSpread
-from kcal.errors import InputError
+from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, relative_rows
+from kcal.errors import DegenerateError, InputError
+from kcal.io.camera_file import provenance
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import Result, Status
+from kcal.solve.result import Result, SolverStatus
 
-# Guess of a corner's noise before the boards themselves tell it, px.
+# px: a corner's noise before the boards themselves tell it.
 _CORNER_SIGMA = 0.2
-# Rival starts are told apart after some steps.
+# Enough steps to tell which of several starts is best.
 _SCREENING = LMOptions(max_iterations=25, tolerance=1e-6, residual_floor=1e-8)
+# Of fewer boards alone, a wrong one cannot be told from a good one.
+_FEW_BOARDS = 3
+# px: a higher RMS is not noise.
+_HIGH_RMS = 1.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class JointOptions:
-    """Options of `solve_rig`.
+class RigOptions:
+    """Options of `solve_rig` and `calibrate_rig`.
 
     Args:
-        intrinsics: "fixed": as the cameras have them; "prior": solved, held by the covariances of `RigData`; "free".
-        reject: leave out what contradicts the rest (it is listed); otherwise it is only warned of.
+        intrinsics: "fixed": as the cameras have them; "prior": solved, held by the covariances of `RigData`; "free":
+            solved, starting from the given cameras.
+        board_warp: estimate how the board bends.
+        weighted: let corners count by their covariances where all views have them.
+        reject: leave out what contradicts the rest; otherwise warnings name it. Left out or not, it is listed.
         solver: options of the Levenberg-Marquardt solver; residuals are in sigmas.
     """
 
     intrinsics: Intrinsics = "fixed"
+    board_warp: bool = False
+    weighted: bool = True
     reject: bool = True
     solver: LMOptions = dataclasses.field(default_factory=lambda: LMOptions(residual_floor=1e-8))
 
@@ -46,7 +57,7 @@ class JointOptions:
             raise InputError(f"intrinsics must be fixed, prior or free, got {self.intrinsics!r}")
 
 
-def solve_rig(data: RigData, options: JointOptions | None = None) -> RigSolution:
+def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     """Solve for the poses of all cameras of a rig (and their parameters, if asked) from everything that is known.
 
     Least squares of all residuals over their standard deviations; landmarks, far features and boards are unknowns too
@@ -55,12 +66,12 @@ def solve_rig(data: RigData, options: JointOptions | None = None) -> RigSolution
 
     Args:
         data: see `RigData`.
-        options: see `JointOptions`.
+        options: see `RigOptions`.
 
     Raises:
-        InputError: data that contradict each other as a whole.
-        DegenerateError: a camera that nothing ties to the others, or relative poses that the data do not determine;
-            what could be anything is named.
+        InputError: data that contradict each other as a whole; cameras that are swapped or given twice.
+        DegenerateError: a camera that nothing connects with the others, or relative poses that the data do not
+            determine; what could be anything is named.
 
     Example:
         >>> from kcal.calibrate.rig.sources import Landmarks
@@ -76,30 +87,31 @@ def solve_rig(data: RigData, options: JointOptions | None = None) -> RigSolution
         >>> round(float(found.stereo().baseline), 6), found.left_out
         (10.0, ())
     """
-    options = options or JointOptions()
-    _check(data)
+    options = options or RigOptions()
+    if not any((data.boards, data.landmarks, data.features, data.positions)):
+        raise InputError("a rig needs boards, landmarks or features; there is nothing to solve it from")
+    if options.board_warp and data.boards is None:
+        raise InputError("the board's warp cannot be estimated without boards")
+    refuse_same_camera(data)
+    if not options.weighted and data.boards is not None:
+        data = dataclasses.replace(data, boards=dataclasses.replace(data.boards, covariance=None))
     data, warnings = _without_rayless(data)
-    begun = first_poses(data, options.solver)
-    data = begun.data
-    masks = _first_masks(begun)
-    reasons = _initial_reasons(begun, masks)
-    work = _robust(begun, masks, options)
+    initial = first_poses(data, options.solver)
+    masks, reasons = _first_masks(initial, reject=options.reject)
+    work = _robust(initial, masks, options)
     if options.reject:
-        reject_wrong(work, masks, reasons, options.solver)
+        masks = without_wrong(work, masks, options.solver)
+    else:
+        masks = possible(work, masks)
+        warnings += _suspicions(work, masks, reasons, options.solver)
     for _ in range(3):
-        problem, result = work.solve(masks, options.solver)
+        work.solve(masks, options.solver)
         before = work.sigma_corner
         work.fit_corners(masks)
         if abs(work.sigma_corner / before - 1.0) < 1e-3:
             break
-    problem, result = work.solve(masks, options.solver)
-    return _solution(work, problem, result, masks, reasons, begun, warnings)
-
-
-def _check(data: RigData) -> None:
-    sources = (data.boards, data.landmarks, data.features)
-    if not any(sources) and not data.positions:
-        raise InputError("a rig needs boards, landmarks or features; there is nothing to solve it from")
+    _, found = work.solve(masks, options.solver)
+    return _rig_result(work, found, masks, reasons, initial, warnings)
 
 
 def _without_rayless(data: RigData) -> tuple[RigData, list[str]]:
@@ -114,119 +126,142 @@ def _without_rayless(data: RigData) -> tuple[RigData, list[str]]:
             seen = torch.isfinite(pixels[:, c]).all(-1)
             _, valid = camera.unproject(pixels[:, c])
             lost = seen & ~valid
-            if bool(lost.any()):
-                warnings.append(f"{int(lost.sum())} of the {kind} left out where {data.names[c]}'s lens has no ray")
-                pixels[:, c] = torch.where(lost[..., None], torch.nan, pixels[:, c])
+            if not bool(lost.any()):
+                continue
+            if kind == "boards":
+                few = (seen.sum(-1) >= MINIMUM_CORNERS) & ((seen & valid).sum(-1) < MINIMUM_CORNERS)
+                for i in few.nonzero()[:, 0].tolist():
+                    raise InputError(
+                        f"board {source.names[i]}: the {data.names[c]} camera's lens model has no ray at most of its "
+                        "corners: it folds inside the image; calibrate with views nearer the image's border or with a "
+                        "smaller model"
+                    )
+            warnings.append(f"{int(lost.sum())} pixels of {kind} left out where {data.names[c]}'s lens has no ray")
+            pixels[:, c] = torch.where(lost[..., None], torch.nan, pixels[:, c])
         changed[kind] = dataclasses.replace(source, pixels=pixels)
     return dataclasses.replace(data, **changed), warnings
 
 
-def _first_masks(begun: InitialPoses) -> list[Tensor]:
-    data = begun.data
-    none = torch.zeros(0, dtype=torch.bool)
-    boards = begun.usable.clone()
-    boards[list(begun.foreign)] = False
-    seen = [
-        none if source is None else torch.isfinite(source.pixels).all(-1).sum(-1)
+def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reasons]:
+    """What can take part, and why not the others."""
+    data = initial.data
+    marks = [
+        torch.zeros(0) if source is None else torch.isfinite(source.pixels).all(-1).sum(-1)
         for source in (data.landmarks, data.features)
     ]
-    return [boards, seen[0] >= 1, seen[1] >= 2]
-
-
-def _initial_reasons(begun: InitialPoses, masks: Sequence[Tensor]) -> list[dict[int, str]]:
-    plain = (
+    boards = initial.usable.clone()
+    foreign = initial.foreign if reject else {}
+    boards[list(foreign)] = False
+    masks = PerKind(boards, marks[0] >= 1, marks[1] >= 2)
+    texts = (
         "fewer than two cameras see enough of it",
         "no camera has a mark of it",
         "fewer than two cameras have a mark of it",
     )
-    reasons = [dict.fromkeys((~mask).nonzero()[:, 0].tolist(), text) for mask, text in zip(masks, plain, strict=True)]
-    reasons[0].update(begun.foreign)
-    return reasons
+    reasons = {
+        kind: dict.fromkeys((~mask).nonzero()[:, 0].tolist(), text)
+        for kind, mask, text in zip(KINDS, masks, texts, strict=True)
+    }
+    reasons["boards"].update(foreign)
+    return masks, reasons
 
 
-def _robust(begun: InitialPoses, masks: list[Tensor], options: JointOptions) -> Adjustment:
-    """The best robust solution of all starts."""
-    boards = begun.data.boards
+def _robust(initial: InitialPoses, masks: PerKind, options: RigOptions) -> Adjustment:
+    """The best robust solution from all starts."""
+    boards = initial.data.boards
     sigma = _CORNER_SIGMA if boards is None or boards.sigma is None else boards.sigma
-    best: tuple[float, Adjustment, list[Tensor]] | None = None
-    for start in begun.starts:
-        work = Adjustment(begun.data, start, options.intrinsics, sigma)
-        here = [mask.clone() for mask in masks]
-        for mask, squares in zip(here, work.squares(here), strict=True):
-            # Behind a camera, or beyond what its lens shows: no number says how wrong it is.
-            mask &= torch.isfinite(squares)
+    best: tuple[float, Adjustment, PerKind] | None = None
+    for start in initial.starts:
+        work = Adjustment(initial.data, start, options.intrinsics, sigma, board_warp=options.board_warp)
+        here = possible(work, masks)
         work.fit_corners(here, robust=True)
-        _, result = work.solve(here, _SCREENING, LOSS)
-        cost = float(result.cost) + 1e6 * sum(int((a & ~b).sum()) for a, b in zip(masks, here, strict=True))
+        problem, result = work.solve(here, _SCREENING, LOSS)
+        cost = float(result.cost) + cost_of_features_behind(problem, work.part(here))
+        cost += 1e6 * sum(int((a & ~b).sum()) for a, b in zip(masks, here, strict=True))
         if best is None or cost < best[0]:
             best = (cost, work, here)
     assert best is not None
-    work, here = best[1:]
+    _, work, here = best
     work.fit_corners(here, robust=True)
     work.solve(here, ROUGHLY, LOSS)
     return work
 
 
-def _solution(
-    work: Adjustment,
-    problem: RigProblem,
-    result: Result,
-    masks: list[Tensor],
-    reasons: list[dict[int, str]],
-    begun: InitialPoses,
-    warnings: list[str],
-) -> RigSolution:
-    data, state = work.data, work.part(masks)
-    terms = problem.term_rows(state)
-    chi2 = 2.0 * float(problem.cost(state))
-    unknowns = problem.shared_size + sum(len(group) * group.size for group in problem.groups)
-    freedom = problem.residual_count - 1 + terms.shape[1] - unknowns
-    variance = 1.0
-    if freedom > 0 and chi2 > float(chi2_quantile(torch.tensor(float(freedom)), 0.999)):
-        variance = chi2 / freedom
-        warnings.append(
-            f"residuals are {math.sqrt(variance):.1f} times as large as their sigmas say; the covariance was widened"
-        )
-    if freedom <= 0:
+def _suspicions(work: Adjustment, masks: PerKind, reasons: Reasons, solver: LMOptions) -> list[str]:
+    """Warnings that name what would be left out, were it not to be kept."""
+    trial = copy.copy(work)
+    try:
+        kept = without_wrong(trial, masks, solver)
+    except InputError as error:
+        return [str(error)]
+    named = {(kind, work.names(kind)[i]) for kind in KINDS for i in reasons[kind]}
+    return [
+        f"{item.label}: {item.reason}; it was kept"
+        for item in item_records(trial, kept, reasons)
+        if not item.used and (item.source, item.name) not in named
+    ]
+
+
+def _rig_result(
+    work: Adjustment, found: Result, masks: PerKind, reasons: Reasons, initial: InitialPoses, warnings: list[str]
+) -> RigResult:
+    data, state, problem = work.data, work.part(masks), work.problem(masks)
+    fit = goodness_of_fit(problem, state)
+    covariance = SharedCovariance(problem, state, fit.variance)
+    undetermined = covariance.open_directions(data.names, absolute=data.absolute)
+    for second in range(1, len(data.cameras)):
+        if not bool(covariance.of(relative_rows(problem, state, 0, second))[1].all()):
+            what = "; ".join(undetermined[:3]) + (" and more" if len(undetermined) > 3 else "")
+            raise DegenerateError(
+                f"the data do not determine how {data.names[second]} stands from {data.names[0]}: {what} could be "
+                "anything; add boards seen by both, surveyed landmarks, far features of known range, a measured "
+                "baseline or measured positions"
+            )
+    squared, counts = torch.zeros(len(data.cameras)).double(), torch.zeros(len(data.cameras)).double()
+    for block in problem.blocks:
+        squared += block.errors(problem.posed(state), state).square().sum((0, 2, 3))
+        counts += block.seen.sum((0, 2))
+    rms, status = math.sqrt(float(squared.sum() / counts.sum())), SolverStatus(int(found.status))
+    if fit.variance > 1.0:
+        times = math.sqrt(fit.variance)
+        warnings.append(f"residuals are {times:.1f} times as large as their sigmas say; the covariance was widened")
+    if fit.freedom <= 0:
         warnings.append("nothing is left over to check the solution with: a wrong measurement could not be noticed")
-    status = Status(int(result.status))
-    if status not in (Status.CONVERGED, Status.EXACT):
+    only_boards = len(problem.blocks) == 1 and problem.blocks[0].kind == "boards"
+    if only_boards and (count := int(masks.boards.sum())) < _FEW_BOARDS:
+        warnings.append(f"{count} pair(s) only: a wrong one could not be noticed; 5 or more are good")
+    if only_boards and rms > _HIGH_RMS:
+        warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
+    if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         warnings.append(f"the solver {status.message}")
-    spread = SharedSpread(problem, state, variance)
-    undetermined = spread.open_directions(data.names, absolute=data.absolute)
-    check_determined(spread, problem, state, data.names, undetermined)
     warnings += [f"not determined by the data: {text}" for text in undetermined]
+    warnings += swap_warnings(data, problem, state, covariance)
     items = item_records(work, masks, reasons)
-    solved = problem.cameras(state)
-    kept = all(not len(free) for free in work.free)
-    cameras = data.cameras if kept else tuple(
-        camera.with_parameters(values)
-        for values, camera in zip(solved.parameters, data.cameras, strict=True)
-    )  # fmt: skip
-    squared, counts = torch.zeros(len(cameras)).double(), torch.zeros(len(cameras)).double()
-    sights = problem.sights(state)
-    for group, local in zip(problem.groups, problem.locals(state), strict=True):
-        squared += group.errors(sights, local).square().sum((0, 2, 3))
-        counts += group.seen.sum((0, 2))
-    return RigSolution(
+    cameras = data.cameras
+    if any(len(free) for free in problem.free):
+        solved = zip(data.cameras, problem.parameters(state), strict=True)
+        cameras = tuple(camera.with_parameters(parameters) for camera, parameters in solved)
+    return RigResult(
+        data=data,
         cameras=cameras,
-        names=data.names,
-        rotation=solved.rotation,
-        center=solved.center,
-        absolute=data.absolute,
+        rotation=state.rotation,
+        center=state.center,
+        board_warp=None if problem.warp is None else state.warp,
         sources=source_records(work, masks, items),
         items=items,
-        flipped=tuple(begun.flipped),
+        flipped=tuple(initial.flipped),
+        rms=rms,
         rms_px=tuple((squared / counts).sqrt().tolist()),
-        chi2=chi2,
-        freedom=freedom,
-        variance=variance,
+        chi2=fit.chi2,
+        freedom=fit.freedom,
+        variance=fit.variance,
         sigma_corner=None if data.boards is None else work.sigma_corner,
         undetermined=undetermined,
         status=status,
         warnings=tuple(warnings),
         _problem=problem,
         _state=state,
-        _spread=spread,
+        _covariance=covariance,
         _places=places(work),
+        _provenance=provenance(),
     )

@@ -1,4 +1,4 @@
-"""What a rig can be solved from: boards, surveyed landmarks, far features, measured baselines, measured positions.
+"""Hold what a rig is solved from: boards, surveyed landmarks, far features, measured baselines and positions.
 
 All of it is in one local frame in meters: east, north, up of an origin where anything is known on the Earth
 (`kcal.locate.survey` reads latitudes and longitudes), the first camera's frame where nothing is. `C` is the number of
@@ -25,7 +25,7 @@ def _positive(name: str, value: float) -> None:
         raise InputError(f"{name}: a positive number is needed, got {value}")
 
 
-def _marked(kind: str, names: tuple[str, ...], pixels: Tensor) -> None:
+def _check_marks(kind: str, names: tuple[str, ...], pixels: Tensor) -> None:
     """Refuse marks that are not one in each camera for each name."""
     count = len(names)
     if pixels.ndim != 3 or pixels.shape[::2] != (count, 2):
@@ -48,7 +48,7 @@ class Boards:
     Args:
         board: the board.
         pixels: (V, C, N, 2) its corners.
-        names: one a moment.
+        names: one for each moment.
         covariance: (V, C, N, 2, 2) px² of corners, by which they weigh; all alike if left out.
         sigma: of a corner along an axis, px; estimated from the residuals if left out.
     """
@@ -85,7 +85,7 @@ class Landmarks:
     """Surveyed points, marked in the images.
 
     Args:
-        names: one each.
+        names: one for each.
         points: (L, 3) meters in the local frame.
         sigma: (L, 3) meters along the frame's axes, of the survey; independent from point to point.
         pixels: (L, C, 2) marks.
@@ -105,7 +105,7 @@ class Landmarks:
                 f"landmarks: points and sigma ({count}, 3) are needed, got {tuple(self.points.shape)} and "
                 f"{tuple(self.sigma.shape)}"
             )
-        _marked("landmarks", self.names, self.pixels)
+        _check_marks("landmarks", self.names, self.pixels)
         require_finite("landmarks: points", as_points("landmarks: points", self.points, 3))
         if not bool((torch.isfinite(self.sigma) & (self.sigma > 0)).all()):
             raise InputError("landmarks: every sigma must be a positive number of meters; nothing is surveyed exactly")
@@ -116,12 +116,12 @@ class Landmarks:
 class Features:
     """Things matched between the images whose position nobody surveyed.
 
-    A feature alone ties the epipolar geometry: relative pitch and roll. It locks relative yaw if something is known of
-    its range, and the farther it is, the less need be known: a summit 20 km ± 2 km away is 0.8 ± 0.08 px of disparity
-    with 10 m of baseline and f 1600 px; a star has none.
+    A feature alone determines the epipolar geometry: relative pitch and roll. It determines relative yaw if something
+    is known of its range, and the farther away it is, the less need be known: a summit 20 km ± 2 km away is
+    0.8 ± 0.08 px of disparity with 10 m of baseline and f 1600 px; a star has none.
 
     Args:
-        names: one each.
+        names: one for each.
         pixels: (F, C, 2) marks.
         inverse_range: (F,) one over meters from the middle of the rig; 0 at infinity.
         inverse_range_sigma: (F,) its standard deviation; infinite where the range is not known.
@@ -136,7 +136,7 @@ class Features:
 
     def __post_init__(self) -> None:
         count = len(self.names)
-        _marked("features", self.names, self.pixels)
+        _check_marks("features", self.names, self.pixels)
         if self.inverse_range.shape != (count,) or self.inverse_range_sigma.shape != (count,):
             raise InputError(f"features: inverse_range and its sigma ({count},) are needed")
         if not bool((torch.isfinite(self.inverse_range) & (self.inverse_range_sigma > 0)).all()):
@@ -228,7 +228,7 @@ class RigData:
         if not all(isinstance(camera, Camera) and camera.params.ndim == 1 for camera in self.cameras):
             raise InputError("a rig is made of single cameras of the kinds Camera and HybridCamera")
         if self.covariances is not None and len(self.covariances) != count:
-            raise InputError(f"covariances: one a camera is needed, got {len(self.covariances)} for {count}")
+            raise InputError(f"covariances: one for each camera is needed, got {len(self.covariances)} for {count}")
         for kind, source in (("boards", self.boards), ("landmarks", self.landmarks), ("features", self.features)):
             if source is not None and source.pixels.shape[1] != count:
                 raise InputError(f"{kind}: pixels of {source.pixels.shape[1]} cameras, the rig has {count}")

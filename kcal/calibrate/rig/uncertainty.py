@@ -1,26 +1,52 @@
-"""How well the data determine a rig: joint covariances, and names for what they leave open."""
+"""Tell how well the data determine a rig: goodness of fit, joint covariances, names for what the data leave open."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from kcal.calibrate.rig.adjustment import chi2_quantile
+from kcal.calibrate.rig.blocks import RigState
 from kcal.calibrate.rig.problem import RigProblem
-from kcal.lens.projection import parameter_names
-from kcal.solve.result import State
 
 # Eigenvalues of the scaled information below this share of the largest are rounding, not information.
 _RANK_TOLERANCE = 1e-12
-# What has more than this share of its length in directions that nothing determines is not determined.
+# A function of the unknowns with more than this share of its length in open directions is not determined.
 _LOST_SHARE = 1e-6
-# A motion is named if it lies in the open directions but for this share.
+# A motion gives an open direction its name if it lies in the open directions but for this share.
 _NAMED_SHARE = 0.02
+_IDENTITY = torch.eye(3, dtype=torch.float64)
 
 
-class SharedSpread:
-    """Covariance of the cameras' unknowns at a solution, the eliminated ones free.
+class GoodnessOfFit(NamedTuple):
+    """How residuals compare with their sigmas.
+
+    Attributes:
+        chi2: sum of squares of all residuals over their sigmas.
+        freedom: degrees of freedom.
+        variance: by which covariances are to be multiplied: χ² per degree of freedom where that is larger than chance
+            explains, otherwise 1.
+    """
+
+    chi2: float
+    freedom: int
+    variance: float
+
+
+def goodness_of_fit(problem: RigProblem, state: RigState) -> GoodnessOfFit:
+    """Compare the residuals at a minimum with their sigmas."""
+    chi2 = 2.0 * float(problem.cost(state))
+    counted = sum(int((block.counts - block.size).sum()) for block in problem.blocks)
+    freedom = counted + problem.term_rows(state).shape[1] - problem.shared_size
+    large = freedom > 0 and chi2 > float(chi2_quantile(torch.tensor(float(freedom)), 0.999))
+    return GoodnessOfFit(chi2, freedom, chi2 / freedom if large else 1.0)
+
+
+class SharedCovariance:
+    """Covariance of the shared unknowns at a solution, with all others free.
 
     Args:
         problem: the problem.
@@ -28,13 +54,13 @@ class SharedSpread:
         variance: by which the covariance is multiplied: 1 where the stated sigmas are right.
     """
 
-    def __init__(self, problem: RigProblem, state: State, variance: float = 1.0) -> None:
+    def __init__(self, problem: RigProblem, state: RigState, variance: float = 1.0) -> None:
         self._problem, self._state = problem, state
         information, self._scale = problem.linearize(state).information()
         values, vectors = torch.linalg.eigh(information)
-        open_ends = values <= _RANK_TOLERANCE * values[-1:].sum()
-        self._open = vectors[:, open_ends]
-        inverse = torch.where(open_ends, 0.0, 1.0 / torch.where(open_ends, 1.0, values))
+        is_open = values <= _RANK_TOLERANCE * values[-1:].sum()
+        self._open = vectors[:, is_open]
+        inverse = torch.where(is_open, 0.0, 1.0 / torch.where(is_open, 1.0, values))
         self._root = self._scale[:, None] * vectors * (inverse * variance).sqrt()
 
     def of(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,7 +79,7 @@ class SharedSpread:
     def open_directions(self, names: Sequence[str], *, absolute: bool) -> tuple[str, ...]:
         """Names of what the data leave open, plainest first."""
         left, found = self._open, []
-        motions = _motions(self._problem, self._state, names, absolute=absolute)
+        motions = _named_motions(self._problem, self._state, names, absolute=absolute)
         while left.shape[1]:
             best: tuple[float, str, Tensor] = (0.0, "", left[0])
             for label, motion in motions:
@@ -65,7 +91,7 @@ class SharedSpread:
                     best = (share, label, inside)
             share, label, inside = best
             if share <= 1.0 - _NAMED_SHARE:
-                label = f"a mixture of {_largest(self._problem, left[:, 0], names)}"
+                label = f"a mixture of {_largest_parts(self._problem, left[:, 0], names)}"
                 inside = torch.eye(left.shape[1], dtype=left.dtype)[0]
             found.append(label)
             # What is left of the open directions without the one that has a name now.
@@ -74,11 +100,12 @@ class SharedSpread:
         return tuple(found)
 
 
-def _motions(problem: RigProblem, state: State, names: Sequence[str], *, absolute: bool) -> list[tuple[str, Tensor]]:
+def _named_motions(
+    problem: RigProblem, state: RigState, names: Sequence[str], *, absolute: bool
+) -> list[tuple[str, Tensor]]:
     """Motions (S,) of the cameras that people have a name for."""
-    rotation, center = state[1], state[2]
+    rotation, center = state.rotation, state.center
     middle = center.mean(0)
-    axes = torch.eye(3, dtype=torch.float64)
     out: list[tuple[str, Tensor]] = []
 
     def rig_motion(label: str, turn: Tensor, shift: Tensor) -> None:
@@ -93,105 +120,92 @@ def _motions(problem: RigProblem, state: State, names: Sequence[str], *, absolut
 
     zero = torch.zeros(3, dtype=torch.float64)
     if absolute:
-        for axis, word in zip(axes, ("east", "north", "up"), strict=True):
+        for axis, word in zip(_IDENTITY, ("east", "north", "up"), strict=True):
             rig_motion(f"where the rig stands ({word})", zero, axis.expand_as(center))
         along = center[1] - center[0]
-        turns = [(axes[2], "the heading (a turn about the vertical)")]
-        turns += [
+        axes_of_turns = [(_IDENTITY[2], "the heading (a turn about the vertical)")]
+        axes_of_turns += [
             (axis, f"a tilt of the rig about the {word} axis")
-            for axis, word in zip(axes[:2], ("east", "north"), strict=True)
+            for axis, word in zip(_IDENTITY[:2], ("east", "north"), strict=True)
         ]
         if bool(along.any()):
-            turns.append((along / torch.linalg.vector_norm(along), "a turn of the rig about its baseline"))
-        for axis, label in turns:
+            axes_of_turns.append((along / torch.linalg.vector_norm(along), "a turn of the rig about its baseline"))
+        for axis, label in axes_of_turns:
             for pivot in (middle, *center):
                 rig_motion(label, axis, torch.linalg.cross(axis.expand_as(center), center - pivot))
-    held = 0 if problem.shift[0] is None else None
-    rig_motion("the scale (how far apart the cameras stand)", zero, center - (middle if held is None else center[0]))
+    fixed = center[0] if problem.shift[0] is None else middle
+    rig_motion("the scale (how far apart the cameras stand)", zero, center - fixed)
     for c, name in enumerate(names):
-        turn_slot, shift_slot = problem.turn[c], problem.shift[c]
-        for k, word in enumerate(("pitch", "yaw", "roll")):
-            if turn_slot is not None:
+        turns = [f"the {word} of {name}" for word in ("pitch", "yaw", "roll")]
+        shifts = [f"where {name} stands ({word})" for word in ("sideways", "up and down", "along its axis")]
+        for slot, labels, axes in ((problem.turn[c], turns, _IDENTITY), (problem.shift[c], shifts, rotation[c])):
+            for label, axis in zip(labels if slot else (), axes, strict=False):
                 motion = torch.zeros(problem.shared_size, dtype=torch.float64)
-                motion[turn_slot.start + k] = 1.0
-                out.append((f"the {word} of {name}", motion))
-        for k, word in enumerate(("sideways", "up and down", "along its axis")):
-            if shift_slot is not None:
-                motion = torch.zeros(problem.shared_size, dtype=torch.float64)
-                motion[shift_slot] = rotation[c][k]
-                out.append((f"where {name} stands ({word})", motion))
-    out += [(label, axis) for label, axis in _coordinates(problem, names) if label]
-    return out
+                motion[slot] = axis
+                out.append((label, motion))
+    single = torch.eye(problem.shared_size, dtype=torch.float64)
+    return out + [(label, axis) for label, axis in zip(_labels(problem, names), single, strict=True) if label]
 
 
-def _coordinates(problem: RigProblem, names: Sequence[str]) -> list[tuple[str, Tensor]]:
-    """Every unknown by itself."""
-    axes = torch.eye(problem.shared_size, dtype=torch.float64)
+def _labels(problem: RigProblem, names: Sequence[str]) -> list[str]:
+    """A name for each unknown that has one by itself; empty for turns and shifts."""
     labels = [""] * problem.shared_size
     for c, name in enumerate(names):
-        known = parameter_names(problem.models[c])
         for index, slot in zip(problem.free[c].indices, problem.free[c].slots, strict=True):
-            labels[problem.inner[c].start + slot] = f"{known[index]} of {name}"
-    return list(zip(labels, axes, strict=True))
+            labels[problem.inner[c].start + slot] = f"{problem.cameras[c].names[index]} of {name}"
+    if problem.warp is not None:
+        labels[problem.warp] = ["the board's warp along its rows", "the board's warp along its columns"]
+    return labels
 
 
-def _largest(problem: RigProblem, direction: Tensor, names: Sequence[str]) -> str:
-    labels = [label for label, _ in _coordinates(problem, names)]
+def _largest_parts(problem: RigProblem, direction: Tensor, names: Sequence[str]) -> str:
+    labels = _labels(problem, names)
     for c, name in enumerate(names):
         turn_slot, shift_slot = problem.turn[c], problem.shift[c]
         if turn_slot is not None:
             labels[turn_slot] = [f"the attitude of {name}"] * 3
         if shift_slot is not None:
             labels[shift_slot] = [f"where {name} stands"] * 3
-    order = (direction.abs()).argsort(descending=True).tolist()
-    named: list[str] = []
-    for i in order[:4]:
-        if labels[i] not in named:
-            named.append(labels[i])
-    return ", ".join(named)
+    order = direction.abs().argsort(descending=True)[:4].tolist()
+    return ", ".join(dict.fromkeys(labels[i] for i in order))
 
 
-def relative_rows(problem: RigProblem, state: State, first: int, second: int) -> Tensor:
+def relative_rows(problem: RigProblem, state: RigState, first: int, second: int) -> Tensor:
     """(6, S): the step (ω, v) of second_from_first (see `apply_twist`) by a step of the shared unknowns."""
-    rotation, center = state[1], state[2]
-    relative = rotation[second] @ rotation[first].T
-    translation = rotation[second] @ (center[first] - center[second])
-    rows = torch.zeros(6, problem.shared_size, dtype=torch.float64)
-    cross = _cross_matrix(translation)
-    for camera, turned in ((second, torch.eye(3, dtype=torch.float64)), (first, -relative)):
-        slot = problem.turn[camera]
-        if slot is not None:
-            rows[:3, slot] = turned
-            if camera == second:
-                rows[3:, slot] = -cross
-    for camera, sign in ((first, 1.0), (second, -1.0)):
-        slot = problem.shift[camera]
-        if slot is not None:
-            rows[3:, slot] = sign * rotation[second]
-    return rows
+    rotation, center = state.rotation, state.center
+    shift = rotation[second] @ (center[first] - center[second])
+    by_second = turn_rows(problem, second)
+    turned = by_second - rotation[second] @ rotation[first].T @ turn_rows(problem, first)
+    moved = rotation[second] @ (_shift_rows(problem, first) - _shift_rows(problem, second))
+    # ω × shift, column by column.
+    return torch.cat([turned, moved + torch.linalg.cross(by_second, shift[:, None].expand_as(by_second), dim=0)])
 
 
-def mounting_rows(problem: RigProblem, state: State, camera: int) -> Tensor:
+def mounting_rows(problem: RigProblem, state: RigState, camera: int) -> Tensor:
     """(6, S): shift of a camera's center and turn of the camera about the world's axes."""
-    rows = torch.zeros(6, problem.shared_size, dtype=torch.float64)
-    shift, turn = problem.shift[camera], problem.turn[camera]
-    if shift is not None:
-        rows[:3, shift] = torch.eye(3, dtype=torch.float64)
-    if turn is not None:
-        rows[3:, turn] = -state[1][camera].T
+    return torch.cat([_shift_rows(problem, camera), -state.rotation[camera].T @ turn_rows(problem, camera)])
+
+
+def turn_rows(problem: RigProblem, camera: int) -> Tensor:
+    """(3, S): turn of a camera about its own axes."""
+    return _slot_rows(problem, problem.turn[camera])
+
+
+def _shift_rows(problem: RigProblem, camera: int) -> Tensor:
+    return _slot_rows(problem, problem.shift[camera])
+
+
+def _slot_rows(problem: RigProblem, slot: slice | None) -> Tensor:
+    rows = torch.zeros(3, problem.shared_size, dtype=torch.float64)
+    if slot is not None:
+        rows[:, slot] = _IDENTITY
     return rows
 
 
 def parameter_rows(problem: RigProblem, camera: int) -> Tensor:
     """(5 + P, S): all parameters of a camera, held ones with zeros."""
     free = problem.free[camera]
-    rows = torch.zeros(len(parameter_names(problem.models[camera])), problem.shared_size, dtype=torch.float64)
+    rows = torch.zeros(len(problem.cameras[camera].names), problem.shared_size, dtype=torch.float64)
     for index, slot in zip(free.indices, free.slots, strict=True):
         rows[index, problem.inner[camera].start + slot] = 1.0
     return rows
-
-
-def _cross_matrix(v: Tensor) -> Tensor:
-    x, y, z = v.unbind()
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).unflatten(0, (3, 3))

@@ -1,7 +1,7 @@
-"""Starts for wide-angle lenses, whose corners no pinhole with a few polynomial terms explains.
+"""Initial values for wide-angle lenses, which no pinhole with a few polynomial terms explains.
 
-Beyond some 110° the closed forms fail: they see the strong barrel distortion as tilt. Designs for such lenses follow
-known curves (equidistant r = f θ, stereographic r = 2 f tan(θ/2)), and a rational radial term can imitate these.
+Beyond about 110° the closed forms fail: they take strong barrel distortion for tilt. Such lenses are designed along
+known curves (equidistant r = f θ, stereographic r = 2 f tan(θ/2)), which a rational radial term can approximate.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from kcal.calibrate.bundle.board_problem import BoardState
 from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
-from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.bundle.views import CameraViews
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
-from kcal.solve.result import State
 
 # Image radius in focal lengths as a function of the angle off the axis, and its inverse.
 _CURVES: tuple[tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]], ...] = (
     (lambda angle: angle, lambda radius: radius),
     (lambda angle: 2.0 * torch.tan(0.5 * angle), lambda radius: 2.0 * torch.atan(0.5 * radius)),
 )
-# Angles off the axis that the image's corner may have.
+# Angles off the axis of the image's corner that are tried, degrees.
 _HALF_DIAGONALS = (55.0, 65.0, 75.0, 82.0)
 _STEEPEST = math.radians(84.0)
 
@@ -42,7 +42,7 @@ def rational_curve(curve: Callable[[Tensor], Tensor], model: LensModel, steepest
     angle = torch.linspace(0.0, steepest, 200, dtype=torch.float64)[1:]
     radius = torch.tan(angle)
     ratio = curve(angle) / radius
-    # In units of the largest s, so that powers compare.
+    # In units of the largest s, so that powers have similar scales.
     unit = float(radius[-1] ** 2)
     s = radius**2 / unit
     top = torch.stack([s ** (j + 1) for j in range(model.numerator)], -1)
@@ -59,42 +59,34 @@ def rational_curve(curve: Callable[[Tensor], Tensor], model: LensModel, steepest
     return coefficients
 
 
-def wide_starts(views: Views, model: LensModel, count: int = 2) -> list[State]:
-    """The best few starts over curves and fields of view, judged by how well boards fit them.
+def wide_starts(views: CameraViews, model: LensModel, count: int = 2) -> list[BoardState]:
+    """The best few starts over curves and fields of view, by the cost of the corners.
 
     Args:
         views: the data.
         model: with numerator and denominator of at least order two.
-        count: how many starts to return at the most.
+        count: the largest number of starts to return.
     """
     width, height = views.size
     center = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
-    seen = views.pixels[:, 0]
-    found: list[tuple[float, State]] = []
+    found: list[tuple[float, BoardState]] = []
     for curve, angle_of in _CURVES:
         lens = rational_curve(curve, model, _STEEPEST)
         for degrees in _HALF_DIAGONALS:
             focal = 0.5 * math.hypot(width, height) / float(curve(torch.tensor(math.radians(degrees))))
-            offset = (seen - center) / focal
+            offset = (views.pixels - center) / focal
             radius = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
             angle = angle_of(radius)
             if not bool((torch.nan_to_num(angle) < _STEEPEST).all()):
                 continue
             normalized = offset * torch.tan(angle) / radius.clamp_min(1e-9)
             pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-            rotation, translation = poses_from_homographies(homographies(views.board_points, normalized), pinhole)
+            poses = poses_from_homographies(homographies(views.board_points, normalized), pinhole)
             parameters = torch.zeros(len(INTRINSICS) + model.size, dtype=torch.float64)
             parameters[:4] = torch.cat([torch.full((2,), focal, dtype=torch.float64), center])
             parameters[len(INTRINSICS) :] = lens
-            state: State = (
-                parameters,
-                torch.zeros(2, dtype=torch.float64),
-                torch.zeros(0, 3, 3, dtype=torch.float64),
-                torch.zeros(0, 3, dtype=torch.float64),
-                rotation,
-                translation,
-            )
-            cost = float(views.problem(model).cost(state))
+            state = BoardState.flat(parameters, *poses)
+            cost = float(views.lens_problem(model).cost(state))
             if math.isfinite(cost):
                 found.append((cost, state))
     return [state for _, state in sorted(found, key=lambda entry: entry[0])[:count]]

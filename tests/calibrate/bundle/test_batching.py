@@ -8,10 +8,10 @@ import pytest
 import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 
-from kcal.calibrate.bundle.compressed_problem import CompressedProblem, fold
-from kcal.calibrate.bundle.padding import join_boards, join_compressed, split_boards
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
+from kcal.calibrate.bundle.compressed_problem import CompressedProblem, compress
 from kcal.calibrate.bundle.priors import FoldBarrier
-from kcal.calibrate.bundle.views import Views, free_parameters
+from kcal.calibrate.bundle.views import CameraViews, free_parameters
 from kcal.calibrate.camera.calibrate import (
     CalibrationOptions,
     CameraCalibrationResult,
@@ -25,7 +25,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import State, Status, stack
+from kcal.solve.result import SolverStatus, map_state, pick, stack
 
 CPU = torch.device("cpu")
 
@@ -105,34 +105,33 @@ def test_one_bad_set_does_not_spoil_the_others() -> None:
     assert calibrate_cameras([]) == []
 
 
-def views_of(count: int, seed: int, missing: int = 0) -> tuple[Views, State]:
+def views_of(count: int, seed: int, missing: int = 0) -> tuple[CameraViews, BoardState]:
     seen = scene(count, seed, missing=missing)
     result = calibrate_camera(seen)
-    views = Views(board_points=BOARD.points, pixels=seen.pixels()[:, None], size=SIZE, free_warp=False)
-    nothing = torch.zeros(2).double(), torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
+    views = CameraViews(board_points=BOARD.points, pixels=seen.pixels(), size=SIZE)
     poses = result.cam_from_board_rotation, result.cam_from_board_translation
-    return views, (result.camera.params.detach(), *nothing, *poses)
+    return views, BoardState.flat(result.camera.params.detach(), *poses)
 
 
 class TestJoined:
     SMALL, LARGE = LensModel.named("opencv5"), LensModel.named("opencv8")
 
-    def both(self) -> tuple[list[Views], list[State]]:
+    def both(self) -> tuple[list[CameraViews], list[BoardState]]:
         some, state = views_of(6, 1)
         more, other = views_of(10, 2, missing=3)
         return [some, more], [state, other]
 
     def test_padded_views_have_no_part(self) -> None:
         (some, more), (state, other) = self.both()
-        values = torch.cat([state[0], state[1]])
+        values = torch.cat([state.parameters, state.warp])
         tries = [FoldBarrier(self.SMALL, radius, 0.1) for radius in torch.linspace(1, 3, 100).tolist()]
-        # For one camera a wall that is met, for the other one that is not.
+        # For one camera a barrier that is met, for the other one that is not.
         met = next(b for b in reversed(tries) if bool(b.rows(values).isfinite().all()))
         assert float(met.rows(values)[-1].abs().max()) > 0
         bounds = [(met,), (tries[0],)]
-        problems = [some.problem(self.SMALL, terms=bounds[0]), more.problem(self.SMALL, (2,), bounds[1])]
+        problems = [some.lens_problem(self.SMALL, terms=bounds[0]), more.lens_problem(self.SMALL, (2,), bounds[1])]
         starts = [state, stack([other, other])]
-        joined, start = join_boards(problems, starts, CPU)
+        joined, start = BoardProblem.joined(problems, starts, CPU)
         assert joined.batch == (3,)
         linear, alone = joined.linearize(start), [p.linearize(s) for p, s in zip(problems, starts, strict=True)]
         expected = torch.cat([alone[0].cost[None], alone[1].cost])
@@ -148,31 +147,32 @@ class TestJoined:
 
     def test_each_element_has_its_own_status(self) -> None:
         (some, more), (state, other) = self.both()
-        problems = [some.problem(self.SMALL), more.problem(self.SMALL), some.problem(self.SMALL)]
-        behind = (*state[:-1], -state[-1])
-        starts = [(state[0] * 1.02, *state[1:]), (other[0] * 0.98, *other[1:]), behind]
+        problems = [some.lens_problem(self.SMALL), more.lens_problem(self.SMALL), some.lens_problem(self.SMALL)]
+        behind = state._replace(translation=-state.translation)
+        first, second = (one._replace(parameters=one.parameters * by) for one, by in ((state, 1.02), (other, 0.98)))
+        starts = [first, second, behind]
         options = LMOptions(max_iterations=60)
-        joined, start = join_boards(problems, starts, CPU)
-        found = split_boards(minimize(joined, start, options), problems)
-        assert [result.state[-1].shape[0] for result in found] == [6, 10, 6]
-        assert int(found[2].status) == Status.BAD_START
+        joined, start = BoardProblem.joined(problems, starts, CPU)
+        found = joined.split(minimize(joined, start, options), problems)
+        assert [result.state.translation.shape[0] for result in found] == [6, 10, 6]
+        assert int(found[2].status) == SolverStatus.BAD_START
         assert math.isnan(float(found[2].cost))
         for result, problem, begin in zip(found[:2], problems, starts, strict=False):
             alone = minimize(problem, begin, options)
-            assert int(result.status) == int(alone.status) == Status.CONVERGED
+            assert int(result.status) == int(alone.status) == SolverStatus.CONVERGED
             assert float(result.cost) == pytest.approx(float(alone.cost), rel=1e-10)
 
-    def test_searches_on_folded_views(self) -> None:
+    def test_searches_on_compressed_views(self) -> None:
         (some, more), states = self.both()
         small = self.SMALL
         problems, starts = [], []
         for views, state, count in ((some, states[0], 1), (more, states[1], 3)):
-            folded = fold(views.problem(small, poses_only=True), state, float(views.observed_radius(state)))
-            problem = CompressedProblem(folded, self.LARGE, free_parameters(self.LARGE), batch=(count,))
-            begin = embed(state[0], small, self.LARGE) * torch.linspace(1.0, 1.001, count, dtype=torch.float64)[:, None]
+            compressed = compress(views.problem(small), state, views.observed_radius(state))
+            problem = CompressedProblem(compressed, self.LARGE, free_parameters(self.LARGE), batch=(count,))
+            begin = embed(state.parameters, small, self.LARGE) * torch.linspace(1.0, 1.001, count).double()[:, None]
             problems.append(problem)
             starts.append(problem.start(begin))
-        joined, start = join_compressed(problems, starts, CPU)
+        joined, start = CompressedProblem.joined(problems, starts, CPU)
         costs = joined.linearize(start).cost
         alone = [p.linearize(s).cost for p, s in zip(problems, starts, strict=True)]
         torch.testing.assert_close(costs[0, 0], alone[0][0], rtol=1e-11, atol=0)
@@ -182,14 +182,14 @@ class TestJoined:
 def test_all_starts_of_a_batch_are_taken_apart() -> None:
     """Some have converged long before others; what is then left out of the work changes no answer."""
     views, state = views_of(8, 3)
-    problem = views.problem(LensModel.named("opencv5"), (5,))
+    problem = views.lens_problem(LensModel.named("opencv5"), (5,))
     spread = torch.linspace(0.9, 1.3, 5, dtype=torch.float64)[:, None]
-    parameters = state[0] * torch.cat([spread, spread, torch.ones(5, 8).double()], 1)
-    start = (parameters, *(tensor.expand(5, *tensor.shape).clone() for tensor in state[1:]))
+    start = map_state(lambda tensor: tensor.expand(5, *tensor.shape).clone(), state)
+    start = start._replace(parameters=state.parameters * torch.cat([spread, spread, torch.ones(5, 8).double()], 1))
     options = LMOptions(tolerance=1e-12)
     found = minimize(problem, start, options)
     for i in range(5):
-        own = minimize(views.problem(LensModel.named("opencv5")), tuple(t[i] for t in start), options)
+        own = minimize(views.lens_problem(LensModel.named("opencv5")), pick(start, i), options)
         assert abs(int(found.iterations[i]) - int(own.iterations)) <= 2
         assert float(found.cost[i]) == pytest.approx(float(own.cost), rel=1e-10)
     torch.testing.assert_close(found.history[-1], found.cost, rtol=0, atol=0)

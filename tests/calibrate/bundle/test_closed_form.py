@@ -7,6 +7,7 @@ import torch
 from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, pixels_of
 from torch import Tensor
 
+from kcal.calibrate.bundle.board_problem import BoardState
 from kcal.calibrate.bundle.closed_form import (
     flipped_poses,
     homographies,
@@ -16,10 +17,10 @@ from kcal.calibrate.bundle.closed_form import (
     spread_out,
 )
 from kcal.calibrate.bundle.poses import refine_poses, unflip
+from kcal.calibrate.bundle.views import Views
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import State
 
 CENTERED = Camera.build(focal=(500, 505), center=(319.5, 239.5), size=SIZE, model="pinhole")
 OFF_CENTER = Camera.build(focal=(500, 505), center=(341.5, 221.0), size=SIZE, model="pinhole")
@@ -31,9 +32,8 @@ def true_homographies(truth: Camera, poses: Motions) -> Tensor:
     return h / h[:, 2:, 2:]
 
 
-def state_of(truth: Camera, poses: Motions) -> State:
-    empty = torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
-    return (truth.params.detach().clone(), torch.zeros(2).double(), *empty, *poses)
+def state_of(truth: Camera, poses: Motions) -> BoardState:
+    return BoardState.flat(truth.params.detach().clone(), *poses)
 
 
 class TestHomographies:
@@ -150,23 +150,23 @@ def test_radial_terms_are_exact_under_known_poses(missing: bool) -> None:
 
 class TestFlippedPoses:
     def test_is_an_involution(self) -> None:
-        state = state_of(CENTERED, motions(CENTERED, 6, 5))
-        twice = flipped_poses(BOARD.points, flipped_poses(BOARD.points, state))
-        for before, after in zip(state, twice, strict=True):
+        poses = motions(CENTERED, 6, 5)
+        twice = flipped_poses(BOARD.points, *flipped_poses(BOARD.points, *poses))
+        for before, after in zip(poses, twice, strict=True):
             torch.testing.assert_close(after, before, rtol=0, atol=1e-14)
 
     def test_keeps_the_center_and_mirrors_the_tilt(self) -> None:
-        state = state_of(CENTERED, motions(CENTERED, 6, 5))
-        twin = flipped_poses(BOARD.points, state)
+        rotation, translation = motions(CENTERED, 6, 5)
+        twin = flipped_poses(BOARD.points, rotation, translation)
         middle = BOARD.points.mean(0)
-        center = state[-2] @ middle + state[-1]
-        torch.testing.assert_close(twin[-2] @ middle + twin[-1], center, rtol=0, atol=1e-14)
+        center = rotation @ middle + translation
+        torch.testing.assert_close(twin[0] @ middle + twin[1], center, rtol=0, atol=1e-14)
         identity = torch.eye(3).double().expand(6, 3, 3)
-        torch.testing.assert_close(twin[-2] @ twin[-2].transpose(-1, -2), identity, rtol=0, atol=1e-14)
-        torch.testing.assert_close(torch.linalg.det(twin[-2]), torch.ones(6).double(), rtol=0, atol=1e-14)
+        torch.testing.assert_close(twin[0] @ twin[0].transpose(-1, -2), identity, rtol=0, atol=1e-14)
+        torch.testing.assert_close(torch.linalg.det(twin[0]), torch.ones(6).double(), rtol=0, atol=1e-14)
         # The normals make the same angle with the line of sight, on opposite sides of it.
         d = center / torch.linalg.vector_norm(center, dim=-1, keepdim=True)
-        before, after = state[-2][..., 2], twin[-2][..., 2]
+        before, after = rotation[..., 2], twin[0][..., 2]
         along = (before * d).sum(-1, keepdim=True)
         torch.testing.assert_close((after * d).sum(-1, keepdim=True), along, rtol=0, atol=1e-14)
         torch.testing.assert_close(after - along * d, -(before - along * d), rtol=0, atol=1e-14)
@@ -179,10 +179,9 @@ class TestFlippedPoses:
             truth = Camera.build(focal=(500 * far, 505 * far), center=(319.5, 239.5), size=SIZE, model="pinhole")
             rotation = motions(CENTERED, 5, 5)[0]
             translation = torch.tensor([0.0, 0.0, far]).double() - rotation @ board.points.mean(0)
-            state = state_of(truth, (rotation, translation))
             pixels = pixels_of(truth, (rotation, translation), board=board)
-            twin = flipped_poses(board.points, state)
-            gaps.append(float((pixels_of(truth, (twin[-2], twin[-1]), board=board) - pixels).abs().max()))
+            twin = flipped_poses(board.points, rotation, translation)
+            gaps.append(float((pixels_of(truth, twin, board=board) - pixels).abs().max()))
         # The size of the image is the same, 30 px or so.
         assert gaps[0] < 0.5
         assert gaps[1] == pytest.approx(gaps[0] / 10, rel=0.1)
@@ -192,38 +191,37 @@ class TestUnflip:
     def test_repairs_planted_flips_and_leaves_good_poses_alone(self) -> None:
         truth = camera()
         poses = motions(truth, 12, 6, fill=0.12)
-        pixels = pixels_of(truth, poses, noise=0.1)[:, None]
-        best, cost = refine_poses(BOARD.points, pixels, [truth.model], state_of(truth, poses), LMOptions())
-        twin, worse = refine_poses(
-            BOARD.points, pixels, [truth.model], flipped_poses(BOARD.points, best), LMOptions(max_iterations=1000)
-        )
+        views = Views(board_points=BOARD.points, pixels=pixels_of(truth, poses, noise=0.1))
+        best, cost = refine_poses(views, truth.model, state_of(truth, poses), LMOptions())
+        flipped = state_of(truth, flipped_poses(BOARD.points, best.rotation, best.translation))
+        twin, worse = refine_poses(views, truth.model, flipped, LMOptions(max_iterations=1000))
         # Where the twin leads to a minimum of its own, every second of them.
         planted = worse > 1.2 * cost
         planted[planted.nonzero()[::2, 0]] = False
         assert int(planted.sum()) >= 3
-        mixed = (
-            *best[:-2],
-            torch.where(planted[:, None, None], twin[-2], best[-2]),
-            torch.where(planted[:, None], twin[-1], best[-1]),
+        mixed = best._replace(
+            rotation=torch.where(planted[:, None, None], twin.rotation, best.rotation),
+            translation=torch.where(planted[:, None], twin.translation, best.translation),
         )
-        repaired, changed = unflip(BOARD.points, pixels, [truth.model], mixed)
+        repaired, changed = unflip(views, truth.model, mixed)
         assert changed == planted.nonzero()[:, 0].tolist()
         # The search stops early, within 1e-3 of the cost.
-        final, _ = refine_poses(BOARD.points, pixels, [truth.model], repaired, LMOptions())
-        torch.testing.assert_close(final[-2], best[-2], rtol=0, atol=1e-6)
-        torch.testing.assert_close(final[-1], best[-1], rtol=0, atol=1e-6)
-        _, changed = unflip(BOARD.points, pixels, [truth.model], repaired)
+        final, _ = refine_poses(views, truth.model, repaired, LMOptions())
+        torch.testing.assert_close(final.rotation, best.rotation, rtol=0, atol=1e-6)
+        torch.testing.assert_close(final.translation, best.translation, rtol=0, atol=1e-6)
+        _, changed = unflip(views, truth.model, repaired)
         assert changed == []
 
     def test_refining_poses_moves_nothing_else_and_returns_the_cost_of_each_view(self) -> None:
         truth = camera()
         poses = motions(truth, 4, 6)
-        pixels = pixels_of(truth, poses)[:, None]
+        pixels = pixels_of(truth, poses)
         pixels[2] += 0.5
         state = state_of(truth, poses)
-        refined, cost = refine_poses(BOARD.points, pixels, [truth.model], state, LMOptions())
-        for before, after in zip(state[:-2], refined[:-2], strict=True):
-            assert torch.equal(before, after)
+        views = Views(board_points=BOARD.points, pixels=pixels)
+        refined, cost = refine_poses(views, truth.model, state, LMOptions())
+        assert torch.equal(refined.parameters, state.parameters)
+        assert torch.equal(refined.warp, state.warp)
         assert cost.shape == (4,)
         assert bool((cost[[0, 1, 3]] < 1e-18).all())
         assert float(cost[2]) > 1e-4

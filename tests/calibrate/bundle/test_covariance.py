@@ -9,20 +9,18 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.covariance import Covariance, covariance, projection_covariance, uncertainty_of
 from kcal.calibrate.bundle.views import free_parameters
-from kcal.calibrate.camera import calibrate
+from kcal.calibrate.camera import assess
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.warnings import check_focal
 from kcal.calibrate.rig import adjustment
 from kcal.calibrate.rig.sources import RigData
-from kcal.cli.calibrate import record
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.projection import project_components
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import State
 from kcal.solve.schur import SchurLinearization
 
 TIGHT = LMOptions(max_iterations=300, tolerance=1e-13)
@@ -30,15 +28,14 @@ TIGHT = LMOptions(max_iterations=300, tolerance=1e-13)
 
 def problem_of(pixels: Tensor, model: str, *, warp: bool = False) -> BoardProblem:
     lens = camera(model).model
-    return BoardProblem(BOARD.points, pixels[:, None], [lens], [free_parameters(lens)], free_warp=warp)
+    return BoardProblem(BOARD.points, pixels, lens, free_parameters(lens), free_warp=warp)
 
 
-def true_state(model: str, poses: tuple[Tensor, Tensor]) -> State:
-    none = torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
-    return (camera(model).params.detach().clone(), torch.zeros(2).double(), *none, *poses)
+def true_state(model: str, poses: tuple[Tensor, Tensor]) -> BoardState:
+    return BoardState.flat(camera(model).params.detach().clone(), *poses)
 
 
-def solved(pixels: Tensor, model: str, poses: tuple[Tensor, Tensor]) -> tuple[State, Covariance]:
+def solved(pixels: Tensor, model: str, poses: tuple[Tensor, Tensor]) -> tuple[BoardState, Covariance]:
     problem = problem_of(pixels, model)
     result = minimize(problem, true_state(model, poses), TIGHT)
     assert bool(result.converged)
@@ -97,7 +94,7 @@ def test_pose_sigma_is_opencvs() -> None:
     poses = motions(camera(), 8, 9)
     pixels = pixels_of(camera(), poses, noise=0.2, seed=3).float().double()
     state, found = solved(pixels, "opencv5", poses)
-    lens = state[0].numpy()
+    lens = state.parameters.numpy()
     matrix = camera().matrix.numpy().copy()
     matrix[[0, 1, 0, 1], [0, 1, 2, 2]] = lens[:4]
     out = cv2.calibrateCameraExtended(
@@ -105,7 +102,7 @@ def test_pose_sigma_is_opencvs() -> None:
         flags=cv2.CALIB_USE_INTRINSIC_GUESS, criteria=(3, 300, 1e-15),
     )  # fmt: skip
     # OpenCV's pose is a rotation vector and t; a step (ω, v) changes it by this derivative.
-    vectors = vector_from_rotation(state[-2])
+    vectors = vector_from_rotation(state.rotation)
 
     def vector_after(turn: Tensor, vector: Tensor) -> Tensor:
         return vector_from_rotation(rotation_from_vector(turn) @ rotation_from_vector(vector))
@@ -156,12 +153,12 @@ def test_monte_carlo_of_projections_and_a_pose() -> None:
     squared, pose_squared = [], []
     for seed in range(repeats):
         state, found = solved(pixels_of(truth, poses, noise=0.2, seed=seed + 500), model, poses)
-        seen = project_components(points.T, state[0], truth.model).pixels.T
+        seen = project_components(points.T, state.parameters, truth.model).pixels.T
         error = seen - places
-        spot = projection_covariance(found.shared, points, state[0], truth.model, free)
+        spot = projection_covariance(found.shared, points, state.parameters, truth.model, free)
         squared.append((error * torch.linalg.solve(spot, error)).sum(-1))
-        turn = vector_from_rotation(state[-2][0] @ poses[0][0].T)
-        error = torch.cat([turn, state[-1][0] - poses[1][0]])
+        turn = vector_from_rotation(state.rotation[0] @ poses[0][0].T)
+        error = torch.cat([turn, state.translation[0] - poses[1][0]])
         pose_squared.append(error @ torch.linalg.solve(found.poses[0], error))
     distances = torch.stack(squared)
     for k in range(4):
@@ -203,7 +200,7 @@ class TestWhatCannotBeComputed:
         linearize = BoardProblem.linearize
         calls: list[Tensor] = []
 
-        def folded(problem: BoardProblem, state: State) -> SchurLinearization:
+        def folded(problem: BoardProblem, state: BoardState) -> SchurLinearization:
             linear = linearize(problem, state)
             if calls:
                 linear.cost = linear.cost * torch.nan
@@ -214,8 +211,8 @@ class TestWhatCannotBeComputed:
             return _uncertainty(*given, **named)  # type: ignore[arg-type]
 
         # Only after the solution was found.
-        _uncertainty = calibrate._uncertainty
-        monkeypatch.setattr(calibrate, "_uncertainty", count)
+        _uncertainty = assess._uncertainty
+        monkeypatch.setattr(assess, "_uncertainty", count)
         monkeypatch.setattr(BoardProblem, "linearize", folded)
         result = calibrate_camera(seen, CalibrationOptions(model="opencv14"))
         assert calls
@@ -223,7 +220,7 @@ class TestWhatCannotBeComputed:
         assert bool(result.covariance.diagonal()[:4].isnan().all())
         assert any("no error bars" in text for text in result.warnings)
         assert not any("do not determine" in text for text in result.warnings)
-        assert record(result, seen, "left", "left.json").covariance is None
+        assert result.file(name="left", source="left.json").covariance is None
 
     def test_a_rig_takes_no_such_prior(self) -> None:
         cameras = (camera(), camera())

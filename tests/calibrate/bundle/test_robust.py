@@ -6,7 +6,7 @@ import pytest
 import torch
 from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.errors import InputError
@@ -52,9 +52,8 @@ def test_the_solver_stops_where_the_robust_cost_is_flat(kind: str) -> None:
     pixels = pixels_of(truth, poses, noise=0.1, seed=2)
     pixels[0, 3] += 2.0
     loss = RobustLoss(kind=kind, scale=0.3)
-    problem = BoardProblem(BOARD.points, pixels[:, None], [truth.model], [free_parameters(truth.model)], loss=loss)
-    nothing = torch.zeros(2).double(), torch.zeros(0, 3, 3).double(), torch.zeros(0, 3).double()
-    start = (truth.params.detach(), *nothing, *poses)
+    problem = BoardProblem(BOARD.points, pixels, truth.model, free_parameters(truth.model), loss=loss)
+    start = BoardState.flat(truth.params.detach(), *poses)
     result = minimize(problem, start, LMOptions(tolerance=1e-15))
     steps = (torch.zeros(problem.shared_size).double(), torch.zeros(6, 6).double())
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 from calibrate_scenes import camera, motions, observe, pixels_of
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.observations import Observations
@@ -80,17 +80,14 @@ def test_rows_are_the_derivatives_of_weighted_residuals():
     root = torch.randn(*pixels.shape, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     weights = torch.where(torch.isnan(pixels)[..., None], torch.nan, root)
     board = observe(pixels).board.points
-    free = [[0, 1, 2, 3, 5, 6]]
-    problem = BoardProblem(board, pixels[:, None], [truth.model], free, whitening=weights[:, None])
-    state = (
+    free = [0, 1, 2, 3, 5, 6]
+    problem = BoardProblem(board, pixels, truth.model, free, whitening=weights)
+    state = BoardState.flat(
         truth.params.detach() + 0.01,
-        torch.zeros(2, dtype=torch.float64),
-        torch.zeros(0, 3, 3, dtype=torch.float64),
-        torch.zeros(0, 3, dtype=torch.float64),
         rotation_from_vector(torch.full((3, 3), 1e-3, dtype=torch.float64)) @ rotation,
         translation + 1e-3,
     )
-    errors = problem.pixel_errors(state)[:, 0].mT  # (V, N, 2)
+    errors = problem.pixel_errors(state).mT  # (V, N, 2)
     by_hand = (torch.nan_to_num(weights) @ errors[..., None])[..., 0]
     torch.testing.assert_close(problem.residuals(state), by_hand.mT.flatten(-2), rtol=1e-12, atol=1e-12)
     rows = problem.rows(state)
@@ -98,7 +95,7 @@ def test_rows_are_the_derivatives_of_weighted_residuals():
     step = 1e-6
     for k in range(problem.shared_size):
         shared, local = torch.zeros(problem.shared_size).double(), torch.zeros(3, 6).double()
-        shared[k] = step * max(1.0, float(state[0][free[0][k]]))
+        shared[k] = step * max(1.0, float(state.parameters[free[k]]))
         plus = problem.residuals(problem.retract(state, (shared, local)))
         minus = problem.residuals(problem.retract(state, (-shared, local)))
         difference = (plus - minus) / (2 * shared[k])

@@ -94,7 +94,7 @@ def test_the_curvature_of_residuals_counts() -> None:
     corners = CORNERS.clone().requires_grad_(True)
     found = calibrate_views(corners, BOARD.points, SIZE, CalibrationOptions(model="opencv4"))
     (exact,) = torch.autograd.grad(found.parameters[0], corners)
-    problem = BoardProblem(BOARD.points, CORNERS[:, None], [found.model], [[0, 1, 2, 3, 5, 6, 7, 8]])
+    problem = BoardProblem(BOARD.points, CORNERS, found.model, [0, 1, 2, 3, 5, 6, 7, 8])
     rows = problem.rows(found.state())  # dx/dd = (JᵀJ)⁻¹ Jᵀ, of fx
     whole = torch.zeros(38, 5, rows.shape[-1], dtype=torch.float64)
     whole[:8] = rows[:, 6:-1].transpose(0, 1)

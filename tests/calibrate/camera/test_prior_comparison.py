@@ -101,7 +101,7 @@ class TestMild:
     def test_shifts_at_the_outermost_corner(self) -> None:
         """One σ of any radial term moves the outermost corner by the width; of the others by a thirtieth."""
         model, r = LensModel.named("ext20"), 0.6
-        prior = CoefficientPrior(0.3, r).prior(model, noise=0.2)
+        prior = CoefficientPrior(0.3, r).term(model, noise=0.2)
         names = [("skew", *model.names)[i - 4] for i in prior.index.tolist()]
         sigma = dict(zip(names, (0.2 / prior.weight).tolist(), strict=True))
         assert set(sigma) == set(model.names)
@@ -114,7 +114,7 @@ class TestMild:
 
     def test_own_priors_take_its_place(self) -> None:
         model = LensModel.named("opencv5")
-        prior = CoefficientPrior(0.3, 0.5).prior(model, 0.2, without=("k1", "p2"))
+        prior = CoefficientPrior(0.3, 0.5).term(model, 0.2, without=("k1", "p2"))
         assert [model.names[i - 5] for i in prior.index.tolist()] == ["k2", "p1", "k3"]
 
     def test_which_models_are_rich(self) -> None:

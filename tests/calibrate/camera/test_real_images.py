@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
-from kcal.calibrate.rig.from_boards import RigCalibrationResult, RigOptions, calibrate_rig
+from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.pairs import pair_by_name
+from kcal.calibrate.rig.result import RigResult
+from kcal.calibrate.rig.solve import RigOptions
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_images
 from kcal.corners.observations import Observations
@@ -111,30 +113,26 @@ class TestCamera:
 
 
 @pytest.fixture(scope="module")
-def rigs(seen: dict[str, Observations], solved: Solve) -> dict[bool, RigCalibrationResult]:
-    """Solved with the cameras held (False) and refined (True)."""
+def rigs(seen: dict[str, Observations], solved: Solve) -> dict[bool, RigResult]:
+    """Solved with the cameras held (False) and refined (True); nothing is left out, as in OpenCV."""
     cameras = [solved(side, "opencv5").camera for side in SIDES]
     pairs = pair_by_name(seen["left"].names, seen["right"].names)
-    return {
-        refine: calibrate_rig(*cameras, seen["left"], seen["right"], pairs, RigOptions(refine_cameras=refine))
-        for refine in (False, True)
-    }
+    options = {refine: RigOptions(intrinsics="free" if refine else "fixed", reject=False) for refine in (False, True)}
+    return {refine: calibrate_rig(*cameras, *seen.values(), pairs, option) for refine, option in options.items()}
 
 
 class TestRig:
-    def test_is_opencvs(self, seen: dict[str, Observations], rigs: dict[bool, RigCalibrationResult]) -> None:
+    def test_is_opencvs(self, seen: dict[str, Observations], rigs: dict[bool, RigResult]) -> None:
         result = rigs[False]
         assert len(result.pairs) == 13
         assert result.flipped == ()
-        assert result.excluded == ()
+        assert result.left_out == ()
         # One of these pairs costs ten times as much to join as the typical one: nothing is left out, but it is named.
-        assert [text.split(": its two views disagree")[0] for text in result.warnings] == [
-            "pair left08.jpg, right08.jpg"
-        ]
+        assert [text.split(": it does not fit")[0] for text in result.warnings] == ["board left08.jpg right08.jpg"]
         board = BOARD.points.float().numpy()
         corners = [list(seen[side].pixels().float().numpy()) for side in SIDES]
         lenses = [
-            part for camera in (result.rig.left, result.rig.right)
+            part for camera in result.cameras
             for part in (camera.matrix.numpy().copy(), camera.coefficients.numpy().copy())
         ]  # fmt: skip
         rms, _, _, _, _, rotation, translation, *_ = cv2.stereoCalibrate(
@@ -142,22 +140,22 @@ class TestRig:
         )
         assert result.rms == pytest.approx(rms, rel=1e-6)
         baseline = float((translation**2).sum() ** 0.5)
-        assert float(result.rig.baseline) == pytest.approx(baseline, rel=1e-6)
-        found = result.rig.right_from_left_rotation
+        assert float(result.stereo().baseline) == pytest.approx(baseline, rel=1e-6)
+        found = result.stereo().right_from_left_rotation
         torch.testing.assert_close(found, torch.from_numpy(rotation).double(), rtol=0, atol=1e-6)
 
-    def test_refined_cameras_never_end_above(self, rigs: dict[bool, RigCalibrationResult]) -> None:
+    def test_refined_cameras_never_end_above(self, rigs: dict[bool, RigResult]) -> None:
         assert rigs[True].rms <= rigs[False].rms
-        assert rigs[True].excluded == ()
+        assert rigs[True].left_out == ()
 
     @pytest.mark.parametrize("refined", [False, True])
-    def test_squares_are_as_large_as_they_are(self, rigs: dict[bool, RigCalibrationResult], refined: bool) -> None:
+    def test_squares_are_as_large_as_they_are(self, rigs: dict[bool, RigResult], refined: bool) -> None:
         result = rigs[refined]
-        mean, _ = triangulated_sides(result.rig, BOARD.columns, BOARD.rows, result.pixels)
+        mean, _ = triangulated_sides(result.stereo(), BOARD.columns, BOARD.rows, result.pixels)
         assert mean == pytest.approx(BOARD.square, rel=1e-3)
 
     def test_a_turned_board_changes_nothing(
-        self, seen: dict[str, Observations], solved: Solve, rigs: dict[bool, RigCalibrationResult]
+        self, seen: dict[str, Observations], solved: Solve, rigs: dict[bool, RigResult]
     ) -> None:
         turned = [
             view.model_copy(update={"pixels": view.pixels[::-1]}) if i in (2, 6, 9) else view
@@ -166,6 +164,6 @@ class TestRig:
         right = seen["right"].model_copy(update={"views": tuple(turned)})
         pairs = pair_by_name(seen["left"].names, right.names)
         cameras = [solved(side, "opencv5").camera for side in SIDES]
-        result = calibrate_rig(*cameras, seen["left"], right, pairs)
-        assert [pairs.index(pair) for pair in result.flipped] == [2, 6, 9]
-        assert float(result.rig.baseline) == pytest.approx(float(rigs[False].rig.baseline), rel=1e-7)
+        result = calibrate_rig(*cameras, seen["left"], right, pairs, RigOptions(reject=False))
+        assert [result.pairs.index(turned.board) for turned in result.flipped] == [2, 6, 9]
+        assert float(result.stereo().baseline) == pytest.approx(float(rigs[False].stereo().baseline), rel=1e-7)

@@ -10,12 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.poses import refine_poses
+from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.lensfit.held_out import group_views, without_border
 from kcal.calibrate.lensfit.hybrid import HybridOptions, HybridResult, calibrate_hybrid
 from kcal.calibrate.lensfit.quadratic_forms import linearize_views
-from kcal.calibrate.lensfit.stacking import CANDIDATES, Prior, simplex_minimum, stack_weights
+from kcal.calibrate.lensfit.stacking import CANDIDATES, FieldPrior, simplex_minimum, stack_weights
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import DegenerateError, InputError
@@ -24,7 +25,6 @@ from kcal.lens.hybrid import HybridCamera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.residual import Field, FieldGrid, FieldResidual
 from kcal.solve.lm import LMOptions
-from kcal.solve.result import State
 
 SIZE = (640, 480)
 BOARD = Board(columns=8, rows=6, square=0.04)
@@ -68,14 +68,17 @@ def views(camera_field: float, noise: float, count: int, seed: int = 0) -> tuple
     )
 
 
-def setting(count: int = 10) -> tuple[BoardProblem, State, FieldGrid]:
+def setting(count: int = 10) -> tuple[BoardProblem, BoardState, FieldGrid]:
     seen, rotation, translation = views(0.0, 0.1, count)
     camera = lens(0.0)
-    problem = BoardProblem(BOARD.points, seen.pixels()[:, None], [camera.model], [[0, 1, 2, 3, 5, 6]], free_warp=True)
-    none = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
-    state: State = (camera.params, torch.zeros(2, dtype=torch.float64), *none, rotation, translation)
-    state, _ = refine_poses(BOARD.points, seen.pixels()[:, None], [camera.model], state, EXACT)
-    return problem, state, FieldGrid.covering((-0.65, -0.5), (0.65, 0.5), widths=[0.3])
+    views_of = Views(board_points=BOARD.points, pixels=seen.pixels(), free_warp=True)
+    state = BoardState.flat(camera.params, rotation, translation)
+    state, _ = refine_poses(views_of, camera.model, state, EXACT)
+    return (
+        views_of.problem(camera.model, [0, 1, 2, 3, 5, 6]),
+        state,
+        FieldGrid.covering((-0.65, -0.5), (0.65, 0.5), widths=[0.3]),
+    )
 
 
 class TestForms:
@@ -88,10 +91,10 @@ class TestForms:
         step[:2] = torch.tensor([0.3, -0.2])
         step[-1] = 1.0
         after = problem.retract(state, (step[: forms.lens], torch.zeros(10, 6, dtype=torch.float64)))
-        unit = float(state[0][:2].log().mean().exp())
+        unit = float(state.parameters[:2].log().mean().exp())
         field = Field(grid, step[forms.lens : -1].unflatten(0, (2, -1)) / unit)
-        pixels = problem._target.transpose(-1, -2)
-        _, cost = refine_poses(BOARD.points, pixels, list(problem.models), after, EXACT, [field])
+        given = Views(board_points=BOARD.points, pixels=problem.pixels)
+        _, cost = refine_poses(given, problem.model, after, EXACT, field)
         true = torch.stack([2 * cost[:4].sum(), 2 * cost[4:].sum()])
         predicted = torch.stack([step @ form @ step for form in forms.groups])
         at_start = forms.groups[:, -1, -1]
@@ -102,15 +105,15 @@ class TestForms:
     @pytest.mark.parametrize("alike", [True, False])
     def test_are_the_rows_with_poses_projected_out(self, alike: bool) -> None:
         problem, state, grid = setting(6)
-        state[0][4] = 3.0  # skew: a shift along y moves both coordinates
+        state.parameters[4] = 3.0  # skew: a shift along y moves both coordinates
         seen = torch.rand(6, 48, generator=torch.Generator().manual_seed(7)) < 0.8
-        pixels = torch.where(seen[:, None, :, None], problem.pixels, torch.nan)
+        pixels = torch.where(seen[..., None], problem.pixels, torch.nan)
         root = torch.tensor([[2.0, 0.0], [0.0, 2.0]] if alike else [[2.0, 0.5], [0.0, 1.0]], dtype=torch.float64)
         free = [0, 1, 2, 3, 5, 6]
-        each = torch.rand(6, 1, 48, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(8))
+        each = torch.rand(6, 48, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(8))
         weighed = root * (1.0 + each)
         problem, inner = (
-            BoardProblem(BOARD.points, p, problem.models, [free], free_warp=True, whitening=weighed)
+            BoardProblem(BOARD.points, p, problem.model, free, free_warp=True, whitening=weighed)
             for p in (problem.pixels, pixels)
         )
         field = Field(grid, torch.zeros(2, grid.count, dtype=torch.float64))
@@ -118,10 +121,10 @@ class TestForms:
 
         def residuals(given: BoardProblem, shared: Tensor, weights: Tensor, local: Tensor) -> Tensor:
             moved = copy.copy(given)
-            moved.fields = (Field(grid, weights.unflatten(0, (2, -1)) / unit),)
+            moved.field = Field(grid, weights.unflatten(0, (2, -1)) / unit)
             return moved.residuals(given.retract(state, (shared, local))).flatten()
 
-        unit = state[0][:2].log().mean().exp()
+        unit = state.parameters[:2].log().mean().exp()
         zero = torch.zeros(8).double(), torch.zeros(2 * grid.count).double(), torch.zeros(6, 6).double()
         for given, form in ((problem, forms.groups[0]), (inner, forms.inner[0])):
             blocks = torch.func.jacfwd(functools.partial(residuals, given), (0, 1, 2))(*zero)
@@ -134,7 +137,7 @@ class TestForms:
     def test_fit_is_the_minimum_under_the_prior(self) -> None:
         problem, state, grid = setting()
         weights = 1e-5 * torch.randn(2, grid.count, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-        problem.fields = (Field(grid, weights),)
+        problem.field = Field(grid, weights)
         forms = linearize_views(problem, state, Field(grid, weights), [5, 5])
         form = forms.total(torch.ones(2, dtype=torch.bool))
         precision = torch.full((2 * grid.count,), 3.0, dtype=torch.float64)
@@ -180,12 +183,12 @@ class TestStacking:
 
     def test_precision_grows_as_widths_shrink(self) -> None:
         grid = FieldGrid.covering((-1.0, -0.6), (1.0, 0.6), widths=[0.8, 0.4])
-        precision = Prior(3.0, 1).precision(grid, 1.0)
+        precision = FieldPrior(3.0, 1).precision(grid, 1.0)
         count = grid.scales[0].count
         assert precision[:count].unique().tolist() == [3.0]
         assert precision[count : grid.count].unique().tolist() == pytest.approx([12.0])
         assert torch.equal(precision[: grid.count], precision[grid.count :])
-        assert bool(Prior(torch.inf).precision(grid, 1.0).isinf().all())
+        assert bool(FieldPrior(torch.inf).precision(grid, 1.0).isinf().all())
 
     def test_a_form_without_a_minimum_leaves_no_field(self) -> None:
         problem, state, grid = setting()
@@ -223,13 +226,12 @@ class TestCalibration:
         assert result.held_out["hybrid"] < 0.6 * result.held_out["opencv5"]
         # Nearer to the truth than what noise and the parametric lens leave: fresh views say so.
         fresh, rotation, translation = views(0.7, 0.0, 12, seed=9)
-        none = torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
-        errors = {}
+        given, errors = Views(board_points=BOARD.points, pixels=fresh.pixels()), {}
         rival = solved(0.7, False).held_out
         assert rival == pytest.approx(result.held_out, rel=1e-6)
         for name, one in (("hybrid", camera), ("truth", truth)):
-            state: State = (one.params.detach(), torch.zeros(2).double(), *none, rotation, translation)
-            _, cost = refine_poses(BOARD.points, fresh.pixels()[:, None], [one.model], state, EXACT, [one.field])
+            state = BoardState.flat(one.params.detach(), rotation, translation)
+            _, cost = refine_poses(given, one.model, state, EXACT, one.field)
             errors[name] = float((2 * cost.sum() / (12 * 48)) ** 0.5)
         assert errors["truth"] < 1e-9
         assert errors["hybrid"] < 0.12

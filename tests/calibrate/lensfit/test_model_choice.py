@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from kcal.calibrate.lensfit.model_choice import Contender, choose, excess, surely_worse
+from kcal.calibrate.lensfit.model_choice import Contender, choose, paired_difference, surely_worse
 
 
 def contender(costs: list[float]) -> Contender:
@@ -18,7 +18,7 @@ def test_the_preferred_one_within_chance() -> None:
     # The groups differ far more than the models do: paired, the richer one is 1.5 standard errors better.
     plain = contender([10.0, 40.0, 90.0, 20.0])
     rich = contender([9.0, 39.6, 90.4, 19.0])
-    more, error = excess(plain, rich)
+    more, error = paired_difference(plain, rich)
     assert (more, round(error, 3)) == (pytest.approx(2.0), 1.327)
     assert choose([plain, rich]) is plain
     assert choose([rich, plain]) is rich
@@ -37,7 +37,7 @@ def test_a_corner_that_cannot_be_shown_decides() -> None:
     assert choose([folds, shows]) is shows
     # Both fail: the rest is compared, and nothing becomes NaN.
     other = contender([1.0, 1.0, math.inf])
-    more, error = excess(folds, other)
+    more, error = paired_difference(folds, other)
     assert (more, error) == (0.0, math.inf)
     assert choose([other, folds]) is other
 

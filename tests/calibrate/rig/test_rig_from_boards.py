@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, observe, pixels_of
+from rig_scenes import CAMERAS, landmarks, tensor
 from torch import Tensor
 
-from kcal.calibrate.rig.from_boards import RigCalibrationResult, RigOptions, calibrate_rig
+from kcal.calibrate.bundle.board_problem import warp_shape
+from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.pairs import pair_by_name, read_pairs
+from kcal.calibrate.rig.result import RigResult
+from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.calibrate.rig.sources import RigData
 from kcal.corners.board import Board
 from kcal.errors import FileError, InputError
+from kcal.io.rig_file import load_rig
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.solve.result import Status
+from kcal.solve.result import SolverStatus
 
 # 8 x 6 corners: the colors are the same after half a turn, so that a detector cannot know the first corner.
 AMBIGUOUS = Board(columns=8, rows=6, square=0.04)
@@ -50,31 +57,37 @@ def names(count: int) -> list[tuple[str, str]]:
     return [(f"l{i}", f"r{i}") for i in range(count)]
 
 
+def labels(count: int) -> list[str]:
+    """The pairs' names in a result."""
+    return [" ".join(pair) for pair in names(count)]
+
+
 def solve(
-    pixels: Tensor, *, left: Camera = LEFT, right: Camera = RIGHT, board: Board = BOARD, **options: bool
-) -> RigCalibrationResult:
+    pixels: Tensor, *, left: Camera = LEFT, right: Camera = RIGHT, board: Board = BOARD, **options: Any
+) -> RigResult:
     pairs = names(len(pixels))
     seen = [observe(pixels[:, c], board=board, names=[pair[c] for pair in pairs]) for c in (0, 1)]
     return calibrate_rig(left, right, seen[0], seen[1], pairs, RigOptions(**options))
 
 
-def off(result: RigCalibrationResult) -> tuple[float, float]:
+def off(result: RigResult) -> tuple[float, float]:
     """Angle (radians) and distance (meters) from the true pose."""
-    turn = vector_from_rotation(result.rig.right_from_left_rotation @ ROTATION.T)
-    return float(turn.norm()), float((result.rig.right_from_left_translation - TRANSLATION).norm())
+    rig = result.stereo()
+    turn = vector_from_rotation(rig.right_from_left_rotation @ ROTATION.T)
+    return float(turn.norm()), float((rig.right_from_left_translation - TRANSLATION).norm())
 
 
 class TestTruth:
     @pytest.mark.parametrize("count", [1, 2, 5])
     def test_comes_back(self, count: int) -> None:
         result = solve(views(count, 1))
-        assert result.status == Status.EXACT
+        assert result.status == SolverStatus.EXACT
         assert result.rms < 1e-11
         assert max(off(result)) < 1e-11
-        assert result.pairs == tuple(names(count))
+        assert result.pairs == tuple(labels(count))
         assert result.flipped == ()
-        assert result.excluded == ()
-        assert float(result.rig.baseline) == pytest.approx(float(TRANSLATION.norm()), rel=1e-10)
+        assert result.left_out == ()
+        assert float(result.stereo().baseline) == pytest.approx(float(TRANSLATION.norm()), rel=1e-10)
 
     def test_few_pairs_are_warned_of(self) -> None:
         assert solve(views(3, 1)).warnings == ()
@@ -86,7 +99,7 @@ class TestTruth:
         hidden = torch.rand(pixels.shape[:-1], generator=torch.Generator().manual_seed(1)) < 0.4
         pixels[hidden] = torch.nan
         result = solve(pixels)
-        assert result.status == Status.EXACT
+        assert result.status == SolverStatus.EXACT
         assert max(off(result)) < 1e-10
         assert torch.equal(torch.isnan(result.pixels[..., 0]), hidden)
 
@@ -95,9 +108,10 @@ class TestTruth:
         pixels[2, 1, :9] = torch.nan
         result = solve(pixels)
         seen = torch.isfinite(pixels[..., 0]).sum(-1).double()
-        both = ((result.rms_left**2 * seen[:, 0].sum() + result.rms_right**2 * seen[:, 1].sum()) / seen.sum()) ** 0.5
+        left, right = result.rms_px
+        both = ((left**2 * seen[:, 0].sum() + right**2 * seen[:, 1].sum()) / seen.sum()) ** 0.5
         assert result.rms == pytest.approx(float(both), rel=1e-12)
-        squared = (result.per_pair_rms**2 * seen.sum(-1)).sum() / seen.sum()
+        squared = (result.pair_rms**2 * seen.sum(-1)).sum() / seen.sum()
         assert result.rms == pytest.approx(float(squared**0.5), rel=1e-9)
         # 0.2 px an axis, with 6 parameters and 36 of poses from 990 numbers; 4 standard errors.
         assert result.rms == pytest.approx(0.2 * (2 * (1 - 42 / 990)) ** 0.5, rel=4 / (2 * 990) ** 0.5)
@@ -106,11 +120,11 @@ class TestTruth:
         pixels = views(8, 3, noise=0.1)
         rough = [Camera(c.params * torch.tensor([1.01, 1.01] + [1.0] * 8).double(), size=SIZE) for c in (LEFT, RIGHT)]
         fixed = solve(pixels, left=rough[0], right=rough[1])
-        refined = solve(pixels, left=rough[0], right=rough[1], refine_cameras=True)
+        refined = solve(pixels, left=rough[0], right=rough[1], intrinsics="free")
         assert refined.rms < fixed.rms
         assert refined.rms == pytest.approx(0.1 * 2**0.5, rel=0.1)
-        assert abs(float(refined.rig.left.focal[0]) - 500) < 4
-        assert torch.equal(fixed.rig.left.params, rough[0].params)
+        assert abs(float(refined.cameras[0].focal[0]) - 500) < 4
+        assert torch.equal(fixed.cameras[0].params, rough[0].params)
         # The error of the focal length shows in the σ of the pose.
         assert bool((refined.sigma_translation > solve(pixels).sigma_translation).all())
 
@@ -118,14 +132,59 @@ class TestTruth:
         """40 repetitions: 39 s² / σ² is χ²; s² / σ² lies in 0.332 to 2.17 but for 6e-5 (4 standard deviations)."""
         results = [solve(views(4, 5, noise=0.2, noise_seed=seed)) for seed in range(40)]
         turns = torch.stack(
-            [vector_from_rotation(result.rig.right_from_left_rotation @ ROTATION.T) for result in results]
+            [vector_from_rotation(result.stereo().right_from_left_rotation @ ROTATION.T) for result in results]
         )
-        shifts = torch.stack([result.rig.right_from_left_translation - TRANSLATION for result in results])
+        shifts = torch.stack([result.stereo().right_from_left_translation - TRANSLATION for result in results])
         for found, sigma in ((turns, "sigma_rotation"), (shifts, "sigma_translation")):
             predicted = torch.stack([getattr(result, sigma) for result in results]).pow(2).mean(0)
             ratio = found.var(0) / predicted
             assert bool(((ratio > 0.332) & (ratio < 2.17)).all()), (sigma, ratio)
             assert bool((found.mean(0).abs() < 4.5 * (predicted / 40).sqrt()).all()), sigma
+
+
+class TestSaving:
+    @pytest.mark.parametrize("intrinsics", ["fixed", "free"])
+    def test_all_that_is_known_comes_back(self, tmp_path: Path, intrinsics: str) -> None:
+        pixels = views(6, 2, noise=0.1)
+        pixels[1, 1], pixels[4, 1] = pixels[1, 1].flip(-2), pixels[4, 1] + 40.0
+        result = solve(pixels, intrinsics=intrinsics)
+        rig = load_rig(result.save(tmp_path / "rig.json"))
+        assert rig.fingerprint == result.stereo().fingerprint
+        assert rig.covariance is not None
+        assert torch.equal(rig.covariance.matrix, result.joint_covariance())
+        record = rig.calibration
+        assert record is not None
+        assert record == result.stereo().calibration
+        assert (record.rms, record.rms_left, record.rms_right) == (result.rms, *result.rms_px)
+        assert record.per_pair_rms == dict(zip(result.pairs, result.pair_rms.tolist(), strict=True))
+        assert record.flipped == ("l1 r1",)
+        assert [left_out.name for left_out in record.excluded] == ["l4 r4"]
+        assert record.baseline_m == float(rig.baseline)
+
+
+class TestBoardWarp:
+    def test_comes_back(self) -> None:
+        """A board that bulges by 3 mm along its rows and is flat along its columns."""
+        rotation, translation = poses(8, 3, BOARD)
+        bent = BOARD.points.clone()
+        bent[:, 2] += tensor(0.003, 0.0) @ warp_shape(BOARD.points)
+        points = bent @ rotation.transpose(-1, -2) + translation[:, None]
+        pixels = torch.stack([LEFT.project(points)[0], RIGHT.project(points @ ROTATION.T + TRANSLATION)[0]], 1)
+        flat = solve(pixels, reject=False)
+        assert flat.board_warp is None
+        assert flat.rms > 0.1
+        for intrinsics in ("fixed", "free"):
+            result = solve(pixels, board_warp=True, intrinsics=intrinsics)
+            assert result.board_warp is not None
+            torch.testing.assert_close(result.board_warp, tensor(0.003, 0.0), rtol=0, atol=1e-9)
+            assert max(off(result)) < 1e-8
+
+    def test_needs_boards(self) -> None:
+        marks = landmarks()
+        with pytest.raises(InputError, match="cannot be estimated without boards"):
+            solve_rig(
+                RigData(cameras=CAMERAS[:2], names=("left", "right"), landmarks=marks), RigOptions(board_warp=True)
+            )
 
 
 class TestWeights:
@@ -153,9 +212,9 @@ class TestWeights:
 
     def test_covariance_is_that_of_the_sigmas(self) -> None:
         for refine in (False, True):
-            result = solve(views(5, 3, noise=0.1), refine_cameras=refine)
-            assert result.covariance.shape == (26, 26)
-            sigma = result.covariance.diagonal().sqrt()
+            result = solve(views(5, 3, noise=0.1), intrinsics="free" if refine else "fixed")
+            assert result.joint_covariance().shape == (26, 26)
+            sigma = result.joint_covariance().diagonal().sqrt()
             torch.testing.assert_close(sigma[20:23], result.sigma_rotation, rtol=1e-6, atol=0)
             torch.testing.assert_close(sigma[23:], result.sigma_translation, rtol=1e-6, atol=0)
             # Parameters that were held have none: all, or the skew of each camera.
@@ -176,11 +235,11 @@ class TestTurned:
         which = [3, 1][:count]
         turned[which, side] = turned[which, side].flip(-2)
         result = solve(turned, board=board)
-        assert result.flipped == tuple(names(5)[i] for i in sorted(which))
-        assert result.excluded == ()
+        assert [turned.board for turned in result.flipped] == [labels(5)[i] for i in sorted(which)]
+        assert result.left_out == ()
         assert result.rms == pytest.approx(plain.rms, rel=1e-9)
         # Both stop where the cost is flat to 1e-12 of itself.
-        assert float(result.rig.baseline) == pytest.approx(float(plain.rig.baseline), rel=1e-6)
+        assert float(result.stereo().baseline) == pytest.approx(float(plain.stereo().baseline), rel=1e-6)
         # The corners come back as used.
         expected = pixels.clone()
         if side == 0:
@@ -192,8 +251,8 @@ class TestTurned:
         plain = solve(pixels)
         pixels[:, 1] = pixels[:, 1].flip(-2)
         result = solve(pixels)
-        assert result.flipped == tuple(names(5))
-        assert float(result.rig.baseline) == pytest.approx(float(plain.rig.baseline), rel=1e-6)
+        assert result.flipped == tuple((label, "right") for label in labels(5))
+        assert float(result.stereo().baseline) == pytest.approx(float(plain.stereo().baseline), rel=1e-6)
 
     @pytest.mark.parametrize("count", [1, 2])
     def test_one_or_two_pairs_are_taken_as_read(self, count: int) -> None:
@@ -201,7 +260,7 @@ class TestTurned:
         for seed in range(8):
             result = solve(views(count, seed, noise=0.1))
             assert result.flipped == ()
-            assert result.excluded == ()
+            assert result.left_out == ()
             assert off(result)[1] < 0.01
 
     def test_of_two_pairs_with_unseen_corners(self) -> None:
@@ -211,8 +270,8 @@ class TestTurned:
         plain = solve(pixels)
         pixels[[2, 4], 1] = pixels[[2, 4], 1].flip(-2)
         result = solve(pixels)
-        assert result.flipped == (("l2", "r2"), ("l4", "r4"))
-        assert float(result.rig.baseline) == pytest.approx(float(plain.rig.baseline), rel=1e-6)
+        assert result.flipped == (("l2 r2", "right"), ("l4 r4", "right"))
+        assert float(result.stereo().baseline) == pytest.approx(float(plain.stereo().baseline), rel=1e-6)
 
 
 class TestWrongPairs:
@@ -221,12 +280,21 @@ class TestWrongPairs:
         wrong = pixels.clone()
         wrong[2, 1], wrong[5, 1] = pixels[5, 1], pixels[2, 1]
         result = solve(wrong)
-        assert {pair for pair, _ in result.excluded} == {("l2", "r2"), ("l5", "r5")}
-        assert all("px away from where the other pairs put it" in reason for _, reason in result.excluded)
-        assert [pair for pair in names(8) if pair not in result.pairs] == [("l2", "r2"), ("l5", "r5")]
-        assert len(result.per_pair_rms) == len(result.pixels) == 6
+        assert {item.name for item in result.left_out} == {"l2 r2", "l5 r5"}
+        assert all("px away from where the other boards put it" in item.reason for item in result.left_out)
+        assert [pair for pair in labels(8) if pair not in result.pairs] == ["l2 r2", "l5 r5"]
+        assert len(result.pair_rms) == len(result.pixels) == 6
         kept = torch.tensor([0, 1, 3, 4, 6, 7])
-        assert float(result.rig.baseline) == pytest.approx(float(solve(pixels[kept]).rig.baseline), rel=1e-6)
+        assert float(result.stereo().baseline) == pytest.approx(float(solve(pixels[kept]).stereo().baseline), rel=1e-6)
+
+    def test_stay_and_are_named_where_nothing_is_rejected(self) -> None:
+        pixels = views(8, 2, noise=0.1)
+        pixels[3, 1] += 40.0
+        result = solve(pixels, reject=False)
+        assert result.left_out == ()
+        assert result.pairs == tuple(labels(8))
+        assert any(text.startswith("board l3 r3: ") and text.endswith("it was kept") for text in result.warnings)
+        assert any("px is high" in text for text in result.warnings)
 
     @pytest.mark.parametrize("shift", [(0.0, 4.0), (4.0, 0.0), (0.0, 8.0), (15.0, 0.0)])
     def test_a_board_that_moved_between_the_exposures(self, shift: tuple[float, float]) -> None:
@@ -234,7 +302,7 @@ class TestWrongPairs:
         pixels = views(8, 2, noise=0.1)
         pixels[3, 1] += torch.tensor(shift, dtype=torch.float64)
         result = solve(pixels)
-        assert [pair for pair, _ in result.excluded] == [("l3", "r3")]
+        assert [item.name for item in result.left_out] == ["l3 r3"]
         assert off(result)[0] < 5 * float(result.sigma_rotation.norm())
         assert off(result)[1] < 5 * float(result.sigma_translation.norm())
 
@@ -243,13 +311,13 @@ class TestWrongPairs:
         """Each camera alone fits such a pair well, and the joint RMS hardly rises: what joining it costs tells."""
         pixels = views(8, 2, noise=0.1)
         pixels[3, 1] += torch.tensor(shift, dtype=torch.float64)
-        warned = solve(pixels)
-        assert warned.excluded == ()
-        assert [text.split(":")[0] for text in warned.warnings] == ["pair l3, r3"]
-        assert warned.disagreement.argmax() == 3
+        warned = solve(pixels, reject=False)
+        assert warned.left_out == ()
+        assert [text.split(":")[0] for text in warned.warnings] == ["board l3 r3"]
+        assert max(warned.items, key=lambda item: item.over_limit).name == "l3 r3"
         result = solve(pixels, reject=True)
-        assert [pair for pair, _ in result.excluded] == [("l3", "r3")]
-        assert "disagree about the rig" in result.excluded[0][1]
+        assert [item.name for item in result.left_out] == ["l3 r3"]
+        assert "does not fit the other boards" in result.left_out[0].reason
         assert result.warnings == ()
         assert off(result)[0] < 5 * float(result.sigma_rotation.norm())
         assert off(result)[0] < 0.5 * off(warned)[0]
@@ -257,11 +325,11 @@ class TestWrongPairs:
     def test_good_pairs_are_neither_named_nor_left_out(self) -> None:
         for seed in range(3):
             result = solve(views(6, 2, noise=0.1, noise_seed=seed), reject=True)
-            assert result.excluded == ()
+            assert result.left_out == ()
             assert result.warnings == ()
 
     def test_an_exact_capture_loses_no_pair_to_rounding(self) -> None:
-        assert solve(views(6, 2)).excluded == ()
+        assert solve(views(6, 2)).left_out == ()
 
 
 class TestRefusals:
@@ -276,7 +344,7 @@ class TestRefusals:
     def test_nearly_equal_cameras_are_not_called_swapped_for_noise(self) -> None:
         pixels = views(5, 1, noise=0.3)
         twin = Camera(RIGHT.params * (1 + 1e-5), size=SIZE)
-        assert solve(pixels, right=twin).excluded == ()
+        assert solve(pixels, right=twin).left_out == ()
 
     def test_another_camera(self) -> None:
         other = Camera.build(focal=(1200, 600), center=(320, 240), size=SIZE)

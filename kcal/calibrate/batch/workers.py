@@ -1,4 +1,4 @@
-"""Many pieces of work on many processes, of which some may die: every piece comes back with a result or a reason."""
+"""Run many pieces of work on many processes; each returns a result or a reason, even if its process dies."""
 
 from __future__ import annotations
 
@@ -14,11 +14,9 @@ from typing import Any, NamedTuple
 
 from kcal.errors import FileError, InputError, KcalError
 
-_AHEAD = 3  # pieces handed out a worker: enough to keep it busy, few enough to hold in memory
-
 
 class Task(NamedTuple):
-    """A call to make somewhere; `tag` tells the caller which it was."""
+    """A function call for a worker; `tag` tells the caller which call it was."""
 
     tag: Any
     function: Callable[..., Any]
@@ -26,7 +24,7 @@ class Task(NamedTuple):
 
 
 class WorkerDiedError(KcalError):
-    """The process that did a piece of work ended: out of memory, beyond its time limit, or crashed."""
+    """The process of a piece of work ended: out of memory, over its time limit, or crashed."""
 
 
 # Called with a finished task and its result or exception; returns tasks that can now be done.
@@ -55,17 +53,17 @@ class Pool:
 
     @property
     def ahead(self) -> int:
-        """How many tasks to hand out at a time."""
-        return _AHEAD * self.workers
+        """How many tasks to hand out at a time: enough to keep workers busy, few enough to hold in memory."""
+        return 3 * self.workers
 
     def submit(self, task: Task) -> Future[Any]:
         """Hand out a task."""
         if self._executor is None:
             if self._client is not None:
-                # Pure tasks would be answered from Dask's memory by their arguments, whatever is in the files now.
+                # Dask would answer a pure task from its memory of the same arguments, even if files have changed.
                 self._executor = self._client.get_executor(pure=False)
             else:
-                # Not forked: OpenCV's and torch's threads would be copied half.
+                # Not forked: a fork copies the locks of OpenCV's and torch's threads, but not the threads.
                 context = multiprocessing.get_context("spawn")
                 self._executor = ProcessPoolExecutor(self.workers, mp_context=context, initializer=_begin)
         return self._executor.submit(task.function, *task.arguments)
@@ -79,7 +77,7 @@ class Pool:
         self._executor = None
 
     def close(self) -> None:
-        """Let go of all workers."""
+        """Release all workers."""
         self.restart()
         if self._client is not None:
             self._client.close()
@@ -96,7 +94,7 @@ def pool(workers: int, scheduler: str | None = None) -> Iterator[Pool]:
 
 
 def run_tasks(tasks: Iterable[Task], done: Done, workers: Pool) -> None:
-    """Do all tasks and those that `done` adds; it is called in this process, once for each, in any order.
+    """Do all tasks, and those that `done` adds; `done` is called in this process, once per task, in any order.
 
     A task whose worker dies is tried once more, alone; if its worker dies again it is given up with
     `WorkerDiedError`.
@@ -122,24 +120,24 @@ def run_tasks(tasks: Iterable[Task], done: Done, workers: Pool) -> None:
             if isinstance(future.exception(), BrokenExecutor):
                 casualties.append(task)
             else:
-                added.extend(done(task, _outcome(future)))
+                added.extend(done(task, _result_of(future)))
         if casualties and not pending:
             workers.restart()
             for task in casualties:
-                outcome = _outcome(workers.submit(task))
+                outcome = _result_of(workers.submit(task))
                 if isinstance(outcome, WorkerDiedError):
                     workers.restart()
                 added.extend(done(task, outcome))
             casualties.clear()
 
 
-def _outcome(future: Future[Any]) -> Any:
+def _result_of(future: Future[Any]) -> Any:
     """The result, or the exception instead of raising it."""
     error = future.exception()
     if error is None:
         return future.result()
     if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":
-        return WorkerDiedError("its process ended: out of memory, beyond the time limit (--time-limit), or crashed")
+        return WorkerDiedError("its process ended: out of memory, over the time limit (--time-limit), or crashed")
     return error
 
 
@@ -158,7 +156,7 @@ def _end_with_parent() -> None:
 
 
 def _one_thread() -> None:
-    """One thread a process: as many processes as cores share the work already."""
+    """Use one thread in this process: there are as many processes as cores."""
     from kcal.corners.detect import limit_threads
 
     limit_threads(1)

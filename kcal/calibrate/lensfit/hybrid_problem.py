@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import Free
+from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.twist import apply_twist
 from kcal.lens.model import LensModel
 from kcal.lens.pose import step_rows
@@ -20,7 +20,7 @@ _LOCAL = 6
 _CHUNK = 2_000_000
 
 
-class LearnedState(NamedTuple):
+class HybridState(NamedTuple):
     """What is solved for.
 
     Attributes:
@@ -36,13 +36,13 @@ class LearnedState(NamedTuple):
     translation: Tensor
 
 
-def hybrid_unknowns(model: LensModel) -> Free:
+def hybrid_unknowns(model: LensModel) -> FreeParameters:
     """What is free of a hybrid camera: one focal length, the principal point, and all coefficients; no skew."""
     rest = range(5, 5 + model.size)
-    return Free((0, 1, 2, 3, *rest), (0, 0, 1, 2, *(i - 2 for i in rest)))
+    return FreeParameters((0, 1, 2, 3, *rest), (0, 0, 1, 2, *(i - 2 for i in rest)))
 
 
-class LearnedProblem:
+class HybridProblem:
     """Residuals (pixels, by the corners' weights) of boards, and Gaussian priors on lens and board.
 
     Args:
@@ -78,17 +78,17 @@ class LearnedProblem:
         self.precision = torch.where(self.free, precision, 0.0)
         self.residual_count = 2 * int(self.seen.sum())
 
-    def shared(self, state: LearnedState) -> Tensor:
+    def shared(self, state: HybridState) -> Tensor:
         """(S,) unknowns of the camera and the board, relative to the prior's mean."""
         own = state.params[[0, 2, 3, *range(5, len(state.params))]]
         return torch.cat([own, state.board]) - self.mean
 
-    def _board(self, state: LearnedState, views: slice = slice(None)) -> tuple[Tensor, Tensor]:
+    def _board(self, state: HybridState, views: slice = slice(None)) -> tuple[Tensor, Tensor]:
         flat = self.points + torch.einsum("b,bkn->kn", state.board, self.shapes)
         rotated = state.rotation[views] @ flat
         return rotated, rotated + state.translation[views, :, None]
 
-    def residuals(self, state: LearnedState) -> Tensor:
+    def residuals(self, state: HybridState) -> Tensor:
         """(V, 2, N); NaN where a seen corner has no image."""
         _, points = self._board(state)
         seen = project_components(points, state.params, self.model)
@@ -96,12 +96,12 @@ class LearnedProblem:
         bad = torch.where(seen.regular, 0.0, torch.nan)[:, None]
         return torch.where(self.seen[:, None], error + bad, 0.0)
 
-    def cost(self, state: LearnedState) -> Tensor:
+    def cost(self, state: HybridState) -> Tensor:
         """See `Problem.cost`."""
         x = self.shared(state)
         return 0.5 * (self.residuals(state).square().sum() + (self.precision * x * x).sum())
 
-    def rows(self, state: LearnedState, views: slice = slice(None)) -> Tensor:
+    def rows(self, state: HybridState, views: slice = slice(None)) -> Tensor:
         """(V, 6 + S + 1, 2 N): derivatives by pose, lens and board, and residuals."""
         rotated, points = self._board(state, views)
         seen = project_components(points, state.params, self.model, self.unknowns.indices)
@@ -111,7 +111,7 @@ class LearnedProblem:
         rows = torch.cat([step_rows(seen.by_point, rotated), by_camera, board, error], 1)
         return torch.where(self.seen[views, None, None], rows * self.weights[views, None], 0.0).flatten(-2)
 
-    def linearize(self, state: LearnedState) -> SchurLinearization:
+    def linearize(self, state: HybridState) -> SchurLinearization:
         """See `Problem.linearize`."""
         S = len(self.mean)
         size = max(1, _CHUNK // ((S + _LOCAL + 1) * 2 * self.points.shape[-1]))
@@ -129,19 +129,19 @@ class LearnedProblem:
         prior[:-1, -1] = prior[-1, :-1] = self.precision * x
         return SchurLinearization(torch.cat(local), torch.cat(right), total + prior)
 
-    def retract(self, state: LearnedState, step: State) -> LearnedState:
+    def retract(self, state: HybridState, step: State) -> HybridState:
         """See `Problem.retract`."""
         shared, local = step
         count = len(self.unknowns)
         params = state.params.index_add(0, torch.tensor(self.unknowns.indices), self.unknowns.expand(shared[:count]))
         rotation, translation = apply_twist(state.rotation, state.translation, local)
-        return LearnedState(params, state.board + shared[count:], rotation, translation)
+        return HybridState(params, state.board + shared[count:], rotation, translation)
 
     def select(self, elements: Tensor) -> None:
         """See `Problem.select`: there is one element only."""
         return
 
-    def without_poses(self, state: LearnedState) -> Tensor:
+    def without_poses(self, state: HybridState) -> Tensor:
         """(V, S + 1, 2 N): derivatives by the shared unknowns, and residuals, off what poses can do (by QR)."""
         out = []
         size = max(1, _CHUNK // ((len(self.mean) + _LOCAL + 1) * 2 * self.points.shape[-1]))

@@ -1,15 +1,16 @@
-"""What a batch has finished: pieces on disk, found again by their keys, and the files and the table made from them."""
+"""Calibrate a batch of cameras; keep finished pieces of work on disk, and make files and a table from them."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import io
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from kcal.cli.batch_jobs import (
+from kcal.calibrate.batch.jobs import (
     BatchOptions,
     Calibrated,
     CameraJob,
@@ -19,8 +20,9 @@ from kcal.cli.batch_jobs import (
     detection_key,
     hash_of,
     observations_of,
+    pieces,
 )
-from kcal.cli.batch_run import Task, WorkerDiedError
+from kcal.calibrate.batch.workers import Task, WorkerDiedError, pool, run_tasks
 from kcal.corners.images import read_bytes
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, KcalError
@@ -29,7 +31,7 @@ from kcal.files import NativeFile, write_atomic
 Piece = TypeVar("Piece", bound=NativeFile)
 
 
-class Row(NamedTuple):
+class SummaryRow(NamedTuple):
     """One camera in the table; `failures` counts images without a board."""
 
     camera: str
@@ -50,22 +52,71 @@ class Row(NamedTuple):
     error: str = ""
 
 
+class BatchReport(NamedTuple):
+    """A finished batch.
+
+    Attributes:
+        rows: one for each camera, in their order.
+        summary: the CSV file with these rows.
+        reused: how many pieces of work were finished before.
+        total: how many pieces of work there are.
+    """
+
+    rows: list[SummaryRow]
+    summary: Path
+    reused: int
+    total: int
+
+
+def calibrate_batch(
+    jobs: Sequence[CameraJob],
+    folder: str | Path,
+    options: BatchOptions | None = None,
+    *,
+    workers: int = 0,
+    scheduler: str | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> BatchReport:
+    """Calibrate many cameras from their images, in parallel.
+
+    Writes NAME.obs.json and NAME.camera.json for each camera, and summary.csv. Finished pieces of work are kept in a
+    folder `.work`: the same call continues an interrupted run. A camera that fails does not stop the others.
+
+    Args:
+        jobs: the cameras, from `kcal.calibrate.batch.jobs.read_jobs`.
+        folder: for the results; made if it is missing.
+        options: see `BatchOptions`.
+        workers: processes on this machine; 0 for one per core.
+        scheduler: address of a Dask scheduler whose workers see the same files, instead of processes.
+        progress: called with a text after each piece of work.
+
+    Raises:
+        InputError: a scheduler is given but `distributed` is not installed.
+        FileError: the folder cannot be made, or the scheduler does not answer.
+    """
+    folder = Path(folder)
+    results = Results(folder, jobs, options or BatchOptions())
+    with pool(workers or os.cpu_count() or 1, scheduler) as crew:
+        run_tasks(results.tasks(progress), results.done, crew)
+    rows = results.rows()
+    return BatchReport(rows, write_summary(folder / "summary.csv", rows), results.reused, pieces(jobs))
+
+
 class Results:
     """The state of a batch in a folder.
 
     Args:
         folder: made if missing.
         jobs: the cameras.
-        options: what is done to each.
+        options: of all cameras.
 
     Raises:
         FileError: the folder cannot be made.
     """
 
-    def __init__(self, folder: Path, jobs: list[CameraJob], options: BatchOptions) -> None:
+    def __init__(self, folder: Path, jobs: Sequence[CameraJob], options: BatchOptions) -> None:
         self.folder, self.jobs, self.options = folder, jobs, options
         self.reused = 0
-        self.total = sum(len(job.images) + (not job.error) for job in jobs)
         self._work = folder / ".work"
         try:
             self._work.mkdir(parents=True, exist_ok=True)
@@ -78,7 +129,7 @@ class Results:
         self._calibrated: dict[int, Calibrated] = {}
 
     def tasks(self, advance: Callable[[str], None]) -> Iterator[Task]:
-        """What is left to do, image after image; `advance` is called after each piece of work."""
+        """Yield what is left to do, image after image; `advance` is called after each piece of work."""
         self._advance = advance
         for number, job in enumerate(self.jobs):
             for i, path in enumerate(job.images):
@@ -101,19 +152,19 @@ class Results:
             yield Task(("image", number, i, key), detect_image, (str(path), board, self.options))
 
     def done(self, task: Task, outcome: Any) -> list[Task]:
-        """Keep what a task has given; returns the calibration that has become possible."""
+        """Keep the outcome of a task; return the calibration that has become possible."""
         kind, number, i, key = task.tag
         if kind == "image":
             if isinstance(outcome, Detected):
                 outcome.save(self._path(key))
             else:
                 # Not kept: more memory or time may help.
-                outcome = Detected(reason=_reason(outcome))
+                outcome = Detected(reason=_failure_text(outcome))
             return self._detected(number, i, outcome)
         if isinstance(outcome, Calibrated):
             outcome.save(self._path(key))
         else:
-            outcome = Calibrated(error=_reason(outcome))
+            outcome = Calibrated(error=_failure_text(outcome))
         self._finish(number, outcome)
         return []
 
@@ -147,16 +198,16 @@ class Results:
             path.unlink(missing_ok=True)  # of an earlier run with other images: not this one's result
         self._advance(self.jobs[number].name)
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[SummaryRow]:
         """The table, in the order of the cameras."""
         return [self._row(number, job) for number, job in enumerate(self.jobs)]
 
-    def _row(self, number: int, job: CameraJob) -> Row:
+    def _row(self, number: int, job: CameraJob) -> SummaryRow:
         result = self._calibrated.get(number, Calibrated(error=job.error))
         seen = self._views.get(number)
         views = len(seen.views) if seen is not None else 0
         camera = result.camera
-        row = Row(
+        row = SummaryRow(
             camera=job.name,
             status="failed" if camera is None else "ok",
             model=job.model,
@@ -183,7 +234,7 @@ class Results:
         return self._work / f"{key}.json"
 
     def _load(self, kind: type[Piece], key: str) -> Piece | None:
-        """A finished piece; one that cannot be read is done again."""
+        """Load a finished piece; one that cannot be read is done again."""
         if not self._path(key).exists():
             return None
         try:
@@ -194,16 +245,16 @@ class Results:
         return piece
 
 
-def write_summary(path: Path, rows: list[Row]) -> Path:
+def write_summary(path: Path, rows: list[SummaryRow]) -> Path:
     """Write the table as CSV, atomically."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(Row._fields)
+    writer.writerow(SummaryRow._fields)
     writer.writerows(["" if value is None else value for value in row] for row in rows)
     return write_atomic(path, text.getvalue())
 
 
-def _reason(error: Exception) -> str:
+def _failure_text(error: Exception) -> str:
     if isinstance(error, KcalError | WorkerDiedError):
         return str(error)
     return f"{type(error).__name__}: {error}"

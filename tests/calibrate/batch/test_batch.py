@@ -11,9 +11,9 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from kcal.cli.batch_jobs import BatchOptions, detect_image, read_jobs
-from kcal.cli.batch_results import Results
-from kcal.cli.batch_run import Pool, Task, WorkerDiedError, pool, run_tasks
+from kcal.calibrate.batch.jobs import BatchOptions, detect_image, read_jobs
+from kcal.calibrate.batch.results import Results
+from kcal.calibrate.batch.workers import Pool, Task, WorkerDiedError, pool, run_tasks
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
@@ -155,7 +155,7 @@ class TestResults:
         assert not (tmp_path / "out" / "few.camera.json").exists()
 
     def test_an_unexpected_error_is_listed_and_not_kept(self, folder, tmp_path, monkeypatch):
-        monkeypatch.setattr("kcal.cli.batch_jobs.detect_board", lambda *_: 1 / 0)
+        monkeypatch.setattr("kcal.calibrate.batch.jobs.detect_board", lambda *_: 1 / 0)
         rows, _ = run(folder, tmp_path / "out")
         assert "ZeroDivisionError: division by zero" in rows[0].error
         monkeypatch.undo()

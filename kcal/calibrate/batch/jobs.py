@@ -1,7 +1,7 @@
-"""The work of `kcal batch` in pieces that are each done once: one image's corners, one camera's calibration.
+"""Cameras to calibrate, and the two pieces of work: find the board in one image, and calibrate one camera.
 
-A piece is named by a hash of all it depends on (the image's bytes, the options, kcal's version), so that a finished one
-is found again whatever happened in between, and one whose input changed is not.
+The name of a piece is a hash of everything that it depends on: the image's bytes, the options, and kcal's version. A
+finished piece is found by that name after an interruption, and is done again if its input has changed.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ import faulthandler
 import hashlib
 import io
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar
 
 import kcal
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
 from kcal.corners.images import decode_gray, expand_images, read_bytes, unique_names
@@ -32,12 +33,12 @@ _COLUMNS = ("camera", "images", "board", "square", "model")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BatchOptions:
-    """What is done to every camera.
+    """Options for all cameras of a batch.
 
     Args:
-        refine: see `kcal.corners.refine.refine_corners`.
-        board_warp: estimate how each board bends.
-        time_limit: seconds for one image or one calibration.
+        refine: how corners are refined, see `kcal.corners.refine.refine_corners`.
+        board_warp: also estimate how each board bends.
+        time_limit: seconds for one image or one calibration, after which it is given up.
     """
 
     refine: Refinement = "erf"
@@ -47,7 +48,7 @@ class BatchOptions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CameraJob:
-    """One camera of a batch; `error` says why it cannot be begun."""
+    """One camera of a batch; `error` says why its images cannot be read."""
 
     name: str
     images: tuple[Path, ...] = ()
@@ -80,10 +81,10 @@ class Calibrated(NativeFile):
 
 
 def read_jobs(source: Path, board: Board | None, model: str) -> list[CameraJob]:
-    """The cameras that a folder of folders or a CSV table names.
+    """Read which cameras a folder of folders or a CSV table names.
 
     In a folder, every folder with images is a camera. A table has the columns `camera` and `images` (a file, folder or
-    wildcard, relative to the table) and may have `board`, `square` and `model`, which go before the options.
+    wildcard, relative to the table) and may have `board`, `square` and `model`, which override the arguments.
 
     Raises:
         FileError: no such file or folder, no camera in it, or a table that cannot be read.
@@ -106,6 +107,11 @@ def read_jobs(source: Path, board: Board | None, model: str) -> list[CameraJob]:
         if not name or Path(name).name != name or name.startswith("."):
             raise InputError(f"{source}: {name!r} cannot name a camera: it becomes a file name")
     return [_job(source, row, board, model) for row in rows]
+
+
+def pieces(jobs: Sequence[CameraJob]) -> int:
+    """Count the pieces of work: one for each image and one for each camera."""
+    return sum(len(job.images) + (not job.error) for job in jobs)
 
 
 def _job(source: Path, row: dict[str, str], board: Board | None, model: str) -> CameraJob:
@@ -141,13 +147,13 @@ def _read_table(path: Path) -> list[dict[str, str]]:
 
 
 def hash_of(*parts: object) -> str:
-    """A name for a piece of work from all that it depends on."""
+    """Name a piece of work by everything that it depends on."""
     text = repr((kcal.__version__, *parts))
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def detection_key(digest: str, board: Board, refine: str) -> str:
-    """The name of one image's detection; `digest` is the hash of the file's bytes."""
+    """Name the detection of one image; `digest` is the hash of the file's bytes."""
     return hash_of("detected", digest, board.model_dump_json(), refine)
 
 
@@ -167,7 +173,7 @@ def detect_image(path: str, board: Board, options: BatchOptions) -> Detected:
 
 
 def observations_of(job: CameraJob, pieces: list[Detected], digests: list[str], refine: Refinement) -> Observations:
-    """One camera's observations from the pieces of its images.
+    """Put the pieces of one camera's images together.
 
     Raises:
         InputError: images of several sizes, or no board in any.
@@ -198,22 +204,19 @@ def observations_of(job: CameraJob, pieces: list[Detected], digests: list[str], 
 
 def calibrate_observations(seen: Observations, name: str, model: str, options: BatchOptions) -> Calibrated:
     """Calibrate one camera."""
-    from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-    from kcal.cli.calibrate import record
-
     with _time_limit(options.time_limit):
         try:
             result = calibrate_camera(seen, CalibrationOptions(model=model, board_warp=options.board_warp))
         except KcalError as error:
             return Calibrated(error=str(error))
-        return Calibrated(camera=record(result, seen, name, f"{name}.obs.json"), warnings=result.warnings)
+        return Calibrated(camera=result.file(name=name, source=f"{name}.obs.json"), warnings=result.warnings)
 
 
 @contextmanager
 def _time_limit(seconds: float) -> Iterator[None]:
     """End this process if the work takes longer.
 
-    An endless loop inside a C++ library hears no Python signal; the watchdog is a thread of its own.
+    A Python signal cannot interrupt a C++ library, so the watchdog is a thread of its own.
     """
     with open(os.devnull, "w") as nowhere:
         faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)

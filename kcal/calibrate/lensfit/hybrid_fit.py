@@ -10,8 +10,8 @@ from torch import Tensor
 
 from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
-from kcal.calibrate.lensfit.evidence import maximize_evidence, prior_families, typical_hyperparameters
-from kcal.calibrate.lensfit.learned_problem import LearnedProblem, LearnedState
+from kcal.calibrate.lensfit.evidence import PriorFamilies, maximize_evidence, prior_families, typical_hyperparameters
+from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.errors import InputError
 from kcal.lens.base_map import angle_over_radius
 from kcal.lens.camera import Camera
@@ -29,7 +29,7 @@ _CORNERS = (12.0, 20.0, 30.0, 42.0, 55.0, 68.0, 80.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class LearnedFit:
+class HybridFit:
     """A camera, its board, and what is not known of both.
 
     Args:
@@ -42,11 +42,12 @@ class LearnedFit:
         log_evidence: of the last round.
         effective: number of parameters that the data determine.
         board_shapes: modes of the board.
+        board_points: (N, 3) meters, the board as it was measured.
         rms: of the weighted residuals, px.
     """
 
     camera: Camera
-    state: LearnedState
+    state: HybridState
     half: Tensor
     sigma: float
     tempering: float
@@ -54,42 +55,43 @@ class LearnedFit:
     log_evidence: float
     effective: float
     board_shapes: BoardModes
+    board_points: Tensor
     rms: float
 
 
-def fit_learned(
+def fit_hybrid(
     points: Tensor,
     pixels: Tensor,
     size: tuple[int, int],
     weights: Tensor | None = None,
     modes: ZernikeModes | None = None,
     exact_board: bool = False,
-) -> LearnedFit:
+) -> HybridFit:
     """Fit one camera."""
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     modes = modes or ZernikeModes()
     board = board_modes(points)
-    focal, shape, rotation, translation = _start(points, pixels, size, weights)
+    focal, shape, rotation, translation = _base_start(points, pixels, size, weights)
     radius = _REACH * 0.5 * math.hypot(*size)
     distance = float(translation.norm(dim=-1).median())
     seen = torch.isfinite(pixels).all(-1) & (weights > 0)
     freedom = 2 * int(seen.sum()) - 6 * len(pixels)
 
-    def constants(focal: float, shape: float) -> LensModel:
-        return LensModel(hybrid=HybridForm(shape=shape, radius=radius / focal, modes=modes))
+    def constants(focal: float, shape: float) -> tuple[LensModel, PriorFamilies]:
+        form = HybridForm(shape=shape, radius=radius / focal, modes=modes)
+        return LensModel(hybrid=form), prior_families(form, focal, board, size, distance)
 
     h = typical_hyperparameters()
-    model = constants(focal, shape)
-    families = prior_families(model.hybrid, focal, board, size, distance)
+    model, families = constants(focal, shape)
     held = torch.ones(len(families.mean), dtype=torch.bool)
     held[:4] = False
     params = torch.zeros(5 + model.size, dtype=torch.float64)
     params[:4] = torch.tensor([focal, focal, families.mean[1], families.mean[2]])
-    state = LearnedState(params, torch.zeros_like(board.unit), rotation, translation)
+    state = HybridState(params, torch.zeros_like(board.unit), rotation, translation)
     # The base alone: its focal length and shape are put into the constants until they stay.
     for _ in range(6):
         deviation = families.deviation(h)
-        problem = LearnedProblem(
+        problem = HybridProblem(
             points,
             board.shapes,
             pixels,
@@ -99,11 +101,10 @@ def fit_learned(
             torch.where(held, torch.inf, deviation.square().reciprocal()),
         )
         result = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
-        state = LearnedState(*result.state)
+        state = HybridState(*result.state)
         scale, bend = float(state.params[0]) / focal - 1.0, float(state.params[5])
         focal, shape = float(state.params[0]), shape + min(max(bend, -1.0), 1.0)
-        model = constants(focal, shape)
-        families = prior_families(model.hybrid, focal, board, size, distance)
+        model, families = constants(focal, shape)
         params = state.params.clone()
         params[5] = 0.0
         state = state._replace(params=params)
@@ -115,12 +116,12 @@ def fit_learned(
         never[-len(board.unit) :] = True
     tempering = 1.0
 
-    def solve(state: LearnedState, steps: int, gain: float) -> tuple[LearnedProblem, LearnedState, int]:
+    def solve(state: HybridState, steps: int, gain: float) -> tuple[HybridProblem, HybridState, int]:
         precision = torch.where(never, torch.inf, variance / families.deviation(h).square())
-        problem = LearnedProblem(points, board.shapes, pixels, weights, model, families.mean, precision)
+        problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision)
         options = LMOptions(max_iterations=steps, tolerance=gain / freedom, initial_damping=1e-6)
         result = minimize(problem, state, options)
-        return problem, LearnedState(*result.state), int(result.iterations)
+        return problem, HybridState(*result.state), int(result.iterations)
 
     for turn in range(_ROUNDS):
         problem, state, steps = solve(state, 8 if turn == 0 else 12, 0.1 if turn == 0 else 0.02)
@@ -144,9 +145,9 @@ def fit_learned(
     off = problem.without_poses(state)
     K, _, _ = _quadratic(off, problem.shared(state))
     deviation = torch.where(never, 0.0, families.deviation(h))
-    inverse = _inverse_root(K, deviation, variance)
+    inverse = _posterior_root(K, deviation, variance)
     residuals = problem.residuals(state)
-    return LearnedFit(
+    return HybridFit(
         camera=Camera(state.params, size=size, model=model),
         state=state,
         half=inverse * deviation,
@@ -156,6 +157,7 @@ def fit_learned(
         log_evidence=-loss,
         effective=len(deviation) - float(inverse.square().sum()),
         board_shapes=board,
+        board_points=points + torch.einsum("b,bkn->nk", state.board, board.shapes),
         rms=math.sqrt(float(residuals.square().sum()) / int(seen.sum())),
     )
 
@@ -167,7 +169,7 @@ def _quadratic(off: Tensor, x: Tensor) -> tuple[Tensor, Tensor, float]:
     return flat[:-1] @ flat[:-1].T, flat[:-1] @ target, float(target @ target)
 
 
-def _inverse_root(K: Tensor, deviation: Tensor, variance: float) -> Tensor:
+def _posterior_root(K: Tensor, deviation: Tensor, variance: float) -> Tensor:
     """L⁻¹ of I + √D K √D / σ² = L Lᵀ."""
     A = K * deviation[:, None] * deviation / variance
     A.diagonal().add_(1.0)
@@ -178,13 +180,13 @@ def _overdispersion(off: Tensor, K: Tensor, deviation: Tensor, variance: float) 
     """How much more the scores of views scatter than independent corners explain, over the determined directions."""
     score = (off[:, :-1] @ off[:, -1, :, None])[..., 0]
     score = score - score.mean(0)
-    inverse = _inverse_root(K, deviation, variance)
+    inverse = _posterior_root(K, deviation, variance)
     effective = len(K) - float(inverse.square().sum())
     scattered = float((inverse @ (score * deviation / variance).T).square().sum()) * len(off) / (len(off) - 1)
     return max(1.0, scattered / effective)
 
 
-def _start(
+def _base_start(
     points: Tensor, pixels: Tensor, size: tuple[int, int], weights: Tensor
 ) -> tuple[float, float, Tensor, Tensor]:
     """Focal length, shape and poses: the base projection, among several, under which homographies fit best."""

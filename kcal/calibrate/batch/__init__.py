@@ -1,0 +1,1 @@
+"""Many cameras from their images, in parallel, continued after an interruption."""

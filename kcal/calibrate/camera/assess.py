@@ -1,0 +1,141 @@
+"""Assess a camera's solution: σ, covariance, residuals and warnings, as the result of its calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.bundle.board_problem import BoardState
+from kcal.calibrate.bundle.coefficient_prior import is_overparameterized
+from kcal.calibrate.bundle.covariance import Uncertainty, uncertainty_of
+from kcal.calibrate.bundle.parameters import FreeParameters
+from kcal.calibrate.bundle.priors import GaussianPrior
+from kcal.calibrate.bundle.views import LEAST_NOISE
+from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.prior_comparison import compare_with_prior, weak_prior_term
+from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.solve import Solution
+from kcal.calibrate.camera.warnings import (
+    NO_ERROR_BARS,
+    check_focal,
+    comparison_warnings,
+    general_warnings,
+    outlier_warnings,
+    prior_warnings,
+    rival_warnings,
+)
+from kcal.corners.observations import Observations
+from kcal.lens.camera import Camera
+from kcal.solve.result import SolverStatus
+
+
+def assess(observations: Observations, solution: Solution, options: CalibrationOptions) -> CameraCalibrationResult:
+    """The result of a calibration, from its solution.
+
+    Raises:
+        DegenerateError: the focal length is hardly determined.
+    """
+    problem, solved = solution.problem, solution.result
+    state = problem.tidy(solved.state)
+    # A lens may fold exactly at a corner, where rounding decides whether it has an image.
+    if not bool(torch.isfinite(problem.cost(state))):
+        state = solved.state
+    camera = Camera(state.parameters, size=observations.image_size, model=problem.model)
+    squared, count = problem.pixel_errors(state).square().sum(-2), problem.seen.sum(-1)
+    per_view, rms = torch.sqrt(squared.sum(-1) / count), float(torch.sqrt(squared.sum() / count.sum()))
+
+    uncertainty, comparison = _uncertainty(observations, solution, state, options)
+    free = problem.free
+    slot = {camera.names[i]: k for i, k in zip(free.indices, free.slots, strict=True)}
+    unknowns = [" = ".join(name for name in slot if slot[name] == k) for k in range(len(free))]
+    sigma = {name: float(uncertainty.sigma[k]) if bool(uncertainty.determined[k]) else None for name, k in slot.items()}
+    fixed = tuple(name for name in camera.names if name in solution.views.constraints.fixed)
+    sigma = {name: sigma.get(name) for name in camera.names if name in slot or name in fixed}
+    status = SolverStatus(int(solved.status))
+    doubts = []
+    if uncertainty.computed:
+        check_focal({name: float(uncertainty.sigma[k]) for name, k in slot.items()}, state.parameters)
+        lost = [name for name, known in zip(unknowns, uncertainty.determined.tolist(), strict=False) if not known]
+    else:
+        # Unknown is not the same as undetermined by the views.
+        doubts, lost = [NO_ERROR_BARS], []
+    weighted = problem.corner_residuals(solved.state, weighted=True)
+    minimum, noise = solution.minimum, solution.views.prior_noise
+    return CameraCalibrationResult(
+        camera=camera,
+        observations=observations,
+        rms=rms,
+        weighted_rms=None
+        if problem.whitening is None and problem.loss is None
+        else float(torch.sqrt(2.0 * solved.cost / count.sum())),
+        per_view_rms=per_view,
+        residuals=problem.corner_residuals(state),
+        cam_from_board_rotation=state.rotation,
+        cam_from_board_translation=state.translation,
+        board_warp=state.warp if problem.free_warp else None,
+        sigma=sigma,
+        fixed=fixed,
+        led_by_prior=_led_by_prior(solution, camera.names, slot, uncertainty),
+        status=status,
+        iterations=solution.spent,
+        covariance=_by_parameter(uncertainty, free, len(camera.names)),
+        warnings=(
+            *general_warnings(observations.names, camera, rms, per_view, lost, status),
+            *doubts,
+            *comparison,
+            *rival_warnings(camera, sigma, minimum, solution.plain_cost, problem.residual_count),
+            *prior_warnings(minimum.terms, solved.state, noise),
+            *outlier_warnings(observations.names, weighted),
+        ),
+    )
+
+
+def _uncertainty(
+    observations: Observations, solution: Solution, state: BoardState, options: CalibrationOptions
+) -> tuple[Uncertainty, list[str]]:
+    """Covariance of the unknowns; of an overparameterized model after a comparison with its weak prior."""
+    minimum, model = solution.minimum, options.lens
+    if not solution.problem.shared_size:
+        # Under a known camera and a flat board nothing is shared by the views.
+        return Uncertainty(state.parameters.new_zeros(0, 0), torch.zeros(0, dtype=torch.bool)), []
+    # Barriers before folds are no information about the lens.
+    known = [term for term in minimum.terms if isinstance(term, GaussianPrior)]
+    corners = observations.pixels(), observations.covariances()
+    plain = solution.problem_for(*corners, options.loss, known)
+    linear, count = plain.linearize(state), plain.shared_size + 6 * len(state.translation)
+    own = uncertainty_of(linear, plain.residual_count + plain.prior_count, count)
+    unquestioned = options.weak_prior is not None or options.camera is not None or not minimum.rivals
+    if not own.computed or not is_overparameterized(model) or unquestioned:
+        return own, []
+    noise = max((2.0 * float(linear.cost) / plain.residual_count) ** 0.5, LEAST_NOISE)
+    start = minimum.rivals[0][1]
+    prior = weak_prior_term(solution.views, start, model, noise)
+    with_prior = solution.problem_for(*corners, options.loss, [*known, prior])
+    comparison = compare_with_prior(solution.views, with_prior, plain, start, state, own)
+    if comparison is None:
+        return own, []
+    return comparison.uncertainty, comparison_warnings(comparison)
+
+
+def _led_by_prior(
+    solution: Solution, names: Sequence[str], slot: Mapping[str, int], uncertainty: Uncertainty
+) -> tuple[str, ...]:
+    """Parameters whose variance would more than double without their prior."""
+    led = []
+    for term in solution.minimum.terms:
+        if isinstance(term, GaussianPrior):
+            spread = solution.views.prior_noise / term.weight
+            for index, sigma in zip(term.index.tolist(), spread.tolist(), strict=True):
+                if float(uncertainty.sigma[slot[names[index]]]) ** 2 > 0.5 * sigma**2:
+                    led.append(names[index])
+    return tuple(led)
+
+
+def _by_parameter(uncertainty: Uncertainty, free: FreeParameters, count: int) -> Tensor:
+    """(5 + P, 5 + P) from the covariance of the unknowns: tied parameters alike, held ones zero."""
+    out = uncertainty.covariance.new_zeros(count, count)
+    slots, indices = torch.tensor(free.slots, dtype=torch.long), torch.tensor(free.indices, dtype=torch.long)
+    out[indices[:, None], indices] = uncertainty.covariance[slots[:, None], slots]
+    return out

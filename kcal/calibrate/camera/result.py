@@ -1,0 +1,156 @@
+"""What the calibration of one camera returns."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kcal.corners.observations import Observations
+from kcal.io.camera_file import CameraFile, camera_to_file, provenance
+from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, Exclusion
+from kcal.lens.camera import Camera
+from kcal.solve.result import SolverStatus
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RejectedCorner:
+    """A corner that was left out.
+
+    Args:
+        view: name of its view.
+        corner: its index on the board.
+        residual: pixels between it and its projection by the camera that was calibrated without it.
+        reason: one sentence.
+    """
+
+    view: str
+    corner: int
+    residual: float
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RejectedView:
+    """A view that was left out.
+
+    Args:
+        view: its name.
+        corners: how many corners it had.
+        residual: its RMS in pixels when it was last part of the calibration, without corners left out before.
+        reason: one sentence.
+    """
+
+    view: str
+    corners: int
+    residual: float
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CameraCalibrationResult:
+    """A calibrated camera with its residuals and error bars.
+
+    Args:
+        camera: the camera.
+        rms: sqrt(mean ‖r‖²) over all corners, pixels (Eq. 5), plain also where the corners were weighted.
+        weighted_rms: likewise of what was minimized, with the corners' weights and the robust loss; None where all
+            corners counted alike.
+        per_view_rms: (V,) likewise for each view, in the order of the observations; NaN for a view that was left out.
+        residuals: (V, N, 2) projected minus observed, pixels; NaN where a corner was not seen or was left out.
+        cam_from_board_rotation: (V, 3, 3); NaN for a view that was left out.
+        cam_from_board_translation: (V, 3) meters; likewise.
+        board_warp: (2,) meters of bend along x and y, or None if not estimated.
+        sigma: name -> standard deviation of each parameter, priors included. None where the data do not determine it
+            and where it was fixed; all None, with a warning, where it cannot be computed. Skew is listed only if the
+            options name it.
+        covariance: (5 + P, 5 + P) of all parameters in the order of `Camera.names`, poses free; its diagonal is σ².
+            Zero for what was held. What the data leave open has a large variance, which only rounding limits (σ is None
+            there). NaN, except for what was held, where it cannot be computed.
+        status: why the solver stopped.
+        iterations: trial steps of the solver, all starts and models together.
+        warnings: what the user should doubt, and what to do about it.
+        observations: what was calibrated from.
+        fixed: names of the parameters that the options held.
+        led_by_prior: names of the parameters that a prior determines more than the views do: without it their σ would
+            be more than 1.4 times as large.
+        rejected_corners: corners of the views that were used, left out by `CalibrationOptions.reject`.
+        rejected_views: views left out likewise.
+    """
+
+    camera: Camera
+    rms: float
+    weighted_rms: float | None
+    per_view_rms: Tensor
+    residuals: Tensor
+    cam_from_board_rotation: Tensor
+    cam_from_board_translation: Tensor
+    board_warp: Tensor | None
+    sigma: dict[str, float | None]
+    covariance: Tensor
+    status: SolverStatus
+    iterations: int
+    warnings: tuple[str, ...]
+    observations: Observations
+    fixed: tuple[str, ...] = ()
+    led_by_prior: tuple[str, ...] = ()
+    rejected_corners: tuple[RejectedCorner, ...] = ()
+    rejected_views: tuple[RejectedView, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Give the camera its error bars and history, which it keeps until its parameters change."""
+        known = self.covariance if bool(self.covariance.isfinite().all()) else None
+        self.camera.calibration = CameraCalibration(sigma=self.sigma, covariance=known, record=self._record())
+
+    def _record(self) -> CalibrationRecord:
+        board, warp = self.observations.board, self.board_warp
+        per_view = zip(self.observations.names, self.per_view_rms.tolist(), strict=True)
+        used = {view: rms for view, rms in per_view if not math.isnan(rms)}
+        return CalibrationRecord(
+            rms=self.rms,
+            views=len(used),
+            points=int(self.residuals[..., 0].isfinite().sum()),
+            per_view_rms=used,
+            excluded=self.excluded,
+            board=BoardRecord(columns=board.columns, rows=board.rows, square=board.square),
+            board_warp=None if warp is None else (float(warp[0]), float(warp[1])),
+            stop_reason=self.status.message,
+            iterations=self.iterations,
+            **provenance(),
+        )
+
+    @property
+    def rejected_share(self) -> float:
+        """Share of all corners that was left out, those of left-out views included."""
+        gone = len(self.rejected_corners) + sum(view.corners for view in self.rejected_views)
+        used = int(torch.isfinite(self.residuals).all(-1).sum())
+        return gone / (gone + used)
+
+    @property
+    def excluded(self) -> tuple[Exclusion, ...]:
+        """Views, then single corners, that were left out, each with its reason."""
+        return (
+            *(Exclusion(name=view.view, reason=view.reason) for view in self.rejected_views),
+            *(Exclusion(name=f"{c.view} corner {c.corner}", reason=c.reason) for c in self.rejected_corners),
+        )
+
+    def file(self, *, name: str = "", source: str | None = None) -> CameraFile:
+        """The camera with its error bars and history, in the form in which it is stored.
+
+        Args:
+            name: free text that tells cameras apart.
+            source: name of the observations file, if there is one.
+        """
+        record = dataclasses.replace(self._record(), observations=source)
+        return camera_to_file(self.camera, name=name, calibration=record)
+
+    def save(self, path: str | Path, *, name: str = "", source: str | None = None) -> Path:
+        """Write the camera file, with error bars and record; arguments as in `file`.
+
+        Raises:
+            FileError: the file cannot be written.
+        """
+        return self.file(name=name, source=source).save(path)

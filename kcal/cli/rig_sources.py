@@ -1,0 +1,127 @@
+"""Read what `kcal rig` is given into one frame."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from kcal.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData
+    from kcal.lens.camera import Camera
+    from kcal.lens.mounting import Origin
+
+CAMERAS = ("left", "right")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sources:
+    """What the user gave, as on the command line."""
+
+    pairs: tuple[Path, Path] | None = None
+    match: Path | None = None
+    landmarks: Path | None = None
+    marks: Path | None = None
+    features: Path | None = None
+    positions: Path | None = None
+    baseline: str | None = None
+    origin: str | None = None
+    mark_sigma: float = 0.3
+
+    @property
+    def files(self) -> list[Path]:
+        """All files that are read."""
+        single = (self.match, self.landmarks, self.marks, self.features, self.positions)
+        return [*(self.pairs or ()), *(path for path in single if path is not None)]
+
+
+class RigInput(NamedTuple):
+    """What was read.
+
+    Attributes:
+        data: everything in one frame.
+        origin: of the frame; None where no latitude is known.
+        unpaired: how many views of the boards have no partner.
+    """
+
+    data: RigData
+    origin: Origin | None
+    unpaired: int
+
+
+def parse_baseline(text: str) -> Baseline:
+    """`"10.02±0.005"` or `"10.02+-0.005"`, meters."""
+    from kcal.calibrate.rig.sources import Baseline
+
+    parts = text.replace("+-", "±").split("±")
+    try:
+        length, sigma = (float(part) for part in parts)
+    except ValueError:
+        raise InputError(f"baseline {text!r}: write LENGTH±SIGMA in meters, for example 10.02±0.005") from None
+    return Baseline(first=0, second=1, length=length, sigma=sigma)
+
+
+def read_sources(cameras: tuple[Camera, Camera], sources: Sources, *, prior: bool) -> RigInput:
+    """Read everything; warnings about it are printed."""
+    from kcal.calibrate.rig.pairs import pair_by_name, paired_boards, read_pairs
+    from kcal.calibrate.rig.sources import RigData
+    from kcal.cli.console import err
+    from kcal.corners.observations import Observations
+    from kcal.lens.mounting import Origin
+    from kcal.locate.marks import read_marks
+    from kcal.locate.survey import camera_positions, match_landmarks, read_features, read_survey
+
+    if (sources.landmarks is None) != (sources.marks is None):
+        raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
+    if cameras[0].fingerprint == cameras[1].fingerprint:
+        raise InputError("both camera files hold the same camera: this is the same camera twice; give two cameras")
+    origin = None if sources.origin is None else Origin.parse(sources.origin)
+    boards, landmarks, unpaired = None, None, 0
+    positions: tuple[MeasuredPosition, ...] = ()
+    if sources.positions is not None:
+        placed = read_survey(sources.positions, origin)
+        origin, positions = placed.origin, camera_positions(placed, CAMERAS)
+    if sources.landmarks is not None and sources.marks is not None:
+        survey = read_survey(sources.landmarks, origin)
+        if sources.positions is not None and survey.origin != origin:
+            raise InputError("landmarks and positions: one has latitudes, the other local meters; give an --origin")
+        origin = survey.origin
+        found = match_landmarks(survey, read_marks(sources.marks, single=True), sources.mark_sigma)
+        landmarks = found.landmarks
+        for names, text in ((found.unmarked, "surveyed, but not marked"), (found.unsurveyed, "marked, not surveyed")):
+            if names:
+                err.print(f"[yellow]warning:[/] {text}:", ", ".join(names), markup=True)
+    if sources.pairs is not None:
+        seen = Observations.load(sources.pairs[0]), Observations.load(sources.pairs[1])
+        views = seen[0].names, seen[1].names
+        matched = pair_by_name(*views) if sources.match is None else read_pairs(sources.match, *views)
+        boards, unpaired = paired_boards(cameras, seen, matched), len(views[0]) + len(views[1]) - 2 * len(matched)
+    data = RigData(
+        cameras=cameras,
+        names=CAMERAS,
+        covariances=tuple(map(_prior_covariance, cameras, CAMERAS)) if prior else None,
+        boards=boards,
+        landmarks=landmarks,
+        features=None if sources.features is None else read_features(sources.features, sources.mark_sigma),
+        baselines=() if sources.baseline is None else (parse_baseline(sources.baseline),),
+        positions=positions,
+    )
+    if prior:
+        err.print(
+            "[yellow]warning:[/] the sigmas of the camera files are taken as independent: the priors are looser in "
+            "some directions and tighter in others than the calibrations were"
+        )
+    return RigInput(data, origin, unpaired)
+
+
+def _prior_covariance(camera: Camera, name: str) -> Tensor:
+    import torch
+
+    if camera.calibration is None or camera.calibration.sigma is None:
+        raise InputError(f"the {name} camera file has no standard deviations to hold its parameters with")
+    sigma = [camera.calibration.sigma[key] or 0.0 for key in camera.names]
+    return torch.diag(torch.tensor(sigma, dtype=torch.float64) ** 2)

@@ -1,0 +1,90 @@
+"""Tables of located points as rows of cells, the heads first: for the screen and for pages."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from kcal.corners.board import Board
+from kcal.locate.positions import Located, Position
+
+
+def position_rows(located: Located, off: list[tuple[float, float, bool] | None] | None = None) -> list[list[str]]:
+    """Name, place, range, interval and status of each point.
+
+    Args:
+        located: the points.
+        off: from `kcal.locate.truth.position_errors`, for three more columns.
+    """
+    rows = [["name", "lat °", "lon °", "height m", "range m", "interval m", "status"]]
+    rows += [_position_row(position) for position in located.positions]
+    if off is not None:
+        rows[0][-1:-1] = ["off level m", "off in range m", "in interval"]
+        for row, miss in zip(rows[1:], off, strict=True):
+            row[-1:-1] = (
+                ["", "", ""] if miss is None else [_meters(miss[0]), f"{miss[1]:+.1f}", "yes" if miss[2] else "no"]
+            )
+    return rows
+
+
+def _position_row(position: Position) -> list[str]:
+    low, high = position.range_low_m, position.range_high_m
+    numbers = ["", "", "", ""]
+    if position.lat is not None and position.lon is not None and position.height is not None:
+        place = [f"{position.lat:.7f}", f"{position.lon:.7f}", f"{position.height:.1f}"]
+        numbers = [*place, _meters(position.range_m or 0)]
+    interval = "" if low is None or high is None else f"{_meters(low)} – {_meters(high)}"
+    status = position.status.name.lower().replace("_", " ")
+    return [position.name, *numbers, interval, f"{status} *" if position.reason else status]
+
+
+def _meters(value: float) -> str:
+    return "∞" if math.isinf(value) else f"{value:.1f}" if value < 1000 else f"{value:.0f}"
+
+
+def truth_rows(located: Located, noiseless: Located, truth: Tensor) -> list[list[str]]:
+    """Range, interval and error of each point, along and across the true line of sight.
+
+    Args:
+        located: the points.
+        noiseless: the same points, located from marks without noise: the last column is their error, which the
+            calibration alone has caused.
+        truth: (N, 3) true east, north, up, meters.
+    """
+    rows = [["target", "true m", "estimate m", "95 % interval m", "error m", "%", "across m", "calibration m"]]
+    for position, exact, true in zip(located.positions, noiseless.positions, truth, strict=True):
+        distance = float(true.norm())
+        if position.enu is None or position.range_m is None:
+            rows.append([position.name, f"{distance:.1f}", "-", "-", "-", "-", "-", position.reason])
+            continue
+        along, across = _along_and_across(position, true)
+        low, high = position.range_low_m or 0.0, position.range_high_m or 0.0
+        estimate, interval = f"{position.range_m:.1f}", f"{low:.1f} – {high:.1f}"
+        error = [f"{along:+.2f}", f"{100 * along / distance:+.2f}", f"{across:.2f}"]
+        share = "-" if exact.enu is None else f"{_along_and_across(exact, true)[0]:+.2f}"
+        rows.append([position.name, f"{distance:.1f}", estimate, interval, *error, share])
+    return rows
+
+
+def _along_and_across(position: Position, true: Tensor) -> tuple[float, float]:
+    """Signed error along the line of sight, and error across it, meters."""
+    error = true.new_tensor(position.enu) - true
+    sight = true / true.norm()
+    along = float(error @ sight)
+    return along, float((error - along * sight).norm())
+
+
+def diagonal_rows(located: Located, board: Board) -> list[list[str]]:
+    """The board's diagonal, known and located, for each pair of points named "NAME first" and "NAME last"."""
+    true = board.square * math.hypot(board.columns - 1, board.rows - 1)
+    rows = [["pair", "range m", "true mm", "estimated mm", "error mm"]]
+    ends = {position.name: position for position in located.positions}
+    for name in sorted({name.rsplit(" ", 1)[0] for name in ends}):
+        first, last = ends.get(f"{name} first"), ends.get(f"{name} last")
+        if first is None or last is None or first.enu is None or last.enu is None:
+            continue
+        length = math.dist(first.enu, last.enu)
+        error = f"{1e3 * (length - true):+.2f}"
+        rows.append([name, f"{first.range_m:.3f}", f"{1e3 * true:.2f}", f"{1e3 * length:.2f}", error])
+    return rows

@@ -1,0 +1,64 @@
+"""The real wide lens: 93 views of mrcal's tour, how they are split, and the measure on held-out views."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from kcal.calibrate.bundle.board_problem import BoardState
+from kcal.calibrate.bundle.poses import refine_poses
+from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.rig.board_consensus import Poses, pose_alone
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.lens.camera import Camera
+from kcal.solve.lm import LMOptions
+
+EXACT = LMOptions(max_iterations=60, tolerance=1e-12)
+
+
+def load() -> tuple[Observations, np.ndarray]:
+    folder = os.environ.get("KCAL_DATA")
+    if not folder:
+        raise SystemExit("set KCAL_DATA to the folder that holds wide_lens_corners.npz")
+    with np.load(Path(folder, "wide_lens_corners.npz")) as data:
+        corners, weight, size = data["corners"], data["weight"], data["image_size"]
+        columns, rows = (int(n) for n in data["board_size"])
+        board = Board(columns=columns, rows=rows, square=float(data["square_m"]))
+    views = []
+    for i, (points, weights) in enumerate(zip(corners.tolist(), weight.tolist(), strict=True)):
+        pixels = tuple((p[0], p[1]) if w > 0 else None for p, w in zip(points, weights, strict=True))
+        covariance = tuple((1 / w**2, 0.0, 1 / w**2) if w > 0 else None for w in weights)
+        views.append(View(name=f"{i:03d}", pixels=pixels, covariance=covariance))
+    return Observations(board=board, image_size=(int(size[0]), int(size[1])), views=tuple(views)), np.maximum(
+        weight, 0.0
+    )
+
+
+def folds(split: str, views: int) -> list[np.ndarray]:
+    """Views held out, as in the peers' comparison."""
+    if split == "evenodd":
+        return [np.arange(0, views, 2), np.arange(1, views, 2)]
+    blocks = np.array_split(np.arange(views), int(split.removeprefix("blocks")))
+    order = np.random.default_rng(0).permutation(len(blocks))
+    return [np.sort(np.concatenate([blocks[i] for i in order[k::5]])) for k in range(5)]
+
+
+def held_out(camera: Camera, warp: torch.Tensor, seen: Observations, weight: np.ndarray) -> tuple[float, int]:
+    """Sum of w² |r|² over views whose poses are solved again, and how many corners."""
+    pixels = seen.pixels()
+    alone: Poses
+    alone, _ = pose_alone(seen.board.points, pixels, camera, LMOptions(max_iterations=50))
+    state = BoardState(camera.params.detach(), warp, alone.rotation, alone.translation)
+    weights = torch.from_numpy(weight)[..., None, None] * torch.eye(2, dtype=torch.float64)
+    views = Views(board_points=seen.board.points, pixels=pixels, whitening=weights)
+    _, cost = refine_poses(views, camera.model, state, EXACT, camera.field)
+    return 2.0 * float(torch.nan_to_num(cost, nan=math.inf).sum()), int((weight > 0).sum())
+
+
+def subset(seen: Observations, index: np.ndarray) -> Observations:
+    return seen.subset([seen.names[i] for i in index])

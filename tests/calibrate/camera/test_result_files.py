@@ -1,0 +1,47 @@
+"""A result saves itself: the camera, its error bars, and how it was calibrated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from calibrate_scenes import camera, motions, observe, pixels_of
+
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.camera.outliers import OutlierRejection
+from kcal.io.camera_file import CameraFile, load_camera, save_camera
+
+
+def test_all_that_is_known_is_in_the_file(tmp_path: Path) -> None:
+    truth = camera()
+    pixels = pixels_of(truth, motions(truth, 8, 2))
+    pixels = pixels + 0.1 * torch.randn(pixels.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    pixels[2, 7] += 30.0
+    seen = observe(pixels)
+    result = calibrate_camera(seen, CalibrationOptions(reject=OutlierRejection()))
+    assert [corner.view for corner in result.rejected_corners] == [seen.names[2]]
+
+    path = result.save(tmp_path / "left.camera.json", name="left", source="left.obs.json")
+    file = CameraFile.load(path)
+    assert file.name == "left"
+    assert file.camera().fingerprint == result.camera.fingerprint
+    assert file.standard_deviations is not None
+    assert {name: file.standard_deviations[name] for name in result.sigma} == result.sigma
+    stored = file.covariance_matrix()
+    assert stored is not None
+    torch.testing.assert_close(stored, result.covariance, rtol=0, atol=0)
+    record = file.calibration
+    assert record is not None
+    assert (record.rms, record.views, record.points) == (result.rms, 8, int(pixels.shape[0] * pixels.shape[1]) - 1)
+    assert list(record.per_view_rms) == list(seen.names)
+    assert record.excluded == result.excluded
+    assert record.excluded[0].name == f"{seen.names[2]} corner 7"
+    assert record.observations == "left.obs.json"
+
+    # The camera itself carries all of it, until its parameters change.
+    carried = load_camera(save_camera(result.camera, tmp_path / "again.camera.json")).calibration
+    assert carried is not None
+    assert carried.record is not None
+    assert carried.record.excluded == result.excluded
+    assert carried.sigma is not None
+    assert carried.sigma["fx"] == result.sigma["fx"]

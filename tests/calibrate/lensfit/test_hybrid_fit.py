@@ -1,0 +1,274 @@
+"""The hybrid camera by evidence: simulated truth with a wandering pupil and a printed board comes back."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.board_modes import BENDING, PRINT, STRETCH, board_modes
+from kcal.calibrate.lensfit.evidence import maximize_evidence, prior_families, typical_hyperparameters
+from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
+from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
+from kcal.corners.board import Board
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
+from kcal.lens.pose import rotation_from_vector
+from kcal.solve.lm import LMOptions, minimize
+
+BOARD = Board(columns=9, rows=7, square=0.04)
+SIZE = (1280, 960)
+NOISE = 0.05
+
+
+def truth() -> Camera:
+    """A lens of 90 degrees across the diagonal that is none of ours: opencv5."""
+    return Camera.build(
+        focal=(800, 800), center=(645, 476), size=SIZE, coefficients=[-0.12, 0.03, 4e-4, -3e-4, 0.0], model="opencv5"
+    )
+
+
+def views(
+    camera: Camera, count: int, seed: int, *, bend: float = 0.0, stretch: float = 0.0, pupil: float = 0.0
+) -> Tensor:
+    """Corners (V, N, 2) of a board that is bent (meters) and stretched, seen through a wandering pupil (m / rad²)."""
+    generator = torch.Generator().manual_seed(seed)
+    points = BOARD.points.clone()
+    middle, half = points.mean(0), 0.5 * (points.amax(0) - points.amin(0))
+    a, b = (points[:, 0] - middle[0]) / half[0], (points[:, 1] - middle[1]) / half[1]
+    points[:, 2] = bend * a * b
+    points[:, 0] = middle[0] + (1.0 + stretch) * (points[:, 0] - middle[0])
+    out = []
+    while len(out) < count:
+        u = 2.0 * torch.rand(6, generator=generator, dtype=torch.float64) - 1.0
+        tilt = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], torch.zeros_like(u[0])]))
+        rotation = tilt @ rotation_from_vector(torch.stack([*torch.zeros(2, dtype=torch.float64), math.pi * u[2]]))
+        center = torch.stack([0.35 * u[3], 0.25 * u[4], torch.ones_like(u[0])]) * (0.55 + 0.15 * u[5])
+        cam = (points - middle) @ rotation.T + center
+        angle = torch.atan2(cam[:, :2].norm(dim=-1), cam[:, 2])
+        seen_from = torch.zeros_like(cam)
+        seen_from[:, 2] = pupil * angle**2
+        pixels, valid = camera.project(cam - seen_from)
+        if bool(valid.all()) and bool((pixels > 5).all()) and bool((pixels < torch.tensor(SIZE) - 6).all()):
+            out.append(pixels + NOISE * torch.randn(pixels.shape, generator=generator, dtype=torch.float64))
+    return torch.stack(out)
+
+
+@functools.cache
+def printed() -> HybridFit:
+    """A capture with pupil, bending and stretch, fitted."""
+    pixels = views(truth(), 25, 1, bend=0.8e-3, stretch=1.5e-3, pupil=3e-3)
+    return fit_hybrid(BOARD.points, pixels, SIZE)
+
+
+def seen_pixels(camera: Camera) -> Tensor:
+    """Places in the part of the image that boards filled: all but the corners, which no view reached."""
+    pixels = camera.grid(15, 11).reshape(-1, 2)
+    middle = torch.tensor([(SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2], dtype=torch.float64)
+    return pixels[(pixels - middle).norm(dim=-1) < 0.75 * float(middle.norm())]
+
+
+def error_at_infinity(found: Camera, true: Camera) -> float:
+    """RMS distance in pixels of the images of the same far directions, after the best turn of one camera."""
+    pixels = seen_pixels(true)
+    rays, valid = true.unproject(pixels)
+    rays, valid_here = found.unproject(pixels)[0], valid & found.unproject(pixels)[1]
+    there = true.unproject(pixels)[0][valid_here]
+    u, _, vh = torch.linalg.svd(there.T @ rays[valid_here])
+    turned = rays[valid_here] @ (u @ vh).T
+    return float(true.focal[0]) * float((turned - there).square().sum(-1).mean().sqrt())
+
+
+def test_noise_and_residuals() -> None:
+    found = printed()
+    assert found.sigma == pytest.approx(NOISE, rel=0.05)
+    assert found.rms == pytest.approx(NOISE * math.sqrt(2.0), rel=0.08)
+    assert found.tempering < 1.3
+
+
+def test_far_directions_come_back() -> None:
+    """Where boards were seen, the camera is good to twice the noise of one corner at infinity too."""
+    assert error_at_infinity(printed().camera, truth()) < 0.1
+
+
+def test_pupil_and_board_come_back() -> None:
+    found = printed()
+    deviation = found.half.square().sum(0).sqrt()
+    names = found.camera.names
+    pupil = float(found.camera.params[names.index("pupil1")])
+    # Unknowns: focal length, principal point, coefficients, board; parameters have fx, fy, cx, cy, skew first.
+    sigma = float(deviation[names.index("pupil1") - 2])
+    assert abs(pupil - 3e-3) < 4.0 * sigma
+    assert sigma < 1e-3
+    measured, ordered = found.board_points, BOARD.points
+    bend = measured[0, 2] - measured[BOARD.columns - 1, 2]
+    assert float(bend) == pytest.approx(1.6e-3, abs=2e-4)
+    width = (measured[BOARD.columns - 1, 0] - measured[0, 0]) / (ordered[BOARD.columns - 1, 0] - ordered[0, 0])
+    height = (measured[-1, 1] - measured[0, 1]) / (ordered[-1, 1] - ordered[0, 1])
+    assert float(width / height) == pytest.approx(1.0015, abs=3e-4)
+
+
+def test_errors_are_as_large_as_predicted() -> None:
+    """Images of far directions: their squared errors over their variances, after the best turn, are about one."""
+    found, true = printed(), truth()
+    pixels = seen_pixels(true)
+    rays = true.unproject(pixels)[0]
+    camera, model = found.camera, found.camera.model
+    from kcal.calibrate.lensfit.hybrid_problem import hybrid_unknowns
+    from kcal.lens.pose import step_rows
+    from kcal.lens.projection import project_components
+
+    unknowns = hybrid_unknowns(model)
+    far = 1e6 * rays.T
+    seen = project_components(far, camera.params.detach(), model, unknowns.indices)
+    columns = unknowns.collapse(seen.by_camera, -3).flatten(1).T
+    turn = step_rows(seen.by_point, far)[:3].flatten(1).T
+    basis, _ = torch.linalg.qr(turn)
+    error = (seen.pixels - pixels.T).flatten()
+    error = error - basis @ (basis.T @ error)
+    columns = columns - basis @ (basis.T @ columns)
+    half = found.half[:, : columns.shape[1]] @ columns.T
+    ratio = float(error.square().sum() / half.square().sum())
+    # One capture has few independent errors: the ratio of mean squares scatters widely, but 4 would be twice σ.
+    assert 0.1 < ratio < 4.0
+
+
+def test_an_exact_board_and_few_views() -> None:
+    pixels = views(truth(), 6, 3)
+    free, exact = (fit_hybrid(BOARD.points, pixels, SIZE, exact_board=flag) for flag in (False, True))
+    torch.testing.assert_close(exact.board_points, BOARD.points, rtol=0, atol=0)
+    assert error_at_infinity(exact.camera, truth()) < 1.0
+    assert error_at_infinity(free.camera, truth()) < 2.0
+    assert float(exact.half[:, -28:].abs().max()) == 0.0
+
+
+def test_weights_and_missing_corners() -> None:
+    """A corner of weight zero counts as little as one that was not seen."""
+    pixels = views(truth(), 8, 4)
+    wrong, missing, weights = pixels.clone(), pixels.clone(), torch.ones_like(pixels[..., 0])
+    wrong[2, 5] += 40.0
+    missing[2, 5] = torch.nan
+    weights[2, 5] = 0.0
+    one, other = fit_hybrid(BOARD.points, wrong, SIZE, weights), fit_hybrid(BOARD.points, missing, SIZE)
+    torch.testing.assert_close(one.camera.params, other.camera.params, rtol=0, atol=0)
+
+
+def test_views_of_something_else() -> None:
+    with pytest.raises(InputError, match="no start explains"):
+        fit_hybrid(BOARD.points, torch.full((4, BOARD.corners, 2), torch.nan, dtype=torch.float64), SIZE)
+
+
+def test_board_modes() -> None:
+    modes = board_modes(BOARD.points)
+    assert modes.shapes.shape == (28, 3, BOARD.corners)
+    assert torch.bincount(modes.family).tolist() == [12, 2, 14]
+    assert (BENDING, STRETCH, PRINT) == (0, 1, 2)
+    # No mode is a rigid motion of the board or its scale, to first order.
+    points = BOARD.points - BOARD.points.mean(0)
+    x, y, one = points[:, 0], points[:, 1], torch.ones_like(points[:, 0])
+    zero = torch.zeros_like(one)
+    rigid = [(one, zero, zero), (zero, one, zero), (zero, zero, one), (zero, zero, x), (zero, zero, y), (-y, x, zero)]
+    rigid.append((x, y, zero))
+    basis = torch.stack([torch.cat(parts) for parts in rigid], 1)
+    both = torch.cat([basis / basis.norm(dim=0), modes.shapes.flatten(1).T], 1)
+    assert int(torch.linalg.matrix_rank(both / both.norm(dim=0), rtol=1e-6)) == 28 + len(rigid)
+
+
+def linear_case() -> tuple[Tensor, Tensor, float, object]:
+    model = LensModel(hybrid=_form())
+    board = board_modes(BOARD.points)
+    families = prior_families(_form(), 800.0, board, SIZE, 0.6)
+    generator = torch.Generator().manual_seed(5)
+    rows = torch.randn(400, len(families.mean), generator=generator, dtype=torch.float64)
+    rows = rows / families.deviation(typical_hyperparameters())
+    target = 0.3 * torch.randn(400, generator=generator, dtype=torch.float64)
+    assert len(families.mean) == 3 + model.size + 28
+    return rows.T @ rows, rows.T @ target, float(target @ target), families
+
+
+def _form():
+    from kcal.lens.hybrid_terms import HybridForm
+
+    return HybridForm(shape=0.4, radius=1.1)
+
+
+def test_prior_slopes() -> None:
+    _, _, _, families = linear_case()
+    h = typical_hyperparameters()
+    numeric = []
+    for k in range(len(h)):
+        step = torch.zeros_like(h)
+        step[k] = 1e-6
+        log = [2.0 * families.deviation(h + s).log() for s in (step, -step)]
+        numeric.append((log[0] - log[1]) / 2e-6)
+    torch.testing.assert_close(families.slopes(h), torch.stack(numeric), rtol=1e-7, atol=1e-8)
+
+
+def test_evidence_is_that_of_the_linear_model() -> None:
+    """-ln p of a Gaussian linear model, by the covariance of the data, up to a constant; and it is a maximum."""
+    K, g, c, families = linear_case()
+    h, variance, loss = maximize_evidence(K, g, c, 400.0, families, typical_hyperparameters(), 0.09)
+
+    def value(h: Tensor, variance: float) -> float:
+        from kcal.calibrate.lensfit.evidence import _MEAN, _SD
+
+        d = families.deviation(h)
+        A = K * d[:, None] * d / variance + torch.eye(len(d), dtype=torch.float64)
+        b = d * g / variance
+        fit = c / variance - float(b @ torch.linalg.solve(A, b))
+        z = (h.numpy() - _MEAN) / _SD
+        return 0.5 * (400.0 * math.log(variance) + fit + float(torch.logdet(A))) + 0.5 * float(z @ z)
+
+    assert loss == pytest.approx(value(h, variance), rel=1e-9)
+    for k in range(len(h)):
+        for sign in (-1.0, 1.0):
+            step = torch.zeros_like(h)
+            step[k] = 0.3 * sign
+            assert value(h + step, variance) > loss - 1e-3
+    assert value(h, 1.2 * variance) > loss
+    assert value(h, variance / 1.2) > loss
+
+
+def test_rows_are_derivatives_of_residuals() -> None:
+    found = printed()
+    state = found.state
+    pixels = views(truth(), 4, 7)
+    model = found.camera.model
+    count = 3 + model.size + 28
+    problem = HybridProblem(
+        BOARD.points, found.board_shapes.shapes, pixels, torch.ones(4, BOARD.corners, dtype=torch.float64), model,
+        torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64),
+    )  # fmt: skip
+    state = HybridState(state.params, state.board, state.rotation[:4], state.translation[:4])
+    rows = problem.rows(state)
+    for index in (0, 1, 3, 4, 5, 8, 40, count - 28, count - 1):
+        step = torch.zeros(count, dtype=torch.float64)
+        step[index] = 1e-4 if index < 3 else 1e-6
+        none = torch.zeros(4, 6, dtype=torch.float64)
+        there, back = (problem.residuals(problem.retract(state, (s, none))).flatten(1) for s in (step, -step))
+        numeric = (there - back) / (2.0 * float(step[index]))
+        # Central differences of pixels near 1000: 1e-13 of these over the step.
+        torch.testing.assert_close(rows[:, 6 + index], numeric, rtol=1e-5, atol=1e-4)
+
+
+def test_normal_equations_without_poses() -> None:
+    """Poses eliminated by QR and by the Schur complement are the same."""
+    found = printed()
+    pixels = views(truth(), 5, 8)
+    model = found.camera.model
+    count = 3 + model.size + 28
+    problem = HybridProblem(
+        BOARD.points, found.board_shapes.shapes, pixels, torch.ones(5, BOARD.corners, dtype=torch.float64), model,
+        torch.zeros(count, dtype=torch.float64), torch.full((count,), 1e-3, dtype=torch.float64),
+    )  # fmt: skip
+    start = found.state
+    state = HybridState(start.params, start.board, start.rotation[:5], start.translation[:5])
+    state = HybridState(*minimize(problem, state, LMOptions(max_iterations=5)).state)
+    off = problem.without_poses(state)[:, :-1].transpose(0, 1).flatten(1)
+    matrix, scale = problem.linearize(state).information()
+    reduced = matrix / scale[:, None] / scale - 1e-3 * torch.eye(count, dtype=torch.float64)
+    torch.testing.assert_close(off @ off.T, reduced, rtol=1e-6, atol=1e-6 * float(reduced.diagonal().max()))
