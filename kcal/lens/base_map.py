@@ -24,6 +24,8 @@ _TAN = (1.0, 1 / 3, 2 / 15, 17 / 315, 62 / 2835, 1382 / 155925, 21844 / 6081075,
 _ARCTAN = tuple((-1.0) ** k / (2 * k + 1) for k in range(11))
 # (A(u) (1 + u) - 1) / (2 u) from the series of A: the coefficient of u^k is (a_k + a_(k+1)) / 2.
 _GROWTH = tuple(0.5 * (_ARCTAN[k] + _ARCTAN[k + 1]) for k in range(10))
+# arctan x / x by powers of x², for x up to tan(90° / 8) = 0.199.
+_ARCTAN_FAR = tuple((-1.0) ** k / (2 * k + 1) for k in range(12))
 # Largest angle √|s| θ: the tangent grows without bound towards π/2, and tanh is almost flat beyond 3.
 _STEEPEST, _FLATTEST = 1.5, 3.0
 _WIDEST = math.radians(179.0)
@@ -56,7 +58,7 @@ def radius_over_angle(q: Tensor) -> Tensor:
     """T(q) = m / θ for q = s θ²; the tangent is held beyond an angle √s θ of 86°."""
     slow = q.abs() < _SMALL
     root = torch.sqrt(torch.where(slow, 1.0, q).abs())
-    closed = torch.where(q > 0, torch.tan(root.clamp(max=_STEEPEST)), torch.tanh(root)) / root
+    closed = torch.where(q > 0, _tangent(root.clamp(max=_STEEPEST)), torch.tanh(root)) / root
     return torch.where(slow, series(_TAN, torch.where(slow, q, 0.0)), closed)
 
 
@@ -64,7 +66,7 @@ def angle_over_radius(u: Tensor) -> Tensor:
     """A(u) = θ / m for u = s m²; NaN for u ≤ -1, where no angle has that radius."""
     slow = u.abs() < _SMALL
     root = torch.sqrt(torch.where(slow, 1.0, u).abs())
-    closed = torch.where(u > 0, torch.atan(root), torch.atanh(torch.where(u < 0, root, 0.0))) / root
+    closed = torch.where(u > 0, _arctangent(root), _artanh(torch.where(u < 0, root, 0.0))) / root
     return torch.where(slow, series(_ARCTAN, torch.where(slow, u, 0.0)), closed)
 
 
@@ -77,3 +79,21 @@ def growth_by_shape(u: Tensor) -> tuple[Tensor, Tensor]:
     slope = (0.5 * ratio - 1.5 * value) / far
     by_u = tuple(k * c for k, c in enumerate(_GROWTH))[1:]
     return torch.where(slow, series(_GROWTH, near), value), torch.where(slow, series(by_u, near), slope)
+
+
+# ONNX runtimes have neither of these functions in float64.
+
+
+def _tangent(x: Tensor) -> Tensor:
+    return torch.sin(x) / torch.cos(x)
+
+
+def _arctangent(x: Tensor) -> Tensor:
+    """Halve the angle three times, then add the series: exact to rounding."""
+    for _ in range(3):
+        x = x / (1.0 + torch.sqrt(1.0 + x * x))
+    return 8.0 * x * series(_ARCTAN_FAR, x * x)
+
+
+def _artanh(x: Tensor) -> Tensor:
+    return 0.5 * torch.log((1.0 + x) / (1.0 - x))
