@@ -1,4 +1,4 @@
-"""Checks of tensors at the doors of the library: clear errors instead of silent broadcasting or rounding."""
+"""Check tensors that users pass: clear errors instead of silent broadcasting or rounding."""
 
 from __future__ import annotations
 

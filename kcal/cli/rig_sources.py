@@ -1,4 +1,4 @@
-"""Read what `kcal rig` is given into one frame."""
+"""Read the inputs of `kcal rig` and express them in one coordinate frame."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from kcal.solve.lm import LMOptions
 
 # Reasons for leaving items out, by their indices.
 Reasons = Mapping[Kind, Mapping[int, str]]
-# Marks that an item needs, so that its residuals say anything.
+# Fewest marks of an item whose residuals say anything about it.
 _MARKS: Mapping[Kind, int] = {"boards": 4, "landmarks": 1, "features": 2}
 # 1/m: features are drawn no farther away than 100 km.
 _LEAST_INVERSE_RANGE = 1e-5
