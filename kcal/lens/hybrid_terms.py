@@ -65,6 +65,11 @@ class HybridForm:
         object.__setattr__(self, "reach", min(self.radius, largest_base_radius(self.shape)))
         object.__setattr__(self, "names", LEADING + self.modes.names)
 
+    def constants(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """s₀ and 1 / ρ as tensors on the device of `like`: ONNX would write plain numbers as float32."""
+        shape, inverse = torch.tensor((self.shape, 1.0 / self.radius), dtype=like.dtype, device=like.device).unbind()
+        return shape, inverse
+
     @property
     def radial_names(self) -> frozenset[str]:
         """Names of the coefficients of a lens that is symmetric about its axis."""
@@ -89,21 +94,22 @@ def hybrid_terms(
         The fields of `kcal.lens.distortion.Distorted`; `positive` is the disc on which the lens is defined.
     """
     square = x * x + y * y
-    growth, growth_slope = growth_by_shape(form.shape * square)
+    shape, to_disc = form.constants(x)
+    growth, growth_slope = growth_by_shape(shape * square)
     bend = unbind_last(coefficients[..., :1])[0]
     scale = 1.0 + bend * square * growth
     offset = len(LEADING)
-    f, g, *by_place = form.modes.field(coefficients[..., offset:], x / form.radius, y / form.radius, slopes)
+    f, g, *by_place = form.modes.field(coefficients[..., offset:], x * to_disc, y * to_disc, slopes)
     point: tuple[Tensor, ...] = ()
     if slopes:
         # The derivative of scale by x is rate x.
-        rate = 2.0 * bend * (growth + form.shape * square * growth_slope)
-        f_x, f_y, g_x, g_y = (slope / form.radius for slope in by_place)
+        rate = 2.0 * bend * (growth + shape * square * growth_slope)
+        f_x, f_y, g_x, g_y = (slope * to_disc for slope in by_place)
         cross = rate * x * y
         point = (scale + rate * x * x + f_x, cross + f_y, cross + g_x, scale + rate * y * y + g_y)
     columns: list[tuple[Tensor, Tensor]] = []
     if wanted:
-        fields = form.modes.columns(x / form.radius, y / form.radius)
+        fields = form.modes.columns(x * to_disc, y * to_disc)
         zero, by_bend = torch.zeros_like(x), square * growth
         # The entrance pupil acts before this plane.
         leading = [(by_bend * x, by_bend * y), (zero, zero), (zero, zero)]

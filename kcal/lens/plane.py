@@ -66,7 +66,7 @@ def plane_from_points(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
         return X * inverse, Y * inverse
     ratio = angle_over_distance(X, Y, Z)
     if model.hybrid:
-        ratio = ratio * radius_over_angle(model.hybrid.shape * ratio * ratio * (X * X + Y * Y))
+        ratio = ratio * radius_over_angle(model.hybrid.constants(X)[0] * ratio * ratio * (X * X + Y * Y))
     return ratio * X, ratio * Y
 
 
@@ -80,7 +80,7 @@ def plane_with_slopes(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
     square = X * X + Y * Y
     by_distance = (square + Z * Z).reciprocal()
     if model.hybrid:
-        return _base_with_slopes(X, Y, Z, ratio, square, by_distance, model.hybrid.shape)
+        return _base_with_slopes(X, Y, Z, ratio, square, by_distance, model.hybrid.constants(X)[0])
     # h is the derivative of θ / ρ by ρ, divided by ρ; near the axis the difference would cancel.
     near = (square < _SERIES_LIMIT * Z * Z) & (Z > 0)
     depth = torch.where(near, Z, 1.0)
@@ -93,7 +93,7 @@ def plane_with_slopes(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
 
 
 def _base_with_slopes(
-    X: Tensor, Y: Tensor, Z: Tensor, ratio: Tensor, square: Tensor, by_distance: Tensor, shape: float
+    X: Tensor, Y: Tensor, Z: Tensor, ratio: Tensor, square: Tensor, by_distance: Tensor, shape: Tensor
 ) -> tuple[Tensor, ...]:
     ratio = ratio * radius_over_angle(shape * ratio * ratio * square)
     # Along the direction across the axis the slope is m' Z / R², beside it m / ρ; on the axis both are equal.
@@ -119,7 +119,7 @@ def rays_from_plane(x: Tensor, y: Tensor, model: LensModel) -> tuple[Tensor, Ten
         z = torch.sqrt(1.0 + square).reciprocal()
         return x * z, y * z, z
     if model.hybrid:
-        stretch = angle_over_radius(model.hybrid.shape * square)
+        stretch = angle_over_radius(model.hybrid.constants(x)[0] * square)
         x, y, square = x * stretch, y * stretch, square * stretch * stretch
     near = square < _SERIES_LIMIT
     t = torch.where(near, square, 0.0)
