@@ -62,6 +62,18 @@ def pixel_covariance(
     return torch.where(good[:, None, None], found, torch.nan).reshape(*places.shape[:-1], 2, 2)
 
 
+def image_sigma(camera: Camera, columns: int = 33, rows: int = 25) -> Tensor:
+    """(rows, columns) standard deviation in pixels of far directions, in the direction in which it is largest.
+
+    On a grid whose outermost points are the outermost pixels, after the best turn (`pixel_covariance`); NaN where the
+    camera has no ray.
+    """
+    found = pixel_covariance(camera, camera.grid(columns, rows).reshape(-1, 2))
+    good = found.isfinite().all(-1).all(-1)
+    largest = torch.linalg.eigvalsh(torch.where(good[:, None, None], found, 0.0))[:, -1]
+    return torch.where(good, largest.clamp_min(0.0).sqrt(), torch.nan).reshape(rows, columns)
+
+
 def _slopes(camera: Camera, pixels: Tensor, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     """Derivatives of far directions' pixels by parameters (N, 2, C) and by a turn (N, 2, 3), and which have them."""
     rays, valid = camera.unproject(pixels)

@@ -64,8 +64,9 @@ class CalibrationOptions:
             from a pinhole. Every coefficient gets a prior with mean zero, and with the standard deviation at which its
             term would shift the outermost corner by this share of its radius (a thirtieth of it for decentering, prism
             and tilt; `kcal.calibrate.bundle.coefficient_prior`). 0.3, the default, hardly changes what the views
-            determine, and leaves rich models a single minimum, found quickly, with a reliable σ (docs/measured/solver.md
-            has figures). None: the corners alone decide, as in OpenCV, and the lowest of their minima is searched for.
+            determine, and leaves rich models a single minimum, found quickly, with a reliable σ
+            (docs/measured/solver.md has figures). None: the corners alone decide, as in OpenCV, and the lowest of their
+            minima is searched for.
         camera: a known camera, whose parameters are held except those that `free` names. Only the board's poses (and
             its warp) are found; one view is enough. Its lens model takes the place of `model`.
         solver: options of the Levenberg-Marquardt solver.
