@@ -180,7 +180,10 @@ def fit_hybrid(
         K, g, c = _quadratic(off, problem.shared(state))
         former = tempering
         if not first:
-            tempering = _overdispersion(off, K, torch.where(never, 0.0, families.deviation(h)), variance)
+            found = _overdispersion(off, K, torch.where(never, 0.0, families.deviation(h)), variance)
+            # More tempering leaves fewer parameters, over which the scores scatter less, and so on: the mean of both
+            # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
+            tempering = found if turn < 2 else math.sqrt(tempering * found)
         h_new, noise, loss = maximize_evidence(
             K / tempering, g / tempering, c / tempering, freedom / tempering, families, h, variance / former
         )
