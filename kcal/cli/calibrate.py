@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.calibrate_hybrid import calibrate_hybrid_file
 from kcal.cli.console import out, print_table, print_wrote, steps, warn
 from kcal.errors import InputError
 from kcal.files import check_writable
@@ -23,7 +22,7 @@ def calibrate_command(
         str,
         typer.Option(
             metavar="NAME",
-            help="Lens model: pinhole, opencv4, opencv5, opencv8, opencv12, opencv14, ext16 ... ext24, or hybrid.",
+            help="Lens model: pinhole, opencv4, opencv5, opencv8, opencv12, opencv14, ext16 ... ext24.",
         ),
     ] = "opencv5",
     board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
@@ -75,10 +74,6 @@ def calibrate_command(
         float, typer.Option(metavar="SHARE", help="Largest share of all corners that --reject may leave out.")
     ] = 0.1,
     name: Annotated[str, typer.Option(help="Name of the camera; the name of the observations file if not given.")] = "",
-    groups: Annotated[
-        str,
-        typer.Option(metavar="KIND", help="Hybrid only: hold out blocks of views together, or views one by one."),
-    ] = "blocks",
     picture: Annotated[
         Path | None, typer.Option(help="PNG file to write: coverage, residuals, and RMS of each view.")
     ] = None,
@@ -96,9 +91,6 @@ def calibrate_command(
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --board-warp --picture left.png`
 
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --weak-prior 0.3`
-
-    `kcal calibrate left.obs.json -o left.camera.json --model hybrid --board-warp`: a parametric lens corrected by a
-    smooth field, which is kept only if it predicts held-out views better than every parametric model.
     """
     from kcal.lens.model import LensModel
 
@@ -108,17 +100,6 @@ def calibrate_command(
 
         check_picture(picture)
     name = name or observations.name.split(".")[0]
-    if model == "hybrid":
-        for option, given in (
-            ("--fix", fix), ("--tie", tie), ("--free", free), ("--prior", prior), ("--loss", loss),
-            ("--reject", reject), ("--weak-prior", weak_prior is not None), ("--camera", camera),
-        ):  # fmt: skip
-            if given:
-                raise InputError(f"{option} cannot be combined with --model hybrid")
-        calibrate_hybrid_file(
-            observations, output, name, picture, board_warp=board_warp, focal=focal, fov=fov, groups=groups
-        )
-        return
     lens = LensModel.named(model)
     known = None
     if camera is not None:

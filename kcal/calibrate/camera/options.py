@@ -89,8 +89,6 @@ class CalibrationOptions:
             raise InputError("CalibrationOptions: focal and field_of_view are alternatives; give one")
         if self.weak_prior is not None and not 0 < self.weak_prior < float("inf"):
             raise InputError(f"CalibrationOptions: weak_prior must be positive, got {self.weak_prior}")
-        if self.camera is not None and self.camera.field is not None:
-            raise InputError("CalibrationOptions: a known camera must be parametric, this one has a residual field")
         if self.camera is not None and (self.fixed or self.focal is not None or self.field_of_view is not None):
             raise InputError(
                 "CalibrationOptions: a known camera fixes all parameters; name those to estimate in `free` instead"
