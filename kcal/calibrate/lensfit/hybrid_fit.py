@@ -124,6 +124,7 @@ def fit_hybrid(
     square: float = SQUARE,
     focal: float | None = None,
     start: HybridFit | None = None,
+    robust: bool = False,
     progress: Callable[[str], object] = lambda _: None,
 ) -> HybridFit:
     """Fit one camera.
@@ -138,6 +139,8 @@ def fit_hybrid(
         square: standard deviation of the pixels' aspect and skew.
         focal: roughly known, pixels, for the start.
         start: an earlier fit of the same views with other weights, to begin with.
+        robust: bound the weight of corners that are far off, so that a few wrong ones change nothing. Error bars of
+            such a fit mean nothing; it tells which corners to leave out.
         progress: called after each step.
 
     Raises:
@@ -149,7 +152,9 @@ def fit_hybrid(
     seen = torch.isfinite(pixels).all(-1) & (weights > 0)
     freedom = 2 * int(seen.sum()) - 6 * len(pixels)
     if start is None:
-        estimate, spent = _base_alone(points, pixels, size, weights, modes or ZernikeModes(), board, square, focal)
+        estimate, spent = _base_alone(
+            points, pixels, size, weights, modes or ZernikeModes(), board, square, focal, robust
+        )
         progress("base projection")
     else:
         form = start.camera.model.hybrid
@@ -166,6 +171,8 @@ def fit_hybrid(
     def solve(steps: int, gain: float) -> tuple[HybridProblem, HybridState, int]:
         precision = torch.where(never, torch.inf, variance / families.deviation(h).square())
         problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision)
+        if robust:
+            problem = problem.with_weights(_bounded(problem, state, weights))
         options = LMOptions(max_iterations=steps, tolerance=gain / freedom, initial_damping=1e-6)
         result = minimize(problem, state, options)
         return problem, HybridState(*result.state), int(result.iterations)
@@ -205,7 +212,12 @@ def fit_hybrid(
     K, _, _ = _quadratic(off, problem.shared(state))
     deviation = torch.where(never, 0.0, families.deviation(h))
     inverse = _posterior_root(K, deviation, variance)
-    residuals = problem.residuals(state).transpose(-1, -2) / weights[..., None]
+    errors = problem.errors(state)
+    if not robust and not bool(torch.isfinite(errors).all()):
+        raise InputError(
+            "the lens cannot show all corners where they are: are all views of this board and this camera? Rejection "
+            "of outliers leaves wrong views out"
+        )
     return HybridFit(
         camera=Camera(state.params, size=size, model=model),
         state=state,
@@ -218,8 +230,8 @@ def fit_hybrid(
         effective=len(deviation) - float(inverse.square().sum()),
         board_shapes=board,
         board_points=points + torch.einsum("b,bkn->nk", state.board, board.shapes),
-        residuals=torch.where(seen[..., None], residuals, torch.nan),
-        weighted_rms=math.sqrt(float(problem.residuals(state).square().sum()) / int(seen.sum())),
+        residuals=torch.where(seen[..., None], errors.transpose(-1, -2), torch.nan),
+        weighted_rms=math.sqrt(float((errors * problem.weights).square().sum()) / int(seen.sum())),
         iterations=spent + steps,
         converged=converged,
     )
@@ -243,6 +255,7 @@ def _base_alone(
     board: BoardModes,
     square: float,
     known_focal: float | None,
+    robust: bool,
 ) -> tuple[_Estimate, int]:
     """Fit the base projection alone: its focal length and shape become constants of the lens. Also the trial steps."""
     focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal)
@@ -263,6 +276,8 @@ def _base_alone(
     for _ in range(6):
         precision = torch.where(held, torch.inf, families.deviation(h).square().reciprocal())
         problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision)
+        if robust:
+            problem = problem.with_weights(_bounded(problem, state, weights))
         result = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
         spent += int(result.iterations)
         state = HybridState(*result.state)
@@ -277,11 +292,20 @@ def _base_alone(
         params = state.params.clone()
         params[5] = 0.0
         state = state._replace(params=params)
-        if abs(scale) < 1e-3 and abs(bend) < 1e-3 * (1 + abs(shape)):
+        if not robust and abs(scale) < 1e-3 and abs(bend) < 1e-3 * (1 + abs(shape)):
             break
     freedom = 2 * int(problem.seen.sum()) - 6 * len(pixels)
     variance = max(2.0 * float(result.cost) / freedom, LEAST_NOISE**2)
     return _Estimate(model, families, state, h, variance, 1.0), spent
+
+
+def _bounded(problem: HybridProblem, state: HybridState, weights: Tensor) -> Tensor:
+    """(V, N) weights of a Cauchy loss at a state, its scale three robust standard deviations; 0 without an image."""
+    length = (problem.errors(state) * weights[:, None]).norm(dim=1)
+    shown = torch.isfinite(length) & problem.seen
+    # Of two normal components, the median length is 1.18 standard deviations.
+    scale = max(3.0 * float(length[shown].median()) / 1.18, LEAST_NOISE)
+    return torch.where(shown, weights / torch.sqrt(1.0 + (length / scale) ** 2), 0.0)
 
 
 def _quadratic(off: Tensor, x: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -292,10 +316,10 @@ def _quadratic(off: Tensor, x: Tensor) -> tuple[Tensor, Tensor, float]:
 
 
 def _posterior_root(K: Tensor, deviation: Tensor, variance: float) -> Tensor:
-    """L⁻¹ of I + √D K √D / σ² = L Lᵀ."""
-    A = K * deviation[:, None] * deviation / variance
-    A.diagonal().add_(1.0)
-    return torch.linalg.solve_triangular(torch.linalg.cholesky(A), torch.eye(len(A), dtype=A.dtype), upper=False)
+    """M of MᵀM = (I + √D K √D / σ²)⁻¹."""
+    # By eigenvalues: with wrong corners K is so large that a Cholesky factor loses the I to rounding.
+    values, vectors = torch.linalg.eigh(K * deviation[:, None] * deviation / variance)
+    return (1.0 + values.clamp_min(0.0)).rsqrt()[:, None] * vectors.T
 
 
 def _overdispersion(off: Tensor, K: Tensor, deviation: Tensor, variance: float) -> float:
@@ -337,7 +361,8 @@ def _base_start(
             direction = cam[..., :2] / cam[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-12)
             turned = theta[..., None] * offset / away.clamp_min(1e-9)[..., None]
             error = torch.where(usable, (there[..., None] * direction - turned).norm(dim=-1) * focal, 0.0)
-            value = float(error.square().sum() / usable.sum())
+            # By the median view: a few wrong views do not decide.
+            value = float((error.square().sum(-1) / usable.sum(-1)).median())
             if math.isfinite(value) and (best is None or value < best[0]):
                 best = value, focal, shape, rotation, translation
     if best is None:
