@@ -9,9 +9,17 @@ from kcal.calibrate.camera.layer import CalibratedViews as CalibratedViews
 from kcal.calibrate.camera.layer import CalibrationLayer as CalibrationLayer
 from kcal.calibrate.camera.options import CalibrationOptions as CalibrationOptions
 from kcal.calibrate.camera.options import OutlierRejection as OutlierRejection
+from kcal.calibrate.camera.refit import RefittedCamera as RefittedCamera
+from kcal.calibrate.camera.refit import refit_camera as refit_camera
 from kcal.calibrate.camera.result import CameraCalibrationResult as CameraCalibrationResult
 from kcal.calibrate.camera.result import RejectedCorner as RejectedCorner
 from kcal.calibrate.camera.result import RejectedView as RejectedView
+from kcal.calibrate.camera.summary import CalibrationSummary as CalibrationSummary
+from kcal.calibrate.camera.summary import summarize as summarize
+from kcal.calibrate.lensfit.board_modes import BoardModes as BoardModes
+from kcal.calibrate.lensfit.evidence import PriorFamilies as PriorFamilies
+from kcal.calibrate.lensfit.hybrid_fit import HybridFit as HybridFit
+from kcal.calibrate.lensfit.hybrid_problem import HybridState as HybridState
 from kcal.calibrate.rig.drift import Drift as Drift
 from kcal.calibrate.rig.drift import measure_drift as measure_drift
 from kcal.calibrate.rig.from_boards import calibrate_rig as calibrate_rig
@@ -80,6 +88,8 @@ from kcal.lens.pinhole import new_pinhole as new_pinhole
 from kcal.lens.rig import RigCovariance as RigCovariance
 from kcal.lens.rig import StereoRig as StereoRig
 from kcal.lens.spline import Spline as Spline
+from kcal.lens.uncertainty import image_sigma as image_sigma
+from kcal.lens.uncertainty import pixel_covariance as pixel_covariance
 from kcal.lens.zernike import ZernikeModes as ZernikeModes
 from kcal.locate.budget import BudgetErrors as BudgetErrors
 from kcal.locate.budget import RangeError as RangeError

@@ -51,7 +51,7 @@ class ComparisonResult:
         >>> {name: round(rms, 4) for name, rms in result.rms.items()}
         {'a': 0.2121, 'b': 0.2345}
         >>> [round(value, 4) for value in result.difference("b", "a")]
-        [0.0224, 0.0149]
+        [0.0224, 0.0154]
     """
 
     models: tuple[str, ...]
@@ -149,7 +149,7 @@ def compare_models(
         for number, model in enumerate(models):
             progress(f"{names[number]}, part {part + 1} of {parts}")
             try:
-                found = _fit(train, model, options)
+                found = _fit_model(train, model, options)
             except KcalError as error:
                 failures[names[number]] = error
                 continue
@@ -170,7 +170,9 @@ def compare_models(
     )
 
 
-def _fit(observations: Observations, model: str | LensModel, options: CalibrationOptions) -> CameraCalibrationResult:
+def _fit_model(
+    observations: Observations, model: str | LensModel, options: CalibrationOptions
+) -> CameraCalibrationResult:
     own = (
         dataclasses.replace(options, model=model)
         if model != HYBRID

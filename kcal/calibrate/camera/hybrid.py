@@ -50,13 +50,13 @@ def calibrate_hybrid(
     check_views(board, pixels, names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
     if options.reject is not None:
         return _without_outliers(observations, options, options.reject, progress)
-    fit = _fit(observations, pixels, torch.ones_like(pixels[..., 0]), None, options, progress)
+    fit = _fit_views(observations, pixels, torch.ones_like(pixels[..., 0]), None, options, progress)
     if options.weighted and observations.covariances() is not None:
-        fit = _fit(observations, pixels, _weights(observations, fit.residuals), fit, options, progress)
+        fit = _fit_views(observations, pixels, _weights(observations, fit.residuals), fit, options, progress)
     return _result(observations, fit, options)
 
 
-def _fit(
+def _fit_views(
     observations: Observations,
     pixels: Tensor,
     weights: Tensor,
@@ -102,7 +102,7 @@ def _without_outliers(
     seen = torch.isfinite(pixels).all(-1)
     own = seen.double()
     # A few wrong corners bend a plain fit towards them; bounded weights let them stand out.
-    fit = _fit(observations, pixels, own, None, options, progress, robust=True)
+    fit = _fit_views(observations, pixels, own, None, options, progress, robust=True)
     if options.weighted:
         own = _weights(observations, fit.residuals)
     left = list(range(len(pixels)))
@@ -126,7 +126,7 @@ def _without_outliers(
         progress(f"{int(rejected.sum())} corners and {len(views)} views left out")
         weights = torch.where(rejected, 0.0, own)[left]
         used = observations.subset([names[i] for i in left])
-        fit = _fit(used, pixels[left], weights, None, options, progress).among(left, len(pixels))
+        fit = _fit_views(used, pixels[left], weights, None, options, progress).among(left, len(pixels))
     plain = fit.residuals_of(pixels)
     weighted = plain * own[..., None]
     limits = corner_limits(torch.where(rejected[..., None], torch.nan, weighted))

@@ -34,6 +34,11 @@ class RefittedCamera:
         largest: largest ‖e‖.
         covered: share of the image that was fitted: without what the original camera has no ray for, and without what
             the model cannot show.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.1, 0.01])
+        >>> refit_camera(camera, "pinhole").largest > 1  # a pinhole is no lens
+        True
     """
 
     camera: Camera

@@ -127,6 +127,7 @@ class CameraCalibrationResult:
             iterations=self.iterations,
             noise=self.noise,
             tempering=None if self.hybrid is None else self.hybrid.tempering,
+            board_deviation=tuple((x, y, z) for x, y, z in (self.board_points - board.points).tolist()),
             **provenance(),
         )
 

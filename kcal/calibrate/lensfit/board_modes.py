@@ -22,6 +22,12 @@ class BoardModes(NamedTuple):
         shapes: (B, 3, N) displacement of each corner by a mode of amplitude one.
         unit: (B,) meters; amplitudes of a family are this times the same number.
         family: (B,) `BENDING`, `STRETCH` (with shear) or `PRINT`.
+
+    Example:
+        >>> grid = torch.cartesian_prod(torch.arange(7.0), torch.arange(6.0)).double()
+        >>> modes = board_modes(torch.cat([grid, torch.zeros(42, 1).double()], 1))
+        >>> modes.family.bincount().tolist(), float(modes.unit.max())  # twelve of bending; the extent is 6
+        ([12, 2, 14], 6.0)
     """
 
     shapes: Tensor

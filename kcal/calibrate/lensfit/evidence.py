@@ -46,6 +46,13 @@ class PriorFamilies(NamedTuple):
         amplitude: (S,) index of the log amplitude, -1 where the standard deviation is the unit.
         decay: (S,) index of the log decay, -1 where there is none.
         degree: (S,) x above.
+
+    Example:
+        >>> one = torch.ones(1, dtype=torch.float64)
+        >>> families = PriorFamilies(0 * one, 0 * one, torch.tensor([0]), torch.tensor([1]), 2 * one)
+        >>> h = torch.tensor([0.3, 0.5], dtype=torch.float64).log()
+        >>> round(float(families.deviation(h)), 4)  # 0.3 exp(-0.5 * 2)
+        0.1104
     """
 
     mean: Tensor

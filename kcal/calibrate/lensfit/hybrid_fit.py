@@ -61,6 +61,17 @@ class HybridFit:
         weighted_rms: sqrt(mean w² ‖r‖²), pixels.
         iterations: trial steps of the solver.
         converged: whether the hyperparameters came to rest.
+
+    Example:
+        >>> from kcal.lens.pose import rotation_from_vector
+        >>> points = torch.cartesian_prod(torch.arange(6.0), torch.arange(7.0), torch.zeros(1)).double() * 0.05
+        >>> truth = Camera.build(focal=(800, 800), center=(322, 238), size=(640, 480), model="pinhole")
+        >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)
+        >>> shift = torch.tensor([-0.12, -0.15, 0.6], dtype=torch.float64)
+        >>> pixels = truth.project(points @ rotation_from_vector(tilts).transpose(-1, -2) + shift)[0]
+        >>> fit = fit_hybrid(points, pixels, (640, 480))
+        >>> fit.converged, fit.effective < 20, fit.covariance.shape == 2 * fit.camera.params.shape
+        (True, True, True)
     """
 
     camera: Camera
@@ -162,7 +173,7 @@ def fit_hybrid(
         estimate = _Estimate(
             start.camera.model, start.families, start.state, start.hyperparameters, start.sigma**2, start.tempering
         )
-        spent = 0
+        spent = start.iterations
     model, families, state, h, variance, tempering = estimate
     never = torch.zeros_like(families.mean, dtype=torch.bool)
     if exact_board:
@@ -172,7 +183,7 @@ def fit_hybrid(
         precision = torch.where(never, torch.inf, variance / families.deviation(h).square())
         problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision)
         if robust:
-            problem = problem.with_weights(_bounded(problem, state, weights))
+            problem = problem.with_weights(_cauchy_weights(problem, state, weights))
         options = LMOptions(max_iterations=steps, tolerance=gain / freedom, initial_damping=1e-6)
         result = minimize(problem, state, options)
         return problem, HybridState(*result.state), int(result.iterations)
@@ -277,7 +288,7 @@ def _base_alone(
         precision = torch.where(held, torch.inf, families.deviation(h).square().reciprocal())
         problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision)
         if robust:
-            problem = problem.with_weights(_bounded(problem, state, weights))
+            problem = problem.with_weights(_cauchy_weights(problem, state, weights))
         result = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
         spent += int(result.iterations)
         state = HybridState(*result.state)
@@ -299,7 +310,7 @@ def _base_alone(
     return _Estimate(model, families, state, h, variance, 1.0), spent
 
 
-def _bounded(problem: HybridProblem, state: HybridState, weights: Tensor) -> Tensor:
+def _cauchy_weights(problem: HybridProblem, state: HybridState, weights: Tensor) -> Tensor:
     """(V, N) weights of a Cauchy loss at a state, its scale three robust standard deviations; 0 without an image."""
     length = (problem.errors(state) * weights[:, None]).norm(dim=1)
     shown = torch.isfinite(length) & problem.seen

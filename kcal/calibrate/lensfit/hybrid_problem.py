@@ -22,13 +22,18 @@ _CHUNK = 2_000_000
 
 
 class HybridState(NamedTuple):
-    """What is solved for.
+    """Camera, board and poses: what is solved for.
 
     Attributes:
         params: (5 + P,) of the camera.
         board: (B,) amplitudes of the board's modes, meters.
         rotation: (V, 3, 3) cam_from_board.
         translation: (V, 3) meters.
+
+    Example:
+        >>> state = HybridState(torch.zeros(9), torch.zeros(28), torch.eye(3).expand(4, 3, 3), torch.zeros(4, 3))
+        >>> len(state.rotation)
+        4
     """
 
     params: Tensor

@@ -21,7 +21,7 @@ from kcal.solve.result import SolverStatus
 
 
 def solve(pixels: Tensor, model: str = "opencv5", **options: object) -> CameraCalibrationResult:
-    return calibrate_camera(observe(pixels), CalibrationOptions(model=model, **options))
+    return calibrate_camera(observe(pixels), CalibrationOptions(**{"model": model, "weak_prior": None, **options}))
 
 
 def fitted(result: CameraCalibrationResult) -> dict[str, float]:
