@@ -14,7 +14,7 @@ from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration, UntilChanged
 from kcal.lens.camera_parameters import CameraParameters
 from kcal.lens.distortion import distort_components
-from kcal.lens.hybrid_points import evaluate
+from kcal.lens.hybrid_points import map_points
 from kcal.lens.hybrid_points_fit import FittedPolynomials, worth_fitting
 from kcal.lens.inverse import InverseStart, PreparedInverse, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
@@ -161,7 +161,7 @@ class Camera(CameraParameters):
         if worth_fitting(points, self.params, self.model):
             polynomials = self._fitted.forward(self.params.detach(), self.model, self.valid_region)
             if polynomials is not None:
-                return evaluate(polynomials, self._project_by_formulas, points, 2)
+                return map_points(polynomials, self._project_by_formulas, points, 2)
         return self._project_by_formulas(points)
 
     def _project_by_formulas(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -317,7 +317,7 @@ class Camera(CameraParameters):
             ready = PreparedInverse(self.valid_region, self.inverse_start)
             polynomials = self._fitted.backward(self.params.detach(), self.model, ready)
             if polynomials is not None:
-                return evaluate(polynomials, self._unproject_by_formulas, pixels, 3)
+                return map_points(polynomials, self._unproject_by_formulas, pixels, 3)
         return self._unproject_by_formulas(pixels, start)
 
     def _unproject_by_formulas(self, pixels: Tensor, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:

@@ -144,7 +144,7 @@ def _within(*limits: tuple[Tensor, float]) -> Tensor | None:
     return torch.stack([value <= limit for value, limit in limits]).all(0)
 
 
-def evaluate(
+def map_points(
     polynomials: Forward | Backward,
     formulas: Callable[[Tensor], tuple[Tensor, Tensor]],
     points: Tensor,

@@ -182,7 +182,7 @@ def _forward_error(forward: Forward, parameters: Tensor, model: LensModel) -> fl
     pixels, found = forward(torch.stack([X, Y, Z], -1), X.new_empty((forward.rows, len(X))))
     coefficients = parameters[len(INTRINSICS) :]
     depth, _ = ray_starts(X, Y, Z, coefficients)
-    return _difference(X, Y, Z - depth, pixels, found, parameters, model)
+    return _largest_distance(X, Y, Z - depth, pixels, found, parameters, model)
 
 
 def _backward_error(backward: Backward, parameters: Tensor, model: LensModel) -> float:
@@ -193,10 +193,10 @@ def _backward_error(backward: Backward, parameters: Tensor, model: LensModel) ->
     pixels = torch.stack(to_pixels(radius * torch.cos(turn), radius * torch.sin(turn), parameters), -1)
     rays, found = backward(pixels, pixels.new_empty((backward.rows, len(pixels))))
     X, Y, Z = rays.unbind(-1)
-    return _difference(X, Y, Z, pixels, found, parameters, model)
+    return _largest_distance(X, Y, Z, pixels, found, parameters, model)
 
 
-def _difference(
+def _largest_distance(
     X: Tensor, Y: Tensor, Z: Tensor, pixels: Tensor, found: Tensor | None, parameters: Tensor, model: LensModel
 ) -> float:
     """Largest distance between pixels and those of rays by the formulas; infinite if few are found."""

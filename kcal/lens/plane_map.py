@@ -164,14 +164,14 @@ def _matrix(series: Mapping[int, np.ndarray]) -> Tensor:
     for j, part in series.items():
         # By powers of s = |z|²: z^j s^k is z^(j + k) times the conjugate of z to the power k.
         for k, weight in enumerate(part @ shifted_powers(len(part))):
-            total += weight * _monomials(max(j, 0) + k, max(-j, 0) + k, degree)
+            total += weight * _powers_of_z(max(j, 0) + k, max(-j, 0) + k, degree)
     # [power of y, u or v, power of x]
     both = np.stack([total.real, total.imag], 1)
     return torch.from_numpy(both.reshape(2 * (degree + 1), degree + 1))
 
 
 @functools.cache
-def _monomials(ahead: int, back: int, degree: int) -> np.ndarray:
+def _powers_of_z(ahead: int, back: int, degree: int) -> np.ndarray:
     """(x + i y)^ahead (x - i y)^back: its coefficients by power of y (rows) and of x."""
     product = np.ones(1, dtype=complex)
     for unit in [1j] * ahead + [-1j] * back:
