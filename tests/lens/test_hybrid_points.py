@@ -138,10 +138,13 @@ class TestStandBack:
         camera.unproject(before)
         copied = copy.deepcopy(camera)
         camera.params.data[9] += 1e-3
+        camera.params.data[4] = 0.8  # skew
         after, _ = camera.project(points)
+        assert polynomials(camera).intrinsics[4] == 0.8
         assert distance(after, before) > 0.1
         assert distance(after, camera._project_by_formulas(points)[0]) < 1e-9
         rays, _ = camera.unproject(before)
+        assert camera._fitted._backward is not None
         assert distance(rays, camera._unproject_by_formulas(before)[0]) < 1e-12
         assert torch.equal(copied.project(points)[0], before)
 
