@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 BENDING, STRETCH, PRINT = range(3)
+# Of modes whose amplitudes have a prior of their own.
+KNOWN = -1
 
 
 class BoardModes(NamedTuple):
@@ -21,7 +23,7 @@ class BoardModes(NamedTuple):
     Attributes:
         shapes: (B, 3, N) displacement of each corner by a mode of amplitude one.
         unit: (B,) meters; amplitudes of a family are this times the same number.
-        family: (B,) `BENDING`, `STRETCH` (with shear) or `PRINT`.
+        family: (B,) `BENDING`, `STRETCH` (with shear) or `PRINT`; `KNOWN` where the unit is the standard deviation.
     """
 
     shapes: Tensor

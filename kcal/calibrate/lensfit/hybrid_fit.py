@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
-from kcal.calibrate.lensfit.evidence import PriorFamilies, maximize_evidence, prior_families, typical_hyperparameters
+from kcal.calibrate.lensfit.board_prior import BoardPrior
+from kcal.calibrate.lensfit.evidence import (
+    Hyperprior,
+    PriorFamilies,
+    maximize_evidence,
+    prior_families,
+    typical_hyperprior,
+)
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.errors import InputError
 from kcal.lens.base_map import angle_over_radius
@@ -36,6 +44,7 @@ class HybridFit:
         camera: the camera.
         state: parameters, board, poses.
         half: (S, S); halfᵀ half is the covariance of parameters and board.
+        families: the priors that were used; of a board with a prior of its own, those after the change of variables.
         sigma: px, of a corner of weight one, tempering included.
         tempering: T, by which the data count less because residuals repeat within views.
         hyperparameters: (H,).
@@ -49,6 +58,7 @@ class HybridFit:
     camera: Camera
     state: HybridState
     half: Tensor
+    families: PriorFamilies
     sigma: float
     tempering: float
     hyperparameters: Tensor
@@ -65,13 +75,26 @@ def fit_hybrid(
     size: tuple[int, int],
     weights: Tensor | None = None,
     modes: ZernikeModes | None = None,
-    exact_board: bool = False,
+    board: Literal["printed", "exact"] | BoardPrior = "printed",
+    hyperprior: Hyperprior | None = None,
 ) -> HybridFit:
-    """Fit one camera."""
+    """Fit one camera.
+
+    Args:
+        points: (N, 3) the board's corners as ordered, meters.
+        pixels: (V, N, 2), NaN where not seen.
+        size: of the image.
+        weights: (V, N) by which residuals are multiplied; one if not given.
+        modes: of the field.
+        board: how the board differs from the one that was ordered: as printers err, not at all, or as was measured.
+        hyperprior: of the amplitudes; the typical one if not given.
+    """
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     modes = modes or ZernikeModes()
-    board = board_modes(points)
-    focal, shape, rotation, translation = _base_start(points, pixels, size, weights)
+    hyperprior = hyperprior or typical_hyperprior()
+    ordered, own = points, board_modes(points)
+    points, shown = board.applied(points, own) if isinstance(board, BoardPrior) else (points, own)
+    focal, shape, rotation, translation = _base_start(ordered, pixels, size, weights)
     radius = _REACH * 0.5 * math.hypot(*size)
     distance = float(translation.norm(dim=-1).median())
     seen = torch.isfinite(pixels).all(-1) & (weights > 0)
@@ -79,21 +102,21 @@ def fit_hybrid(
 
     def constants(focal: float, shape: float) -> tuple[LensModel, PriorFamilies]:
         form = HybridForm(shape=shape, radius=radius / focal, modes=modes)
-        return LensModel(hybrid=form), prior_families(form, focal, board, size, distance)
+        return LensModel(hybrid=form), prior_families(form, focal, shown, size, distance)
 
-    h = typical_hyperparameters()
+    h = hyperprior.mean
     model, families = constants(focal, shape)
     held = torch.ones(len(families.mean), dtype=torch.bool)
     held[:4] = False
     params = torch.zeros(5 + model.size, dtype=torch.float64)
     params[:4] = torch.tensor([focal, focal, families.mean[1], families.mean[2]])
-    state = HybridState(params, torch.zeros_like(board.unit), rotation, translation)
+    state = HybridState(params, torch.zeros_like(shown.unit), rotation, translation)
     # The base alone: its focal length and shape are put into the constants until they stay.
     for _ in range(6):
         deviation = families.deviation(h)
         problem = HybridProblem(
             points,
-            board.shapes,
+            shown.shapes,
             pixels,
             weights,
             model,
@@ -112,13 +135,13 @@ def fit_hybrid(
             break
     variance = 2.0 * float(result.cost) / freedom
     never = torch.zeros_like(held)
-    if exact_board:
-        never[-len(board.unit) :] = True
+    if board == "exact":
+        never[-len(shown.unit) :] = True
     tempering = 1.0
 
     def solve(state: HybridState, steps: int, gain: float) -> tuple[HybridProblem, HybridState, int]:
         precision = torch.where(never, torch.inf, variance / families.deviation(h).square())
-        problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision)
+        problem = HybridProblem(points, shown.shapes, pixels, weights, model, families.mean, precision)
         options = LMOptions(max_iterations=steps, tolerance=gain / freedom, initial_damping=1e-6)
         result = minimize(problem, state, options)
         return problem, HybridState(*result.state), int(result.iterations)
@@ -135,7 +158,7 @@ def fit_hybrid(
             tempering_new = 1.0
         h_new, noise, loss = maximize_evidence(
             K / tempering_new, g / tempering_new, c / tempering_new, freedom / tempering_new, families, h,
-            variance / tempering,
+            variance / tempering, hyperprior,
         )  # fmt: skip
         change = float((h_new - h).abs().max())
         h, tempering, variance = h_new, tempering_new, noise * tempering_new
@@ -146,18 +169,23 @@ def fit_hybrid(
     K, _, _ = _quadratic(off, problem.shared(state))
     deviation = torch.where(never, 0.0, families.deviation(h))
     inverse = _posterior_root(K, deviation, variance)
+    half = inverse * deviation
     residuals = problem.residuals(state)
+    if isinstance(board, BoardPrior):
+        state = state._replace(board=board.mean + state.board @ board.half)
+        half = torch.cat([half[:, : -len(board.mean)], half[:, -len(board.mean) :] @ board.half], 1)
     return HybridFit(
         camera=Camera(state.params, size=size, model=model),
         state=state,
-        half=inverse * deviation,
+        half=half,
+        families=families,
         sigma=math.sqrt(variance),
         tempering=tempering,
         hyperparameters=h,
         log_evidence=-loss,
         effective=len(deviation) - float(inverse.square().sum()),
-        board_shapes=board,
-        board_points=points + torch.einsum("b,bkn->nk", state.board, board.shapes),
+        board_shapes=own,
+        board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),
         rms=math.sqrt(float(residuals.square().sum()) / int(seen.sum())),
     )
 

@@ -1,0 +1,215 @@
+"""A board as cameras measured it, with its covariance, and its file."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import pydantic
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.calibrate.lensfit.board_prior import BoardPrior
+from kcal.corners.board import Board
+from kcal.errors import InputError
+from kcal.files import NativeFile
+
+
+class Measured(NamedTuple):
+    """A value and its standard deviation."""
+
+    value: float
+    sigma: float
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class MeasuredBoard:
+    """How a printed board differs from the one that was ordered.
+
+    Convention: the frame is the ordered board's (`Board`). Size, place and tilt of a board cannot be measured by
+    cameras: what differs is bending, stretch, shear and print errors.
+
+    Args:
+        name: of the board.
+        board: as it was ordered.
+        amplitudes: (B,) of the modes of `board_modes`, meters.
+        half: (B, B) upper part of their covariance: halfᵀ half.
+        log_evidence: nats by which the data prefer a printed board over one that is exactly as ordered.
+        observations: names of the observations that it was measured from.
+
+    Raises:
+        InputError: shapes or values that do not fit the board.
+    """
+
+    name: str
+    board: Board
+    amplitudes: Tensor
+    half: Tensor
+    log_evidence: float
+    observations: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        size = len(board_modes(self.board.points).unit)
+        if self.amplitudes.shape != (size,) or self.half.shape != (size, size):
+            raise InputError(f"measured board: {size} amplitudes and a root of {size} x {size} are needed")
+        if not bool(self.amplitudes.isfinite().all() & self.half.isfinite().all()):
+            raise InputError("measured board: amplitudes and their covariance must be finite")
+
+    def prior_for(self, boards: Iterable[Board]) -> BoardPrior:
+        """The prior of its amplitudes, for cameras that saw these boards.
+
+        Raises:
+            InputError: a board of another size.
+        """
+        for board in boards:
+            if board != self.board:
+                raise InputError(f"the measured board {self.name!r} is {self.board}; the observations are of {board}")
+        return BoardPrior(self.amplitudes, self.half)
+
+    @property
+    def points(self) -> Tensor:
+        """(N, 3) the corners as they are, meters."""
+        return self.board.points + (self.amplitudes @ self._rows()).view(-1, 3)
+
+    @property
+    def points_covariance(self) -> Tensor:
+        """(N, 3, 3) covariance of each corner, meters²."""
+        spread = (self.half @ self._rows()).view(len(self.half), -1, 3)
+        return torch.einsum("rnk,rnl->nkl", spread, spread)
+
+    @property
+    def bending(self) -> Measured:
+        """Height of the corner farthest from the best plane, meters."""
+        return self._largest(2, self._low_order()[:, :3])
+
+    @property
+    def stretch(self) -> Measured:
+        """Width over height, relative to the ordered board, less one."""
+        return self._in_plane((1.0, 0.0, 0.0, -1.0))
+
+    @property
+    def shear(self) -> Measured:
+        """Cosine of the angle between rows and columns."""
+        return self._in_plane((0.0, 1.0, 1.0, 0.0))
+
+    @property
+    def print_error(self) -> Measured:
+        """RMS distance of the corners, in the plane, from the best stretched and sheared board, meters."""
+        basis = self._low_order()[:, :3]
+        rows = self._rows().view(len(self.half), -1, 3)[..., :2]
+        rows = rows - torch.einsum("nb,mb,rmk->rnk", basis, basis, rows)
+        error = torch.einsum("r,rnk->nk", self.amplitudes, rows)
+        rms = float(error.square().sum(-1).mean().sqrt())
+        # Of the RMS of noise alone, whose slope is zero, the sigma is its own expected size.
+        slope = torch.einsum("rnk,nk->r", rows, error) / (len(error) * max(rms, 1e-12))
+        noise = torch.einsum("ar,rnk->ank", self.half, rows)
+        both = float((self.half @ slope).norm()), float((noise.square().sum() / len(error)).sqrt())
+        return Measured(rms, both[rms < both[1]])
+
+    def _rows(self) -> Tensor:
+        """(B, 3 N) displacement of the corners by each mode."""
+        return board_modes(self.board.points).shapes.transpose(1, 2).flatten(1)
+
+    def _low_order(self) -> Tensor:
+        """(N, 3) orthonormal: planes over the board."""
+        points = self.board.points
+        return torch.linalg.qr(torch.cat([torch.ones_like(points[:, :1]), points[:, :2]], 1))[0]
+
+    def _largest(self, axis: int, basis: Tensor) -> Measured:
+        rows = self._rows().view(len(self.half), -1, 3)[..., axis]
+        rows = rows - rows @ basis @ basis.T
+        at = int((self.amplitudes @ rows).abs().argmax())
+        return Measured(abs(float(self.amplitudes @ rows[:, at])), float((self.half @ rows[:, at]).norm()))
+
+    def _in_plane(self, weights: tuple[float, float, float, float]) -> Measured:
+        """Of the best linear map of the plane: weights of xx, xy, yx, yy."""
+        points = self.board.points[:, :2] - self.board.points[:, :2].mean(0)
+        rows = self._rows().view(len(self.half), -1, 3)[..., :2]
+        slopes = torch.linalg.lstsq(points.expand(len(rows), -1, -1), rows).solution
+        row = slopes.transpose(1, 2).flatten(1) @ torch.tensor(weights, dtype=points.dtype)
+        return Measured(float(self.amplitudes @ row), float((self.half @ row).norm()))
+
+
+class BoardFile(NativeFile):
+    """A measured board (file kind `board`, version 1).
+
+    Args:
+        name: of the board.
+        board: as it was ordered.
+        amplitudes: of the modes of bending and print, meters; see `kcal.calibrate.lensfit.board_modes`.
+        half: rows of a matrix whose transpose times itself is their covariance.
+        log_evidence: nats by which the data prefer this board over the ordered one.
+        observations: names of the observations that it was measured from.
+    """
+
+    KIND: ClassVar[str] = "board"
+    VERSION: ClassVar[int] = 1
+
+    name: str
+    board: Board
+    amplitudes: tuple[float, ...]
+    half: tuple[tuple[float, ...], ...]
+    log_evidence: float
+    observations: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self) -> BoardFile:
+        if any(len(row) != len(self.amplitudes) for row in self.half):
+            raise ValueError("the root of the covariance must have as many columns as there are amplitudes")
+        self.measured()
+        return self
+
+    def measured(self) -> MeasuredBoard:
+        """The board, equal to the stored one to the last bit."""
+        return MeasuredBoard(
+            name=self.name,
+            board=self.board,
+            amplitudes=torch.tensor(self.amplitudes, dtype=torch.float64),
+            half=torch.tensor(self.half, dtype=torch.float64),
+            log_evidence=self.log_evidence,
+            observations=self.observations,
+        )
+
+
+def save_measured_board(board: MeasuredBoard, path: str | Path) -> Path:
+    """Write a measured board to a JSON file, losslessly and atomically.
+
+    Raises:
+        FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> size = 28
+        >>> half = 1e-5 * torch.eye(size, dtype=torch.float64)
+        >>> plate = Board(columns=9, rows=6, square=0.025)
+        >>> flat = MeasuredBoard(name="A", board=plate, amplitudes=0 * half[0], half=half, log_evidence=0.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = save_measured_board(flat, Path(folder, "a.board.json"))
+        ...     bool((load_measured_board(path).points == plate.points).all())
+        True
+    """
+    return BoardFile(
+        name=board.name,
+        board=board.board,
+        amplitudes=tuple(board.amplitudes.tolist()),
+        half=tuple(map(tuple, board.half.tolist())),
+        log_evidence=board.log_evidence,
+        observations=board.observations,
+    ).save(path)
+
+
+def load_measured_board(path: str | Path) -> MeasuredBoard:
+    """Read a measured board.
+
+    Raises:
+        FileError: missing, another kind of file, or content that is wrong.
+
+    Example:
+        >>> load_measured_board("no-such-file.json")
+        Traceback (most recent call last):
+        kcal.errors.FileError: no-such-file.json: cannot read: No such file or directory
+    """
+    return BoardFile.load(path).measured()
