@@ -7,6 +7,8 @@ even degree change sign. So the evidence of a camera tells which of its views ag
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -14,8 +16,8 @@ from kcal.calibrate.lensfit.board_modes import board_modes
 from kcal.calibrate.lensfit.board_prior import BoardPrior
 from kcal.corners.board import Board
 
-# Nats that a turned view must gain. A view that was read rightly gains them by chance less than once in e^10 = 22,000
-# times; in OpenCV's stereo images the least gain of a turned view is 79.
+# Nats that turned views must gain, beyond the choices that there were: by chance they do once in e^10 = 22,000 times.
+# Measured: one turned view of a printed board gains 79 and more.
 CLEAR = 10.0
 # Random orders from which the search begins, beside the orders as read: half of all views turned is the worst case.
 _STARTS = 12
@@ -62,7 +64,7 @@ def mode_turn(turns: int) -> Tensor:
 
 
 def find_turns(rows: Tensor, board: Board, prior: BoardPrior, lens_deviation: Tensor, variance: float) -> Tensor:
-    """(V,) quarter turns of each view that bring all onto one board; zero where that gains little.
+    """(V,) quarter turns of each view that bring all onto one board; none if that gains little.
 
     Lens, board and the orders are sought together: in turn, lens and board are solved for, and each view takes the
     order that fits best, from the orders as read and from random ones. All is linear, poses included.
@@ -102,25 +104,25 @@ def find_turns(rows: Tensor, board: Board, prior: BoardPrior, lens_deviation: Te
         value = float(z @ z) + float(y @ total @ y) + 2.0 * float(root.diagonal().log().sum())
         return torch.einsum("a,vkab,b->vk", y, forms, y), -0.5 * value
 
+    as_read = torch.zeros(views, dtype=torch.long)
     generator = torch.Generator().manual_seed(0)
-    best: tuple[float, Tensor, Tensor] | None = None
+    best: tuple[float, Tensor] | None = None
     for start in range(1 + _STARTS):
-        orders = torch.randint(len(turns), (views,), generator=generator) * min(start, 1)
+        orders = torch.randint(len(turns), (views,), generator=generator) if start else as_read
         for _ in range(_MOST_ROUNDS):
             chi2, evidence = fit(orders)
-            if torch.equal(chi2.argmin(1), orders):
+            better = chi2.argmin(1)
+            if torch.equal(better, orders):
                 break
-            orders = chi2.argmin(1)
+            orders = better
         if best is None or evidence > best[0]:
-            best = evidence, orders, chi2
+            best = evidence, orders
     assert best is not None
-    _, orders, chi2 = best
+    evidence, orders = best
     found = torch.tensor(turns)[orders]
-    margin = 0.5 * (chi2 - chi2[each, orders][:, None])
     if not bool(prior.mean.any()):
-        # All views turned alike is the same board, turned: most views stay as they were read.
-        common = int(found.mode().values)
-        found = (found - common) % 4
-        margin = margin[:, [turns.index((turn + common) % 4) for turn in turns]]
-    # `margin` by the turns that would be made: the first is to stay as read.
-    return torch.where(margin[:, 0] > CLEAR, found, 0)
+        # All views turned alike are the same board, turned: most views stay as they were read.
+        found = (found - found.mode().values) % 4
+    count = int((found > 0).sum())
+    choices = math.log(views + 1) + math.log(math.comb(views, count)) + count * math.log(len(turns) - 1)
+    return found if evidence - fit(as_read)[1] > CLEAR + choices else as_read
