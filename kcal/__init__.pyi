@@ -10,7 +10,11 @@ from kcal.calibrate.camera.options import OutlierRejection as OutlierRejection
 from kcal.calibrate.camera.result import CameraCalibrationResult as CameraCalibrationResult
 from kcal.calibrate.camera.result import RejectedCorner as RejectedCorner
 from kcal.calibrate.camera.result import RejectedView as RejectedView
+from kcal.calibrate.lensfit.cameras_fit import measure_board as measure_board
 from kcal.calibrate.lensfit.hybrid import calibrate_hybrid as calibrate_hybrid
+from kcal.calibrate.lensfit.measured_board import MeasuredBoard as MeasuredBoard
+from kcal.calibrate.lensfit.measured_board import load_measured_board as load_measured_board
+from kcal.calibrate.lensfit.measured_board import save_measured_board as save_measured_board
 from kcal.calibrate.lensfit.options import HybridOptions as HybridOptions
 from kcal.calibrate.lensfit.options import HybridResult as HybridResult
 from kcal.calibrate.rig.drift import Drift as Drift
@@ -132,6 +136,7 @@ from kcal.nets.inverse import InverseFit as InverseFit
 from kcal.nets.inverse import InverseNet as InverseNet
 from kcal.nets.inverse import InverseNetOptions as InverseNetOptions
 from kcal.nets.inverse import train_inverse as train_inverse
+from kcal.report.board import save_board_picture as save_board_picture
 from kcal.report.budget import save_budget_picture as save_budget_picture
 from kcal.report.calibration import save_calibration_picture as save_calibration_picture
 from kcal.report.gallery import save_coverage as save_coverage

@@ -71,3 +71,15 @@ def board_modes(points: Tensor) -> BoardModes:
             unit += [0.5 ** (degree - 1)] * 2
             family += [PRINT] * 2
     return BoardModes(torch.stack(shapes), extent * torch.tensor(unit, dtype=points.dtype), torch.tensor(family))
+
+
+def undetermined_modes(points: Tensor) -> Tensor:
+    """(7, 3, N) displacements that cameras cannot tell: shifts in x, y, z, two tilts, a turn, and the scale.
+
+    Args:
+        points: (N, 3) meters, z = 0.
+    """
+    x, y = (points[:, :2] - points[:, :2].mean(0)).unbind(-1)
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    modes = [(one, zero, zero), (zero, one, zero), (zero, zero, one), (zero, zero, x), (zero, zero, y)]
+    return torch.stack([torch.stack(mode) for mode in [*modes, (-y, x, zero), (x, y, zero)]])

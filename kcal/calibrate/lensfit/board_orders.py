@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.calibrate.lensfit.board_modes import board_modes, undetermined_modes
 from kcal.calibrate.lensfit.board_prior import BoardPrior
 from kcal.corners.board import Board
 
@@ -48,17 +48,12 @@ def mode_turn(turns: int) -> Tensor:
     """
     # Amplitudes refer to half the board's sides, so that any square board gives the same, and half turns any board.
     board = Board(columns=8, rows=8, square=2.0 / 7.0)
-    points = board.points - board.points.mean(0)
     order = turned_corners(torch.arange(board.corners)[None], board, torch.tensor([turns]))[0]
     # The corner at the end of the first row comes first: x becomes -y, y becomes x.
-    quarter = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=points.dtype)
+    quarter = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     back = torch.linalg.matrix_power(quarter, turns)
-    x, y, one = *points[:, :2].T, torch.ones_like(points[:, 0])
-    zero = torch.zeros_like(one)
-    gauge = [(one, zero, zero), (zero, one, zero), (zero, zero, one), (zero, zero, x), (zero, zero, y)]
-    gauge += [(-y, x, zero), (x, y, zero)]
     shapes = board_modes(board.points).shapes
-    basis = torch.cat([shapes, torch.stack([torch.stack(parts) for parts in gauge])]).flatten(1).T
+    basis = torch.cat([shapes, undetermined_modes(board.points)]).flatten(1).T
     turned = torch.einsum("kl,bln->bkn", back, shapes[:, :, order]).flatten(1).T
     return torch.linalg.lstsq(basis, turned).solution[: len(shapes)].round()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -11,7 +12,7 @@ import pydantic
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.calibrate.lensfit.board_modes import board_modes, undetermined_modes
 from kcal.calibrate.lensfit.board_prior import BoardPrior
 from kcal.corners.board import Board
 from kcal.errors import InputError
@@ -72,65 +73,70 @@ class MeasuredBoard:
     @property
     def points(self) -> Tensor:
         """(N, 3) the corners as they are, meters."""
-        return self.board.points + (self.amplitudes @ self._rows()).view(-1, 3)
+        return self.board.points + torch.einsum("b,bkn->nk", self.amplitudes, board_modes(self.board.points).shapes)
 
     @property
     def points_covariance(self) -> Tensor:
         """(N, 3, 3) covariance of each corner, meters²."""
-        spread = (self.half @ self._rows()).view(len(self.half), -1, 3)
+        spread = torch.einsum("rb,bkn->rnk", self.half, board_modes(self.board.points).shapes)
         return torch.einsum("rnk,rnl->nkl", spread, spread)
 
     @property
     def bending(self) -> Measured:
         """Height of the corner farthest from the best plane, meters."""
-        return self._largest(2, self._low_order()[:, :3])
+        heights = self._fitted()[1][:, 2]
+        at = int((self.amplitudes @ heights).abs().argmax())
+        value, sigma = self._measured(heights[:, at])
+        return Measured(abs(value), sigma)
 
     @property
     def stretch(self) -> Measured:
         """Width over height, relative to the ordered board, less one."""
-        return self._in_plane((1.0, 0.0, 0.0, -1.0))
+        return self._measured(2.0 * self._fitted()[0][:, -2])
 
     @property
     def shear(self) -> Measured:
         """Cosine of the angle between rows and columns."""
-        return self._in_plane((0.0, 1.0, 1.0, 0.0))
+        return self._measured(2.0 * self._fitted()[0][:, -1])
 
     @property
     def print_error(self) -> Measured:
         """RMS distance of the corners, in the plane, from the best stretched and sheared board, meters."""
-        basis = self._low_order()[:, :3]
-        rows = self._rows().view(len(self.half), -1, 3)[..., :2]
-        rows = rows - torch.einsum("nb,mb,rmk->rnk", basis, basis, rows)
-        error = torch.einsum("r,rnk->nk", self.amplitudes, rows)
-        rms = float(error.square().sum(-1).mean().sqrt())
-        # Of the RMS of noise alone, whose slope is zero, the sigma is its own expected size.
-        slope = torch.einsum("rnk,nk->r", rows, error) / (len(error) * max(rms, 1e-12))
-        noise = torch.einsum("ar,rnk->ank", self.half, rows)
-        both = float((self.half @ slope).norm()), float((noise.square().sum() / len(error)).sqrt())
-        return Measured(rms, both[rms < both[1]])
+        rows = self._fitted()[1][:, :2].flatten(1) / math.sqrt(self.board.corners)
+        rms = float((self.amplitudes @ rows).norm())
+        noise = self.half @ rows
+        slope = noise @ (self.amplitudes @ rows) / max(rms, 1e-12)
+        # An RMS no larger than its own noise has no slope to speak of.
+        return Measured(rms, float(slope.norm() if rms > float(noise.norm()) else noise.norm()))
 
-    def _rows(self) -> Tensor:
-        """(B, 3 N) displacement of the corners by each mode."""
-        return board_modes(self.board.points).shapes.transpose(1, 2).flatten(1)
+    def displacements(self, places: Tensor | None = None) -> Tensor:
+        """(M, 3) how far places of the board lie from where they were ordered, at the best shift, turn and scale.
 
-    def _low_order(self) -> Tensor:
-        """(N, 3) orthonormal: planes over the board."""
-        points = self.board.points
-        return torch.linalg.qr(torch.cat([torch.ones_like(points[:, :1]), points[:, :2]], 1))[0]
+        Args:
+            places: (M, 3) of the ordered board, meters, z = 0; the corners if not given.
+        """
+        coefficients, rest = self._fitted(places)
+        points = self.board.points if places is None else places
+        x, y = (points[:, :2] - self.board.points[:, :2].mean(0)).unbind(-1)
+        stretch, shear = (self.amplitudes @ coefficients[:, -2:]).tolist()
+        plane = torch.stack([stretch * x + shear * y, shear * x - stretch * y, torch.zeros_like(x)])
+        return (torch.einsum("b,bkn->kn", self.amplitudes, rest) + plane).T
 
-    def _largest(self, axis: int, basis: Tensor) -> Measured:
-        rows = self._rows().view(len(self.half), -1, 3)[..., axis]
-        rows = rows - rows @ basis @ basis.T
-        at = int((self.amplitudes @ rows).abs().argmax())
-        return Measured(abs(float(self.amplitudes @ rows[:, at])), float((self.half @ rows[:, at]).norm()))
-
-    def _in_plane(self, weights: tuple[float, float, float, float]) -> Measured:
-        """Of the best linear map of the plane: weights of xx, xy, yx, yy."""
-        points = self.board.points[:, :2] - self.board.points[:, :2].mean(0)
-        rows = self._rows().view(len(self.half), -1, 3)[..., :2]
-        slopes = torch.linalg.lstsq(points.expand(len(rows), -1, -1), rows).solution
-        row = slopes.transpose(1, 2).flatten(1) @ torch.tensor(weights, dtype=points.dtype)
+    def _measured(self, row: Tensor) -> Measured:
         return Measured(float(self.amplitudes @ row), float((self.half @ row).norm()))
+
+    def _fitted(self, places: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """For each mode: what shifts, turns, scale, stretch and shear fit of it (B, 9), and the rest (B, 3, M)."""
+        corners = self.board.points
+        points = corners if places is None else torch.cat([corners, places])
+        x, y = (points[:, :2] - corners[:, :2].mean(0)).unbind(-1)
+        zero = torch.zeros_like(x)
+        affine = torch.stack([torch.stack([x, -y, zero]), torch.stack([y, x, zero])])
+        basis = torch.cat([undetermined_modes(points), affine])
+        shapes, count = board_modes(points).shapes, len(corners)
+        fitted = torch.linalg.lstsq(basis[..., :count].flatten(1).T, shapes[..., :count].flatten(1).T).solution.T
+        rest = shapes - torch.einsum("bg,gkn->bkn", fitted, basis)
+        return fitted, rest if places is None else rest[..., count:]
 
 
 class BoardFile(NativeFile):
