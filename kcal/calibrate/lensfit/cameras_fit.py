@@ -116,7 +116,7 @@ def fit_cameras(
             advance(names[i])
         return found
 
-    known = board.prior_for([seen.board for seen in sets]) if isinstance(board, MeasuredBoard) else board
+    known = [board.prior_for(seen.board.points) for seen in sets][0] if isinstance(board, MeasuredBoard) else board
     cameras = [fit(i, None, known, typical) for i in each]
     if known == "printed":
         cameras = _grouped(cameras, [seen.board for seen in sets])

@@ -20,6 +20,7 @@ from kcal.calibrate.lensfit.evidence import (
     typical_hyperprior,
 )
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
+from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.errors import InputError
 from kcal.lens.base_map import angle_over_radius
 from kcal.lens.camera import Camera
@@ -75,7 +76,7 @@ def fit_hybrid(
     size: tuple[int, int],
     weights: Tensor | None = None,
     modes: ZernikeModes | None = None,
-    board: Literal["printed", "exact"] | BoardPrior = "printed",
+    board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
     hyperprior: Hyperprior | None = None,
 ) -> HybridFit:
     """Fit one camera.
@@ -92,6 +93,8 @@ def fit_hybrid(
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     modes = modes or ZernikeModes()
     hyperprior = hyperprior or typical_hyperprior()
+    if isinstance(board, MeasuredBoard):
+        board = board.prior_for(points)
     ordered, own = points, board_modes(points)
     points, shown = board.applied(points, own) if isinstance(board, BoardPrior) else (points, own)
     focal, shape, rotation, translation = _base_start(ordered, pixels, size, weights)

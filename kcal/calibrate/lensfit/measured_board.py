@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -59,15 +58,14 @@ class MeasuredBoard:
         if not bool(self.amplitudes.isfinite().all() & self.half.isfinite().all()):
             raise InputError("measured board: amplitudes and their covariance must be finite")
 
-    def prior_for(self, boards: Iterable[Board]) -> BoardPrior:
-        """The prior of its amplitudes, for cameras that saw these boards.
+    def prior_for(self, points: Tensor) -> BoardPrior:
+        """The prior of the amplitudes, for a camera that saw a board with these corners as ordered, (N, 3) meters.
 
         Raises:
-            InputError: a board of another size.
+            InputError: they are not this board's.
         """
-        for board in boards:
-            if board != self.board:
-                raise InputError(f"the measured board {self.name!r} is {self.board}; the observations are of {board}")
+        if not torch.equal(points, self.board.points):
+            raise InputError(f"the measured board {self.name!r} is {self.board}; the observations show another board")
         return BoardPrior(self.amplitudes, self.half)
 
     @property
