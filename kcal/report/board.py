@@ -46,7 +46,7 @@ def board_figure(board: MeasuredBoard) -> Figure:
     figure = new_figure(9.0, min(12.0, 7.4 * (tall + 2 * square) / (wide + 2 * square) + 2.0))
     axes = figure.add_axes((0.08, 0.08, 0.78, 0.9 - 1.25 / figure.get_figheight()))
     most = max(float(np.abs(heights).max()), _LEAST)
-    levels = MaxNLocator(nbins=20, symmetric=True).tick_values(-most, most)
+    levels = MaxNLocator(nbins=20, symmetric=True).tick_values(-1.0001 * most, 1.0001 * most)
     drawn = axes.contourf(x.numpy(), y.numpy(), heights, levels=levels, cmap="RdBu_r", alpha=0.8)
     beside = axes.inset_axes((1.02, 0.0, 0.025, 1.0))
     figure.colorbar(drawn, cax=beside, label="height, mm (positive: away from the cameras)", ticks=levels[::2])

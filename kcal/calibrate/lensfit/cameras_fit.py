@@ -10,55 +10,20 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, cast
 
-import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_orders import CLEAR, find_turns, mode_turn, quarter_turns, turned_corners
-from kcal.calibrate.lensfit.board_prior import (
-    BoardMessage,
-    BoardPrior,
-    message_from_rows,
-    multiplied,
-    printed_board,
-    printed_prior,
-)
-from kcal.calibrate.lensfit.evidence import BOARD, Hyperprior, Quadratic, typical_hyperprior
-from kcal.calibrate.lensfit.fleet import HyperLikelihood, fleet_hyperprior, hyper_likelihood
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
-from kcal.calibrate.lensfit.hybrid_problem import HybridProblem
+from kcal.calibrate.lensfit.board_orders import CLEAR, mode_turn, quarter_turns
+from kcal.calibrate.lensfit.board_prior import BoardMessage, BoardPrior, multiplied, printed_board
+from kcal.calibrate.lensfit.evidence import Hyperprior, typical_hyperprior
+from kcal.calibrate.lensfit.fleet import LEAST_CAMERAS, LensPrior, fleet_priors, typical_lens
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
+from kcal.calibrate.lensfit.turned_fit import CameraFit, Shape, fit_turned
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.lens.zernike import ZernikeModes
-
-# Until no view is to be turned: two are enough as a rule.
-_MOST_FITS = 5
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class CameraFit:
-    """One of several cameras.
-
-    Args:
-        fit: the camera, with poses of the corners as they are turned.
-        turns: (V,) quarter turns of the board by which the corners of each view were read from another end.
-        message: what its data say about the board.
-        hyper: what its data say about the amplitudes of lenses.
-        board: which of the boards it saw; -1 for an exact one.
-        nats: log evidence that it shares its board with the others of that board, against a board of its own. Of a
-            camera that shares none: the same with the board that is most like its own, negative. NaN if there is no
-            other camera with a board of this kind.
-    """
-
-    fit: HybridFit
-    turns: Tensor
-    message: BoardMessage
-    hyper: HyperLikelihood
-    board: int = -1
-    nats: float = math.nan
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,12 +33,12 @@ class CamerasFit:
     Args:
         cameras: in the order of the observations.
         boards: that they saw.
-        hyperprior: what the next camera may expect; the typical one unless the cameras were of one type.
+        lens: what the next camera of the type may expect, if the cameras were of one type, and four at least.
     """
 
     cameras: tuple[CameraFit, ...]
     boards: tuple[MeasuredBoard, ...]
-    hyperprior: Hyperprior
+    lens: LensPrior | None
 
 
 def fit_cameras(
@@ -95,7 +60,7 @@ def fit_cameras(
         weights: (V, N) of each camera's corners; one if not given.
         modes: of the fields.
         board: how boards differ from the ones that were ordered: as printers err, not at all, or as was measured.
-        one_type: the cameras are of one type: the amplitudes of their lenses are learned together.
+        one_type: the cameras are of one type: from four cameras on, each learns from the others what its lens is like.
         passes: how often the cameras are fitted again, with what the others tell, after they were fitted alone.
         advance: called with a text after each fit.
 
@@ -106,41 +71,44 @@ def fit_cameras(
         raise InputError("no observations: at least one camera is needed")
     names = names or [str(i + 1) for i in range(len(sets))]
     weights = weights or [None] * len(sets)
-    each, typical = range(len(sets)), typical_hyperprior()
+    known: BoardPrior | None = None
+    if isinstance(board, MeasuredBoard):
+        for seen in sets:
+            known = board.prior_for(seen.board.points)
+    each, alone = range(len(sets)), cast(Shape, "exact" if board == "exact" else "printed")
 
-    def fit(
-        i: int, turns: Tensor | None, shape: Literal["printed", "exact"] | BoardPrior, hyperprior: Hyperprior
-    ) -> CameraFit:
-        found = _fit_turned(sets[i], weights[i], modes, turns, shape, hyperprior)
+    def fit(i: int, turns: Tensor | None, shape: Shape, lens: LensPrior | None = None) -> CameraFit:
+        found = fit_turned(sets[i], weights[i], modes, turns, shape, lens)
         if advance is not None:
             advance(names[i])
         return found
 
-    known = [board.prior_for(seen.board.points) for seen in sets][0] if isinstance(board, MeasuredBoard) else board
-    cameras = [fit(i, None, known, typical) for i in each]
-    if known == "printed":
+    cameras = [fit(i, None, alone) for i in each]
+    if known is not None:
+        cameras = [_compared(camera, known, seen.board) for camera, seen in zip(cameras, sets, strict=True)]
+    elif alone == "printed":
         cameras = _grouped(cameras, [seen.board for seen in sets])
-    elif known != "exact":
-        cameras = [_compared(camera, known) for camera in cameras]
-    for _ in range(passes):
+    fleet = one_type and len(sets) >= LEAST_CAMERAS
+    lens = _begun_fleet(cameras) if fleet else None
+    lenses = [lens] * len(sets)
+    for turn in range(max(passes, 2) if fleet else passes):
+        if lens is not None and turn == 1:
+            lens, lenses[:] = _learned_fleet(cameras, lens)
         before = list(cameras)
         for i in each:
             same = [camera.message for j, camera in enumerate(before) if j != i and camera.board == before[i].board]
-            shape = known
-            if known == "printed" and same:
+            shape = alone if known is None else known
+            if shape == "printed" and same:
                 base, _ = printed_board(before[i].fit.board_shapes, [before[i].message, *same])
                 shape = multiplied(base, same).board
-            if one_type or shape is not known:
-                # What a camera tells itself does not enter its own priors.
-                others = [camera.hyper for j, camera in enumerate(before) if one_type and j != i]
-                again = fit(i, before[i].turns, shape, fleet_hyperprior(others, typical))
+            if fleet or shape is not alone:
+                again = fit(i, before[i].turns, shape, lenses[i])
                 cameras[i] = dataclasses.replace(again, board=before[i].board, nats=before[i].nats)
     if isinstance(board, MeasuredBoard):
         boards = [board]
     else:
         boards = [_measured(k, sets, names, cameras) for k in range(1 + max(camera.board for camera in cameras))]
-    learned = fleet_hyperprior([camera.hyper for camera in cameras], typical) if one_type else typical
-    return CamerasFit(cameras=tuple(cameras), boards=tuple(boards), hyperprior=learned)
+    return CamerasFit(cameras=tuple(cameras), boards=tuple(boards), lens=lens)
 
 
 def measure_board(
@@ -162,12 +130,13 @@ def measure_board(
         InputError: no observations.
 
     Example:
-        >>> from kcal.sim.board import BoardSize
-        >>> from kcal.sim.captures import capture_corners, drawn_lens
         >>> from kcal.corners.observations import View
-        >>> shots = capture_corners(drawn_lens("machine-vision", 1.0, 7), 8, sigma=0.1, seed=3).pixels.tolist()
+        >>> from kcal.lens.camera import Camera
+        >>> from kcal.sim.captures import capture_corners
+        >>> camera = Camera.build(focal=(500, 500), center=(320, 240), size=(640, 480), coefficients=[-0.1])
+        >>> shots = capture_corners(camera, 6, sigma=0.1, seed=3).pixels.tolist()
         >>> views = tuple(View(name=str(i), pixels=pixels) for i, pixels in enumerate(shots))
-        >>> seen = Observations(board=Board(columns=7, rows=6, square=0.05), image_size=(1920, 1080), views=views)
+        >>> seen = Observations(board=Board(columns=7, rows=6, square=0.05), image_size=(640, 480), views=views)
         >>> board, = measure_board([seen])
         >>> board.bending.value < 1e-4, tuple(board.points.shape)
         (True, (42, 3))
@@ -175,62 +144,19 @@ def measure_board(
     return fit_cameras(sets, names=names, advance=advance).boards
 
 
-def _fit_turned(
-    seen: Observations,
-    weights: Tensor | None,
-    modes: ZernikeModes | None,
-    turns: Tensor | None,
-    shape: Literal["printed", "exact"] | BoardPrior,
-    hyperprior: Hyperprior,
-) -> CameraFit:
-    """Fit one camera, turn its views that were read from another end, and fit again until none is left."""
-    board, pixels = seen.board, seen.pixels()
-    weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
-    turns = torch.zeros(len(pixels), dtype=torch.long) if turns is None else turns
-    for attempt in range(_MOST_FITS):
-        ordered, weighted = (turned_corners(values, board, turns) for values in (pixels, weights))
-        fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, modes, shape, hyperprior)
-        rows = _rows(fit, board.points, ordered, weighted)
-        lens = fit.families.deviation(fit.hyperparameters)[: rows.shape[1] - 1 - len(fit.state.board)]
-        if shape == "exact" or attempt == _MOST_FITS - 1:
-            break
-        prior = printed_prior(fit.board_shapes, fit.hyperparameters[BOARD:]) if shape == "printed" else shape
-        more = find_turns(rows, board, prior, lens, fit.sigma**2)
-        if not bool(more.any()):
-            break
-        turns = (turns + more) % 4
-    flat = rows.transpose(1, 2).flatten(0, 1)
-    freedom = 2 * int((torch.isfinite(ordered).all(-1) & (weighted > 0)).sum()) - 6 * len(pixels)
-    message = message_from_rows(flat, lens, fit.sigma**2)
-    return CameraFit(fit=fit, turns=turns, message=message, hyper=_hyper(fit, flat, len(lens), shape, freedom))
+def _begun_fleet(cameras: Sequence[CameraFit]) -> LensPrior:
+    """One form for the lenses of a type, that of the camera of middle focal length, and the amplitudes of all."""
+    middle = sorted(cameras, key=lambda camera: float(camera.fit.camera.params[0]))[len(cameras) // 2].fit
+    form = middle.camera.model.hybrid
+    assert form is not None
+    hyperprior, _ = fleet_priors([camera.hyper for camera in cameras], typical_hyperprior())
+    return LensPrior(form, float(middle.families.mean[0]), *typical_lens(form, middle.families, hyperprior.mean))
 
 
-def _rows(fit: HybridFit, points: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
-    """(V, S + 1, 2 N) derivatives by lens and board off the poses, and the target of these rows, pixels."""
-    count = len(fit.state.board)
-    mean = torch.cat([fit.families.mean[:-count], torch.zeros_like(fit.state.board)])
-    problem = HybridProblem(
-        points, fit.board_shapes.shapes, pixels, weights, fit.camera.model, mean, torch.zeros_like(mean)
-    )
-    rows = problem.without_poses(fit.state)
-    rows[:, -1] = problem.shared(fit.state) @ rows[:, :-1] - rows[:, -1]
-    return rows
-
-
-def _hyper(
-    fit: HybridFit, rows: Tensor, lens: int, shape: Literal["printed", "exact"] | BoardPrior, freedom: int
-) -> HyperLikelihood:
-    """What the rows (R, S + 1) say about the hyperparameters."""
-    by_lens, by_board, target = rows[:, :lens], rows[:, lens:-1], rows[:, -1]
-    if shape == "exact":
-        by_board = torch.zeros_like(by_board)
-    elif shape != "printed":
-        target = target - by_board @ shape.mean
-        by_board = by_board @ shape.half.T
-    both = torch.cat([by_lens, by_board], 1) / math.sqrt(fit.tempering)
-    target = target / math.sqrt(fit.tempering)
-    data = Quadratic(both.T @ both, both.T @ target, float(target @ target), freedom / fit.tempering)
-    return hyper_likelihood(data, fit.families, fit.hyperparameters, fit.sigma**2 / fit.tempering)
+def _learned_fleet(cameras: Sequence[CameraFit], typical: LensPrior) -> tuple[LensPrior, list[LensPrior]]:
+    """The lens of the next camera, and each camera's from all others: what a camera tells does not enter its prior."""
+    following, each = fleet_priors([camera.lens for camera in cameras], Hyperprior(typical.mean, typical.sd))
+    return typical._replace(**following._asdict()), [typical._replace(**prior._asdict()) for prior in each]
 
 
 def _evidence(messages: Sequence[BoardMessage], like: CameraFit) -> float:
@@ -278,10 +204,16 @@ def _grouped(cameras: Sequence[CameraFit], kinds: Sequence[Board]) -> list[Camer
     return out
 
 
-def _compared(camera: CameraFit, known: BoardPrior) -> CameraFit:
-    """With the evidence that the board is the measured one."""
-    nats = multiplied(known, [camera.message]).log_evidence - _evidence([camera.message], camera)
-    return dataclasses.replace(camera, board=0, nats=nats)
+def _compared(camera: CameraFit, known: BoardPrior, kind: Board) -> CameraFit:
+    """With the evidence that the board is the measured one, and all views turned if it was read from another end."""
+
+    def nats(camera: CameraFit) -> float:
+        return multiplied(known, [camera.message]).log_evidence - _evidence([camera.message], camera)
+
+    best = camera
+    for turn in quarter_turns(kind)[1:]:
+        best = max(best, _turned(camera, turn), key=lambda found: nats(found) + CLEAR * (found is camera))
+    return dataclasses.replace(best, board=0, nats=nats(best))
 
 
 def _measured(

@@ -19,6 +19,7 @@ from kcal.calibrate.lensfit.evidence import (
     prior_families,
     typical_hyperprior,
 )
+from kcal.calibrate.lensfit.fleet import LensPrior
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.errors import InputError
@@ -78,6 +79,7 @@ def fit_hybrid(
     modes: ZernikeModes | None = None,
     board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
     hyperprior: Hyperprior | None = None,
+    lens: LensPrior | None = None,
 ) -> HybridFit:
     """Fit one camera.
 
@@ -89,6 +91,7 @@ def fit_hybrid(
         modes: of the field.
         board: how the board differs from the one that was ordered: as printers err, not at all, or as was measured.
         hyperprior: of the amplitudes; the typical one if not given.
+        lens: what is known of it from cameras of its type; its modes are used.
     """
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     modes = modes or ZernikeModes()
@@ -104,6 +107,9 @@ def fit_hybrid(
     freedom = 2 * int(seen.sum()) - 6 * len(pixels)
 
     def constants(focal: float, shape: float) -> tuple[LensModel, PriorFamilies]:
+        if lens is not None:
+            usual = prior_families(lens.form, lens.focal, shown, size, distance)
+            return LensModel(hybrid=lens.form), lens.families(usual)
         form = HybridForm(shape=shape, radius=radius / focal, modes=modes)
         return LensModel(hybrid=form), prior_families(form, focal, shown, size, distance)
 
@@ -113,6 +119,9 @@ def fit_hybrid(
     held[:4] = False
     params = torch.zeros(5 + model.size, dtype=torch.float64)
     params[:4] = torch.tensor([focal, focal, families.mean[1], families.mean[2]])
+    if lens is not None:
+        params[[0, 2, 3, *range(5, len(params))]] = lens.mean
+        params[1] = params[0]
     state = HybridState(params, torch.zeros_like(shown.unit), rotation, translation)
     # The base alone: its focal length and shape are put into the constants until they stay.
     for _ in range(6):
@@ -128,6 +137,8 @@ def fit_hybrid(
         )
         result = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
         state = HybridState(*result.state)
+        if lens is not None:
+            break
         scale, bend = float(state.params[0]) / focal - 1.0, float(state.params[5])
         focal, shape = float(state.params[0]), shape + min(max(bend, -1.0), 1.0)
         model, families = constants(focal, shape)

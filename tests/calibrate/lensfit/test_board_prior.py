@@ -69,12 +69,13 @@ def test_amplitudes_of_largest_evidence() -> None:
     a = MODES.unit * spread[MODES.family] * normal(28, seed=4)
     message = BoardMessage(1e6 * torch.eye(28, dtype=F64), 1e6 * a)
     prior, value = printed_board(MODES, [message])
-    hyper = typical_hyperprior()
-    mean, sd = hyper.mean[BOARD:], hyper.sd[BOARD:]
+    typical = typical_hyperprior()
+    mean, sd = typical.mean[BOARD:], typical.sd[BOARD:]
     h = torch.stack([(prior.half.diagonal() / MODES.unit)[MODES.family == k][0].log() for k in range(3)])
 
     def evidence(h: Tensor) -> float:
-        return multiplied(printed_prior(MODES, h), [message]).log_evidence - 0.5 * float(((h - mean) / sd).square().sum())
+        hyper = 0.5 * float(((h - mean) / sd).square().sum())
+        return multiplied(printed_prior(MODES, h), [message]).log_evidence - hyper
 
     assert value == pytest.approx(evidence(h), rel=1e-9)
     for k in range(3):
