@@ -107,7 +107,7 @@ def measure_command(
     names = [path.name.split(".")[0] for path in observations]
     if len(set(names)) < len(names):
         names = [str(path) for path in observations]
-    with steps("measuring", len(sets)) as advance:
+    with steps("measuring", 2 * len(sets) if len(sets) > 1 else 1) as advance:
         found = fit_cameras(sets, names=names, advance=advance)
     board = dataclasses.replace(found.boards[0], name=output.name.split(".")[0])
     save_measured_board(board, output)

@@ -84,7 +84,7 @@ def find_turns(rows: Tensor, board: Board, prior: BoardPrior, lens_deviation: Te
     for turn in turns:
         # A view that is to be turned shows the board turned back.
         seen = affine.clone()
-        seen[lens:-1] = torch.linalg.solve(mode_turn(turn), affine[lens:-1])
+        seen[lens:-1] = mode_turn(turn).T @ affine[lens:-1]
         part = rows.transpose(1, 2) @ seen
         parts.append(part.transpose(1, 2) @ part / variance)
     forms = torch.stack(parts, 1)

@@ -56,8 +56,8 @@ class BoardMessage(NamedTuple):
     target: Tensor
 
     def turned(self, turn: Tensor) -> BoardMessage:
-        """The same message about the amplitudes a' = turn a, (B, B)."""
-        return self._replace(root=torch.linalg.solve(turn, self.root, left=False))
+        """The same message about the amplitudes a' = turn a; turns (B, B) are orthogonal."""
+        return self._replace(root=self.root @ turn.T)
 
 
 class BoardPosterior(NamedTuple):

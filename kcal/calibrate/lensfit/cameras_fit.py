@@ -65,10 +65,15 @@ def fit_cameras(
         advance: called with a text after each fit.
 
     Raises:
-        InputError: no observations, or those of another board than the measured one.
+        InputError: no observations, those of another board than the measured one, no pass, or images of several sizes
+            from cameras of one type.
     """
     if not sets:
         raise InputError("no observations: at least one camera is needed")
+    if passes < 1:
+        raise InputError(f"passes {passes}: one at least is needed, so that cameras learn from each other")
+    if one_type and len({seen.image_size for seen in sets}) > 1:
+        raise InputError("cameras of one type have images of one size; these have several")
     names = names or [str(i + 1) for i in range(len(sets))]
     weights = weights or [None] * len(sets)
     known: BoardPrior | None = None
@@ -138,7 +143,7 @@ def measure_board(
         >>> views = tuple(View(name=str(i), pixels=pixels) for i, pixels in enumerate(shots))
         >>> seen = Observations(board=Board(columns=7, rows=6, square=0.05), image_size=(640, 480), views=views)
         >>> board, = measure_board([seen])
-        >>> board.bending.value < 1e-4, tuple(board.points.shape)
+        >>> board.bending.value < 3 * board.bending.sigma, tuple(board.points.shape)
         (True, (42, 3))
     """
     return fit_cameras(sets, names=names, advance=advance).boards

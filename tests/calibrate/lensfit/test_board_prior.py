@@ -126,7 +126,7 @@ def test_a_turned_board_has_turned_amplitudes(board: Board, turns: tuple[int, ..
 
 
 def test_a_message_turns_with_its_board() -> None:
-    turn = mode_turn(2)
+    turn = mode_turn(1)
     message = BoardMessage(normal(30, 28, seed=9), normal(30, seed=10))
     a = normal(28, seed=11)
     there = message.turned(turn)

@@ -187,3 +187,7 @@ def test_bad_input() -> None:
     seen = seen_by(camera(1), PRINT, 5, 1)
     with pytest.raises(InputError, match="show another board"):
         fit_cameras([seen], board=other)
+    with pytest.raises(InputError, match="one at least"):
+        fit_cameras([seen], passes=0)
+    with pytest.raises(InputError, match="one size"):
+        fit_cameras([seen, seen.model_copy(update={"image_size": (1280, 961)})], one_type=True)
