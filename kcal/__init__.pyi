@@ -3,6 +3,8 @@
 from kcal.calibrate.bundle.covariance import projection_covariance as projection_covariance
 from kcal.calibrate.camera.calibrate import calibrate_camera as calibrate_camera
 from kcal.calibrate.camera.calibrate import calibrate_cameras as calibrate_cameras
+from kcal.calibrate.camera.compare import ComparisonResult as ComparisonResult
+from kcal.calibrate.camera.compare import compare_models as compare_models
 from kcal.calibrate.camera.layer import CalibratedViews as CalibratedViews
 from kcal.calibrate.camera.layer import CalibrationLayer as CalibrationLayer
 from kcal.calibrate.camera.options import CalibrationOptions as CalibrationOptions
@@ -11,12 +13,9 @@ from kcal.calibrate.camera.result import CameraCalibrationResult as CameraCalibr
 from kcal.calibrate.camera.result import RejectedCorner as RejectedCorner
 from kcal.calibrate.camera.result import RejectedView as RejectedView
 from kcal.calibrate.lensfit.cameras_fit import measure_board as measure_board
-from kcal.calibrate.lensfit.hybrid import calibrate_hybrid as calibrate_hybrid
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard as MeasuredBoard
 from kcal.calibrate.lensfit.measured_board import load_measured_board as load_measured_board
 from kcal.calibrate.lensfit.measured_board import save_measured_board as save_measured_board
-from kcal.calibrate.lensfit.options import HybridOptions as HybridOptions
-from kcal.calibrate.lensfit.options import HybridResult as HybridResult
 from kcal.calibrate.rig.drift import Drift as Drift
 from kcal.calibrate.rig.drift import measure_drift as measure_drift
 from kcal.calibrate.rig.from_boards import calibrate_rig as calibrate_rig
@@ -71,7 +70,6 @@ from kcal.lens.calibration import Exclusion as Exclusion
 from kcal.lens.calibration import RigCalibration as RigCalibration
 from kcal.lens.calibration import RigSource as RigSource
 from kcal.lens.camera import Camera as Camera
-from kcal.lens.hybrid import HybridCamera as HybridCamera
 from kcal.lens.hybrid_terms import HybridForm as HybridForm
 from kcal.lens.images import Undistort as Undistort
 from kcal.lens.images import UndistortMaps as UndistortMaps
@@ -83,9 +81,6 @@ from kcal.lens.modules import Unproject as Unproject
 from kcal.lens.mounting import Mounting as Mounting
 from kcal.lens.mounting import Origin as Origin
 from kcal.lens.pinhole import new_pinhole as new_pinhole
-from kcal.lens.residual import FieldGrid as FieldGrid
-from kcal.lens.residual import FieldResidual as FieldResidual
-from kcal.lens.residual import FieldScale as FieldScale
 from kcal.lens.rig import RigCovariance as RigCovariance
 from kcal.lens.rig import StereoRig as StereoRig
 from kcal.lens.spline import Spline as Spline

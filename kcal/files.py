@@ -105,7 +105,7 @@ class NativeFile(pydantic.BaseModel):
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
             what = first["msg"].removeprefix("Value error, ")
-            raise FileError(f"{source}: bad {kind} file: {where}: {what}") from error
+            raise FileError(": ".join(filter(None, [source, f"bad {kind} file", where, what]))) from error
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

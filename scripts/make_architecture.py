@@ -29,7 +29,7 @@ LOOKS = {
     "cli": (2.6, "commands"),
     "report": (1.6, "pictures and maps"),
     "calibrate/batch": (4.6, "many cameras"),
-    "calibrate/lensfit": (3.4, "hybrid cameras"),
+    "calibrate/lensfit": (3.4, "hybrid lens"),
     "locate": (1.0, "pixels to positions"),
     "calibrate/camera": (3.2, "one camera"),
     "calibrate/rig": (1.0, "several cameras"),

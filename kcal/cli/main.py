@@ -14,6 +14,7 @@ from kcal.cli.batch import batch_command
 from kcal.cli.board import app as board
 from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
+from kcal.cli.compare import compare_command
 from kcal.cli.console import err
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
@@ -51,6 +52,7 @@ app.command("demo")(demo_command)
 app.add_typer(board, name="board")
 app.command("detect")(detect_command)
 app.command("calibrate")(calibrate_command)
+app.command("compare")(compare_command)
 app.command("batch")(batch_command)
 app.add_typer(rig, name="rig")
 app.command("locate")(locate_command)

@@ -21,41 +21,7 @@ from kcal.io.lens_record import LensOrders
 from kcal.io.record import CovarianceRecord, Record
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid import HybridCamera
 from kcal.lens.projection import INTRINSICS
-from kcal.lens.residual import Field, FieldGrid, FieldResidual, FieldScale
-
-
-class FieldScaleRecord(Record):
-    """A grid of Gaussian units of a residual field (`kcal.lens.residual.FieldScale`), and their weights.
-
-    Args:
-        width: of the units, on the distorted plane in focal lengths.
-        left: x of the first column of units.
-        top: y of the first row.
-        columns: how many.
-        rows: likewise.
-        along_x: weights of the correction along x, focal lengths; column after column, each from the top.
-        along_y: likewise along y.
-    """
-
-    width: pydantic.PositiveFloat
-    left: float
-    top: float
-    columns: pydantic.PositiveInt
-    rows: pydantic.PositiveInt
-    along_x: tuple[float, ...]
-    along_y: tuple[float, ...]
-
-    @pydantic.model_validator(mode="after")
-    def _counted(self) -> FieldScaleRecord:
-        if not len(self.along_x) == len(self.along_y) == self.columns * self.rows:
-            raise ValueError(f"{self.columns} x {self.rows} units need as many weights along x and along y")
-        return self
-
-    def scale(self) -> FieldScale:
-        """The units."""
-        return FieldScale(width=self.width, left=self.left, top=self.top, columns=self.columns, rows=self.rows)
 
 
 class IntrinsicsRecord(Record):
@@ -99,9 +65,6 @@ class CameraFile(NativeFile):
         standard_deviations: name -> one sigma of the parameter, None where it was held fixed; the whole is None
             when none was computed.
         covariance: of all parameters together; None when none was computed.
-        residual: what corrects the lens before the intrinsics are applied, one entry a width; None: nothing. A camera
-            with it is a `HybridCamera`, and means nothing without it: weights and parameters share one file, so that
-            they cannot be mixed up.
         valid_region: where the lens is valid; None if whoever wrote the file did not say.
         calibration: how the camera was calibrated, if it was.
 
@@ -125,9 +88,18 @@ class CameraFile(NativeFile):
     coefficients: dict[str, float]
     standard_deviations: dict[str, pydantic.NonNegativeFloat | None] | None = None
     covariance: CovarianceRecord | None = None
-    residual: tuple[FieldScaleRecord, ...] | None = None
     valid_region: ValidRegion | None = None
     calibration: CalibrationRecord | None = None
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _without_residual_field(cls, value: Any) -> Any:
+        if isinstance(value, dict) and "residual" in value:
+            raise ValueError(
+                "its lens has a residual field, which this version cannot read: a hybrid of kcal 0.1; calibrate again: "
+                "kcal calibrate OBS -o CAMERA"
+            )
+        return value
 
     @pydantic.field_validator("coefficients", "standard_deviations")
     @classmethod
@@ -162,7 +134,9 @@ class CameraFile(NativeFile):
 
     def camera(self) -> Camera:
         """The camera, equal to the stored one to the last bit, with its `calibration` if the file has one."""
-        camera = self._plain_camera()
+        values = [*(getattr(self.intrinsics, name) for name in INTRINSICS), *self.coefficients.values()]
+        parameters = torch.tensor(values, dtype=torch.float64)
+        camera = Camera(parameters, size=self.image_size, model=self.model.model())
         if self.name or self.standard_deviations or self.covariance or self.calibration:
             camera.calibration = CameraCalibration(
                 name=self.name,
@@ -172,56 +146,11 @@ class CameraFile(NativeFile):
             )
         return camera
 
-    def _plain_camera(self) -> Camera:
-        values = [*(getattr(self.intrinsics, name) for name in INTRINSICS), *self.coefficients.values()]
-        parameters, model = torch.tensor(values, dtype=torch.float64), self.model.model()
-        if self.residual is None:
-            return Camera(parameters, size=self.image_size, model=model)
-        grid = FieldGrid(scales=tuple(part.scale() for part in self.residual))
-        weights = [[value for part in self.residual for value in getattr(part, way)] for way in ("along_x", "along_y")]
-        residual = FieldResidual(grid, torch.tensor(weights, dtype=torch.float64))
-        return HybridCamera(parameters, size=self.image_size, model=model, residual=residual)
-
-    @pydantic.model_serializer(mode="wrap")
-    def _without_empty_residual(self, plain: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Files of parametric cameras stay as they were before there was a residual.
-        stored: dict[str, Any] = plain(self)
-        if stored["residual"] is None:
-            del stored["residual"]
-        return stored
-
-    @pydantic.model_validator(mode="after")
-    def _invertible(self) -> CameraFile:
-        if self.residual is not None:
-            try:
-                self._plain_camera()
-            except InputError as error:
-                raise ValueError(str(error)) from error
-        return self
-
 
 def _listed(names: tuple[str, ...]) -> str:
     """Names for a message; the first and the last of very many."""
     shown = names if len(names) <= 40 else (*names[:12], "...", names[-1])
     return ", ".join(shown)
-
-
-def _residual(field: Field | None) -> tuple[FieldScaleRecord, ...] | None:
-    """A residual field as it is stored."""
-    if field is None:
-        return None
-    return tuple(
-        FieldScaleRecord(
-            width=scale.width,
-            left=scale.left,
-            top=scale.top,
-            columns=scale.columns,
-            rows=scale.rows,
-            along_x=tuple(weights[0].flatten().tolist()),
-            along_y=tuple(weights[1].flatten().tolist()),
-        )
-        for scale, weights in zip(field.grid.scales, field.grid.scale_weights(field.weights.detach()), strict=True)
-    )
 
 
 def provenance() -> dict[str, Any]:
@@ -288,7 +217,6 @@ def camera_to_file(
             coefficients={key: stored[key] for key in camera.model.names},
             standard_deviations=standard_deviations,
             covariance=None if covariance is None else CovarianceRecord.of(covariance.detach(), camera.names),
-            residual=_residual(camera.field),
             valid_region=ValidRegion(
                 radius=float(camera.valid_radius),
                 polygon=tuple((round(u, 3), round(v, 3)) for u, v in camera.valid_polygon().tolist()),

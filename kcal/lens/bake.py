@@ -43,7 +43,7 @@ class _Table(NamedTuple):
 def bake(camera: Camera, tolerance: float = 1e-3) -> LookupCamera:
     """Tabulate both directions of a camera, with the coarsest tables that keep a tolerance.
 
-    Reading a table takes the same time for every lens and needs no lens formula, which helps most for a `HybridCamera`.
+    Reading a table takes the same time for every lens and needs no lens formula, which helps most for a hybrid lens.
     `kcal.io.lookup_file` stores tables for programs without torch.
 
     Errors are distances in pixels: for `project`, between the table's pixel and the camera's; for `unproject`, between

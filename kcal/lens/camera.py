@@ -21,7 +21,6 @@ from kcal.lens.plane import angle_over_distance, plane_from_points, rays_from_pl
 from kcal.lens.projection import from_pixels, to_pixels
 from kcal.lens.pupil import pupil_depth, ray_starts
 from kcal.lens.region import Region, in_region, surely_in_region
-from kcal.lens.residual import Field
 from kcal.lens.tracing import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
 
 
@@ -92,11 +91,6 @@ class Camera(CameraParameters):
         values = [*map(float, focal), *map(float, center), float(skew), *lens]
         return cls(torch.tensor(values, dtype=torch.float64), size=size, model=model)
 
-    @property
-    def field(self) -> Field | None:
-        """The residual field between lens and intrinsics of a `HybridCamera`; None for other cameras."""
-        return None
-
     def with_parameters(self, parameters: Tensor) -> Camera:
         """Make a camera of the same kind, size and model with other parameters; no memory is shared."""
         return Camera(parameters, size=self.size, model=self.model)
@@ -120,7 +114,7 @@ class Camera(CameraParameters):
             raise InputError(
                 f"valid_polygon: a single camera is needed, not a batch of {tuple(self.valid_radius.shape)}"
             )
-        return image_outline(self._to_sensor, self.params.detach(), self.model, self.valid_region, self.size)
+        return image_outline(self.params.detach(), self.model, self.valid_region, self.size)
 
     def _measured_region(self) -> dict[str, Tensor]:
         with torch.no_grad():
@@ -176,7 +170,7 @@ class Camera(CameraParameters):
                 with torch.no_grad():
                     known = None if differentiated else lens
                     valid = valid & in_region(x, y, coefficients, self.model, self.valid_region, known)
-            pixels = torch.stack(self._to_sensor(lens.x, lens.y, values), -1)
+            pixels = torch.stack(to_pixels(lens.x, lens.y, values), -1)
             return pixels if all_valid and settled else torch.where(valid[..., None], pixels, center), valid
 
         return self._in_chunks(one, points)
@@ -241,14 +235,6 @@ class Camera(CameraParameters):
             return sure, True
         return usable & self.valid_region.encloses(x, y), False
 
-    def _to_sensor(self, x: Tensor, y: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Map distorted coordinates (..., N) to pixels; a hybrid camera applies its field here."""
-        return to_pixels(x, y, values)
-
-    def _from_sensor(self, u: Tensor, v: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """The inverse of `_to_sensor`, and a mask (..., N) of where it was found; None: everywhere."""
-        return *from_pixels(u, v, values), None
-
     def _in_chunks(self, function: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor) -> tuple[Tensor, Tensor]:
         differentiated = is_differentiated(points, *self.parameters())
         return in_chunks(function, points, self.valid_radius.numel(), differentiated=differentiated)
@@ -259,10 +245,9 @@ class Camera(CameraParameters):
         cx, cy = values[..., 2, None], values[..., 3, None]
         u, v = split_coordinates(pixels)
         u, v, finite = finite_or(u, v, cx, cy)
-        x, y, settled = self._from_sensor(u, v, values)
-        usable = finite if settled is None else finite & settled
+        x, y = from_pixels(u, v, values)
         ready = PreparedInverse(self.valid_region, self.inverse_start, start)
-        return undistort_components(x, y, usable, values[..., 5:], self.model, ready)
+        return undistort_components(x, y, finite, values[..., 5:], self.model, ready)
 
     def normalize(self, pixels: Tensor, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
         """Map pixels (..., N, 2) to undistorted coordinates (..., N, 2) on the plane z = 1, and valid (..., N).

@@ -1,4 +1,4 @@
-"""Newton's method in two unknowns, shared by the inverses of lens and residual field: one step, and when to stop."""
+"""Newton's method in two unknowns, for the inverse of a lens: one step, and when to stop."""
 
 from __future__ import annotations
 

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from kcal.lens.distortion import distort_components
 from kcal.lens.model import LensModel
-from kcal.lens.projection import INTRINSICS
+from kcal.lens.projection import INTRINSICS, to_pixels
 from kcal.lens.region import Region
 
 
-def image_outline(
-    to_sensor: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
-    parameters: Tensor,
-    model: LensModel,
-    region: Region,
-    size: tuple[int, int],
-) -> Tensor:
+def image_outline(parameters: Tensor, model: LensModel, region: Region, size: tuple[int, int]) -> Tensor:
     """Map the valid region to the image (width, height): a polygon (V, 2) in pixels.
 
     Args:
-        to_sensor: maps distorted coordinates x, y (N,) and the parameters to pixels u, v.
         parameters: (5 + P,) of a single camera.
         model: its lens model.
         region: its valid region.
@@ -32,7 +23,7 @@ def image_outline(
     # A little inside the edge: at a pole the edge itself is mapped to infinity.
     x, y = (region.outline(256) * (1.0 - 1e-6)).unbind(-1)
     lens = distort_components(x, y, parameters[len(INTRINSICS) :], model, slopes=False)
-    polygon = torch.stack(to_sensor(lens.x, lens.y, parameters), -1)
+    polygon = torch.stack(to_pixels(lens.x, lens.y, parameters), -1)
     return clip_to_image(polygon, size) if bool(region.radius > 0) else polygon[:0]
 
 

@@ -4,9 +4,8 @@ Camera parameters are one vector (..., 5 + P): fx, fy, cx, cy, skew, then the le
 
     x = X / Z, y = Y / Z;  (x_D, y_D) = distortion(x, y);  u = fx x_D + skew y_D + cx,  v = fy y_D + cy
 
-(Eq. 1 to 4 of the paper). A residual field (`kcal.lens.residual`) moves (x_D, y_D) before the last step. Skew is γ of
-Eq. 3; `cv2.fisheye` stores it as alpha = skew / fx. Fisheyes and hybrid lenses replace the first step
-(`kcal.lens.plane`), and rays of hybrid lenses start at their entrance pupil (`kcal.lens.pupil`).
+(Eq. 1 to 4 of the paper). Skew is γ of Eq. 3; `cv2.fisheye` stores it as alpha = skew / fx. Fisheyes and hybrid lenses
+replace the first step (`kcal.lens.plane`), and rays of hybrid lenses start at their entrance pupil (`kcal.lens.pupil`).
 """
 
 from __future__ import annotations
@@ -17,11 +16,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.distortion import Distorted, distort_components
+from kcal.lens.distortion import distort_components
 from kcal.lens.model import LensModel
 from kcal.lens.plane import plane_with_slopes
 from kcal.lens.pupil import entrance_pupil
-from kcal.lens.residual import Field, correct_components
 from kcal.lens.zernike import unbind_last
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "skew")
@@ -67,7 +65,6 @@ def project_components(
     parameters: Tensor,
     model: LensModel,
     wanted: Sequence[int] | None = None,
-    field: Field | None = None,
 ) -> Projection:
     """Project points given as (..., 3, N), with derivatives by the point and the wanted camera parameters.
 
@@ -77,7 +74,6 @@ def project_components(
         model: the lens model.
         wanted: indices of the camera parameters of `by_camera`; None: no derivatives, `by_point` and `by_camera` are
             empty.
-        field: a residual field after the lens, or None.
     """
     X, Y, Z = points[..., 0, :], points[..., 1, :], points[..., 2, :]
     offset = len(INTRINSICS)
@@ -91,9 +87,6 @@ def project_components(
     regular = lens.positive & (lens.determinant > 0)
     if pupil:
         regular = regular & pupil.found
-    if field is not None:
-        # The field is one-to-one, so it neither makes nor removes folds.
-        lens = _with_field(lens, field)
     pixels = torch.stack(to_pixels(lens.x, lens.y, parameters), -2)
     if not model.wide:
         regular = regular & (Z > 0)
@@ -137,16 +130,3 @@ def project_components(
             if place in wanted:
                 by_camera[..., list(wanted).index(place), :, :] = -by_depth * rate[..., None, :]
     return Projection(pixels, by_point, by_camera, regular)
-
-
-def _with_field(lens: Distorted, field: Field) -> Distorted:
-    """The lens followed by the field: positions, and derivatives by the chain rule."""
-    moved = correct_components(lens.x, lens.y, field)
-    p, q, r, t = moved.point
-    a, b, d, e = lens.point
-    return lens._replace(
-        x=moved.x,
-        y=moved.y,
-        point=(p * a + q * d, p * b + q * e, r * a + t * d, r * b + t * e),
-        coefficients=[(p * du + q * dv, r * du + t * dv) for du, dv in lens.coefficients],
-    )

@@ -170,9 +170,7 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
         if not known_true(good):
             # The axis is a harmless stand-in: no NaN in values or gradients.
             seen = torch.where(good[..., None, :], seen, seen.new_tensor([[0.0], [0.0], [1.0]]))
-        projection = project_components(
-            seen, camera.camera.values, camera.camera.model, fixed.wanted[number], camera.camera.field
-        )
+        projection = project_components(seen, camera.camera.values, camera.camera.model, fixed.wanted[number])
         columns = torch.stack([along, across, shift[:, None].expand_as(along)], -3)
         # (..., 3 unknowns, 3 of the point, 2, N) summed over the point.
         rows.append((columns[..., None, :] * projection.by_point[..., None, :, :, :]).sum(-3))

@@ -20,7 +20,6 @@ from kcal.lens.camera import Camera
 from kcal.lens.inverse_start import start_from, undo_tilt
 from kcal.lens.plane import plane_from_points, rays_from_plane
 from kcal.lens.projection import from_pixels
-from kcal.lens.residual import undo_components
 from kcal.nets.fit import RegressionProblem, fit_weights
 from kcal.nets.mlp import Network, evaluate, initial_weights
 from kcal.solve.lm import LMOptions
@@ -33,8 +32,7 @@ _SMALLEST_DIVISOR = 1.0 - math.tan(math.radians(89.9 / 2)) ** 2
 class InverseNet(Network):
     """Map distorted to undistorted coordinates by a network of three layers (Eq. 12 of the paper).
 
-    Convention: both lie on the plane of the lens: z = 1, or the plane of angles for a fisheye. For a hybrid camera,
-    distorted positions are those before its residual field, which has an inverse of its own. The network works on a
+    Convention: both lie on the plane of the lens: z = 1, or the plane of angles for a fisheye. The network works on a
     chart on which wide angles do not grow without bound. For the plane z = 1 it is the stereographic chart
     p = 2 x / (1 + √(1 + |x|²)), where 90° is |p| = 2; the plane of angles is used as it is. With p0 the closed-form
     guess, p = p0 + a · net(p0 / r), where r and a (`reach`, `amplitude`) scale inputs and outputs to the order of one.
@@ -243,14 +241,13 @@ def _training_pixels(camera: Camera, counts: tuple[int, int]) -> Tensor:
 
 
 def _distorted(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Distorted coordinates x, y (N,) of pixels (N, 2); for a hybrid camera, before its residual field."""
-    x, y = from_pixels(pixels[:, 0], pixels[:, 1], camera.params)
-    return (x, y) if camera.field is None else undo_components(x, y, camera.field)[:2]
+    """Distorted coordinates x, y (N,) of pixels (N, 2)."""
+    return from_pixels(pixels[:, 0], pixels[:, 1], camera.params)
 
 
 def _reprojection_errors(camera: Camera, pixels: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Reprojection errors (N,) in pixels of points x, y (N,) of the lens's plane."""
-    again, seen = camera.project(torch.stack(rays_from_plane(x, y, camera.model), -1))
+    again, seen = camera.project_rays(torch.stack(rays_from_plane(x, y, camera.model), -1))
     return torch.where(seen, torch.linalg.vector_norm(again - pixels, dim=-1), torch.inf)
 
 

@@ -4,8 +4,8 @@
 
 For one camera K* is a constant, and so is the network's value. The corrected camera has the same lens model, and the
 weights are only another way to write its parameters, so this net can fit nothing that the parameters cannot (tests
-prove it). It is here for comparison. The correction drawn in the paper's Fig. 8, which depends on the position, is
-`kcal.lens.residual`.
+prove it). It is here for comparison. The correction drawn in the paper's Fig. 8, which depends on the position, is the
+field of a hybrid lens (`kcal.lens.hybrid_terms`).
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ class ResidualNet(Network):
     zero. Float64; the weights do not require gradients until asked.
 
     Args:
-        camera: a single parametric camera: A* and K*.
+        camera: a single camera: A* and K*.
         hidden: number of features in each of the two hidden layers.
         seed: seed of the initial weights.
 
     Raises:
-        InputError: a batch of cameras, a hybrid camera, or a lens without coefficients.
+        InputError: a batch of cameras, or a lens without coefficients.
 
     Example:
         >>> start = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.2, 0.05])
@@ -55,8 +55,8 @@ class ResidualNet(Network):
 
     def __init__(self, camera: Camera, *, hidden: int = 8, seed: int = 0) -> None:
         start = camera.params.detach()
-        if start.ndim != 1 or camera.field is not None:
-            raise InputError("ResidualNet: a single parametric camera is needed")
+        if start.ndim != 1:
+            raise InputError("ResidualNet: a single camera is needed")
         if camera.model.size == 0:
             raise InputError("ResidualNet: a lens without coefficients has no distortion vector")
         corrected = tuple(i for i in range(len(start)) if i != _SKEW)
@@ -86,7 +86,7 @@ class ResidualNet(Network):
         return self.units[:, None] * evaluate_with_slopes(self.inputs, weights, self.widths).by_weights[..., 0].T
 
     def camera(self) -> Camera:
-        """The corrected camera: an ordinary parametric one."""
+        """The corrected camera: an ordinary one."""
         return Camera(self().detach(), size=self.size, model=self.model)
 
 

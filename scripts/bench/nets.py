@@ -1,4 +1,4 @@
-"""Inverse nets and lookup tables, measured; two sections of docs/measured/hybrid.md.
+"""Inverse nets and lookup tables, measured; two sections of docs/measured/nets.md.
 
     python -m scripts.bench.nets [--rounds 15] [--write]
 
@@ -24,19 +24,19 @@ import kcal.lens.inverse
 from kcal.lens.bake import bake
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort_components
-from kcal.lens.hybrid import HybridCamera
+from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.inverse import InverseStart
 from kcal.lens.inverse_start import start_from, undo_tilt
+from kcal.lens.model import LensModel
 from kcal.lens.newton import TOLERANCE
 from kcal.lens.projection import from_pixels
-from kcal.lens.residual import FieldGrid, FieldResidual, undo_components
 from kcal.nets.inverse import InverseNetOptions, train_inverse
 from scripts.bench.lens import LENS, SIZE
 from scripts.bench.lens import build as build_hd
 from scripts.shared.page import write_section
 from scripts.shared.timing import ratios, row, show, spread, times
 
-PAGE = "hybrid.md"
+PAGE = "nets.md"
 POINTS = 10_000
 # A lens of some 150 degrees, as fitted to a real one.
 WIDE = [0.4749, 0.02579, 3e-5, -9e-6, 8.2e-5, 0.7623, 0.09433, 1.329e-3, 3.1e-5, -2e-7, -2.6e-5, 3e-8, 1.1e-3, 1e-3]
@@ -44,12 +44,16 @@ WIDE = [0.4749, 0.02579, 3e-5, -9e-6, 8.2e-5, 0.7623, 0.09433, 1.329e-3, 3.1e-5,
 FOLDING = [-0.2535, 0.0924, -0.0006, 0.0007, -0.0191]
 
 
-def hybrid() -> HybridCamera:
-    """The camera of 14 coefficients with a field of about a tenth of a pixel."""
-    grid = FieldGrid.covering((-0.6, -0.34), (0.6, 0.34), widths=[0.2, 0.1])
-    generator = torch.Generator().manual_seed(0)
-    weights = 1e-4 * torch.randn(2, grid.count, generator=generator, dtype=torch.float64)
-    return HybridCamera.of(build_hd("opencv14"), FieldResidual(grid, weights))
+def hybrid() -> Camera:
+    """A lens between pinhole and stereographic with all default modes, decaying with their degree as real ones do."""
+    form = HybridForm(shape=0.7, radius=0.8)
+    degree = torch.tensor([mode[-1] for mode in form.modes.real_modes], dtype=torch.float64)
+    noise = torch.randn(len(degree), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights = (3e-4 * torch.exp(-0.5 * (degree - 3)) * noise).tolist()
+    return Camera.build(
+        focal=(1500, 1500), center=(957, 541), size=SIZE, coefficients=[0, 2e-3, 1e-3, *weights],
+        model=LensModel(hybrid=form),
+    )  # fmt: skip
 
 
 CAMERAS: dict[str, Callable[[], Camera]] = {
@@ -65,7 +69,7 @@ CAMERAS: dict[str, Callable[[], Camera]] = {
     "fisheye4": lambda: Camera.build(
         focal=(400, 402), center=(637, 481), size=(1280, 960), coefficients=[0.02, -0.01, 0.003], model="fisheye4"
     ),
-    "hybrid: opencv14 and a field": hybrid,
+    "hybrid": hybrid,
 }
 
 
@@ -79,8 +83,6 @@ def random_pixels(camera: Camera, count: int) -> Tensor:
 def steps_from(camera: Camera, pixels: Tensor, start: InverseStart | None) -> Tensor:
     """How many full Newton steps each pixel takes to the tolerance of `kcal.lens.newton`, at the most 12."""
     goal_x, goal_y = from_pixels(pixels[:, 0], pixels[:, 1], camera.params)
-    if camera.field is not None:
-        goal_x, goal_y, _ = undo_components(goal_x, goal_y, camera.field)
     if start is None:
         x, y, _, rest = undo_tilt(goal_x, goal_y, camera.coefficients, camera.model)
         x, y = start_from(x, y, rest, camera.inverse_start)
@@ -193,11 +195,11 @@ def tables(rounds: int) -> list[str]:
             lookup = bake(camera, tolerance)
             seconds = time.process_time() - clock
             again, valid = lookup.unproject(pixels)
-            largest = float((camera.project(again)[0] - pixels).norm(dim=-1)[valid].max())
+            largest = float((camera.project_rays(again)[0] - pixels).norm(dim=-1)[valid].max())
             there, seen = lookup.project(rays)
             largest = max(largest, float((there - pixels).norm(dim=-1)[seen].max()))
             calls: list[Callable[[], Any]] = [
-                lambda: camera.project(few_rays),  # noqa: B023
+                lambda: camera.project_rays(few_rays),  # noqa: B023
                 lambda: lookup.project(few_rays),  # noqa: B023
                 lambda: camera.unproject(few),  # noqa: B023
                 lambda: lookup.unproject(few),  # noqa: B023
@@ -238,7 +240,7 @@ def main() -> None:
         "Made by `scripts/bench/nets.py`. The net of `train_inverse` (three layers, Inv_NN of the paper's Fig. 8), "
         "fitted by Levenberg-Marquardt to exact rays of pixels all over the image, and judged on others. *Guess*: "
         f"what it corrects, in closed form. Medians over {arguments.seeds} seeds. Infinite: somewhere the answer lies "
-        "beyond the fold. A hybrid camera's field is undone before, by Newton steps of its own.",
+        "beyond the fold.",
         "",
         *alone(arguments.seeds),
         "",

@@ -21,20 +21,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardState
-from kcal.calibrate.bundle.poses import refine_poses
-from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
-from kcal.calibrate.rig.board_consensus import pose_alone
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_images
 from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
-from kcal.solve.lm import LMOptions
 from scripts.shared.timing import row, show
-from scripts.shared.wide_lens import EXACT, folds, load
+from scripts.shared.wide_lens import folds, held_out, load, warped
 
 # A camera and the corners of its board (N, 3), from views and their weights (V, N).
 Fitter = Callable[[Observations, Tensor], tuple[Camera, Tensor]]
@@ -53,10 +48,7 @@ def parametric(model: str, weak_prior: float | None) -> Fitter:
     def fit(seen: Observations, weight: Tensor) -> tuple[Camera, Tensor]:
         found = calibrate_camera(seen, CalibrationOptions(model=model, board_warp=True, weak_prior=weak_prior))
         assert found.board_warp is not None
-        points = seen.board.points.clone()
-        low, high = points[:, :2].amin(0), points[:, :2].amax(0)
-        points[:, 2] = (1.0 - ((2.0 * points[:, :2] - low - high) / (high - low)) ** 2) @ found.board_warp
-        return found.camera, points
+        return found.camera, warped(seen, found.board_warp)
 
     return fit
 
@@ -69,28 +61,17 @@ MODELS: dict[str, Fitter] = {
 }
 
 
-def squared_error(camera: Camera, points: Tensor, seen: Observations, weight: Tensor) -> float:
-    """Sum of w² |r|² over views whose poses are solved again."""
-    pixels = torch.where((weight > 0)[..., None], seen.pixels(), torch.nan)
-    alone, _ = pose_alone(points, pixels, camera, LMOptions(max_iterations=50))
-    state = BoardState.flat(camera.params.detach(), alone.rotation, alone.translation)
-    whitening = weight[..., None, None] * torch.eye(2, dtype=torch.float64)
-    views = Views(board_points=points, pixels=pixels, whitening=whitening)
-    _, cost = refine_poses(views, camera.model, state, EXACT, camera.field)
-    return 2.0 * float(torch.nan_to_num(cost, nan=math.inf).sum())
-
-
 def measure(name: str, seen: Observations, weight: Tensor, parts: list[np.ndarray]) -> str:
-    total, seconds = 0.0, 0.0
+    total, seconds, count = 0.0, 0.0, 0
     for out in parts:
         train = np.setdiff1d(np.arange(len(seen.views)), out)
         start = time.process_time()
         camera, points = MODELS[name](seen.subset([seen.names[i] for i in train]), weight[train])
         seconds += time.process_time() - start
         test = seen.subset([seen.names[i] for i in out])
-        total += squared_error(camera, points, test, weight[out])
-    held = np.concatenate(parts)
-    return row(name, f"{math.sqrt(total / int((weight[held] > 0).sum())):.4f}", f"{seconds / len(parts):.1f}")
+        error, corners = held_out(camera, points, test, weight[out])
+        total, count = total + error, count + corners
+    return row(name, f"{math.sqrt(total / count):.4f}", f"{seconds / len(parts):.1f}")
 
 
 def main() -> None:

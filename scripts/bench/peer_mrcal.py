@@ -1,4 +1,4 @@
-"""mrcal's splined lens on one training set, for `bench_hybrid.py`; runs in an interpreter that has mrcal, without kcal.
+"""mrcal's splined lens on one training set, for comparison; runs in an interpreter that has mrcal, without kcal.
 
     /usr/bin/python3 scripts/bench/peer_mrcal.py problem.npz SPLINED13x9
 

@@ -34,7 +34,7 @@ from scripts.shared.page import DOCS
 
 COLORS = {
     "14": "#dd7a1f", "16": "#b7791f", "18": "#8a5a00", "20": "#2b6cb0", "24": "#6b46c1", "hybrid": "#2f855a",
-    "field": "#9f1239", "OpenCV": "#6b7280",
+    "OpenCV": "#6b7280",
 }  # fmt: skip
 TRUE, FOUND, FAINT, INK, GRID = "#c02a6b", "#2b6cb0", "#9aa3af", "#111827", "#e5e7eb"
 
@@ -129,7 +129,7 @@ def _turbo(share: float) -> tuple[float, float, float, float]:
 
 def _models(results: Results) -> None:
     figure = new_figure(11.0, 3.6 * len(results))
-    models = [*TABLE_3, "hybrid", "field"]
+    models = [*TABLE_3, "hybrid"]
     panels = (
         ("RMS position error of seven points by calibration, m", position),
         ("RMS of held-out views, pixels", lambda run, label: run["held_out"][label]),

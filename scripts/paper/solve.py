@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import time
@@ -14,7 +13,8 @@ from typing import Any
 import cv2
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.lensfit.hybrid import HybridOptions, HybridResult, calibrate_hybrid
+from kcal.calibrate.camera.compare import compare_models
+from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
@@ -33,9 +33,6 @@ MODELS = {
     "22": "ext22",
     "24": "ext24",
 }
-# Every model of Table 3 is a rival, so that one call holds views out for all. Poses are drawn and have no neighbors:
-# every view may be held out for itself.
-HYBRID = HybridOptions(rivals=tuple(MODELS.values()), groups="views")
 NAN = math.nan
 # What ends one model and not the whole run; the page lists it.
 REFUSED = (KcalError, RuntimeError)
@@ -58,8 +55,7 @@ class _Run:
         self.scene = paper_scene(KINDS[name], seed)
         self.path = folder / "result.json"
         self.result: dict[str, Any] = {
-            "name": name, "seed": seed, "spent": {}, "cameras": {}, "held_out": {}, "located": {}, "kept": {},
-            "failed": [],
+            "name": name, "seed": seed, "spent": {}, "cameras": {}, "held_out": {}, "located": {}, "failed": [],
         }  # fmt: skip
         if self.path.exists():
             self.result |= json.loads(self.path.read_text())
@@ -79,8 +75,10 @@ class _Run:
         for label, model in MODELS.items():
             if label not in self.result["located"]:
                 self._model(label, model)
-        if not {"hybrid", "field"} <= set(self.result["located"]):
+        if "hybrid" not in self.result["located"]:
             self._hybrid()
+        if not self.result["held_out"]:
+            self._held_out()
         if not {"OpenCV", "OpenCV, kcal's rig"} <= set(self.result["located"]):
             self._opencv()
         return self.result
@@ -96,35 +94,31 @@ class _Run:
         self._locate(label, pair)
 
     def _hybrid(self) -> None:
-        """The hybrid as kcal returns it, and the field in any case; where the first has one they are the same."""
-        pairs: dict[str, Pair | None] = {"hybrid": None, "field": None}
-        held_out: dict[str, list[float]] = {}
+        pair = None
         with self._stage("calibrate, hybrid"):
             try:
-                found = {side: calibrate_hybrid(seen, HYBRID) for side, seen in self.seen.items()}
-                pairs["hybrid"] = {s: (each.calibration.camera, each.calibration.rms) for s, each in found.items()}
-                self.result["kept"] = {side: each.kept for side, each in found.items()}
-                for each in found.values():
-                    for label, rms in _held_out(each).items():
-                        held_out.setdefault(label, []).append(rms)
+                found = {
+                    side: fit_hybrid(seen.board.points, seen.pixels(), seen.image_size)
+                    for side, seen in self.seen.items()
+                }
+                pair = {side: (each.camera, each.rms) for side, each in found.items()}
             except REFUSED as error:
                 self.result["failed"].append(f"hybrid: {error}")
-        if pairs["hybrid"] is not None:
-            always = dataclasses.replace(HYBRID, gate=False, rivals=())
-            with self._stage("calibrate, field"):
-                try:
-                    forced = {
-                        side: each if each.kept else calibrate_hybrid(self.seen[side], always)
-                        for side, each in found.items()
-                    }
-                    pairs["field"] = {s: (each.calibration.camera, each.calibration.rms) for s, each in forced.items()}
-                except REFUSED as error:
-                    self.result["failed"].append(f"field: {error}")
-        for label in (*MODELS, "hybrid", "field"):
-            values = held_out.get(label, [NAN])
-            self.result["held_out"][label] = math.sqrt(sum(value**2 for value in values) / len(values))
-        for label, pair in pairs.items():
-            self._locate(label, pair)
+        self._locate("hybrid", pair)
+
+    def _held_out(self) -> None:
+        """RMS of views that were held out, of both cameras together."""
+        models = {**MODELS, "hybrid": "hybrid"}
+        with self._stage("compare, all"):
+            # Poses are drawn and have no neighbors: every view may be held out for itself.
+            found = [
+                compare_models(seen, tuple(models.values()), groups="views", options=CalibrationOptions())
+                for seen in self.seen.values()
+            ]
+        for label, model in models.items():
+            squared = sum(each.rms[model] ** 2 for each in found) / len(found)
+            self.result["held_out"][label] = math.sqrt(squared) if math.isfinite(squared) else NAN
+        self._keep()
 
     def _opencv(self) -> None:
         with self._stage("calibrate, OpenCV"):
@@ -160,15 +154,6 @@ class _Run:
         part = self.path.with_suffix(".part")
         part.write_text(json.dumps(self.result))
         part.replace(self.path)
-
-
-def _held_out(result: HybridResult) -> dict[str, float]:
-    """RMS of views that were held out, by the labels of this script; what is returned has the returned model's."""
-    found = {label: result.held_out[model] for label, model in MODELS.items()}
-    found["field"] = result.held_out["hybrid"]
-    returned = str(result.calibration.camera.model)
-    found["hybrid"] = found["field"] if result.kept else result.held_out[returned]
-    return found
 
 
 def describe(camera: Camera, rms: float, truth: TruthLens) -> dict[str, float]:

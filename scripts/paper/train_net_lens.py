@@ -1,4 +1,4 @@
-"""Calibration with a pure network lens by gradient descent, Adam and Levenberg-Marquardt (docs/measured/hybrid.md).
+"""Calibration with a pure network lens by gradient descent, Adam and Levenberg-Marquardt (docs/measured/nets.md).
 
     python -m scripts.paper.train_net_lens [--steps 2000] [--seeds 3] [--write]
 
@@ -36,7 +36,7 @@ from scripts.shared.page import DOCS, write_section
 from scripts.shared.timing import row, show, spread
 from scripts.shared.views import COLUMNS, NOISE, ROWS, SIZE, simulate
 
-PAGE, PICTURE = "hybrid.md", "net-lens.png"
+PAGE, PICTURE = "nets.md", "net-lens.png"
 VIEWS, HELD_OUT = 20, 20
 # Half the image's width in focal lengths, a little more.
 REACH = 0.65

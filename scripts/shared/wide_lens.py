@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kcal.calibrate.bundle.board_problem import BoardState
+from kcal.calibrate.bundle.board_problem import BoardState, warp_shape
 from kcal.calibrate.bundle.poses import refine_poses
 from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.rig.board_consensus import Poses, pose_alone
@@ -48,15 +48,22 @@ def folds(split: str, views: int) -> list[np.ndarray]:
     return [np.sort(np.concatenate([blocks[i] for i in order[k::5]])) for k in range(5)]
 
 
-def held_out(camera: Camera, warp: torch.Tensor, seen: Observations, weight: np.ndarray) -> tuple[float, int]:
-    """Sum of w² |r|² over views whose poses are solved again, and how many corners."""
-    pixels = seen.pixels()
+def warped(seen: Observations, warp: torch.Tensor) -> torch.Tensor:
+    """Corners (N, 3) of a board that bulges."""
+    points = seen.board.points.clone()
+    points[:, 2] = warp @ warp_shape(points)
+    return points
+
+
+def held_out(camera: Camera, points: torch.Tensor, seen: Observations, weight: torch.Tensor) -> tuple[float, int]:
+    """Sum of w² |r|² over views of a board (N, 3) whose poses are solved again, and how many corners."""
+    pixels = torch.where((weight > 0)[..., None], seen.pixels(), torch.nan)
     alone: Poses
-    alone, _ = pose_alone(seen.board.points, pixels, camera, LMOptions(max_iterations=50))
-    state = BoardState(camera.params.detach(), warp, alone.rotation, alone.translation)
-    weights = torch.from_numpy(weight)[..., None, None] * torch.eye(2, dtype=torch.float64)
-    views = Views(board_points=seen.board.points, pixels=pixels, whitening=weights)
-    _, cost = refine_poses(views, camera.model, state, EXACT, camera.field)
+    alone, _ = pose_alone(points, pixels, camera, LMOptions(max_iterations=50))
+    state = BoardState.flat(camera.params.detach(), alone.rotation, alone.translation)
+    whitening = weight[..., None, None] * torch.eye(2, dtype=torch.float64)
+    views = Views(board_points=points, pixels=pixels, whitening=whitening)
+    _, cost = refine_poses(views, camera.model, state, EXACT)
     return 2.0 * float(torch.nan_to_num(cost, nan=math.inf).sum()), int((weight > 0).sum())
 
 

@@ -162,6 +162,31 @@ class TestDemo:
         assert Path("taken").read_text() == "mine"
 
 
+class TestCompare:
+    def test_one_table_of_all_models(self, run: Run) -> None:
+        observations(8, tilt=0.5).save("a.obs.json")
+        command = "compare a.obs.json --model pinhole opencv4 --groups views --parts 2"
+        code, shown, error = run(*command.split())
+        assert (code, error) == (0, "")
+        rows = [line.split() for line in shown.splitlines()]
+        assert [row[0] for row in rows[1:2]] == ["model"]
+        table = {row[0]: [float(value) for value in row[1:]] for row in rows[2:]}
+        assert set(table) == {"pinhole", "opencv4"}
+        lowest = min(table, key=lambda name: table[name][0])
+        assert len(table[lowest]) == 1
+        (other,) = set(table) - {lowest}
+        held_out, more, sigma = table[other]
+        assert held_out - table[lowest][0] == pytest.approx(more, abs=2e-4)
+        assert sigma > 0
+
+    def test_bad_input(self, run: Run) -> None:
+        observations(5, tilt=0.5).save("a.obs.json")
+        refused(run("compare", "a.obs.json"), "name the models", "--model")
+        refused(run("compare", "a.obs.json", "--model", "opencv5", "--groups", "days"), "blocks or views")
+        refused(run("compare", "a.obs.json", "--model", "opencv6"), "unknown lens model 'opencv6'")
+        refused(run("compare", "a.obs.json", "--model", "pinhole", "--parts", 6), "5 groups", "6 parts")
+
+
 def observations(count: int, *, tilt: float, size: tuple[int, int] = (640, 480)) -> Observations:
     """Views of a board through a pinhole camera with 0.1 px of noise, each turned by `tilt` radians another way."""
     board = Board(columns=7, rows=6, square=0.05)

@@ -157,6 +157,7 @@ class TestPupil:
 
     def test_origins_carry_gradients(self) -> None:
         camera = plain(0.5, pupil1=3e-3).free("pupil1", "pupil2")
+        assert camera.free_names == ("pupil1", "pupil2")
         camera.ray_origins(directions(torch.tensor([0.5]).double(), 2))[:, 2].sum().backward()
         assert camera.params.grad is not None
         named = dict(zip(camera.names, camera.params.grad.tolist(), strict=True))

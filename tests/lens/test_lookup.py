@@ -10,6 +10,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from lenses import hybrid_camera
 from torch import Tensor
 
 from kcal.errors import DegenerateError, FileError, InputError
@@ -17,9 +18,7 @@ from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.onnx_file import save_onnx
 from kcal.lens.bake import bake
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid import HybridCamera
 from kcal.lens.lookup import LookupCamera, chart_from_points, rays_from_chart
-from kcal.lens.residual import FieldGrid, FieldResidual
 from kcal.lens.spline import RINGS, Spline, evaluate_spline, extend_nodes, filter_nodes
 
 _BARREL = [-0.28, 0.1, 5e-4, -3e-4, 0.02, 0.05, 0.02, 0.01, 4e-4, -2e-4, -3e-4, 1e-4, 0.004, -0.006]
@@ -28,13 +27,6 @@ _HD: dict[str, Any] = {"focal": (1600, 1605), "center": (957, 541), "size": (192
 
 def _opencv14() -> Camera:
     return Camera.build(**_HD, coefficients=_BARREL, model="opencv14")
-
-
-def _hybrid() -> Camera:
-    grid = FieldGrid.covering((-0.6, -0.34), (0.6, 0.34), widths=[0.2, 0.1])
-    generator = torch.Generator().manual_seed(0)
-    weights = 2e-4 * torch.randn(2, grid.count, generator=generator, dtype=torch.float64)
-    return HybridCamera.of(_opencv14(), FieldResidual(grid, weights))
 
 
 def _folding() -> Camera:
@@ -50,7 +42,12 @@ def _fisheye() -> Camera:
     )
 
 
-CAMERAS = {"opencv14": _opencv14, "hybrid": _hybrid, "folding": _folding, "fisheye": _fisheye}
+CAMERAS = {
+    "opencv14": _opencv14,
+    "hybrid": functools.partial(hybrid_camera, "webcam"),
+    "folding": _folding,
+    "fisheye": _fisheye,
+}
 
 
 @functools.cache
@@ -71,7 +68,7 @@ def check_bounds(camera: Camera, lookup: LookupCamera) -> None:
     found, valid = lookup.unproject(pixels)
     assert not bool((valid & ~exact).any())
     assert float(valid.sum() / exact.sum()) > lookup.coverage[1] - 0.01
-    again, seen = camera.project(found[valid])
+    again, seen = camera.project_rays(found[valid])
     assert bool(seen.all())
     assert float(torch.linalg.vector_norm(again - pixels[valid], dim=-1).max()) <= lookup.bound[1]
     torch.testing.assert_close(torch.linalg.vector_norm(found, dim=-1), torch.ones(len(found)).double())
@@ -85,7 +82,7 @@ def check_bounds(camera: Camera, lookup: LookupCamera) -> None:
     generator = torch.Generator().manual_seed(3)
     points = torch.randn(20000, 3, generator=generator, dtype=torch.float64)
     found, valid = lookup.project(points)
-    wanted, seen = camera.project(points)
+    wanted, seen = camera.project_rays(points)
     # Within the bound of the image's edge the two may differ about what is in the image.
     seen &= camera.inside(wanted) | (torch.linalg.vector_norm(found - wanted, dim=-1) <= lookup.bound[0])
     assert int(valid.sum()) > 100

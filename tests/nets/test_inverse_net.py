@@ -10,15 +10,14 @@ from typing import Any
 import onnxruntime
 import pytest
 import torch
+from lenses import hybrid_camera
 from torch import Tensor
 
 import kcal.lens.inverse
 from kcal.errors import DegenerateError, InputError
 from kcal.io.onnx_file import save_onnx
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid import HybridCamera
 from kcal.lens.modules import Unproject
-from kcal.lens.residual import FieldGrid, FieldResidual
 from kcal.nets.fit import RegressionProblem
 from kcal.nets.inverse import InverseFit, InverseNet, InverseNetOptions, train_inverse
 from kcal.nets.mlp import evaluate, initial_weights
@@ -50,15 +49,8 @@ CAMERAS: dict[str, Callable[[], Camera]] = {
     "fisheye": lambda: Camera.build(
         focal=(400, 402), center=(637, 481), size=(1280, 960), coefficients=[0.02, -0.01, 0.003], model="fisheye4"
     ),
-    "hybrid": lambda: _hybrid(),
+    "hybrid": lambda: hybrid_camera("webcam"),
 }
-
-
-def _hybrid() -> HybridCamera:
-    grid = FieldGrid.covering((-0.6, -0.34), (0.6, 0.34), widths=[0.2])
-    generator = torch.Generator().manual_seed(0)
-    weights = 5e-4 * torch.randn(2, grid.count, generator=generator, dtype=torch.float64)
-    return HybridCamera.of(CAMERAS["opencv14"](), FieldResidual(grid, weights))
 
 
 @functools.cache
@@ -85,7 +77,7 @@ def assert_same_answers(camera: Camera, start: Any) -> None:
     assert torch.equal(valid_again, valid)
     assert int(valid.sum()) > 1000
     # Both stop within 1e-13 on the plane; beside a fold the ray is that much less determined than its pixel.
-    torch.testing.assert_close(camera.project(again)[0], camera.project(rays)[0], rtol=0, atol=2e-9)
+    torch.testing.assert_close(camera.project_rays(again)[0], camera.project_rays(rays)[0], rtol=0, atol=2e-9)
     torch.testing.assert_close(again, rays, rtol=0, atol=1e-6)
     plain = torch.linalg.vector_norm(again - rays, dim=-1).sort().values
     assert float(plain[int(0.95 * len(plain))]) < 1e-12

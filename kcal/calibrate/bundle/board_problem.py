@@ -22,7 +22,6 @@ from kcal.calibrate.bundle.twist import apply_twist
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import project_components
-from kcal.lens.residual import Field
 from kcal.solve.result import Result, State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import SchurLinearization, SchurProblem
@@ -81,7 +80,6 @@ class BoardProblem(SchurProblem[BoardState]):
             None: all corners count alike.
         loss: of the length of each corner's residual (after whitening), or None for plain least squares.
         terms: priors and barriers on the camera's parameters and the warp, as further residuals.
-        field: a correction of the lens that is held fixed, or None.
         batch: leading shape of the states, () for one solve.
 
     Example:
@@ -114,10 +112,9 @@ class BoardProblem(SchurProblem[BoardState]):
         whitening: Tensor | None = None,
         loss: RobustLoss | None = None,
         terms: Sequence[Term] = (),
-        field: Field | None = None,
         batch: tuple[int, ...] = (),
     ) -> None:
-        self.model, self.field, self.loss, self.terms = model, field, loss, tuple(terms)
+        self.model, self.loss, self.terms = model, loss, tuple(terms)
         self.free, self.free_warp = FreeParameters.of(free), free_warp
         self.batch = batch
         self.board_points = board_points
@@ -152,9 +149,7 @@ class BoardProblem(SchurProblem[BoardState]):
         """Problems for which this is equal can be joined into one batch."""
         terms = tuple(term.alike for term in self.terms)
         board = tuple(self.board_points.flatten().tolist())
-        # A batch has one field for all its elements.
-        field, whitened = id(self.field), self.whitening is not None
-        return board, self.model, self.free, self.free_warp, whitened, self.loss, terms, field
+        return board, self.model, self.free, self.free_warp, self.whitening is not None, self.loss, terms
 
     @property
     def prior_count(self) -> int:
@@ -213,7 +208,6 @@ class BoardProblem(SchurProblem[BoardState]):
             whitening=by_view(whitening, 4) if whitening else None,
             loss=first.loss,
             terms=[term.to(device) for term in terms],
-            field=first.field,
             batch=(sum(counts),),
         )
         parameters, warp = (
@@ -250,7 +244,7 @@ class BoardProblem(SchurProblem[BoardState]):
         NaN where a seen corner lies behind the camera, or beyond a pole or a fold of the lens.
         """
         _, points = self.points(state)
-        projected = project_components(points, state.parameters[..., None, :], self.model, None, self.field)
+        projected = project_components(points, state.parameters[..., None, :], self.model)
         bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
         return torch.where(self.seen[..., None, :], projected.pixels - self._target + bad, 0.0)
 
@@ -302,13 +296,11 @@ class BoardProblem(SchurProblem[BoardState]):
         seen, target = self.seen[..., views, :], self._target[..., views, :, :]
         rotated, points = self.points(state)
         normal = state.rotation[..., 2]  # along which a warped board bulges
-        if self.field is None and on_host(self.model, points, state.parameters):
+        if on_host(self.model, points, state.parameters):
             bend = normal[..., None, :, None] * self._shape[:, None] if self.free_warp else None
             rows = board_rows(rotated, points, state.parameters, self.model, self.free, target, bend)
         else:
-            projected = project_components(
-                points, state.parameters[..., None, :], self.model, self.free.indices, self.field
-            )
+            projected = project_components(points, state.parameters[..., None, :], self.model, self.free.indices)
             parts = [step_rows(projected.by_point, rotated), self.free.collapse(projected.by_camera, -3)]
             if self.free_warp:
                 along = torch.einsum("...vkun,...vk->...vun", projected.by_point, normal)

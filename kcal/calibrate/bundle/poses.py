@@ -9,7 +9,6 @@ from kcal.calibrate.bundle.board_problem import BoardState
 from kcal.calibrate.bundle.closed_form import flipped_poses
 from kcal.calibrate.bundle.views import Views
 from kcal.lens.model import LensModel
-from kcal.lens.residual import Field
 from kcal.solve.lm import LMOptions
 
 # Enough to tell which of two tilts fits; the chosen one is refined with everything else afterwards.
@@ -19,9 +18,7 @@ _FIRST_STEPS = LMOptions(max_iterations=4, tolerance=1e-4)
 _HOPELESS = 30.0
 
 
-def refine_poses(
-    views: Views, model: LensModel, state: BoardState, options: LMOptions, field: Field | None = None
-) -> tuple[BoardState, Tensor]:
+def refine_poses(views: Views, model: LensModel, state: BoardState, options: LMOptions) -> tuple[BoardState, Tensor]:
     """Minimize over each view's board pose alone, with everything else held.
 
     Args:
@@ -29,7 +26,6 @@ def refine_poses(
         model: the lens model.
         state: whose poses are the initial ones.
         options: of the solver.
-        field: a correction of the lens, see `BoardProblem`.
 
     Returns:
         the state with refined board poses, and the cost of each view (V,), without a robust loss; NaN where the initial
@@ -43,14 +39,12 @@ def refine_poses(
     )
     camera = state.parameters.expand(count, -1), state.warp.expand(count, -1)
     start = BoardState(*camera, state.rotation[:, None], state.translation[:, None])
-    result = minimize(each.problem(model, field=field, batch=(count,)), start, options)
+    result = minimize(each.problem(model, batch=(count,)), start, options)
     poses = result.state
     return state._replace(rotation=poses.rotation[:, 0], translation=poses.translation[:, 0]), result.cost
 
 
-def unflip(
-    views: Views, model: LensModel, state: BoardState, field: Field | None = None
-) -> tuple[BoardState, list[int]]:
+def unflip(views: Views, model: LensModel, state: BoardState) -> tuple[BoardState, list[int]]:
     """Replace every board pose whose counterpart with the opposite tilt fits better (see `flipped_poses`).
 
     A view from far away or nearly face-on has two poses of almost equal cost, and a solver that starts at the wrong one
@@ -61,19 +55,18 @@ def unflip(
         views: V views of a board.
         model: the lens model.
         state: with board poses that are already refined.
-        field: a correction of the lens, see `BoardProblem`.
 
     Returns:
         the state with the better poses, roughly refined, and the indices of the views that changed.
     """
-    cost = 0.5 * (views.problem(model, field=field).residuals(state) ** 2).sum(-1)
+    cost = 0.5 * (views.problem(model).residuals(state) ** 2).sum(-1)
     rotation, translation = flipped_poses(views.board_points, state.rotation, state.translation)
     flipped = state._replace(rotation=rotation, translation=translation)
-    flipped, flipped_cost = refine_poses(views, model, flipped, _FIRST_STEPS, field)
+    flipped, flipped_cost = refine_poses(views, model, flipped, _FIRST_STEPS)
     near = (flipped_cost < _HOPELESS * cost).nonzero()[:, 0]
     if not len(near):
         return state, []
-    flipped, flipped_cost = refine_poses(views.some(near), model, flipped.views(near), _ROUGH, field)
+    flipped, flipped_cost = refine_poses(views.some(near), model, flipped.views(near), _ROUGH)
     better = flipped_cost < 0.999 * cost[near]
     changed = near[better]
     rotation, translation = state.rotation.clone(), state.translation.clone()

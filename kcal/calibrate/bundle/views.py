@@ -15,7 +15,6 @@ from kcal.calibrate.bundle.parameters import FreeParameters, ParameterConstraint
 from kcal.calibrate.bundle.priors import Term
 from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names, project_components
-from kcal.lens.residual import Field
 from kcal.solve.robust import RobustLoss
 
 # Noise of a corner (pixels) that is assumed at least, where data are exact.
@@ -52,7 +51,6 @@ class Views:
         free: Sequence[int] | FreeParameters = (),
         *,
         terms: Sequence[Term] = (),
-        field: Field | None = None,
         batch: tuple[int, ...] = (),
     ) -> BoardProblem:
         """The least-squares problem of these views; without free parameters, of the poses (and the warp) alone."""
@@ -65,7 +63,6 @@ class Views:
             whitening=self.whitening,
             loss=self.loss,
             terms=terms,
-            field=field,
             batch=batch,
         )
 

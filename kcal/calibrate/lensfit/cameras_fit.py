@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Literal, cast
 
+import torch
 from torch import Tensor
 
 from kcal.calibrate.lensfit.board_orders import CLEAR, mode_turn, quarter_turns
@@ -82,13 +83,20 @@ def fit_cameras(
             known = board.prior_for(seen.board.points)
     each, alone = range(len(sets)), cast(Shape, "exact" if board == "exact" else "printed")
 
-    def fit(i: int, turns: Tensor | None, shape: Shape, lens: LensPrior | None = None) -> CameraFit:
-        found = fit_turned(sets[i], weights[i], modes, turns, shape, lens)
+    fitted: dict[int, Tensor] = {}
+
+    def fit(i: int, shape: Shape, before: CameraFit | None = None, lens: LensPrior | None = None) -> CameraFit:
+        turns = None if before is None else before.turns
+        # Views that were turned since, and lenses of another form, have other unknowns.
+        same = before is not None and lens is None and torch.equal(before.turns, fitted[i])
+        start = before.fit if before is not None and same else None
+        found = fit_turned(sets[i], weights[i], modes, turns, shape, lens, start)
+        fitted[i] = found.turns
         if advance is not None:
             advance(names[i])
         return found
 
-    cameras = [fit(i, None, alone) for i in each]
+    cameras = [fit(i, alone) for i in each]
     if known is not None:
         cameras = [_compared(camera, known, seen.board) for camera, seen in zip(cameras, sets, strict=True)]
     elif alone == "printed":
@@ -107,7 +115,7 @@ def fit_cameras(
                 base, _ = printed_board(before[i].fit.board_shapes, [before[i].message, *same])
                 shape = multiplied(base, same).board
             if fleet or shape is not alone:
-                again = fit(i, before[i].turns, shape, lenses[i])
+                again = fit(i, shape, before[i], lenses[i])
                 cameras[i] = dataclasses.replace(again, board=before[i].board, nats=before[i].nats)
     if isinstance(board, MeasuredBoard):
         boards = [board]

@@ -19,6 +19,7 @@ import torch
 from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
+from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.board_modes import KNOWN, BoardModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.zernike import ASPECT, RADIAL
@@ -69,6 +70,15 @@ class PriorFamilies(NamedTuple):
     amplitude: Tensor
     decay: Tensor
     degree: Tensor
+
+    def with_board(self, board: BoardModes) -> PriorFamilies:
+        """The same camera, and another board, or the same in other variables."""
+        lens = len(self.mean) - len(board.unit)
+        family = torch.where(board.family == KNOWN, -1, BOARD + board.family)
+        return self._replace(
+            log_unit=torch.cat([self.log_unit[:lens], board.unit.log()]),
+            amplitude=torch.cat([self.amplitude[:lens], family]),
+        )
 
     def deviation(self, h: Tensor) -> Tensor:
         """(S,) prior standard deviations."""
@@ -200,7 +210,8 @@ def maximize_evidence(
         return value + 0.5 * float(z @ z), slope + np.append(z / sd, 0.0)
 
     start = np.append(h.numpy(), math.log(variance))
-    bounds = [(m - 5 * s, m + 5 * s) for m, s in zip(mean, sd, strict=True)] + [(start[-1] - 8, start[-1] + 8)]
+    bounds = [(m - 5 * s, m + 5 * s) for m, s in zip(mean, sd, strict=True)]
+    bounds.append((max(start[-1] - 8, 2.0 * math.log(LEAST_NOISE)), start[-1] + 8))
     found = lbfgs(
         objective,
         start,

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
+from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
 from kcal.calibrate.lensfit.board_prior import BoardPrior
 from kcal.calibrate.lensfit.evidence import (
+    SQUARE,
     Hyperprior,
     PriorFamilies,
     maximize_evidence,
@@ -20,12 +23,12 @@ from kcal.calibrate.lensfit.evidence import (
     typical_hyperprior,
 )
 from kcal.calibrate.lensfit.fleet import LensPrior
-from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
+from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, hybrid_unknowns
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
-from kcal.errors import InputError
-from kcal.lens.base_map import angle_over_radius
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.base_map import angle_over_radius, radius_over_angle
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.hybrid_terms import LEADING, HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions, minimize
@@ -33,6 +36,10 @@ from kcal.solve.lm import LMOptions, minimize
 # R in half diagonals: the disc on which fields live reaches a little beyond the image's corners.
 _REACH = 1.08
 _ROUNDS = 6
+# Pixels that a mode can move any point by, below which it is left out.
+_UNFELT = 1e-6
+# Unknowns before the field's weights: focal length, principal point, shape, pupil.
+_LEADING = 6
 # Shapes and angles of the image's corner from which the base projection is begun.
 _SHAPES = (1.0, 0.25, 0.0)
 _CORNERS = (12.0, 20.0, 30.0, 42.0, 55.0, 68.0, 80.0)
@@ -46,29 +53,69 @@ class HybridFit:
         camera: the camera.
         state: parameters, board, poses.
         half: (S, S); halfᵀ half is the covariance of parameters and board.
-        families: the priors that were used; of a board with a prior of its own, those after the change of variables.
         sigma: px, of a corner of weight one, tempering included.
         tempering: T, by which the data count less because residuals repeat within views.
         hyperparameters: (H,).
+        families: the priors that these set; of a board with a prior of its own, those after the change of variables.
         log_evidence: of the last round.
         effective: number of parameters that the data determine.
         board_shapes: modes of the board.
         board_points: (N, 3) meters, the board as it was measured.
-        rms: of the weighted residuals, px.
+        residuals: (V, N, 2) projected minus observed, pixels, weights left out; NaN where a corner did not count.
+        weighted_rms: sqrt(mean w² ‖r‖²), pixels.
+        iterations: trial steps of the solver.
+        converged: whether the hyperparameters came to rest.
     """
 
     camera: Camera
     state: HybridState
     half: Tensor
-    families: PriorFamilies
     sigma: float
     tempering: float
     hyperparameters: Tensor
+    families: PriorFamilies
     log_evidence: float
     effective: float
     board_shapes: BoardModes
     board_points: Tensor
-    rms: float
+    residuals: Tensor
+    weighted_rms: float
+    iterations: int
+    converged: bool
+
+    @property
+    def rms(self) -> float:
+        """sqrt(mean ‖r‖²) over the corners, pixels, all counting alike."""
+        return float(self.residuals.square().sum(-1).nanmean().sqrt())
+
+    def residuals_of(self, pixels: Tensor) -> Tensor:
+        """(V, N, 2) as `residuals`, of any corners of the same views; infinite where the lens has no image of one."""
+        state = self.state
+        found, valid = self.camera.project(
+            self.board_points @ state.rotation.transpose(-1, -2) + state.translation[:, None]
+        )
+        return torch.where(valid[..., None], found, torch.inf) - pixels
+
+    def among(self, views: Sequence[int], count: int) -> HybridFit:
+        """This fit of some views as one of `count` views: NaN for the others."""
+
+        def of_all(values: Tensor) -> Tensor:
+            out = values.new_full((count, *values.shape[1:]), torch.nan)
+            out[list(views)] = values
+            return out
+
+        state = self.state._replace(rotation=of_all(self.state.rotation), translation=of_all(self.state.translation))
+        return dataclasses.replace(self, state=state, residuals=of_all(self.residuals))
+
+    @property
+    def covariance(self) -> Tensor:
+        """(5 + P, 5 + P) of the camera's parameters in the order of `Camera.names`: fx and fy alike, skew held."""
+        unknowns = hybrid_unknowns(self.camera.model)
+        count = len(self.state.params)
+        onto = self.half.new_zeros(len(self.half), count)
+        onto[list(unknowns.slots), list(unknowns.indices)] = 1.0
+        root = self.half @ onto
+        return root.T @ root
 
 
 def fit_hybrid(
@@ -78,42 +125,170 @@ def fit_hybrid(
     weights: Tensor | None = None,
     modes: ZernikeModes | None = None,
     board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
+    square: float = SQUARE,
+    focal: float | None = None,
+    start: HybridFit | None = None,
+    robust: bool = False,
     hyperprior: Hyperprior | None = None,
     lens: LensPrior | None = None,
+    progress: Callable[[str], object] = lambda _: None,
 ) -> HybridFit:
     """Fit one camera.
 
     Args:
-        points: (N, 3) the board's corners as ordered, meters.
+        points: (N, 3) the board's corners as ordered, meters, z = 0.
         pixels: (V, N, 2), NaN where not seen.
-        size: of the image.
-        weights: (V, N) by which residuals are multiplied; one if not given.
+        size: (width, height) of the image.
+        weights: (V, N) by which residuals are multiplied; 0 leaves a corner out. None: all count alike.
         modes: of the field.
-        board: how the board differs from the one that was ordered: as printers err, not at all, or as was measured.
+        board: how it differs from the one that was ordered: as printers err, not at all, or as was measured.
+        square: standard deviation of the pixels' aspect and skew.
+        focal: roughly known, pixels, for the start.
+        start: an earlier fit of the same views with other weights or another board, to begin with.
+        robust: bound the weight of corners that are far off, so that a few wrong ones change nothing. Error bars of
+            such a fit mean nothing; it tells which corners to leave out.
         hyperprior: of the amplitudes; the typical one if not given.
         lens: what is known of it from cameras of its type; its modes are used.
+        progress: called after each step.
+
+    Raises:
+        InputError: no start explains the corners.
+        DegenerateError: the board is seen from one side only, or from too few, so that no projection is found.
     """
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
-    modes = modes or ZernikeModes()
     hyperprior = hyperprior or typical_hyperprior()
     if isinstance(board, MeasuredBoard):
         board = board.prior_for(points)
     ordered, own = points, board_modes(points)
     points, shown = board.applied(points, own) if isinstance(board, BoardPrior) else (points, own)
-    focal, shape, rotation, translation = _base_start(ordered, pixels, size, weights)
-    radius = _REACH * 0.5 * math.hypot(*size)
-    distance = float(translation.norm(dim=-1).median())
     seen = torch.isfinite(pixels).all(-1) & (weights > 0)
     freedom = 2 * int(seen.sum()) - 6 * len(pixels)
+    if start is None:
+        estimate, spent = _base_alone(
+            points, pixels, size, weights, modes or ZernikeModes(), shown, square, focal, robust, hyperprior.mean, lens
+        )
+        progress("base projection")
+    else:
+        state = start.state
+        if isinstance(board, BoardPrior):
+            state = state._replace(board=torch.zeros_like(board.mean))
+        families, h = start.families.with_board(shown), start.hyperparameters
+        estimate = _Estimate(start.camera.model, families, state, h, start.sigma**2, start.tempering)
+        spent = 0
+    model, families, state, h, variance, tempering = estimate
+    never = torch.zeros_like(families.mean, dtype=torch.bool)
+    if board == "exact":
+        never[-len(shown.unit) :] = True
+
+    def solve(steps: int, gain: float) -> tuple[HybridProblem, HybridState, int]:
+        precision = torch.where(never, torch.inf, variance / families.deviation(h).square())
+        problem = HybridProblem(points, shown.shapes, pixels, weights, model, families.mean, precision)
+        if robust:
+            problem = problem.with_weights(_bounded(problem, state, weights))
+        options = LMOptions(max_iterations=steps, tolerance=gain / freedom, initial_damping=1e-6)
+        result = minimize(problem, state, options)
+        return problem, HybridState(*result.state), int(result.iterations)
+
+    converged = False
+    for turn in range(_ROUNDS):
+        first = turn == 0 and start is None
+        problem, state, steps = solve(8 if first else 12, 0.1 if first else 0.02)
+        spent += steps
+        off = problem.without_poses(state)
+        off[:, :-1][:, never] = 0.0
+        K, g, c = _quadratic(off, problem.shared(state))
+        former = tempering
+        if not first:
+            found = _overdispersion(off, K, torch.where(never, 0.0, families.deviation(h)), variance)
+            # More tempering leaves fewer parameters, over which the scores scatter less, and so on: the mean of both
+            # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
+            tempering = found if turn < 2 else math.sqrt(tempering * found)
+        h_new, noise, loss = maximize_evidence(
+            K / tempering, g / tempering, c / tempering, freedom / tempering, families, h, variance / former, hyperprior
+        )
+        change = float((h_new - h).abs().max())
+        h, variance = h_new, noise * tempering
+        progress(f"evidence, round {turn + 1}")
+        if not first and change < 0.1 and steps <= 2:
+            converged = True
+            break
+    # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
+    form = model.hybrid
+    assert form is not None
+    degree = torch.tensor([mode[-1] for mode in form.modes.real_modes])
+    shift = families.deviation(h)[_LEADING : -len(shown.unit)] * float(state.params[0]) * (degree + 1).sqrt()
+    never[_LEADING : -len(shown.unit)] |= shift < _UNFELT
+    mean = families.mean[_LEADING : -len(shown.unit)]
+    state.params[5 + len(LEADING) :] = torch.where(shift < _UNFELT, mean, state.params[5 + len(LEADING) :])
+    problem, state, steps = solve(10, 0.01)
+    off = problem.without_poses(state)
+    K, _, _ = _quadratic(off, problem.shared(state))
+    deviation = torch.where(never, 0.0, families.deviation(h))
+    inverse = _posterior_root(K, deviation, variance)
+    errors = problem.errors(state)
+    if not robust and not bool(torch.isfinite(errors).all()):
+        raise InputError(
+            "the lens cannot show all corners where they are: are all views of this board and this camera? Rejection "
+            "of outliers leaves wrong views out"
+        )
+    half = inverse * deviation
+    if isinstance(board, BoardPrior):
+        state = state._replace(board=board.mean + state.board @ board.half)
+        half = torch.cat([half[:, : -len(board.mean)], half[:, -len(board.mean) :] @ board.half], 1)
+    return HybridFit(
+        camera=Camera(state.params, size=size, model=model),
+        state=state,
+        half=half,
+        sigma=math.sqrt(variance),
+        tempering=tempering,
+        hyperparameters=h,
+        families=families,
+        log_evidence=-loss,
+        effective=len(deviation) - float(inverse.square().sum()),
+        board_shapes=own,
+        board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),
+        residuals=torch.where(seen[..., None], errors.transpose(-1, -2), torch.nan),
+        weighted_rms=math.sqrt(float((errors * problem.weights).square().sum()) / int(seen.sum())),
+        iterations=spent + steps,
+        converged=converged,
+    )
+
+
+class _Estimate(NamedTuple):
+    model: LensModel
+    families: PriorFamilies
+    state: HybridState
+    hyperparameters: Tensor
+    variance: float
+    tempering: float
+
+
+def _base_alone(
+    points: Tensor,
+    pixels: Tensor,
+    size: tuple[int, int],
+    weights: Tensor,
+    modes: ZernikeModes,
+    board: BoardModes,
+    square: float,
+    known_focal: float | None,
+    robust: bool,
+    h: Tensor,
+    lens: LensPrior | None,
+) -> tuple[_Estimate, int]:
+    """Fit the base projection alone: its focal length and shape become constants of the lens. Also the trial steps."""
+    focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal, lens)
+    radius = _REACH * 0.5 * math.hypot(*size)
+    distance = float(translation.norm(dim=-1).median())
+    spent = 0
 
     def constants(focal: float, shape: float) -> tuple[LensModel, PriorFamilies]:
         if lens is not None:
-            usual = prior_families(lens.form, lens.focal, shown, size, distance)
+            usual = prior_families(lens.form, lens.focal, board, size, distance, square)
             return LensModel(hybrid=lens.form), lens.families(usual)
         form = HybridForm(shape=shape, radius=radius / focal, modes=modes)
-        return LensModel(hybrid=form), prior_families(form, focal, shown, size, distance)
+        return LensModel(hybrid=form), prior_families(form, focal, board, size, distance, square)
 
-    h = hyperprior.mean
     model, families = constants(focal, shape)
     held = torch.ones(len(families.mean), dtype=torch.bool)
     held[:4] = False
@@ -122,86 +297,42 @@ def fit_hybrid(
     if lens is not None:
         params[[0, 2, 3, *range(5, len(params))]] = lens.mean
         params[1] = params[0]
-    state = HybridState(params, torch.zeros_like(shown.unit), rotation, translation)
-    # The base alone: its focal length and shape are put into the constants until they stay.
+    state = HybridState(params, torch.zeros_like(board.unit), rotation, translation)
     for _ in range(6):
-        deviation = families.deviation(h)
-        problem = HybridProblem(
-            points,
-            shown.shapes,
-            pixels,
-            weights,
-            model,
-            families.mean,
-            torch.where(held, torch.inf, deviation.square().reciprocal()),
-        )
+        precision = torch.where(held, torch.inf, families.deviation(h).square().reciprocal())
+        problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision)
+        if robust:
+            problem = problem.with_weights(_bounded(problem, state, weights))
         result = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
+        spent += int(result.iterations)
         state = HybridState(*result.state)
         if lens is not None:
             break
         scale, bend = float(state.params[0]) / focal - 1.0, float(state.params[5])
         focal, shape = float(state.params[0]), shape + min(max(bend, -1.0), 1.0)
+        if not (0 < focal < math.inf and abs(shape) <= 10):
+            raise DegenerateError(
+                "the views do not determine the focal length: they are parallel to the image or too similar; add views "
+                "with the board tilted by 30 to 45 degrees in different directions"
+            )
         model, families = constants(focal, shape)
         params = state.params.clone()
         params[5] = 0.0
         state = state._replace(params=params)
-        if abs(scale) < 1e-3 and abs(bend) < 1e-3 * (1 + abs(shape)):
+        if not robust and abs(scale) < 1e-3 and abs(bend) < 1e-3 * (1 + abs(shape)):
             break
-    variance = 2.0 * float(result.cost) / freedom
-    never = torch.zeros_like(held)
-    if board == "exact":
-        never[-len(shown.unit) :] = True
-    tempering = 1.0
+    freedom = 2 * int(problem.seen.sum()) - 6 * len(pixels)
+    variance = max(2.0 * float(result.cost) / freedom, LEAST_NOISE**2)
+    return _Estimate(model, families, state, h, variance, 1.0), spent
 
-    def solve(state: HybridState, steps: int, gain: float) -> tuple[HybridProblem, HybridState, int]:
-        precision = torch.where(never, torch.inf, variance / families.deviation(h).square())
-        problem = HybridProblem(points, shown.shapes, pixels, weights, model, families.mean, precision)
-        options = LMOptions(max_iterations=steps, tolerance=gain / freedom, initial_damping=1e-6)
-        result = minimize(problem, state, options)
-        return problem, HybridState(*result.state), int(result.iterations)
 
-    for turn in range(_ROUNDS):
-        problem, state, steps = solve(state, 8 if turn == 0 else 12, 0.1 if turn == 0 else 0.02)
-        off = problem.without_poses(state)
-        off[:, :-1][:, never] = 0.0
-        K, g, c = _quadratic(off, problem.shared(state))
-        if turn:
-            deviation = torch.where(never, 0.0, families.deviation(h))
-            tempering_new = _overdispersion(off, K, deviation, variance)
-        else:
-            tempering_new = 1.0
-        h_new, noise, loss = maximize_evidence(
-            K / tempering_new, g / tempering_new, c / tempering_new, freedom / tempering_new, families, h,
-            variance / tempering, hyperprior,
-        )  # fmt: skip
-        change = float((h_new - h).abs().max())
-        h, tempering, variance = h_new, tempering_new, noise * tempering_new
-        if turn and change < 0.1 and steps <= 2:
-            break
-    problem, state, _ = solve(state, 10, 0.01)
-    off = problem.without_poses(state)
-    K, _, _ = _quadratic(off, problem.shared(state))
-    deviation = torch.where(never, 0.0, families.deviation(h))
-    inverse = _posterior_root(K, deviation, variance)
-    half = inverse * deviation
-    residuals = problem.residuals(state)
-    if isinstance(board, BoardPrior):
-        state = state._replace(board=board.mean + state.board @ board.half)
-        half = torch.cat([half[:, : -len(board.mean)], half[:, -len(board.mean) :] @ board.half], 1)
-    return HybridFit(
-        camera=Camera(state.params, size=size, model=model),
-        state=state,
-        half=half,
-        families=families,
-        sigma=math.sqrt(variance),
-        tempering=tempering,
-        hyperparameters=h,
-        log_evidence=-loss,
-        effective=len(deviation) - float(inverse.square().sum()),
-        board_shapes=own,
-        board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),
-        rms=math.sqrt(float(residuals.square().sum()) / int(seen.sum())),
-    )
+def _bounded(problem: HybridProblem, state: HybridState, weights: Tensor) -> Tensor:
+    """(V, N) weights of a Cauchy loss at a state, its scale three robust standard deviations; 0 without an image."""
+    length = (problem.errors(state) * weights[:, None]).norm(dim=1)
+    shown = torch.isfinite(length) & problem.seen
+    # Of two normal components, the median length is 1.18 standard deviations.
+    scale = max(3.0 * float(length[shown].median()) / 1.18, LEAST_NOISE)
+    return torch.where(shown, weights / torch.sqrt(1.0 + (length / scale) ** 2), 0.0)
 
 
 def _quadratic(off: Tensor, x: Tensor) -> tuple[Tensor, Tensor, float]:
@@ -212,10 +343,10 @@ def _quadratic(off: Tensor, x: Tensor) -> tuple[Tensor, Tensor, float]:
 
 
 def _posterior_root(K: Tensor, deviation: Tensor, variance: float) -> Tensor:
-    """L⁻¹ of I + √D K √D / σ² = L Lᵀ."""
-    A = K * deviation[:, None] * deviation / variance
-    A.diagonal().add_(1.0)
-    return torch.linalg.solve_triangular(torch.linalg.cholesky(A), torch.eye(len(A), dtype=A.dtype), upper=False)
+    """M of MᵀM = (I + √D K √D / σ²)⁻¹."""
+    # By eigenvalues: with wrong corners K is so large that a Cholesky factor loses the I to rounding.
+    values, vectors = torch.linalg.eigh(K * deviation[:, None] * deviation / variance)
+    return (1.0 + values.clamp_min(0.0)).rsqrt()[:, None] * vectors.T
 
 
 def _overdispersion(off: Tensor, K: Tensor, deviation: Tensor, variance: float) -> float:
@@ -229,7 +360,7 @@ def _overdispersion(off: Tensor, K: Tensor, deviation: Tensor, variance: float) 
 
 
 def _base_start(
-    points: Tensor, pixels: Tensor, size: tuple[int, int], weights: Tensor
+    points: Tensor, pixels: Tensor, size: tuple[int, int], weights: Tensor, known: float | None, lens: LensPrior | None
 ) -> tuple[float, float, Tensor, Tensor]:
     """Focal length, shape and poses: the base projection, among several, under which homographies fit best."""
     seen = torch.isfinite(pixels).all(-1) & (weights > 0)
@@ -239,27 +370,27 @@ def _base_start(
     half = 0.5 * math.hypot(*size)
     pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
     best: tuple[float, float, float, Tensor, Tensor] | None = None
-    for shape in _SHAPES:
+    angles = torch.tensor(_CORNERS, dtype=torch.float64).deg2rad()
+    radii = [(s, m) for s in _SHAPES for m in (angles * radius_over_angle(s * angles**2)).tolist()]
+    usual = dict.fromkeys((s, known or half / m) for s, m in radii)
+    for shape, focal in usual if lens is None else [(lens.form.shape, lens.focal)]:
         s = torch.tensor(shape, dtype=torch.float64)
-        for corner in _CORNERS:
-            angle = math.radians(corner)
-            root = math.sqrt(shape)
-            focal = half / (math.tan(root * angle) / root if shape else angle)
-            theta = away / focal * angle_over_radius(s * (away / focal) ** 2)
-            usable = seen & (theta < math.radians(80.0))
-            ideal = offset * (torch.tan(theta) / away.clamp_min(1e-9))[..., None]
-            ideal = torch.where(usable[..., None], ideal, torch.nan)
-            if bool((usable.sum(-1) < 6).any()):
-                continue
-            rotation, translation = poses_from_homographies(homographies(points, ideal), pinhole)
-            cam = points @ rotation.transpose(-1, -2) + translation[:, None]
-            there = torch.atan2(cam[..., :2].norm(dim=-1), cam[..., 2])
-            direction = cam[..., :2] / cam[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-12)
-            turned = theta[..., None] * offset / away.clamp_min(1e-9)[..., None]
-            error = torch.where(usable, (there[..., None] * direction - turned).norm(dim=-1) * focal, 0.0)
-            value = float(error.square().sum() / usable.sum())
-            if math.isfinite(value) and (best is None or value < best[0]):
-                best = value, focal, shape, rotation, translation
+        theta = away / focal * angle_over_radius(s * (away / focal) ** 2)
+        usable = seen & (theta < math.radians(80.0))
+        ideal = offset * (torch.tan(theta) / away.clamp_min(1e-9))[..., None]
+        ideal = torch.where(usable[..., None], ideal, torch.nan)
+        if bool((usable.sum(-1) < 6).any()):
+            continue
+        rotation, translation = poses_from_homographies(homographies(points, ideal), pinhole)
+        cam = points @ rotation.transpose(-1, -2) + translation[:, None]
+        there = torch.atan2(cam[..., :2].norm(dim=-1), cam[..., 2])
+        direction = cam[..., :2] / cam[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        turned = theta[..., None] * offset / away.clamp_min(1e-9)[..., None]
+        error = torch.where(usable, (there[..., None] * direction - turned).norm(dim=-1) * focal, 0.0)
+        # By the median view: a few wrong views do not decide.
+        value = float((error.square().sum(-1) / usable.sum(-1)).median())
+        if math.isfinite(value) and (best is None or value < best[0]):
+            best = value, focal, shape, rotation, translation
     if best is None:
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
     return best[1:]

@@ -57,6 +57,7 @@ def fit_turned(
     turns: Tensor | None,
     shape: Shape,
     lens: LensPrior | None = None,
+    start: HybridFit | None = None,
 ) -> CameraFit:
     """Fit one camera, turn its views that were read from another end, and fit again until none is left.
 
@@ -67,13 +68,14 @@ def fit_turned(
         turns: (V,) quarter turns that are known already.
         shape: of the board.
         lens: what is known of the lens.
+        start: an earlier fit of the views with these turns, to begin with.
     """
     board, pixels = seen.board, seen.pixels()
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     turns = torch.zeros(len(pixels), dtype=torch.long) if turns is None else turns
     for attempt in range(_MOST_FITS):
         ordered, weighted = (turned_corners(values, board, turns) for values in (pixels, weights))
-        fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, modes, shape, lens=lens)
+        fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, modes, shape, lens=lens, start=start)
         rows = _absolute_rows(fit, board.points, ordered, weighted)
         deviation = fit.families.deviation(fit.hyperparameters)[: -len(fit.state.board)]
         if shape == "exact" or attempt == _MOST_FITS - 1:
@@ -82,7 +84,7 @@ def fit_turned(
         more = find_turns(rows, board, prior, deviation, fit.sigma**2)
         if not bool(more.any()):
             break
-        turns = (turns + more) % 4
+        turns, start = (turns + more) % 4, None
     flat = rows.transpose(1, 2).flatten(0, 1)
     freedom = 2 * int((torch.isfinite(ordered).all(-1) & (weighted > 0)).sum()) - 6 * len(pixels)
     message = message_from_rows(flat, deviation, fit.sigma**2)

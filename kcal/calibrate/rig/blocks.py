@@ -134,7 +134,7 @@ class Block(ABC):
         for c, posed in enumerate(cameras):
             q = posed.rotation @ (y - w * posed.center[:, None])
             wanted = posed.free.indices if derivatives else None
-            found = project_components(q, posed.parameters, posed.camera.model, wanted, posed.camera.field)
+            found = project_components(q, posed.parameters, posed.camera.model, wanted)
             # NaN where a seen point has no projection, so that such a pose is never accepted.
             bad = torch.where(found.regular, 0.0, torch.nan)[..., None, :]
             error = torch.where(self.seen[:, c, None, :], found.pixels - self.target[:, c] + bad, 0.0)

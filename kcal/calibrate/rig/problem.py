@@ -83,7 +83,7 @@ class RigProblem:
     """Everything that a rig is solved from, as one problem whose state is a `RigState`.
 
     Args:
-        cameras: the cameras; what is not free keeps the state's values, and a field (`Camera.field`) stays as it is.
+        cameras: the cameras; what is not free keeps the state's values.
         blocks: what is seen, one block for each kind.
         terms: what was measured of the cameras besides.
         free: free parameters of each camera.

@@ -226,7 +226,7 @@ class RigData:
             raise InputError("a rig has two cameras or more")
         _names("cameras", self.names, count)
         if not all(isinstance(camera, Camera) and camera.params.ndim == 1 for camera in self.cameras):
-            raise InputError("a rig is made of single cameras of the kinds Camera and HybridCamera")
+            raise InputError("a rig is made of single cameras")
         if self.covariances is not None and len(self.covariances) != count:
             raise InputError(f"covariances: one for each camera is needed, got {len(self.covariances)} for {count}")
         for kind, source in (("boards", self.boards), ("landmarks", self.landmarks), ("features", self.features)):
