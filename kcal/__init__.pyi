@@ -17,9 +17,13 @@ from kcal.calibrate.camera.result import RejectedView as RejectedView
 from kcal.calibrate.camera.summary import CalibrationSummary as CalibrationSummary
 from kcal.calibrate.camera.summary import summarize as summarize
 from kcal.calibrate.lensfit.board_modes import BoardModes as BoardModes
+from kcal.calibrate.lensfit.cameras_fit import measure_board as measure_board
 from kcal.calibrate.lensfit.evidence import PriorFamilies as PriorFamilies
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit as HybridFit
 from kcal.calibrate.lensfit.hybrid_problem import HybridState as HybridState
+from kcal.calibrate.lensfit.measured_board import MeasuredBoard as MeasuredBoard
+from kcal.calibrate.lensfit.measured_board import load_measured_board as load_measured_board
+from kcal.calibrate.lensfit.measured_board import save_measured_board as save_measured_board
 from kcal.calibrate.rig.drift import Drift as Drift
 from kcal.calibrate.rig.drift import measure_drift as measure_drift
 from kcal.calibrate.rig.from_boards import calibrate_rig as calibrate_rig
@@ -137,6 +141,7 @@ from kcal.nets.inverse import InverseFit as InverseFit
 from kcal.nets.inverse import InverseNet as InverseNet
 from kcal.nets.inverse import InverseNetOptions as InverseNetOptions
 from kcal.nets.inverse import train_inverse as train_inverse
+from kcal.report.board import save_board_picture as save_board_picture
 from kcal.report.budget import save_budget_picture as save_budget_picture
 from kcal.report.calibration import save_calibration_picture as save_calibration_picture
 from kcal.report.gallery import save_coverage as save_coverage

@@ -70,7 +70,7 @@ def _fit_views(
         pixels,
         observations.image_size,
         weights,
-        exact_board=options.board == "exact",
+        board=options.board,
         square=ANALOG if options.analog else SQUARE,
         focal=options.start_focal(observations.image_size),
         start=start,

@@ -20,7 +20,7 @@ from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
 from kcal.calibrate.bundle.views import LEAST_NOISE
-from kcal.calibrate.lensfit.board_modes import BoardModes
+from kcal.calibrate.lensfit.board_modes import KNOWN, BoardModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.zernike import ASPECT, RADIAL
 
@@ -28,13 +28,30 @@ from kcal.lens.zernike import ASPECT, RADIAL
 # pupil (in units of the board's range), board: bending, stretch, print (in units of its extent): mean and sd of ln.
 _MEAN = np.log([5e-4, 3e-4, 5e-5, 4e-5, 0.5, 0.6, 2e-4, 5e-4, 5e-4, 2e-4])
 _SD = np.array([1.75, 1.5, 1.75, 1.75, 0.7, 0.5, 2.0, 1.5, 1.5, 1.5])
-_DECAY, _PUPIL, _BOARD = 4, 6, 7
+_DECAY, _PUPIL, BOARD = 4, 6, 7
 # Degree at which each family of fields begins: amplitudes refer to it.
 _FIRST_DEGREE = torch.tensor([5.0, 2.0, 3.0, 2.0, 1.0], dtype=torch.float64)
 # Unequal and skewed axes, in units of R: pixels are square.
 SQUARE, ANALOG = 1e-4, 2e-3
 # Of the principal point about the middle, in diagonals.
 _CENTER = 0.05
+
+
+class Hyperprior(NamedTuple):
+    """A normal prior of the hyperparameters h.
+
+    Attributes:
+        mean: (H,).
+        sd: (H,) standard deviations.
+    """
+
+    mean: Tensor
+    sd: Tensor
+
+
+def typical_hyperprior() -> Hyperprior:
+    """That of a camera and a board of which nothing is known."""
+    return Hyperprior(torch.from_numpy(_MEAN.copy()), torch.from_numpy(_SD.copy()))
 
 
 class PriorFamilies(NamedTuple):
@@ -60,6 +77,15 @@ class PriorFamilies(NamedTuple):
     amplitude: Tensor
     decay: Tensor
     degree: Tensor
+
+    def with_board(self, board: BoardModes) -> PriorFamilies:
+        """The same camera, and another board, or the same in other variables."""
+        lens = len(self.mean) - len(board.unit)
+        family = torch.where(board.family == KNOWN, -1, BOARD + board.family)
+        return self._replace(
+            log_unit=torch.cat([self.log_unit[:lens], board.unit.log()]),
+            amplitude=torch.cat([self.amplitude[:lens], family]),
+        )
 
     def deviation(self, h: Tensor) -> Tensor:
         """(S,) prior standard deviations."""
@@ -107,10 +133,11 @@ def prior_families(
     none = torch.full((len(leading),), -1)
     pupils = torch.tensor([-1, -1, -1, -1, _PUPIL, _PUPIL])
     zeros = torch.zeros(len(leading), dtype=torch.float64)
+    board_family = torch.where(board.family == KNOWN, -1, BOARD + board.family)
     return PriorFamilies(
         mean,
         torch.cat([torch.tensor(leading, dtype=torch.float64).log(), field_unit, board.unit.log()]),
-        torch.cat([pupils, torch.where(family == ASPECT, -1, family), _BOARD + board.family]),
+        torch.cat([pupils, torch.where(family == ASPECT, -1, family), board_family]),
         torch.cat(
             [
                 none,
@@ -122,13 +149,52 @@ def prior_families(
     )
 
 
-def typical_hyperparameters() -> Tensor:
-    """(H,) means of the hyperprior."""
-    return torch.from_numpy(_MEAN.copy())
+class Quadratic(NamedTuple):
+    """Data near a solution: chi²(x) = c - 2 gᵀx + xᵀKx, poses eliminated.
+
+    Attributes:
+        K: (S, S).
+        g: (S,).
+        c: number.
+        freedom: ν, residuals without those that poses take up.
+    """
+
+    K: Tensor
+    g: Tensor
+    c: float
+    freedom: float
+
+
+def negative_log_evidence(data: Quadratic, families: PriorFamilies, v: np.ndarray) -> tuple[float, np.ndarray]:
+    """The negative logarithm of the evidence of v = (h, ln σ²), (H + 1,), and its gradient."""
+    K, g, c, freedom = data.K.numpy(), data.g.numpy(), data.c, data.freedom
+    here, log_variance = torch.from_numpy(v[:-1]), v[-1]
+    s2 = math.exp(log_variance)
+    d = families.deviation(here).numpy()
+    A = torch.from_numpy(K * d[:, None] * d / s2)
+    A.diagonal().add_(1.0)
+    root, info = torch.linalg.cholesky_ex(A)
+    if int(info):
+        return 1e30, np.zeros_like(v)
+    inverse = torch.linalg.solve_triangular(root, torch.eye(len(g), dtype=A.dtype), upper=False).numpy()
+    y = inverse.T @ (inverse @ (d * g / s2))
+    kept = (inverse**2).sum(0)
+    x = d * y
+    rss = c - 2 * g @ x + x @ (K @ x)
+    value = 0.5 * (freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
+    by_h = families.slopes(here).numpy() @ (0.5 * (1 - y * y - kept))
+    return value, np.append(by_h, 0.5 * (freedom - (len(g) - kept.sum()) - rss / s2))
 
 
 def maximize_evidence(
-    K: Tensor, g: Tensor, c: float, freedom: float, families: PriorFamilies, h: Tensor, variance: float
+    K: Tensor,
+    g: Tensor,
+    c: float,
+    freedom: float,
+    families: PriorFamilies,
+    h: Tensor,
+    variance: float,
+    hyperprior: Hyperprior | None = None,
 ) -> tuple[Tensor, float, float]:
     """The hyperparameters and the noise variance of largest evidence, and its negative logarithm.
 
@@ -140,32 +206,18 @@ def maximize_evidence(
         families: the priors.
         h: start.
         variance: start.
+        hyperprior: of h; the typical one if not given.
     """
-    K_, g_, S = K.numpy(), g.numpy(), len(g)
+    data = Quadratic(K, g, c, freedom)
+    mean, sd = (part.numpy() for part in hyperprior or typical_hyperprior())
 
     def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
-        here, log_variance = torch.from_numpy(v[:-1]), v[-1]
-        s2 = math.exp(log_variance)
-        d = families.deviation(here).numpy()
-        A = torch.from_numpy(K_ * d[:, None] * d / s2)
-        A.diagonal().add_(1.0)
-        root, info = torch.linalg.cholesky_ex(A)
-        if int(info):
-            return 1e30, np.zeros_like(v)
-        inverse = torch.linalg.solve_triangular(root, torch.eye(S, dtype=A.dtype), upper=False).numpy()
-        y = inverse.T @ (inverse @ (d * g_ / s2))
-        kept = (inverse**2).sum(0)
-        x = d * y
-        rss = c - 2 * g_ @ x + x @ (K_ @ x)
-        value = 0.5 * (freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
-        by_variance = 0.5 * (1 - y * y - kept)
-        by_h = families.slopes(here).numpy() @ by_variance
-        z = (v[:-1] - _MEAN) / _SD
-        by_noise = 0.5 * (freedom - (S - kept.sum()) - rss / s2)
-        return value + 0.5 * z @ z, np.append(by_h + z / _SD, by_noise)
+        value, slope = negative_log_evidence(data, families, v)
+        z = (v[:-1] - mean) / sd
+        return value + 0.5 * float(z @ z), slope + np.append(z / sd, 0.0)
 
     start = np.append(h.numpy(), math.log(variance))
-    bounds = [(m - 5 * s, m + 5 * s) for m, s in zip(_MEAN, _SD, strict=True)]
+    bounds = [(m - 5 * s, m + 5 * s) for m, s in zip(mean, sd, strict=True)]
     bounds.append((max(start[-1] - 8, 2.0 * math.log(LEAST_NOISE)), start[-1] + 8))
     found = lbfgs(
         objective,

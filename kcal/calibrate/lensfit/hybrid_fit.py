@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,16 +13,20 @@ from torch import Tensor
 from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
 from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
+from kcal.calibrate.lensfit.board_prior import BoardPrior
 from kcal.calibrate.lensfit.evidence import (
     SQUARE,
+    Hyperprior,
     PriorFamilies,
     maximize_evidence,
     prior_families,
-    typical_hyperparameters,
+    typical_hyperprior,
 )
+from kcal.calibrate.lensfit.fleet import LensPrior
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, hybrid_unknowns
+from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.base_map import angle_over_radius
+from kcal.lens.base_map import angle_over_radius, radius_over_angle
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import LEADING, HybridForm
 from kcal.lens.model import LensModel
@@ -52,7 +56,7 @@ class HybridFit:
         sigma: px, of a corner of weight one, tempering included.
         tempering: T, by which the data count less because residuals repeat within views.
         hyperparameters: (H,).
-        families: the priors that these set.
+        families: the priors that these set; of a board with a prior of its own, those after the change of variables.
         log_evidence: of the last round.
         effective: number of parameters that the data determine.
         board_shapes: modes of the board.
@@ -131,11 +135,13 @@ def fit_hybrid(
     size: tuple[int, int],
     weights: Tensor | None = None,
     modes: ZernikeModes | None = None,
-    exact_board: bool = False,
+    board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
     square: float = SQUARE,
     focal: float | None = None,
     start: HybridFit | None = None,
     robust: bool = False,
+    hyperprior: Hyperprior | None = None,
+    lens: LensPrior | None = None,
     progress: Callable[[str], object] = lambda _: None,
 ) -> HybridFit:
     """Fit one camera.
@@ -146,12 +152,14 @@ def fit_hybrid(
         size: (width, height) of the image.
         weights: (V, N) by which residuals are multiplied; 0 leaves a corner out. None: all count alike.
         modes: of the field.
-        exact_board: whether the board is as ordered.
+        board: how it differs from the one that was ordered: as printers err, not at all, or as was measured.
         square: standard deviation of the pixels' aspect and skew.
         focal: roughly known, pixels, for the start.
-        start: an earlier fit of the same views with other weights, to begin with.
+        start: an earlier fit of the same views with other weights or another board, to begin with.
         robust: bound the weight of corners that are far off, so that a few wrong ones change nothing. Error bars of
             such a fit mean nothing; it tells which corners to leave out.
+        hyperprior: of the amplitudes; the typical one if not given.
+        lens: what is known of it from cameras of its type; its modes are used.
         progress: called after each step.
 
     Raises:
@@ -159,29 +167,33 @@ def fit_hybrid(
         DegenerateError: the board is seen from one side only, or from too few, so that no projection is found.
     """
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
-    board = board_modes(points)
+    hyperprior = hyperprior or typical_hyperprior()
+    if isinstance(board, MeasuredBoard):
+        board = board.prior_for(points)
+    ordered, own = points, board_modes(points)
+    points, shown = board.applied(points, own) if isinstance(board, BoardPrior) else (points, own)
     seen = torch.isfinite(pixels).all(-1) & (weights > 0)
     freedom = 2 * int(seen.sum()) - 6 * len(pixels)
     if start is None:
         estimate, spent = _base_alone(
-            points, pixels, size, weights, modes or ZernikeModes(), board, square, focal, robust
+            points, pixels, size, weights, modes or ZernikeModes(), shown, square, focal, robust, hyperprior.mean, lens
         )
         progress("base projection")
     else:
-        form = start.camera.model.hybrid
-        assert form is not None
-        estimate = _Estimate(
-            start.camera.model, start.families, start.state, start.hyperparameters, start.sigma**2, start.tempering
-        )
+        state = start.state
+        if isinstance(board, BoardPrior):
+            state = state._replace(board=torch.zeros_like(board.mean))
+        families, h = start.families.with_board(shown), start.hyperparameters
+        estimate = _Estimate(start.camera.model, families, state, h, start.sigma**2, start.tempering)
         spent = start.iterations
     model, families, state, h, variance, tempering = estimate
     never = torch.zeros_like(families.mean, dtype=torch.bool)
-    if exact_board:
-        never[-len(board.unit) :] = True
+    if board == "exact":
+        never[-len(shown.unit) :] = True
 
     def solve(steps: int, gain: float) -> tuple[HybridProblem, HybridState, int]:
         precision = torch.where(never, torch.inf, variance / families.deviation(h).square())
-        problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision)
+        problem = HybridProblem(points, shown.shapes, pixels, weights, model, families.mean, precision)
         if robust:
             problem = problem.with_weights(_cauchy_weights(problem, state, weights))
         options = LMOptions(max_iterations=steps, tolerance=gain / freedom, initial_damping=1e-6)
@@ -203,7 +215,7 @@ def fit_hybrid(
             # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
             tempering = found if turn < 2 else math.sqrt(tempering * found)
         h_new, noise, loss = maximize_evidence(
-            K / tempering, g / tempering, c / tempering, freedom / tempering, families, h, variance / former
+            K / tempering, g / tempering, c / tempering, freedom / tempering, families, h, variance / former, hyperprior
         )
         change = float((h_new - h).abs().max())
         h, variance = h_new, noise * tempering
@@ -215,9 +227,10 @@ def fit_hybrid(
     form = model.hybrid
     assert form is not None
     degree = torch.tensor([mode[-1] for mode in form.modes.real_modes])
-    shift = families.deviation(h)[_LEADING : -len(board.unit)] * float(state.params[0]) * (degree + 1).sqrt()
-    never[_LEADING : -len(board.unit)] |= shift < _UNFELT
-    state.params[5 + len(LEADING) :][shift < _UNFELT] = 0.0
+    shift = families.deviation(h)[_LEADING : -len(shown.unit)] * float(state.params[0]) * (degree + 1).sqrt()
+    never[_LEADING : -len(shown.unit)] |= shift < _UNFELT
+    mean = families.mean[_LEADING : -len(shown.unit)]
+    state.params[5 + len(LEADING) :] = torch.where(shift < _UNFELT, mean, state.params[5 + len(LEADING) :])
     problem, state, steps = solve(10, 0.01)
     off = problem.without_poses(state)
     K, _, _ = _quadratic(off, problem.shared(state))
@@ -229,18 +242,22 @@ def fit_hybrid(
             "the lens cannot show all corners where they are: are all views of this board and this camera? Rejection "
             "of outliers leaves wrong views out"
         )
+    half = inverse * deviation
+    if isinstance(board, BoardPrior):
+        state = state._replace(board=board.mean + state.board @ board.half)
+        half = torch.cat([half[:, : -len(board.mean)], half[:, -len(board.mean) :] @ board.half], 1)
     return HybridFit(
         camera=Camera(state.params, size=size, model=model),
         state=state,
-        half=inverse * deviation,
+        half=half,
         sigma=math.sqrt(variance),
         tempering=tempering,
         hyperparameters=h,
         families=families,
         log_evidence=-loss,
         effective=len(deviation) - float(inverse.square().sum()),
-        board_shapes=board,
-        board_points=points + torch.einsum("b,bkn->nk", state.board, board.shapes),
+        board_shapes=own,
+        board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),
         residuals=torch.where(seen[..., None], errors.transpose(-1, -2), torch.nan),
         weighted_rms=math.sqrt(float((errors * problem.weights).square().sum()) / int(seen.sum())),
         iterations=spent + steps,
@@ -267,14 +284,19 @@ def _base_alone(
     square: float,
     known_focal: float | None,
     robust: bool,
+    h: Tensor,
+    lens: LensPrior | None,
 ) -> tuple[_Estimate, int]:
     """Fit the base projection alone: its focal length and shape become constants of the lens. Also the trial steps."""
-    focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal)
+    focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal, lens)
     radius = _REACH * 0.5 * math.hypot(*size)
     distance = float(translation.norm(dim=-1).median())
-    h, spent = typical_hyperparameters(), 0
+    spent = 0
 
     def constants(focal: float, shape: float) -> tuple[LensModel, PriorFamilies]:
+        if lens is not None:
+            usual = prior_families(lens.form, lens.focal, board, size, distance, square)
+            return LensModel(hybrid=lens.form), lens.families(usual)
         form = HybridForm(shape=shape, radius=radius / focal, modes=modes)
         return LensModel(hybrid=form), prior_families(form, focal, board, size, distance, square)
 
@@ -283,6 +305,9 @@ def _base_alone(
     held[:4] = False
     params = torch.zeros(5 + model.size, dtype=torch.float64)
     params[:4] = torch.tensor([focal, focal, families.mean[1], families.mean[2]])
+    if lens is not None:
+        params[[0, 2, 3, *range(5, len(params))]] = lens.mean
+        params[1] = params[0]
     state = HybridState(params, torch.zeros_like(board.unit), rotation, translation)
     for _ in range(6):
         precision = torch.where(held, torch.inf, families.deviation(h).square().reciprocal())
@@ -292,6 +317,8 @@ def _base_alone(
         result = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
         spent += int(result.iterations)
         state = HybridState(*result.state)
+        if lens is not None:
+            break
         scale, bend = float(state.params[0]) / focal - 1.0, float(state.params[5])
         focal, shape = float(state.params[0]), shape + min(max(bend, -1.0), 1.0)
         if not (0 < focal < math.inf and abs(shape) <= 10):
@@ -344,7 +371,7 @@ def _overdispersion(off: Tensor, K: Tensor, deviation: Tensor, variance: float) 
 
 
 def _base_start(
-    points: Tensor, pixels: Tensor, size: tuple[int, int], weights: Tensor, known: float | None
+    points: Tensor, pixels: Tensor, size: tuple[int, int], weights: Tensor, known: float | None, lens: LensPrior | None
 ) -> tuple[float, float, Tensor, Tensor]:
     """Focal length, shape and poses: the base projection, among several, under which homographies fit best."""
     seen = torch.isfinite(pixels).all(-1) & (weights > 0)
@@ -354,28 +381,27 @@ def _base_start(
     half = 0.5 * math.hypot(*size)
     pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
     best: tuple[float, float, float, Tensor, Tensor] | None = None
-    for shape in _SHAPES:
+    angles = torch.tensor(_CORNERS, dtype=torch.float64).deg2rad()
+    radii = [(s, m) for s in _SHAPES for m in (angles * radius_over_angle(s * angles**2)).tolist()]
+    usual = dict.fromkeys((s, known or half / m) for s, m in radii)
+    for shape, focal in usual if lens is None else [(lens.form.shape, lens.focal)]:
         s = torch.tensor(shape, dtype=torch.float64)
-        root = math.sqrt(shape)
-        angles = [math.radians(corner) for corner in _CORNERS]
-        focals = [half / (math.tan(root * angle) / root if shape else angle) for angle in angles]
-        for focal in focals if known is None else [known]:
-            theta = away / focal * angle_over_radius(s * (away / focal) ** 2)
-            usable = seen & (theta < math.radians(80.0))
-            ideal = offset * (torch.tan(theta) / away.clamp_min(1e-9))[..., None]
-            ideal = torch.where(usable[..., None], ideal, torch.nan)
-            if bool((usable.sum(-1) < 6).any()):
-                continue
-            rotation, translation = poses_from_homographies(homographies(points, ideal), pinhole)
-            cam = points @ rotation.transpose(-1, -2) + translation[:, None]
-            there = torch.atan2(cam[..., :2].norm(dim=-1), cam[..., 2])
-            direction = cam[..., :2] / cam[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-12)
-            turned = theta[..., None] * offset / away.clamp_min(1e-9)[..., None]
-            error = torch.where(usable, (there[..., None] * direction - turned).norm(dim=-1) * focal, 0.0)
-            # By the median view: a few wrong views do not decide.
-            value = float((error.square().sum(-1) / usable.sum(-1)).median())
-            if math.isfinite(value) and (best is None or value < best[0]):
-                best = value, focal, shape, rotation, translation
+        theta = away / focal * angle_over_radius(s * (away / focal) ** 2)
+        usable = seen & (theta < math.radians(80.0))
+        ideal = offset * (torch.tan(theta) / away.clamp_min(1e-9))[..., None]
+        ideal = torch.where(usable[..., None], ideal, torch.nan)
+        if bool((usable.sum(-1) < 6).any()):
+            continue
+        rotation, translation = poses_from_homographies(homographies(points, ideal), pinhole)
+        cam = points @ rotation.transpose(-1, -2) + translation[:, None]
+        there = torch.atan2(cam[..., :2].norm(dim=-1), cam[..., 2])
+        direction = cam[..., :2] / cam[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        turned = theta[..., None] * offset / away.clamp_min(1e-9)[..., None]
+        error = torch.where(usable, (there[..., None] * direction - turned).norm(dim=-1) * focal, 0.0)
+        # By the median view: a few wrong views do not decide.
+        value = float((error.square().sum(-1) / usable.sum(-1)).median())
+        if math.isfinite(value) and (best is None or value < best[0]):
+            best = value, focal, shape, rotation, translation
     if best is None:
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
     return best[1:]

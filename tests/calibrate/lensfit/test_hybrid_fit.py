@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.lensfit.board_modes import BENDING, PRINT, STRETCH, board_modes
-from kcal.calibrate.lensfit.evidence import maximize_evidence, prior_families, typical_hyperparameters
+from kcal.calibrate.lensfit.evidence import maximize_evidence, prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.corners.board import Board
@@ -139,7 +139,7 @@ def test_errors_are_as_large_as_predicted() -> None:
 
 def test_an_exact_board_and_few_views() -> None:
     pixels = views(truth(), 6, 3)
-    free, exact = (fit_hybrid(BOARD.points, pixels, SIZE, exact_board=flag) for flag in (False, True))
+    free, exact = (fit_hybrid(BOARD.points, pixels, SIZE, board=kind) for kind in ("printed", "exact"))
     torch.testing.assert_close(exact.board_points, BOARD.points, rtol=0, atol=0)
     assert error_at_infinity(exact.camera, truth()) < 1.0
     assert error_at_infinity(free.camera, truth()) < 2.0
@@ -184,7 +184,7 @@ def linear_case() -> tuple[Tensor, Tensor, float, object]:
     families = prior_families(_form(), 800.0, board, SIZE, 0.6)
     generator = torch.Generator().manual_seed(5)
     rows = torch.randn(400, len(families.mean), generator=generator, dtype=torch.float64)
-    rows = rows / families.deviation(typical_hyperparameters())
+    rows = rows / families.deviation(typical_hyperprior().mean)
     target = 0.3 * torch.randn(400, generator=generator, dtype=torch.float64)
     assert len(families.mean) == 3 + model.size + 28
     return rows.T @ rows, rows.T @ target, float(target @ target), families
@@ -198,7 +198,7 @@ def _form():
 
 def test_prior_slopes() -> None:
     _, _, _, families = linear_case()
-    h = typical_hyperparameters()
+    h = typical_hyperprior().mean
     numeric = []
     for k in range(len(h)):
         step = torch.zeros_like(h)
@@ -211,7 +211,7 @@ def test_prior_slopes() -> None:
 def test_evidence_is_that_of_the_linear_model() -> None:
     """-ln p of a Gaussian linear model, by the covariance of the data, up to a constant; and it is a maximum."""
     K, g, c, families = linear_case()
-    h, variance, loss = maximize_evidence(K, g, c, 400.0, families, typical_hyperparameters(), 0.09)
+    h, variance, loss = maximize_evidence(K, g, c, 400.0, families, typical_hyperprior().mean, 0.09)
 
     def value(h: Tensor, variance: float) -> float:
         from kcal.calibrate.lensfit.evidence import _MEAN, _SD
