@@ -14,18 +14,42 @@ from kcal.files import check_writable
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
 
+_PARAMETRIC = "Options of parametric models"
+
 
 def calibrate_command(
     observations: Annotated[Path, typer.Argument(help="Observations file from `kcal detect`.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Camera file to write.")],
+    picture: Annotated[
+        Path | None,
+        typer.Option(help="PNG file to write: coverage, where the camera is uncertain, residuals, RMS of each view."),
+    ] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Print every parameter with its σ.")] = False,
+    board: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND",
+            help="printed: bending and print errors are estimated. exact: the board is a metrology plate.",
+        ),
+    ] = "printed",
+    analog: Annotated[
+        bool, typer.Option("--analog", help="Pixels may not be square: an analog camera behind a frame grabber.")
+    ] = False,
+    reject: Annotated[
+        bool, typer.Option("--reject", help="Leave out and list corners and views that noise cannot explain.")
+    ] = False,
+    reject_limit: Annotated[
+        float, typer.Option(metavar="SHARE", help="Largest share of all corners that --reject may leave out.")
+    ] = 0.1,
+    name: Annotated[str, typer.Option(help="Name of the camera; the name of the observations file if not given.")] = "",
     model: Annotated[
         str,
         typer.Option(
             metavar="NAME",
-            help="Lens model: pinhole, opencv4, opencv5, opencv8, opencv12, opencv14, ext16 ... ext24.",
+            help="hybrid, which fits any camera, or for exchange a parametric lens: pinhole, opencv4, opencv5, "
+            "opencv8, opencv12, opencv14, ext16 ... ext24, fisheye4.",
         ),
-    ] = "opencv5",
-    board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
+    ] = "hybrid",
     focal: Annotated[
         float | None,
         typer.Option(metavar="PX", help="Rough focal length to start from, in pixels; estimated if not given."),
@@ -34,63 +58,80 @@ def calibrate_command(
         float | None,
         typer.Option(metavar="DEG", help="Rough horizontal field of view to start from, instead of --focal."),
     ] = None,
+    board_warp: Annotated[
+        bool,
+        typer.Option("--board-warp", help="Parametric: estimate how the board bends.", rich_help_panel=_PARAMETRIC),
+    ] = False,
     fix: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME[=VALUE]",
             help="Hold a parameter at a value; without one, cx and cy at the image center, all others at 0.",
+            rich_help_panel=_PARAMETRIC,
         ),
     ] = None,
     tie: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=NAME", help="Keep parameters equal, for example fx=fy.")
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=NAME", help="Keep parameters equal, for example fx=fy.", rich_help_panel=_PARAMETRIC
+        ),
     ] = None,
     free: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Estimate a parameter that is held by default, as skew.")
+        list[str] | None,
+        typer.Option(
+            metavar="NAME", help="Estimate a parameter that is held by default, as skew.", rich_help_panel=_PARAMETRIC
+        ),
     ] = None,
     prior: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=VALUE±SIGMA", help="Gaussian prior of a parameter; +- may be typed for ±."),
-    ] = None,
-    weak_prior: Annotated[
-        float | None,
         typer.Option(
-            metavar="SHARE",
-            help="Weak prior that keeps a rich lens model near a pinhole; 0.3 suits most lenses. None by default.",
+            metavar="NAME=VALUE±SIGMA",
+            help="Gaussian prior of a parameter; +- may be typed for ±.",
+            rich_help_panel=_PARAMETRIC,
         ),
     ] = None,
+    weak_prior: Annotated[
+        float,
+        typer.Option(
+            metavar="SHARE",
+            min=0.0,
+            help="How far a rich lens is expected to be from a pinhole; 0: no such prior, as in OpenCV.",
+            rich_help_panel=_PARAMETRIC,
+        ),
+    ] = 0.3,
     camera: Annotated[
         Path | None,
-        typer.Option(help="Camera file with known parameters; only board poses and what --free names are estimated."),
+        typer.Option(
+            help="Camera file with known parameters; only board poses and what --free names are estimated.",
+            rich_help_panel=_PARAMETRIC,
+        ),
     ] = None,
     loss: Annotated[
         str | None,
-        typer.Option(metavar="KIND", help="Robust loss against wrong corners: huber, cauchy or tukey."),
+        typer.Option(
+            metavar="KIND",
+            help="Robust loss against wrong corners: huber, cauchy or tukey.",
+            rich_help_panel=_PARAMETRIC,
+        ),
     ] = None,
-    loss_scale: Annotated[float, typer.Option(metavar="PX", help="Residual at which the robust loss sets in.")] = 1.0,
-    reject: Annotated[
-        bool, typer.Option("--reject", help="Leave out and list corners and views that noise cannot explain.")
-    ] = False,
-    reject_limit: Annotated[
-        float, typer.Option(metavar="SHARE", help="Largest share of all corners that --reject may leave out.")
-    ] = 0.1,
-    name: Annotated[str, typer.Option(help="Name of the camera; the name of the observations file if not given.")] = "",
-    picture: Annotated[
-        Path | None, typer.Option(help="PNG file to write: coverage, residuals, and RMS of each view.")
-    ] = None,
+    loss_scale: Annotated[
+        float,
+        typer.Option(metavar="PX", help="Residual at which the robust loss sets in.", rich_help_panel=_PARAMETRIC),
+    ] = 1.0,
 ) -> None:
     """Calibrate one camera: intrinsics, lens and error bars.
 
-    Minimizes the reprojection error of all corners over all parameters. Rich lens models start from the simpler models
-    nested in them, so that more coefficients never end with a larger RMS. A small RMS does not prove an accurate
-    camera: check σ of the parameters, and use fewer coefficients or a weak prior where they are large.
+    There is no lens model to choose: the views themselves tell how much of each term of the lens, of the entrance
+    pupil's movement and of the board's bending and print errors there is. A small RMS does not prove an accurate
+    camera; read the uncertainty of far directions, in pixels, and what to photograph next.
 
     **Examples**
 
     `kcal calibrate left.obs.json -o left.camera.json`
 
-    `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --board-warp --picture left.png`
+    `kcal calibrate left.obs.json -o left.camera.json --picture left.png --verbose`
 
-    `kcal calibrate left.obs.json -o left.camera.json --model opencv14 --weak-prior 0.3`
+    `kcal calibrate left.obs.json -o left.camera.json --model opencv14`: for exchange with OpenCV.
     """
     from kcal.lens.model import LensModel
 
@@ -100,22 +141,24 @@ def calibrate_command(
 
         check_picture(picture)
     name = name or observations.name.split(".")[0]
-    lens = LensModel.named(model)
+    if model != "hybrid":
+        LensModel.named(model)
     known = None
     if camera is not None:
         from kcal.io.camera_file import load_camera
 
         known = load_camera(camera)
-        lens = known.model
 
     from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
     from kcal.calibrate.camera.outliers import OutlierRejection
-    from kcal.calibrate.search.model_ladder import nested_models
     from kcal.corners.observations import Observations
     from kcal.solve.robust import RobustLoss
 
     options = CalibrationOptions(
-        model=lens,
+        model=model,
+        # An unknown kind is refused by the options themselves, and that of a loss by the loss.
+        board=board,  # type: ignore[arg-type]
+        analog=analog,
         board_warp=board_warp,
         focal=focal,
         field_of_view=fov,
@@ -123,27 +166,46 @@ def calibrate_command(
         tied=tuple(tuple(name.strip() for name in text.split("=")) for text in tie or []),
         free=tuple(free or []),
         priors=_priors(prior or []),
-        weak_prior=weak_prior,
+        weak_prior=weak_prior or None,
         camera=known,
-        # An unknown kind is refused by the loss itself.
         loss=None if loss is None else RobustLoss(kind=loss, scale=loss_scale),  # type: ignore[arg-type]
         reject=OutlierRejection(limit=reject_limit) if reject else None,
     )
     seen = Observations.load(observations)
-    with steps("calibrating", 1 + max(1, len(nested_models(lens)) - 1)) as advance:
+    with steps("calibrating", None) as advance:
         result = calibrate_camera(seen, options, advance)
-    file = result.file(name=name, source=observations.name)
-    file.save(output)
+    result.save(output, name=name, source=observations.name)
     if picture is not None:
         from kcal.report.calibration import save_calibration_picture
 
         save_calibration_picture(picture, result)
+    _print_result(result, reject=reject, verbose=verbose or not options.hybrid)
+    print_wrote(output, picture)
 
-    width, height = seen.image_size
-    if (found := file.calibration) is not None:
-        out.print(f"{found.views} views, {found.points} corners, {width}x{height} px, model {lens}")
-    out.print(f"RMS [bold]{result.rms:.4f} px[/]; {result.status.message} ({result.iterations} steps)")
-    print_table([["parameter", "value", "± σ"], *_parameters(result)])
+
+def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:
+    from kcal.calibrate.camera.summary import summarize
+
+    record = result.file().calibration
+    assert record is not None
+    width, height = result.observations.image_size
+    model = "hybrid" if result.hybrid is not None else str(result.camera.model)
+    out.print(f"{record.views} views, {record.points} corners, {width}x{height} px, model {model}")
+    fitted = f"; noise {result.noise:.4f} px along an axis; {result.status.message} ({result.iterations} steps)"
+    out.print(f"RMS [bold]{result.rms:.4f} px[/]{fitted}")
+    brief = summarize(result)
+    if brief.worst == brief.worst:
+        out.print(
+            f"far directions: ± {brief.center:.3f} px in the middle of the image, {brief.border:.3f} px at its border, "
+            f"{brief.worst:.3f} px at worst; no board reached {100 * brief.unreached:.0f} % of it"
+        )
+    if result.hybrid is not None:
+        (f, _, cx, cy), (sf, sx, sy) = result.camera.params[:4].tolist(), (result.sigma[n] for n in ("fx", "cx", "cy"))
+        out.print(f"focal length {f:.3f} ± {sf:.3f} px; principal point {cx:.2f} ± {sx:.2f}, {cy:.2f} ± {sy:.2f} px")
+    if brief.pupil is not None and brief.pupil_sigma is not None:
+        out.print(f"entrance pupil: {1e3 * brief.pupil:+.2f} ± {1e3 * brief.pupil_sigma:.2f} mm at the image's corner")
+    if verbose:
+        print_table([["parameter", "value", "± σ"], *_parameters(result)])
     if result.board_warp is not None:
         x, y = (1e3 * result.board_warp).tolist()
         out.print(f"board warp: {x:+.3f} mm along its rows, {y:+.3f} mm along its columns")
@@ -153,7 +215,8 @@ def calibrate_command(
         out.print(f"  {entry.name}: {entry.reason}", markup=False)
     for text in result.warnings:
         warn(text)
-    print_wrote(output, picture)
+    for text in result.advice:
+        out.print(f"next: {text}", markup=False)
 
 
 def _option_number(text: str, option: str) -> float:

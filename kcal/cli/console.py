@@ -41,7 +41,7 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
 
 
 @contextmanager
-def steps(description: str, total: int) -> Iterator[Callable[[str], None]]:
+def steps(description: str, total: int | None) -> Iterator[Callable[[str], None]]:
     """Show a progress bar on the error stream: call the value with a text after each step."""
     with Progress(
         TextColumn("{task.description}"),

@@ -65,6 +65,8 @@ class CalibrationRecord:
         board_warp: height of the board's bend in x and y, meters; None if it was not estimated.
         stop_reason: why the solver stopped.
         iterations: of the solver.
+        noise: of a corner along an axis, pixels; None if it was not estimated.
+        tempering: by how much the corners count less because residuals repeat within views; None if not estimated.
         observations: name of the observations file, if there was one.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
         created: when, with its time zone.
@@ -79,12 +81,14 @@ class CalibrationRecord:
     board_warp: tuple[float, float] | None = None
     stop_reason: str
     iterations: int
+    noise: float | None = None
+    tempering: float | None = None
     observations: str | None = None
     kcal_version: str
     created: datetime.datetime
 
     def __post_init__(self) -> None:
-        _refuse_negative(self, ("rms", "per_view_rms", "iterations"))
+        _refuse_negative(self, ("rms", "per_view_rms", "iterations", "noise", "tempering"))
         _refuse_local_time(self.created)
         if min(self.views, self.points) < 1:
             raise InputError(f"views is {self.views} and points is {self.points}; both must be positive")

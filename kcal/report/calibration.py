@@ -6,32 +6,36 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.corners.observations import Observations
+from kcal.lens.uncertainty import image_sigma
 from kcal.report.figures import ACCENT, FAINT, INK, WARN, draw_arrows, frame_image, new_figure, save_png
 
 
 def calibration_figure(result: CameraCalibrationResult) -> Figure:
-    """Draw coverage (the paper's Fig. 1) with magnified residuals, residuals against noise, and the RMS of each view.
+    """Draw coverage (the paper's Fig. 1) with magnified residuals, and where the camera is uncertain.
+
+    Below them are residuals against noise and the RMS of each view.
 
     Args:
         result: from `calibrate_camera`.
     """
     observations = result.observations
-    figure = new_figure(13.0, 7.0)
-    grid = figure.add_gridspec(2, 2, width_ratios=[1.5, 1.0], left=0.05, right=0.98, top=0.9, bottom=0.08, hspace=0.38)
-    _draw_coverage(figure.add_subplot(grid[:, 0]), observations, result)
-    _draw_residuals(figure.add_subplot(grid[0, 1]), result)
-    _draw_view_rms(figure.add_subplot(grid[1, 1]), observations, result)
-    figure.suptitle(
-        f"{len(observations.views)} views, model {result.camera.model}: RMS {result.rms:.3f} px",
-        x=0.05,
-        ha="left",
-        fontsize=14,
+    figure = new_figure(13.0, 9.2)
+    grid = figure.add_gridspec(
+        2, 2, height_ratios=[1.35, 1.0], left=0.05, right=0.97, top=0.92, bottom=0.07, hspace=0.22, wspace=0.12
     )
+    _draw_coverage(figure.add_subplot(grid[0, 0]), observations, result)
+    _draw_uncertainty(figure.add_subplot(grid[0, 1]), observations, result)
+    _draw_residuals(figure.add_subplot(grid[1, 0]), result)
+    _draw_view_rms(figure.add_subplot(grid[1, 1]), observations, result)
+    model = "" if result.hybrid is not None else f", model {result.camera.model}"
+    figure.suptitle(f"{len(observations.views)} views{model}: RMS {result.rms:.3f} px", x=0.05, ha="left", fontsize=14)
     return figure
 
 
@@ -59,6 +63,42 @@ def _draw_coverage(axes: Axes, observations: Observations, result: CameraCalibra
         axes.text(0.02, 0.02, "shaded: no valid ray", transform=axes.transAxes, color=WARN, fontsize=9)
     frame_image(axes, observations.image_size, margin=0.03)
     axes.set_title(f"Corners, one color per view; arrows: observed minus modeled, x {scale:g}", fontsize=10, loc="left")
+
+
+def _draw_uncertainty(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
+    width, height = observations.image_size
+    frame_image(axes, observations.image_size, margin=0.03)
+    axes.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor=INK, linewidth=1.2))
+    known = result.camera.calibration
+    if known is None or known.covariance is None:
+        axes.set_title("No error bars", fontsize=10, loc="left")
+        return
+    columns, rows = 65, max(2, round(65 * height / width))
+    sigma = image_sigma(result.camera, columns, rows).numpy()
+    places = result.camera.grid(columns, rows).numpy()
+    good = np.isfinite(sigma)
+    low, high = np.quantile(sigma[good], [0.0, 0.98])
+    levels = _round_levels(max(low, 1e-6), max(high, 2e-6))
+    shown = axes.contourf(
+        places[..., 0], places[..., 1], np.where(good, sigma, np.nan), levels=levels, cmap="viridis_r",
+        norm=LogNorm(levels[0], levels[-1]), extend="both",
+    )  # fmt: skip
+    lines = axes.contour(places[..., 0], places[..., 1], sigma, levels=levels, colors="white", linewidths=0.6)
+    axes.clabel(lines, fontsize=8, fmt="%g")
+    seen = reached(observations, 4 * columns, 4 * rows).numpy()
+    if not seen.all():
+        x, y = (np.linspace(-0.5, size - 0.5, count) for size, count in ((width, 4 * columns), (height, 4 * rows)))
+        axes.contour(x, y, seen, levels=[0.5], colors=INK, linewidths=1.0, linestyles="dashed")
+    axes.set_title("σ of far directions, pixels; dashed: what boards reached", fontsize=10, loc="left")
+    axes.figure.colorbar(shown, ax=axes, fraction=0.035, pad=0.02, format="%g")
+
+
+def _round_levels(low: float, high: float) -> list[float]:
+    """Values 1, 2, 5, 10, ... around a range."""
+    steps = [m * 10.0**e for e in range(-7, 7) for m in (1, 2, 5)]
+    first = max(i for i, value in enumerate(steps) if value <= low)
+    last = min(i for i, value in enumerate(steps) if value >= high)
+    return steps[first : max(last, first + 1) + 1]
 
 
 def _draw_residuals(axes: Axes, result: CameraCalibrationResult) -> None:

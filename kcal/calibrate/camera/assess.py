@@ -8,19 +8,15 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.board_problem import BoardState
-from kcal.calibrate.bundle.coefficient_prior import is_overparameterized
 from kcal.calibrate.bundle.covariance import Uncertainty, uncertainty_of
 from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.priors import GaussianPrior
-from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.camera.options import CalibrationOptions
-from kcal.calibrate.camera.prior_comparison import compare_with_prior, weak_prior_term
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.solve import Solution
 from kcal.calibrate.camera.warnings import (
     NO_ERROR_BARS,
     check_focal,
-    comparison_warnings,
     general_warnings,
     outlier_warnings,
     prior_warnings,
@@ -29,6 +25,7 @@ from kcal.calibrate.camera.warnings import (
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from kcal.solve.result import SolverStatus
+from kcal.solve.robust import RobustLoss
 
 
 def assess(observations: Observations, solution: Solution, options: CalibrationOptions) -> CameraCalibrationResult:
@@ -46,7 +43,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
     squared, count = problem.pixel_errors(state).square().sum(-2), problem.seen.sum(-1)
     per_view, rms = torch.sqrt(squared.sum(-1) / count), float(torch.sqrt(squared.sum() / count.sum()))
 
-    uncertainty, comparison = _uncertainty(observations, solution, state, options)
+    uncertainty = _uncertainty(observations, solution, state, options.loss)
     free = problem.free
     slot = {camera.names[i]: k for i, k in zip(free.indices, free.slots, strict=True)}
     unknowns = [" = ".join(name for name in slot if slot[name] == k) for k in range(len(free))]
@@ -84,7 +81,6 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
         warnings=(
             *general_warnings(observations.names, camera, rms, per_view, lost, status),
             *doubts,
-            *comparison,
             *rival_warnings(camera, sigma, minimum, solution.plain_cost, problem.residual_count),
             *prior_warnings(minimum.terms, solved.state, noise),
             *outlier_warnings(observations.names, weighted),
@@ -93,30 +89,17 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
 
 
 def _uncertainty(
-    observations: Observations, solution: Solution, state: BoardState, options: CalibrationOptions
-) -> tuple[Uncertainty, list[str]]:
-    """Covariance of the unknowns; of an overparameterized model after a comparison with its weak prior."""
-    minimum, model = solution.minimum, options.lens
+    observations: Observations, solution: Solution, state: BoardState, loss: RobustLoss | None
+) -> Uncertainty:
+    """Covariance of the unknowns."""
     if not solution.problem.shared_size:
         # Under a known camera and a flat board nothing is shared by the views.
-        return Uncertainty(state.parameters.new_zeros(0, 0), torch.zeros(0, dtype=torch.bool)), []
+        return Uncertainty(state.parameters.new_zeros(0, 0), torch.zeros(0, dtype=torch.bool))
     # Barriers before folds are no information about the lens.
-    known = [term for term in minimum.terms if isinstance(term, GaussianPrior)]
-    corners = observations.pixels(), observations.covariances()
-    plain = solution.problem_for(*corners, options.loss, known)
-    linear, count = plain.linearize(state), plain.shared_size + 6 * len(state.translation)
-    own = uncertainty_of(linear, plain.residual_count + plain.prior_count, count)
-    unquestioned = options.weak_prior is not None or options.camera is not None or not minimum.rivals
-    if not own.computed or not is_overparameterized(model) or unquestioned:
-        return own, []
-    noise = max((2.0 * float(linear.cost) / plain.residual_count) ** 0.5, LEAST_NOISE)
-    start = minimum.rivals[0][1]
-    prior = weak_prior_term(solution.views, start, model, noise)
-    with_prior = solution.problem_for(*corners, options.loss, [*known, prior])
-    comparison = compare_with_prior(solution.views, with_prior, plain, start, state, own)
-    if comparison is None:
-        return own, []
-    return comparison.uncertainty, comparison_warnings(comparison)
+    known = [term for term in solution.minimum.terms if isinstance(term, GaussianPrior)]
+    plain = solution.problem_for(observations.pixels(), observations.covariances(), loss, known)
+    count = plain.shared_size + 6 * len(state.translation)
+    return uncertainty_of(plain.linearize(state), plain.residual_count + plain.prior_count, count)
 
 
 def _led_by_prior(

@@ -10,19 +10,18 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Hashable, Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardState, warp_shape
+from kcal.calibrate.bundle.board_problem import BoardState
 from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies, spread_out
 from kcal.calibrate.bundle.poses import refine_poses, unflip
 from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.options import CalibrationOptions
-from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
+from kcal.calibrate.camera.options import HYBRID, CalibrationOptions
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
@@ -52,7 +51,7 @@ class ComparisonResult:
         >>> {name: round(rms, 4) for name, rms in result.rms.items()}
         {'a': 0.2121, 'b': 0.2345}
         >>> [round(value, 4) for value in result.difference("b", "a")]
-        [0.0224, 0.0149]
+        [0.0224, 0.0154]
     """
 
     models: tuple[str, ...]
@@ -81,14 +80,6 @@ class ComparisonResult:
         return self.rms[one] - self.rms[other], error
 
 
-class _Fitted(NamedTuple):
-    """A camera, the board's corners (N, 3) as the views show them, and the RMS of the fit in pixels."""
-
-    camera: Camera
-    board_points: Tensor
-    rms: float
-
-
 def compare_models(
     observations: Observations,
     models: Sequence[str | LensModel],
@@ -108,8 +99,8 @@ def compare_models(
             views that differ from the others as the groups differ from each other.
         parts: the groups are dealt into so many parts, each of which is held out once. As many parts as groups leave
             out one group at a time.
-        options: for the parametric models; not given: with the board's warp. Of these, `weighted`, `focal` and
-            `field_of_view` also apply to the hybrid.
+        options: for the parametric models; not given: with the board's warp. The hybrid takes
+            `board`, `analog`, `weighted`, `focal` and `field_of_view` of them.
         progress: called after each fit.
 
     Returns:
@@ -137,10 +128,10 @@ def compare_models(
         >>> result.rms["pinhole"] > 5 * result.rms["opencv4"]
         True
     """
-    options = options or CalibrationOptions(board_warp=True)
+    options = options or CalibrationOptions(model="opencv5", board_warp=True)
     if options.camera is not None:
         raise InputError("compare_models: a known camera leaves no models to compare")
-    names = tuple(str(model if model == "hybrid" else LensModel.named(model)) for model in models)
+    names = tuple(str(model if model == HYBRID else LensModel.named(model)) for model in models)
     if not names or len(set(names)) < len(names):
         raise InputError(f"compare_models: one or more different models are needed, got {', '.join(names) or 'none'}")
     members = _groups(observations, groups, parts)
@@ -157,14 +148,14 @@ def compare_models(
         for number, model in enumerate(models):
             progress(f"{names[number]}, part {part + 1} of {parts}")
             try:
-                found = _fit(train, model, options)
+                found = calibrate_camera(train, _options(model, options))
             except KcalError as error:
                 failures[names[number]] = error
                 continue
             covariances = observations.covariances() if options.weighted else None
             if covariances is not None and not weighted:
                 weights, weighted = whitening(covariances, 0.5 * found.rms**2), True
-            by_view = _held_out(found, observations.pixels()[out], weights[out])
+            by_view = _held_out(found.camera, found.board_points, observations.pixels()[out], weights[out])
             for g in held:
                 costs[number, g] = by_view[[out.index(i) for i in members[g]]].sum()
     if not bool(costs.isfinite().any()) and failures:
@@ -178,17 +169,12 @@ def compare_models(
     )
 
 
-def _fit(observations: Observations, model: str | LensModel, options: CalibrationOptions) -> _Fitted:
-    """The camera and its board, the latter as the same views show it."""
-    points = observations.board.points
-    if model == "hybrid":
-        fit = fit_hybrid(points, observations.pixels(), observations.image_size)
-        return _Fitted(fit.camera, fit.board_points, fit.rms)
-    result = calibrate_camera(observations, dataclasses.replace(options, model=model))
-    if result.board_warp is not None:
-        height = result.board_warp @ warp_shape(points)
-        points = torch.cat([points[:, :2], height[:, None]], -1)
-    return _Fitted(result.camera, points, result.rms)
+def _options(model: str | LensModel, options: CalibrationOptions) -> CalibrationOptions:
+    """The options for one model; the hybrid takes those that are its own."""
+    if model != HYBRID:
+        return dataclasses.replace(options, model=model, board="printed", analog=False)
+    own = ("board", "analog", "weighted", "focal", "field_of_view")
+    return CalibrationOptions(model=HYBRID, **{name: getattr(options, name) for name in own})
 
 
 def _groups(
@@ -211,9 +197,8 @@ def _groups(
     return found
 
 
-def _held_out(found: _Fitted, pixels: Tensor, weights: Tensor) -> Tensor:
+def _held_out(camera: Camera, board: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
     """(V,) weighted squared residuals of views whose poses alone are solved; infinite where the lens has no image."""
-    camera, board = found.camera, found.board_points
     rays, valid = camera.unproject(torch.nan_to_num(pixels))
     used = torch.isfinite(pixels).all(-1) & valid & (rays[..., 2] > 0)
     ideal = torch.where(used[..., None], rays[..., :2] / rays[..., 2:], torch.nan)

@@ -101,7 +101,8 @@ def calibrate_views(
         board_points: (N, 3) meters, in the order of the corners, near the plane z = 0. A board's warp is as wide as
             its outermost corners; where several tie, they share the derivative of that width.
         size: (width, height) of the image in pixels.
-        options: as for `calibrate_camera`; `reject` is refused, because leaving out corners is not continuous.
+        options: as for `calibrate_camera`, with a parametric model (by default opencv5); `reject` is refused, because
+            leaving out corners is not continuous.
         mask: (V, N) bool, which corners count; None: those that are finite.
         prior_means: (Q,) in the order of `options.priors`, in place of their means.
         corner_sigma: pixels of a corner's noise along an axis, against which priors count. Given, not measured, so
@@ -132,7 +133,7 @@ def calibrate_views(
         >>> [round(float(value), 9) + 0.0 for value in by_pixels.sum((0, 1))]  # all corners one pixel to the right
         [1.0, 0.0]
     """
-    options = options or CalibrationOptions()
+    options = options or CalibrationOptions(model="opencv5")
     pixels, board_points, means = _checked(pixels, board_points, options, mask, prior_means, corner_sigma, backward)
     constraints = options.constraints(size)
     known = [parameter_names(options.lens).index(name) for name in options.priors]
@@ -191,7 +192,7 @@ class CalibrationLayer(nn.Module):
 
     Args:
         size: (width, height) of the image in pixels.
-        options: as for `calibrate_camera`.
+        options: as for `calibrate_camera`, with a parametric model; opencv5 by default.
         backward: "implicit" (exact first derivatives), "unroll" (derivatives of any order, more memory) or "none".
         corner_sigma: pixels of a corner's noise along an axis, against which priors count.
 
@@ -212,7 +213,7 @@ class CalibrationLayer(nn.Module):
         corner_sigma: float = 0.2,
     ) -> None:
         super().__init__()
-        self.size, self.options = size, options or CalibrationOptions()
+        self.size, self.options = size, options or CalibrationOptions(model="opencv5")
         self.backward, self.corner_sigma = backward, corner_sigma
 
     def forward(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Literal
 
 from kcal.calibrate.bundle.parameters import ParameterConstraints, natural_value
 from kcal.errors import InputError
@@ -12,6 +13,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
 from kcal.solve.robust import RobustLoss
+
+HYBRID = "hybrid"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,8 +38,13 @@ class CalibrationOptions:
     """Options of `calibrate_camera`.
 
     Args:
-        model: lens model, by name or as a `LensModel`.
-        board_warp: estimate how the board bends (two more parameters).
+        model: "hybrid", the default: a lens that fits any camera, whose amplitudes, entrance pupil and board the views
+            themselves determine (`kcal.calibrate.camera.hybrid`). Or a parametric lens model, by name or as a
+            `LensModel`, for exchange with other programs.
+        board: "printed", the default: bending and print errors of the board are estimated with a hybrid lens. "exact":
+            the board is a metrology plate.
+        analog: the pixels may not be square (an analog camera behind a frame grabber). Hybrid lens only.
+        board_warp: with a parametric model, estimate how the board bends (two more parameters).
         weighted: weight corners by their covariances where all views have them (`kcal.calibrate.bundle.weights`);
             False minimizes the plain RMS, as OpenCV does.
         loss: a robust loss of each corner's residual in pixels, for data with wrong corners, or None. It is used after
@@ -52,18 +60,21 @@ class CalibrationOptions:
         free: names that are estimated although they are held by default: "skew".
         priors: Gaussian priors by name, as {"fx": (1600, 5)}: mean and standard deviation. They count in proportion to
             the corners' noise, which is estimated from the residuals.
-        weak_prior: how far a rich lens (with a denominator, prism or tilt) is expected to be from a pinhole. Every
-            coefficient gets a prior with mean zero, and with the standard deviation at which its term would shift the
-            outermost corner by this share of its radius (a thirtieth of it for decentering, prism and tilt;
-            `kcal.calibrate.bundle.coefficient_prior`). 0.3 hardly changes what the views determine, and leaves rich
-            models a single minimum, found quickly, with a reliable σ (docs/measured/solver.md has figures). None, the
-            default: the corners alone decide, as in OpenCV, and the lowest of their minima is searched for.
+        weak_prior: with a parametric model, how far a rich lens (with a denominator, prism or tilt) is expected to be
+            from a pinhole. Every coefficient gets a prior with mean zero, and with the standard deviation at which its
+            term would shift the outermost corner by this share of its radius (a thirtieth of it for decentering, prism
+            and tilt; `kcal.calibrate.bundle.coefficient_prior`). 0.3, the default, hardly changes what the views
+            determine, and leaves rich models a single minimum, found quickly, with a reliable σ
+            (docs/measured/solver.md has figures). None: the corners alone decide, as in OpenCV, and the lowest of their
+            minima is searched for.
         camera: a known camera, whose parameters are held except those that `free` names. Only the board's poses (and
             its warp) are found; one view is enough. Its lens model takes the place of `model`.
         solver: options of the Levenberg-Marquardt solver.
     """
 
-    model: LensModel | str = "opencv5"
+    model: LensModel | str = HYBRID
+    board: Literal["printed", "exact"] = "printed"
+    analog: bool = False
     board_warp: bool = False
     weighted: bool = True
     loss: RobustLoss | None = None
@@ -74,7 +85,7 @@ class CalibrationOptions:
     tied: tuple[tuple[str, ...], ...] = ()
     free: tuple[str, ...] = ()
     priors: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
-    weak_prior: float | None = None
+    weak_prior: float | None = 0.3
     camera: Camera | None = None
     solver: LMOptions = dataclasses.field(
         default_factory=lambda: LMOptions(max_iterations=1000, tolerance=1e-12, flatness=2e-6)
@@ -89,16 +100,38 @@ class CalibrationOptions:
             raise InputError("CalibrationOptions: focal and field_of_view are alternatives; give one")
         if self.weak_prior is not None and not 0 < self.weak_prior < float("inf"):
             raise InputError(f"CalibrationOptions: weak_prior must be positive, got {self.weak_prior}")
+        if self.board not in ("printed", "exact"):
+            raise InputError(f"CalibrationOptions: board must be 'printed' or 'exact', got {self.board!r}")
         if self.camera is not None and (self.fixed or self.focal is not None or self.field_of_view is not None):
             raise InputError(
                 "CalibrationOptions: a known camera fixes all parameters; name those to estimate in `free` instead"
             )
+        if self.hybrid:
+            self._refuse_parametric()
+            return
+        if self.analog:
+            raise InputError("CalibrationOptions: analog belongs to the hybrid lens; a parametric one has fx and fy")
         fixed = self._of_camera() or {name: 1.0 if value is None else value for name, value in self.fixed.items()}
         self._constraints(fixed).check(self.lens)
 
     @property
+    def hybrid(self) -> bool:
+        """Whether the lens is the hybrid one, fitted by evidence."""
+        return self.camera is None and (self.model == HYBRID or bool(LensModel.named(self.model).hybrid))
+
+    def _refuse_parametric(self) -> None:
+        names = ("board_warp", "loss", "fixed", "tied", "free", "priors")
+        if isinstance(self.model, LensModel):
+            raise InputError('CalibrationOptions: write model="hybrid"; its constants follow from the views')
+        if given := [name for name in names if getattr(self, name)]:
+            raise InputError(
+                f"CalibrationOptions: {', '.join(given)} cannot be combined with the hybrid lens, whose parameters and "
+                'board the views determine; name a parametric model, for example model="opencv5"'
+            )
+
+    @property
     def lens(self) -> LensModel:
-        """The lens model to solve for."""
+        """The parametric lens model to solve for."""
         return LensModel.named(self.model) if self.camera is None else self.camera.model
 
     def _of_camera(self) -> dict[str, float]:

@@ -9,6 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from kcal.calibrate.bundle.board_problem import warp_shape
+from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.corners.observations import Observations
 from kcal.io.camera_file import CameraFile, camera_to_file, provenance
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, Exclusion
@@ -74,6 +76,8 @@ class CameraCalibrationResult:
         iterations: trial steps of the solver, all starts and models together.
         warnings: what the user should doubt, and what to do about it.
         observations: what was calibrated from.
+        hybrid: how the hybrid lens and the board were fitted: noise, tempering, board; None for parametric models.
+        advice: what to photograph next, the most useful first.
         fixed: names of the parameters that the options held.
         led_by_prior: names of the parameters that a prior determines more than the views do: without it their σ would
             be more than 1.4 times as large.
@@ -95,6 +99,8 @@ class CameraCalibrationResult:
     iterations: int
     warnings: tuple[str, ...]
     observations: Observations
+    hybrid: HybridFit | None = None
+    advice: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
     led_by_prior: tuple[str, ...] = ()
     rejected_corners: tuple[RejectedCorner, ...] = ()
@@ -119,8 +125,30 @@ class CameraCalibrationResult:
             board_warp=None if warp is None else (float(warp[0]), float(warp[1])),
             stop_reason=self.status.message,
             iterations=self.iterations,
+            noise=self.noise,
+            tempering=None if self.hybrid is None else self.hybrid.tempering,
             **provenance(),
         )
+
+    @property
+    def board_points(self) -> Tensor:
+        """(N, 3) meters: the board's corners as the views show them."""
+        if self.hybrid is not None:
+            return self.hybrid.board_points
+        points = self.observations.board.points.clone()
+        if self.board_warp is not None:
+            points[:, 2] = self.board_warp @ warp_shape(points)
+        return points
+
+    @property
+    def noise(self) -> float:
+        """Pixels of a corner along an axis, from the residuals and without what the fit takes up."""
+        if self.hybrid is not None:
+            return self.hybrid.sigma / math.sqrt(self.hybrid.tempering)
+        used = int(self.residuals[..., 0].isfinite().sum())
+        views = int(self.per_view_rms.isfinite().sum())
+        free = sum(value is not None for value in self.sigma.values()) + (0 if self.board_warp is None else 2)
+        return self.rms * math.sqrt(used / max(2 * used - 6 * views - free, 1))
 
     @property
     def rejected_share(self) -> float:

@@ -5,32 +5,27 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.batching import minimize
 from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.closed_form import spread_out
 from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior, is_overparameterized
 from kcal.calibrate.bundle.poses import unflip
 from kcal.calibrate.bundle.priors import Term
 from kcal.calibrate.bundle.views import CameraViews
 from kcal.calibrate.bundle.weights import whitening
+from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
 from kcal.calibrate.camera.initial_model import first_model, poses_under
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.search.direct_solve import solve_directly
 from kcal.calibrate.search.model_ladder import Minimum, Progress, nested_models, solve_ladder
 from kcal.corners.observations import Observations
-from kcal.errors import DegenerateError, InputError
+from kcal.errors import InputError
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, SolverStatus
 from kcal.solve.robust import RobustLoss
 
-_MINIMUM_VIEWS = 3
-_MINIMUM_CORNERS = 6
-# RMS distance in pixels of a view's corners from the best line, below which they do not span a plane.
-_MINIMUM_WIDTH = 0.5
 # Maximum number of times the noise level that weights the priors is re-estimated, and the smallest relative change that
 # is worth it: it moves the solution by less than 1e-4 standard deviations.
 _PRIOR_ROUNDS, _SAME = 5, 1e-4
@@ -104,7 +99,8 @@ def solve_corners(
     names = names or [f"view {i}" for i in range(len(pixels))]
     constraints, warp = options.constraints(size), options.board_warp
     views = CameraViews(board_points=board_points, pixels=pixels, free_warp=warp, size=size, constraints=constraints)
-    _check(views, names, len(constraints.free_parameters(model)), _MINIMUM_VIEWS if options.camera is None else 1)
+    unknowns = len(constraints.free_parameters(model)) + 2 * warp
+    check_views(board_points, pixels, names, unknowns, fewest=MINIMUM_VIEWS if options.camera is None else 1)
 
     weak_prior = options.weak_prior if options.camera is None and is_overparameterized(model) else None
     if options.camera is None:
@@ -183,35 +179,3 @@ def _reweight_priors(
         result = minimize(views.lens_problem(model, terms=minimum.terms), result.state, near)
         spent += int(result.iterations)
     return views, result, spent
-
-
-def _check(views: CameraViews, names: Sequence[str], parameters: int, fewest: int) -> None:
-    """Raise where there are too few views or corners, or where a view does not determine a pose."""
-    pixels = views.pixels
-    seen = torch.isfinite(pixels).all(-1).sum(-1)
-    if len(pixels) < fewest:
-        raise DegenerateError(
-            f"{len(pixels)} view(s) of the board: at least {fewest} at different tilts are needed, 10 to 40 are good"
-        )
-    poor = (seen < _MINIMUM_CORNERS).nonzero()[:, 0].tolist()
-    if poor:
-        raise InputError(
-            f"view {names[poor[0]]!r} has {int(seen[poor[0]])} corners; at least {_MINIMUM_CORNERS} are needed: remove "
-            "the view"
-        )
-    on_line = (~spread_out(views.board_points, pixels)).nonzero()[:, 0].tolist()
-    if on_line:
-        raise InputError(
-            f"view {names[on_line[0]]!r}: all its corners, or all but one, lie on one line, which leaves the board's "
-            "pose open; remove the view"
-        )
-    centered = torch.nan_to_num(pixels - pixels.nanmean(1, keepdim=True))
-    width = torch.linalg.svdvals(centered)[:, 1] / seen.sqrt()
-    thin = (width < _MINIMUM_WIDTH).nonzero()[:, 0].tolist()
-    if thin:
-        raise InputError(f"view {names[thin[0]]!r}: its corners coincide or the board is seen edge-on; remove the view")
-    unknowns = parameters + 2 * views.free_warp + 6 * len(pixels)
-    if 2 * int(seen.sum()) <= unknowns:
-        raise DegenerateError(
-            f"{int(seen.sum())} corners cannot determine {unknowns} parameters: add views or choose a smaller model"
-        )

@@ -19,6 +19,7 @@ import torch
 from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
+from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.board_modes import BoardModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.zernike import ASPECT, RADIAL
@@ -157,7 +158,8 @@ def maximize_evidence(
         return value + 0.5 * z @ z, np.append(by_h + z / _SD, by_noise)
 
     start = np.append(h.numpy(), math.log(variance))
-    bounds = [(m - 5 * s, m + 5 * s) for m, s in zip(_MEAN, _SD, strict=True)] + [(start[-1] - 8, start[-1] + 8)]
+    bounds = [(m - 5 * s, m + 5 * s) for m, s in zip(_MEAN, _SD, strict=True)]
+    bounds.append((max(start[-1] - 8, 2.0 * math.log(LEAST_NOISE)), start[-1] + 8))
     found = lbfgs(
         objective,
         start,

@@ -1,0 +1,187 @@
+"""Calibrate one camera without a lens model to choose: the default of `calibrate_camera`.
+
+The lens is a base projection between pinhole and fisheye, corrected by a smooth field and by an entrance pupil that
+moves with the angle (`kcal.lens.hybrid_terms`); the board may be bent and misprinted
+(`kcal.calibrate.lensfit.board_modes`). How large each of these may be is told by the evidence of the views themselves
+(`kcal.calibrate.lensfit.evidence`), so a few views give a plain lens with wide error bars, and many views a detailed
+one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.bundle.views import LEAST_NOISE
+from kcal.calibrate.camera.advice import what_to_photograph
+from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
+from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection
+from kcal.calibrate.camera.outliers import (
+    check_share,
+    corner_limits,
+    corners_beyond,
+    noise_scale,
+    view_rms,
+    views_beyond,
+)
+from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
+from kcal.calibrate.camera.warnings import check_focal, general_warnings, hybrid_warnings, outlier_warnings
+from kcal.calibrate.lensfit.evidence import ANALOG, SQUARE
+from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
+from kcal.calibrate.search.model_ladder import Progress
+from kcal.corners.observations import Observations
+from kcal.solve.result import SolverStatus
+
+# The unknowns that the views alone must determine: focal length, principal point, shape of the base projection.
+_UNKNOWNS = 4
+# Largest number of fits with outliers left out; two or three are the rule.
+_ROUNDS = 6
+# Scale of the loss with which outliers are looked for, in units of the noise, and how often its weights are renewed.
+_CAUCHY_SCALE, _CAUCHY_ROUNDS = 3.0, 2
+
+
+def calibrate_hybrid(
+    observations: Observations, options: CalibrationOptions, progress: Progress
+) -> CameraCalibrationResult:
+    """As `kcal.calibrate.camera.calibrate.calibrate_camera`, for the hybrid lens."""
+    board, pixels, names = observations.board.points, observations.pixels(), observations.names
+    check_views(board, pixels, names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
+    fit = _fit(observations, pixels, torch.ones_like(pixels[..., 0]), None, options, progress)
+    if options.weighted and observations.covariances() is not None:
+        fit = _fit(observations, pixels, _weights(observations, fit), fit, options, progress)
+    if options.reject is None:
+        return _result(observations, fit, options)
+    return _without_outliers(observations, fit, options, options.reject, progress)
+
+
+def _fit(
+    observations: Observations,
+    pixels: Tensor,
+    weights: Tensor,
+    start: HybridFit | None,
+    options: CalibrationOptions,
+    progress: Progress,
+) -> HybridFit:
+    return fit_hybrid(
+        observations.board.points,
+        pixels,
+        observations.image_size,
+        weights,
+        exact_board=options.board == "exact",
+        square=ANALOG if options.analog else SQUARE,
+        focal=options.start_focal(observations.image_size),
+        start=start,
+        progress=progress,
+    )
+
+
+def _weights(observations: Observations, fit: HybridFit) -> Tensor:
+    """(V, N) by the corners' covariances, and by what residuals have beyond these, which is the same for all.
+
+    Normalized to a mean information of one; 0 where a corner was not seen.
+    """
+    covariances = observations.covariances()
+    seen = torch.isfinite(fit.residuals).all(-1)
+    if covariances is None:
+        return seen.double()
+    own = 0.5 * covariances.diagonal(dim1=-2, dim2=-1).sum(-1)
+    total = 0.5 * fit.rms**2
+    information = 1.0 / (own + max(total - float(own[seen].mean()), 0.0))
+    return torch.where(seen, information / information[seen].mean(), 0.0).sqrt()
+
+
+def _without_outliers(
+    observations: Observations,
+    fit: HybridFit,
+    options: CalibrationOptions,
+    reject: OutlierRejection,
+    progress: Progress,
+) -> CameraCalibrationResult:
+    """Leave out corners and views that noise cannot explain, and fit again until nothing changes."""
+    pixels, names = observations.pixels(), observations.names
+    seen = torch.isfinite(pixels).all(-1)
+    own = _weights(observations, fit) if options.weighted else seen.double()
+    # A few wrong corners bend the first fit towards them; bounded weights let them stand out.
+    for _ in range(_CAUCHY_ROUNDS):
+        weighted = fit.residuals_of(pixels) * own[..., None]
+        scale = max(_CAUCHY_SCALE * float(noise_scale(weighted.flatten(0, 1))), LEAST_NOISE)
+        bounded = own / torch.sqrt(1.0 + (weighted.norm(dim=-1) / scale) ** 2)
+        fit = _fit(observations, pixels, torch.where(seen, bounded, 0.0), fit, options, progress)
+    left = list(range(len(pixels)))
+    rejected = torch.zeros_like(seen)
+    views: list[RejectedView] = []
+    for _ in range(_ROUNDS):
+        weighted = fit.residuals_of(pixels)[left] * own[left][..., None]
+        beyond = corners_beyond(weighted)
+        gone = views_beyond(observations.board.points, weighted, pixels[left], beyond)
+        if not gone and bool((beyond == rejected[left]).all()):
+            break
+        rms = view_rms(weighted, beyond)
+        for k, reason in gone.items():
+            count = int(seen[left[k]].sum())
+            views.append(RejectedView(view=names[left[k]], corners=count, residual=float(rms[k]), reason=reason))
+        rejected[left] = beyond
+        left = [i for k, i in enumerate(left) if k not in gone]
+        rejected[[i for i in range(len(pixels)) if i not in left]] = False
+        lost = int(rejected.sum()) + sum(view.corners for view in views)
+        check_share(lost, int(seen.sum()), views, reject.limit)
+        progress(f"{int(rejected.sum())} corners and {len(views)} views left out")
+        weights = torch.where(rejected, 0.0, own)[left]
+        used = observations.subset([names[i] for i in left])
+        fit = _fit(used, pixels[left], weights, None, options, progress).among(left, len(pixels))
+    plain = fit.residuals_of(pixels)
+    weighted = plain * own[..., None]
+    limits = corner_limits(torch.where(rejected[..., None], torch.nan, weighted))
+    corners = tuple(
+        RejectedCorner(
+            view=names[i],
+            corner=n,
+            residual=float(plain[i, n].norm()),
+            reason=f"{float(weighted[i, n].norm()):.2f} px off, noise explains {float(limits[i]):.2f} px",
+        )
+        for i, n in rejected.nonzero().tolist()
+    )
+    result = _result(observations, fit, options)
+    return dataclasses.replace(result, rejected_corners=corners, rejected_views=tuple(views))
+
+
+def _result(observations: Observations, fit: HybridFit, options: CalibrationOptions) -> CameraCalibrationResult:
+    """The result of a fit, with its warnings.
+
+    Raises:
+        DegenerateError: the focal length is hardly determined.
+    """
+    camera, covariance = fit.camera, fit.covariance
+    per_view = fit.residuals.square().sum(-1).nanmean(-1).sqrt()
+    spread = covariance.diagonal().sqrt()
+    sigma: dict[str, float | None] = {
+        name: float(value) for name, value in zip(camera.names, spread, strict=True) if name != "skew"
+    }
+    check_focal({name: float(spread[i]) for i, name in enumerate(("fx", "fy"))}, camera.params)
+    status = SolverStatus.CONVERGED if fit.converged else SolverStatus.ITERATION_LIMIT
+    used = [i for i in range(len(per_view)) if not math.isnan(float(per_view[i]))]
+    return CameraCalibrationResult(
+        camera=camera,
+        observations=observations,
+        rms=fit.rms,
+        weighted_rms=fit.weighted_rms if options.weighted and observations.covariances() is not None else None,
+        per_view_rms=per_view,
+        residuals=fit.residuals,
+        cam_from_board_rotation=fit.state.rotation,
+        cam_from_board_translation=fit.state.translation,
+        board_warp=None,
+        sigma=sigma,
+        covariance=covariance,
+        status=status,
+        iterations=fit.iterations,
+        hybrid=fit,
+        advice=what_to_photograph(observations, camera, fit.state.rotation),
+        warnings=(
+            *general_warnings([observations.names[i] for i in used], camera, fit.rms, per_view[used], (), status),
+            *hybrid_warnings(fit),
+            *outlier_warnings(observations.names, fit.residuals),
+        ),
+    )

@@ -1,0 +1,70 @@
+"""Sum up a calibration in the few numbers that tell whether a camera can be trusted."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+
+from kcal.calibrate.camera.advice import unreached_share
+from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.lens.pupil import pupil_depth
+from kcal.lens.uncertainty import image_sigma
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CalibrationSummary:
+    """What to read first.
+
+    Args:
+        center: px, standard deviation of a far direction in the middle of the image, after the best turn of the camera
+            (`kcal.lens.uncertainty.pixel_covariance`).
+        border: its median along the image's border.
+        worst: its largest value in the image; NaN where the camera has no error bars.
+        unreached: share of the image that no board reached.
+        pupil: meters by which the entrance pupil of the image's farthest corner lies before that of its middle; None
+            without a hybrid lens.
+        pupil_sigma: its standard deviation.
+    """
+
+    center: float
+    border: float
+    worst: float
+    unreached: float
+    pupil: float | None = None
+    pupil_sigma: float | None = None
+
+
+def summarize(result: CameraCalibrationResult) -> CalibrationSummary:
+    """The figures of one calibration."""
+    camera = result.camera
+    center = border = worst = math.nan
+    if camera.calibration is not None and camera.calibration.covariance is not None:
+        sigma = image_sigma(camera)
+        rows, columns = sigma.shape
+        edge = torch.cat([sigma[0], sigma[-1], sigma[1:-1, 0], sigma[1:-1, -1]])
+        center, border = float(sigma[rows // 2, columns // 2]), float(edge.nanmedian())
+        worst = float(sigma[sigma.isfinite()].max())
+    pupil, pupil_sigma = _pupil(result)
+    return CalibrationSummary(
+        center=center,
+        border=border,
+        worst=worst,
+        unreached=unreached_share(result.observations),
+        pupil=pupil,
+        pupil_sigma=pupil_sigma,
+    )
+
+
+def _pupil(result: CameraCalibrationResult) -> tuple[float | None, float | None]:
+    camera = result.camera
+    if not camera.model.hybrid:
+        return None, None
+    rays, valid = camera.unproject(camera.grid(17, 13).reshape(-1, 2))
+    angle = torch.acos(rays[valid][:, 2].clamp(-1.0, 1.0)).max()
+    place = [camera.names.index(name) for name in ("pupil1", "pupil2")]
+    slope = torch.stack([angle**2, angle**4])
+    depth = pupil_depth(angle[None] ** 2, camera.params.detach()[5:])
+    variance = slope @ result.covariance[place][:, place] @ slope
+    return float(depth[0]), math.sqrt(float(variance))

@@ -1,0 +1,87 @@
+"""How uncertain the image of a far direction is, from the covariance of a camera's parameters."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcal.checks import as_covariance, as_points
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.projection import project_components
+
+# Rays are continued to this distance, meters: far beyond what the entrance pupil matters for.
+_FAR = 1e9
+
+
+def pixel_covariance(
+    camera: Camera, pixels: Tensor, covariance: Tensor | None = None, *, grid: tuple[int, int] = (25, 17)
+) -> Tensor:
+    """Covariance of where the camera sees what is far away, after the best turn of the whole camera.
+
+    No board determines how the camera's frame is turned in its housing, and a rig solves its cameras' attitudes anew.
+    So the change of the image that a turn undoes does not count: the turn for which the squared change is smallest,
+    summed over a grid of the image (mrcal calls it the implied rotation at infinity).
+
+    Args:
+        camera: a single camera.
+        pixels: (..., N, 2).
+        covariance: (5 + P, 5 + P) of its parameters; None: that of its calibration.
+        grid: columns and rows.
+
+    Returns:
+        (..., N, 2, 2) px²; NaN where the camera has no ray.
+
+    Raises:
+        InputError: a batch of cameras, or a camera without a covariance.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
+        >>> shifts = torch.diag(torch.tensor([0.0, 0, 1, 1, 0], dtype=torch.float64))  # 1 px of the principal point
+        >>> found = pixel_covariance(camera, torch.tensor([[319.5, 239.5], [0.0, 0.0]]), shifts)
+        >>> [round(float(value), 2) for value in found[:, 0, 0].sqrt()]  # nearly a turn
+        [0.06, 0.15]
+    """
+    params = camera.params.detach()
+    if params.ndim != 1:
+        raise InputError("pixel_covariance: a single camera is needed, not a batch")
+    if covariance is None:
+        covariance = camera.calibration.covariance if camera.calibration is not None else None
+        if covariance is None:
+            raise InputError("pixel_covariance: the camera has no covariance: calibrate it with kcal, or give one")
+    as_covariance("pixel_covariance: covariance", covariance, len(params))
+    places = as_points("pixels", pixels, 2)
+    flat = places.reshape(-1, 2)
+    wanted = covariance.diagonal().nonzero()[:, 0].tolist()
+    by_camera, by_turn, good = _slopes(camera, camera.grid(*grid).reshape(-1, 2), wanted)
+    # The turn that best undoes each parameter's effect.
+    undo = torch.linalg.lstsq(by_turn[good].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
+    by_camera, by_turn, good = _slopes(camera, flat, wanted)
+    by_camera = by_camera - by_turn @ undo
+    found = by_camera @ covariance[wanted][:, wanted] @ by_camera.transpose(-1, -2)
+    return torch.where(good[:, None, None], found, torch.nan).reshape(*places.shape[:-1], 2, 2)
+
+
+def image_sigma(camera: Camera, columns: int = 33, rows: int = 25) -> Tensor:
+    """(rows, columns) standard deviation in pixels of far directions, in the direction in which it is largest.
+
+    On a grid whose outermost points are the outermost pixels, after the best turn (`pixel_covariance`); NaN where the
+    camera has no ray.
+    """
+    found = pixel_covariance(camera, camera.grid(columns, rows).reshape(-1, 2))
+    good = found.isfinite().all(-1).all(-1)
+    largest = torch.linalg.eigvalsh(torch.where(good[:, None, None], found, 0.0))[:, -1]
+    return torch.where(good, largest.clamp_min(0.0).sqrt(), torch.nan).reshape(rows, columns)
+
+
+def _slopes(camera: Camera, pixels: Tensor, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Derivatives of far directions' pixels by parameters (N, 2, C) and by a turn (N, 2, 3), and which have them."""
+    rays, valid = camera.unproject(pixels)
+    rays = torch.where(valid[:, None], rays, rays.new_tensor([0.0, 0.0, 1.0]))
+    seen = project_components(_FAR * rays.T, camera.params.detach(), camera.model, wanted)
+    x, y, z = (_FAR * rays).unbind(-1)
+    zero = torch.zeros_like(x)
+    # Derivatives of ω x p by each component of ω.
+    cross = torch.stack([torch.stack(axis) for axis in ((zero, -z, y), (z, zero, -x), (-y, x, zero))])
+    by_turn = torch.einsum("pin,kpn->nik", seen.by_point, cross)
+    return seen.by_camera.permute(2, 1, 0), by_turn, valid & seen.regular
