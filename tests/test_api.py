@@ -42,7 +42,9 @@ PUBLIC = {
     "Exclusion",
     "Failure",
     "Features",
+    "FieldModes",
     "FileError",
+    "GaussianModes",
     "Geoid",
     "HybridForm",
     "InputError",
@@ -68,6 +70,7 @@ PUBLIC = {
     "Mounting",
     "Observations",
     "Origin",
+    "NetworkModes",
     "OutlierRejection",
     "Position",
     "PositionStatus",
@@ -155,6 +158,7 @@ PUBLIC = {
     "save_rig",
     "save_rig_picture",
     "solve_rig",
+    "train_features",
     "train_inverse",
     "triangulated_sides",
     "true_from_grid",
@@ -188,6 +192,7 @@ RECORDS = {
     "MatchStatus",
     "Matches",
     "MeasuredPosition",
+    "NetworkModes",
     "OutlierRejection",
     "Position",
     "PositionStatus",
@@ -212,6 +217,7 @@ RECORDS = {
 }
 # They write a picture or page of a whole result, or need a video or observations: the tests of their rooms show them.
 WITHOUT_EXAMPLE = {
+    "FieldModes",
     "detect_video",
     "paired_boards",
     "read_pairs",

@@ -12,6 +12,7 @@ prior on h (type-II maximum likelihood, MacKay 1992; restricted maximum likeliho
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,20 +22,30 @@ from torch import Tensor
 
 from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.board_modes import BoardModes
+from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.zernike import ASPECT, RADIAL
+from kcal.lens.zernike import ZernikeModes
 
-# ln amplitude of the four families of fields (in units of R), decays per degree of radial and of other fields,
-# pupil (in units of the board's range), board: bending, stretch, print (in units of its extent): mean and sd of ln.
-_MEAN = np.log([5e-4, 3e-4, 5e-5, 4e-5, 0.5, 0.6, 2e-4, 5e-4, 5e-4, 2e-4])
-_SD = np.array([1.75, 1.5, 1.75, 1.75, 0.7, 0.5, 2.0, 1.5, 1.5, 1.5])
-_DECAY, _PUPIL, _BOARD = 4, 6, 7
-# Degree at which each family of fields begins: amplitudes refer to it.
-_FIRST_DEGREE = torch.tensor([5.0, 2.0, 3.0, 2.0, 1.0], dtype=torch.float64)
+# After the hyperparameters of the modes: ln amplitudes of the pupil (in units of the board's range) and of the board:
+# bending, stretch, print (in units of its extent): mean and sd of ln.
+_MEAN = np.log([2e-4, 5e-4, 5e-4, 2e-4])
+_SD = np.array([2.0, 1.5, 1.5, 1.5])
 # Unequal and skewed axes, in units of R: pixels are square.
 SQUARE, ANALOG = 1e-4, 2e-3
 # Of the principal point about the middle, in diagonals.
 _CENTER = 0.05
+
+
+class Hyperprior(NamedTuple):
+    """A normal prior of the hyperparameters h.
+
+    Attributes:
+        mean: (H,).
+        sd: (H,) standard deviations.
+    """
+
+    mean: Tensor
+    sd: Tensor
 
 
 class PriorFamilies(NamedTuple):
@@ -93,35 +104,42 @@ def prior_families(
     leading = [focal, _CENTER * diagonal, _CENTER * diagonal, 1.0 + 0.5 / corner**2, distance, distance]
     mean = torch.zeros(len(leading) + len(form.modes) + len(board.unit), dtype=torch.float64)
     mean[:4] = torch.tensor([focal, (size[0] - 1) / 2, (size[1] - 1) / 2, 0.5 - form.shape])
-    _, _, family, degree = torch.tensor(form.modes.real_modes).T
-    above = (degree - _FIRST_DEGREE[family]).clamp_min(-1.0)
-    field_unit = torch.full((len(family),), math.log(form.radius), dtype=torch.float64)
-    field_unit[family == ASPECT] += math.log(square)
-    none = torch.full((len(leading),), -1)
-    pupils = torch.tensor([-1, -1, -1, -1, _PUPIL, _PUPIL])
-    zeros = torch.zeros(len(leading), dtype=torch.float64)
+    amplitude, decay, degree = zip(*form.modes.weight_priors, strict=True)
+    by_pupil = len(form.modes.hyperprior)
+    # Without an amplitude: how surely pixels are square.
+    field_unit = [math.log(form.radius) + (math.log(square) if own is None else 0.0) for own in amplitude]
+    none = [-1] * len(leading)
     return PriorFamilies(
         mean,
-        torch.cat([torch.tensor(leading, dtype=torch.float64).log(), field_unit, board.unit.log()]),
-        torch.cat([pupils, torch.where(family == ASPECT, -1, family), _BOARD + board.family]),
-        torch.cat(
-            [
-                none,
-                torch.where(family == ASPECT, -1, torch.where(family == RADIAL, _DECAY, _DECAY + 1)),
-                torch.full_like(board.family, -1),
-            ]
-        ),
-        torch.cat([zeros, torch.where(family == ASPECT, 0.0, above), torch.zeros_like(board.unit)]),
+        torch.cat([torch.tensor([*map(math.log, leading), *field_unit], dtype=torch.float64), board.unit.log()]),
+        torch.cat([torch.tensor([*none[:-2], by_pupil, by_pupil, *_numbers(amplitude)]), by_pupil + 1 + board.family]),
+        torch.cat([torch.tensor([*none, *_numbers(decay)]), torch.full_like(board.family, -1)]),
+        torch.cat([torch.tensor([0.0] * len(leading) + [*degree], dtype=torch.float64), torch.zeros_like(board.unit)]),
     )
 
 
-def typical_hyperparameters() -> Tensor:
-    """(H,) means of the hyperprior."""
-    return torch.from_numpy(_MEAN.copy())
+def _numbers(indices: Sequence[int | None]) -> list[int]:
+    return [-1 if index is None else index for index in indices]
+
+
+def typical_hyperprior(modes: FieldModes | None = None) -> Hyperprior:
+    """That of a camera and a board of which nothing is known; without modes, for the default field."""
+    mean, sd = np.array((modes or ZernikeModes()).hyperprior).T
+    return Hyperprior(
+        torch.from_numpy(np.concatenate([mean, _MEAN])),
+        torch.from_numpy(np.concatenate([sd, _SD])),
+    )
 
 
 def maximize_evidence(
-    K: Tensor, g: Tensor, c: float, freedom: float, families: PriorFamilies, h: Tensor, variance: float
+    K: Tensor,
+    g: Tensor,
+    c: float,
+    freedom: float,
+    families: PriorFamilies,
+    h: Tensor,
+    variance: float,
+    hyperprior: Hyperprior | None = None,
 ) -> tuple[Tensor, float, float]:
     """The hyperparameters and the noise variance of largest evidence, and its negative logarithm.
 
@@ -133,8 +151,10 @@ def maximize_evidence(
         families: the priors.
         h: start.
         variance: start.
+        hyperprior: of h; the typical one of the default field if not given.
     """
     K_, g_, S = K.numpy(), g.numpy(), len(g)
+    h_mean, h_sd = (part.numpy() for part in hyperprior or typical_hyperprior())
 
     def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
         here, log_variance = torch.from_numpy(v[:-1]), v[-1]
@@ -153,12 +173,12 @@ def maximize_evidence(
         value = 0.5 * (freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
         by_variance = 0.5 * (1 - y * y - kept)
         by_h = families.slopes(here).numpy() @ by_variance
-        z = (v[:-1] - _MEAN) / _SD
+        z = (v[:-1] - h_mean) / h_sd
         by_noise = 0.5 * (freedom - (S - kept.sum()) - rss / s2)
-        return value + 0.5 * z @ z, np.append(by_h + z / _SD, by_noise)
+        return value + 0.5 * z @ z, np.append(by_h + z / h_sd, by_noise)
 
     start = np.append(h.numpy(), math.log(variance))
-    bounds = [(m - 5 * s, m + 5 * s) for m, s in zip(_MEAN, _SD, strict=True)]
+    bounds = [(m - 5 * s, m + 5 * s) for m, s in zip(h_mean, h_sd, strict=True)]
     bounds.append((max(start[-1] - 8, 2.0 * math.log(LEAST_NOISE)), start[-1] + 8))
     found = lbfgs(
         objective,

@@ -18,12 +18,13 @@ from kcal.calibrate.lensfit.evidence import (
     PriorFamilies,
     maximize_evidence,
     prior_families,
-    typical_hyperparameters,
+    typical_hyperprior,
 )
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, hybrid_unknowns
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.base_map import angle_over_radius
 from kcal.lens.camera import Camera
+from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import LEADING, HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
@@ -119,7 +120,7 @@ def fit_hybrid(
     pixels: Tensor,
     size: tuple[int, int],
     weights: Tensor | None = None,
-    modes: ZernikeModes | None = None,
+    modes: FieldModes | None = None,
     exact_board: bool = False,
     square: float = SQUARE,
     focal: float | None = None,
@@ -159,6 +160,9 @@ def fit_hybrid(
         )
         spent = 0
     model, families, state, h, variance, tempering = estimate
+    form = model.hybrid
+    assert form is not None
+    hyperprior = typical_hyperprior(form.modes)
     never = torch.zeros_like(families.mean, dtype=torch.bool)
     if exact_board:
         never[-len(board.unit) :] = True
@@ -185,7 +189,7 @@ def fit_hybrid(
             # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
             tempering = found if turn < 2 else math.sqrt(tempering * found)
         h_new, noise, loss = maximize_evidence(
-            K / tempering, g / tempering, c / tempering, freedom / tempering, families, h, variance / former
+            K / tempering, g / tempering, c / tempering, freedom / tempering, families, h, variance / former, hyperprior
         )
         change = float((h_new - h).abs().max())
         h, variance = h_new, noise * tempering
@@ -194,10 +198,8 @@ def fit_hybrid(
             converged = True
             break
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
-    form = model.hybrid
-    assert form is not None
-    degree = torch.tensor([mode[-1] for mode in form.modes.real_modes])
-    shift = families.deviation(h)[_LEADING : -len(board.unit)] * float(state.params[0]) * (degree + 1).sqrt()
+    peaks = torch.tensor(form.modes.peaks, dtype=torch.float64)
+    shift = families.deviation(h)[_LEADING : -len(board.unit)] * float(state.params[0]) * peaks
     never[_LEADING : -len(board.unit)] |= shift < _UNFELT
     state.params[5 + len(LEADING) :][shift < _UNFELT] = 0.0
     problem, state, steps = solve(10, 0.01)
@@ -239,7 +241,7 @@ def _base_alone(
     pixels: Tensor,
     size: tuple[int, int],
     weights: Tensor,
-    modes: ZernikeModes,
+    modes: FieldModes,
     board: BoardModes,
     square: float,
     known_focal: float | None,
@@ -248,7 +250,7 @@ def _base_alone(
     focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal)
     radius = _REACH * 0.5 * math.hypot(*size)
     distance = float(translation.norm(dim=-1).median())
-    h, spent = typical_hyperparameters(), 0
+    h, spent = typical_hyperprior(modes).mean, 0
 
     def constants(focal: float, shape: float) -> tuple[LensModel, PriorFamilies]:
         form = HybridForm(shape=shape, radius=radius / focal, modes=modes)

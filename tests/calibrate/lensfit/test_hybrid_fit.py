@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.lensfit.board_modes import BENDING, PRINT, STRETCH, board_modes
-from kcal.calibrate.lensfit.evidence import maximize_evidence, prior_families, typical_hyperparameters
+from kcal.calibrate.lensfit.evidence import maximize_evidence, prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.corners.board import Board
@@ -184,7 +184,7 @@ def linear_case() -> tuple[Tensor, Tensor, float, object]:
     families = prior_families(_form(), 800.0, board, SIZE, 0.6)
     generator = torch.Generator().manual_seed(5)
     rows = torch.randn(400, len(families.mean), generator=generator, dtype=torch.float64)
-    rows = rows / families.deviation(typical_hyperparameters())
+    rows = rows / families.deviation(typical_hyperprior().mean)
     target = 0.3 * torch.randn(400, generator=generator, dtype=torch.float64)
     assert len(families.mean) == 3 + model.size + 28
     return rows.T @ rows, rows.T @ target, float(target @ target), families
@@ -198,7 +198,7 @@ def _form():
 
 def test_prior_slopes() -> None:
     _, _, _, families = linear_case()
-    h = typical_hyperparameters()
+    h = typical_hyperprior().mean
     numeric = []
     for k in range(len(h)):
         step = torch.zeros_like(h)
@@ -211,16 +211,15 @@ def test_prior_slopes() -> None:
 def test_evidence_is_that_of_the_linear_model() -> None:
     """-ln p of a Gaussian linear model, by the covariance of the data, up to a constant; and it is a maximum."""
     K, g, c, families = linear_case()
-    h, variance, loss = maximize_evidence(K, g, c, 400.0, families, typical_hyperparameters(), 0.09)
+    h, variance, loss = maximize_evidence(K, g, c, 400.0, families, typical_hyperprior().mean, 0.09)
 
     def value(h: Tensor, variance: float) -> float:
-        from kcal.calibrate.lensfit.evidence import _MEAN, _SD
-
         d = families.deviation(h)
         A = K * d[:, None] * d / variance + torch.eye(len(d), dtype=torch.float64)
         b = d * g / variance
         fit = c / variance - float(b @ torch.linalg.solve(A, b))
-        z = (h.numpy() - _MEAN) / _SD
+        mean, sd = typical_hyperprior()
+        z = ((h - mean) / sd).numpy()
         return 0.5 * (400.0 * math.log(variance) + fit + float(torch.logdet(A))) + 0.5 * float(z @ z)
 
     assert loss == pytest.approx(value(h, variance), rel=1e-9)
