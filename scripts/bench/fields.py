@@ -133,8 +133,8 @@ def main() -> None:
         "sorted by how modes turn around the axis. *gaussian*: units on square grids, from one radius of the disc down "
         "by halves. *network*: the last layer over a fixed hidden layer of tanh features, which are random or trained "
         "on the field and the residuals of a first fit with Zernike modes (that fit is part of the CPU seconds). "
-        f"Held out: RMS in pixels of {arguments.wide_folds} folds of whole blocks of views of the wide lens (by the file's "
-        f"weights), and of {arguments.stereo_folds} single views of OpenCV's images, poses solved again. "
+        f"Held out: RMS in pixels of {arguments.wide_folds} folds of whole blocks of views of the wide lens (by the "
+        f"file's weights), and of {arguments.stereo_folds} single views of OpenCV's images, poses solved again. "
         "Effective: parameters of lens and board that the views determine, of the weights of the field and some more "
         "(medians). Tempering: by how much residuals repeat within views. CPU seconds: per fit, one thread.",
     ]

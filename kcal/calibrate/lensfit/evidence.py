@@ -156,6 +156,8 @@ def maximize_evidence(
     K_, g_, S = K.numpy(), g.numpy(), len(g)
     h_mean, h_sd = (part.numpy() for part in hyperprior or typical_hyperprior())
 
+    values: list[float] = []
+
     def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
         here, log_variance = torch.from_numpy(v[:-1]), v[-1]
         s2 = math.exp(log_variance)
@@ -164,7 +166,8 @@ def maximize_evidence(
         A.diagonal().add_(1.0)
         root, info = torch.linalg.cholesky_ex(A)
         if int(info):
-            return 1e30, np.zeros_like(v)
+            # Priors are far too wide for this precision: worse than any trial before, so that a shorter step follows.
+            return max(values, default=1e30) + 1.0, np.zeros_like(v)
         inverse = torch.linalg.solve_triangular(root, torch.eye(S, dtype=A.dtype), upper=False).numpy()
         y = inverse.T @ (inverse @ (d * g_ / s2))
         kept = (inverse**2).sum(0)
@@ -175,11 +178,13 @@ def maximize_evidence(
         by_h = families.slopes(here).numpy() @ by_variance
         z = (v[:-1] - h_mean) / h_sd
         by_noise = 0.5 * (freedom - (S - kept.sum()) - rss / s2)
-        return value + 0.5 * z @ z, np.append(by_h + z / h_sd, by_noise)
+        values.append(value + 0.5 * float(z @ z))
+        return values[-1], np.append(by_h + z / h_sd, by_noise)
 
     start = np.append(h.numpy(), math.log(variance))
-    bounds = [(m - 5 * s, m + 5 * s) for m, s in zip(h_mean, h_sd, strict=True)]
-    bounds.append((max(start[-1] - 8, 2.0 * math.log(LEAST_NOISE)), start[-1] + 8))
+    # The last bound is open: where all are closed, L-BFGS-B makes its first trial at the bounds.
+    bounds: list[tuple[float, float | None]] = [(m - 5 * s, m + 5 * s) for m, s in zip(h_mean, h_sd, strict=True)]
+    bounds.append((max(start[-1] - 8, 2.0 * math.log(LEAST_NOISE)), None))
     found = lbfgs(
         objective,
         start,

@@ -232,6 +232,24 @@ def test_evidence_is_that_of_the_linear_model() -> None:
     assert value(h, variance / 1.2) > loss
 
 
+def test_evidence_is_found_where_a_trial_cannot_be_factorized() -> None:
+    """Data that determine few directions very well: at the bounds the matrix cannot be factorized."""
+    _, _, _, families = linear_case()
+    h = typical_hyperprior().mean
+    generator = torch.Generator().manual_seed(2)
+    wide = families.deviation(h)
+    few = 1e2 * torch.randn(400, 5, generator=generator, dtype=torch.float64)
+    rows = few @ torch.randn(5, len(wide), generator=generator, dtype=torch.float64) / wide
+    truth = 30.0 * wide * torch.randn(len(wide), generator=generator, dtype=torch.float64)
+    target = rows @ truth + 0.3 * torch.randn(400, generator=generator, dtype=torch.float64)
+    data = rows.T @ rows, rows.T @ target, float(target @ target), 400.0
+    found, variance, loss = maximize_evidence(*data, families, h, 100.0)
+    assert float((found - h).abs().max()) > 0.5
+    assert variance < 1.0
+    _, _, again = maximize_evidence(*data, families, found, variance)
+    assert loss == pytest.approx(again, abs=0.5)
+
+
 def test_rows_are_derivatives_of_residuals() -> None:
     found = printed()
     state = found.state
