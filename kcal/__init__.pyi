@@ -78,6 +78,8 @@ from kcal.lens.calibration import Exclusion as Exclusion
 from kcal.lens.calibration import RigCalibration as RigCalibration
 from kcal.lens.calibration import RigSource as RigSource
 from kcal.lens.camera import Camera as Camera
+from kcal.lens.field_modes import FieldModes as FieldModes
+from kcal.lens.gaussian_modes import GaussianModes as GaussianModes
 from kcal.lens.hybrid_terms import HybridForm as HybridForm
 from kcal.lens.images import Undistort as Undistort
 from kcal.lens.images import UndistortMaps as UndistortMaps
@@ -88,6 +90,7 @@ from kcal.lens.modules import LearnedStart as LearnedStart
 from kcal.lens.modules import Unproject as Unproject
 from kcal.lens.mounting import Mounting as Mounting
 from kcal.lens.mounting import Origin as Origin
+from kcal.lens.network_modes import NetworkModes as NetworkModes
 from kcal.lens.pinhole import new_pinhole as new_pinhole
 from kcal.lens.rig import RigCovariance as RigCovariance
 from kcal.lens.rig import StereoRig as StereoRig
@@ -137,6 +140,7 @@ from kcal.locate.triangulate import Triangulate as Triangulate
 from kcal.locate.triangulate import Triangulation as Triangulation
 from kcal.locate.truth import position_errors as position_errors
 from kcal.locate.truth import read_truth as read_truth
+from kcal.nets.field_features import train_features as train_features
 from kcal.nets.inverse import InverseFit as InverseFit
 from kcal.nets.inverse import InverseNet as InverseNet
 from kcal.nets.inverse import InverseNetOptions as InverseNetOptions

@@ -44,7 +44,9 @@ PUBLIC = {
     "Exclusion",
     "Failure",
     "Features",
+    "FieldModes",
     "FileError",
+    "GaussianModes",
     "Geoid",
     "HybridFit",
     "HybridForm",
@@ -73,6 +75,7 @@ PUBLIC = {
     "Mounting",
     "Observations",
     "Origin",
+    "NetworkModes",
     "OutlierRejection",
     "Position",
     "PositionStatus",
@@ -170,6 +173,7 @@ PUBLIC = {
     "save_rig_picture",
     "solve_rig",
     "summarize",
+    "train_features",
     "train_inverse",
     "triangulated_sides",
     "true_from_grid",
@@ -204,6 +208,7 @@ RECORDS = {
     "Matches",
     "MeasuredBoard",
     "MeasuredPosition",
+    "NetworkModes",
     "OutlierRejection",
     "Position",
     "PositionStatus",
@@ -228,6 +233,7 @@ RECORDS = {
 }
 # They write a picture or page of a whole result, or need a video or observations: the tests of their rooms show them.
 WITHOUT_EXAMPLE = {
+    "FieldModes",
     "detect_video",
     "paired_boards",
     "read_pairs",

@@ -7,8 +7,10 @@ from typing import Any
 import pydantic
 
 from kcal.io.record import Record
+from kcal.lens.gaussian_modes import GaussianModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
+from kcal.lens.network_modes import NetworkModes
 from kcal.lens.zernike import ZernikeModes
 
 
@@ -21,18 +23,62 @@ class ZernikeRecord(Record):
     other: int
 
 
+class GaussianRecord(Record):
+    """Gaussian units by their widths (`kcal.lens.gaussian_modes.GaussianModes`)."""
+
+    widths: tuple[float, ...]
+
+
+class NetworkRecord(Record):
+    """A fixed hidden layer: a, b, c of each feature (`kcal.lens.network_modes.NetworkModes`)."""
+
+    hidden: tuple[tuple[float, float, float], ...]
+
+
+# The key under which a file has each kind of field.
+_KINDS: dict[str, tuple[type[Record], type]] = {
+    "modes": (ZernikeRecord, ZernikeModes),
+    "gaussian": (GaussianRecord, GaussianModes),
+    "network": (NetworkRecord, NetworkModes),
+}
+
+
 class HybridRecord(Record):
     """The constants of a hybrid lens (`kcal.lens.hybrid_terms.HybridForm`).
 
     Args:
         shape: of the base projection.
         radius: of the disc of the field, on the plane of the base projection.
-        modes: of the field.
+        modes: of the field, if they are Zernike modes; exactly one of this and the following is in a file.
+        gaussian: of the field, if it is made of Gaussian units.
+        network: of the field, if it is the last layer of a network.
     """
 
     shape: float
     radius: float
-    modes: ZernikeRecord
+    modes: ZernikeRecord | None = None
+    gaussian: GaussianRecord | None = None
+    network: NetworkRecord | None = None
+
+    @pydantic.model_serializer(mode="wrap")
+    def _without_other_kinds(self, plain: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        stored: dict[str, Any] = plain(self)
+        return {key: value for key, value in stored.items() if value is not None}
+
+    @classmethod
+    def of(cls, form: HybridForm) -> HybridRecord:
+        """The constants of a lens."""
+        key, record = next((key, record) for key, (record, kind) in _KINDS.items() if isinstance(form.modes, kind))
+        fields = {key: record.model_validate(form.modes, from_attributes=True)}
+        return cls.model_validate({"shape": form.shape, "radius": form.radius, **fields})
+
+    def form(self) -> HybridForm:
+        """The `HybridForm` with these constants."""
+        given = [key for key in _KINDS if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(f"a field has one kind, {' or '.join(_KINDS)}; got {' and '.join(given) or 'none'}")
+        modes = _KINDS[given[0]][1](**dict(getattr(self, given[0])))
+        return HybridForm(shape=self.shape, radius=self.radius, modes=modes)
 
 
 class LensOrders(Record):
@@ -71,15 +117,9 @@ class LensOrders(Record):
     @classmethod
     def of(cls, model: LensModel) -> LensOrders:
         """The orders of a lens model."""
-        return cls.model_validate(model, from_attributes=True)
+        orders = {name: getattr(model, name) for name in cls.model_fields}
+        return cls(**orders | {"hybrid": model.hybrid and HybridRecord.of(model.hybrid)})
 
     def model(self) -> LensModel:
         """The `LensModel` with these orders."""
-        orders = dict(self)
-        if self.hybrid is not None:
-            orders["hybrid"] = HybridForm(
-                shape=self.hybrid.shape,
-                radius=self.hybrid.radius,
-                modes=ZernikeModes(**dict(self.hybrid.modes)),
-            )
-        return LensModel(**orders)
+        return LensModel(**dict(self) | {"hybrid": self.hybrid and self.hybrid.form()})

@@ -21,6 +21,7 @@ from kcal.lens.projection import INTRINSICS, to_pixels
 from kcal.lens.pupil import pupil_depth, ray_starts
 from kcal.lens.region import SURE, Region
 from kcal.lens.tracing import is_traced, may_overwrite
+from kcal.lens.zernike import ZernikeModes
 
 # Pixels: left out of each polynomial; largest difference to the formulas; what the last step of an inverse may leave.
 _LEFT_OUT, _LARGEST_ERROR, _REMAINDER = 5e-11, 5e-10, 1e-10
@@ -61,6 +62,8 @@ class FittedPolynomials:
 def worth_fitting(points: Tensor, parameters: Tensor, model: LensModel) -> bool:
     """Whether polynomials may map these points (..., N, K), and are worth their fit."""
     if is_traced() or model.hybrid is None or parameters.ndim > 1:
+        return False
+    if not isinstance(model.hybrid.modes, ZernikeModes):
         return False
     on_host = points.device.type == "cpu" and parameters.device.type == "cpu"
     return on_host and points.numel() >= FEWEST * points.shape[-1] and may_overwrite(points, parameters)
@@ -133,6 +136,7 @@ def fit_backward(forward: Forward, parameters: Tensor, model: LensModel, ready: 
 
 def _degrees(form: HybridForm) -> dict[int, int]:
     """Highest degree of each j in the field, and enough for the shape of the base projection in the radial profile."""
+    assert isinstance(form.modes, ZernikeModes)
     found = {1: form.modes.radial + 20}
     for j, degree in form.modes.complex_modes:
         found[j] = max(found.get(j, 0), degree)

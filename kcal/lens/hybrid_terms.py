@@ -4,9 +4,10 @@ On the plane of the base projection with shape s₀ (`kcal.lens.base_map`), wher
 
     (x_D, y_D) = (1 + δ m² G(s₀ m²)) (x, y) + Σ w_k Z_k(x / ρ, y / ρ)
 
-δ ("shape") corrects the shape of the base projection. Z_k are the Zernike fields of `kcal.lens.zernike` on the disc of
-radius ρ. Two more coefficients, ζ₁ and ζ₂ ("pupil1" and "pupil2"), move the entrance pupil: a ray at the angle θ from
-the optical axis starts at (0, 0, ζ₁ θ² + ζ₂ θ⁴), in meters (`kcal.lens.pupil`).
+δ ("shape") corrects the shape of the base projection. Z_k are fields on the disc of radius ρ: those of
+`kcal.lens.zernike`, or another kind of `kcal.lens.field_modes`. Two more coefficients, ζ₁ and ζ₂ ("pupil1" and
+"pupil2"), move the entrance pupil: a ray at the angle θ from the optical axis starts at (0, 0, ζ₁ θ² + ζ₂ θ⁴), in
+meters (`kcal.lens.pupil`).
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.base_map import growth_by_shape, largest_base_radius
-from kcal.lens.zernike import RADIAL, ZernikeModes, unbind_last
+from kcal.lens.field_modes import FieldModes
+from kcal.lens.zernike import ZernikeModes, unbind_last
 
 # The coefficients before the field's weights.
 LEADING = ("shape", "pupil1", "pupil2")
@@ -34,7 +36,7 @@ class HybridForm:
         shape: s₀ of the base projection: 1 is a pinhole, 1/4 stereographic, 0 equidistant.
         radius: ρ of the disc on which the field is defined, on the plane of the base projection. Points outside the
             disc are not valid.
-        modes: the Zernike modes of the field.
+        modes: of the field: `ZernikeModes`, `GaussianModes` or `NetworkModes`.
 
     Attributes:
         reach: largest distance from the origin of the plane that is valid: ρ, or less where the base projection ends.
@@ -51,7 +53,7 @@ class HybridForm:
 
     shape: float
     radius: float
-    modes: ZernikeModes = dataclasses.field(default_factory=ZernikeModes)
+    modes: FieldModes = dataclasses.field(default_factory=ZernikeModes)
 
     # Computed once: compilers cannot trace lazily computed attributes.
     reach: float = dataclasses.field(init=False, repr=False, compare=False)
@@ -73,8 +75,7 @@ class HybridForm:
     @property
     def radial_names(self) -> frozenset[str]:
         """Names of the coefficients of a lens that is symmetric about its axis."""
-        modes = zip(self.modes.names, self.modes.real_modes, strict=True)
-        return frozenset({LEADING[0], *(name for name, (_, _, family, _) in modes if family == RADIAL)})
+        return self.modes.radial_names | {LEADING[0]}
 
 
 def hybrid_terms(

@@ -25,10 +25,15 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.lens.field_modes import WeightPrior
 from kcal.lens.tracing import may_overwrite
 
 RADIAL, DECENTERED, ASTIGMATIC, OTHER, ASPECT = range(5)
 
+# Median and sd of ln: amplitudes of the families in this order, decays per degree of radial and of other modes.
+# Below: the degrees at which these families begin, to which the amplitudes refer.
+_HYPERPRIOR = ((5e-4, 1.75), (3e-4, 1.5), (5e-5, 1.75), (4e-5, 1.75), (0.5, 0.7), (0.6, 0.5))
+_FIRST_DEGREE = (5, 2, 3, 2)
 # The coefficients of Jacobi polynomials by powers of t grow by 2.4 with each second degree: 5e7 at degree 40.
 _HIGHEST = 40
 # Real and imaginary part of a complex number for each point.
@@ -113,6 +118,33 @@ class ZernikeModes:
     def __len__(self) -> int:
         """Number of real weights."""
         return len(self.real_modes)
+
+    @property
+    def radial_names(self) -> frozenset[str]:
+        """See `FieldModes`."""
+        return frozenset(
+            name for name, (_, _, family, _) in zip(self.names, self.real_modes, strict=True) if family == RADIAL
+        )
+
+    @property
+    def hyperprior(self) -> tuple[tuple[float, float], ...]:
+        """See `FieldModes`: amplitudes of the four families, then decays per degree of radial and of other modes."""
+        return tuple((math.log(value), sd) for value, sd in _HYPERPRIOR)
+
+    @property
+    def weight_priors(self) -> tuple[WeightPrior, ...]:
+        """See `FieldModes`."""
+        return tuple(
+            WeightPrior(None, None, 0.0)
+            if family == ASPECT
+            else WeightPrior(family, 4 if family == RADIAL else 5, max(degree - _FIRST_DEGREE[family], -1.0))
+            for _, _, family, degree in self.real_modes
+        )
+
+    @property
+    def peaks(self) -> tuple[float, ...]:
+        """See `FieldModes`."""
+        return tuple(math.sqrt(degree + 1) for *_, degree in self.real_modes)
 
     def columns(self, x: Tensor, y: Tensor) -> Tensor:
         """Evaluate each real mode at places (x, y) (...) of the unit disc: (M, 2, ...)."""

@@ -30,6 +30,7 @@ from kcal.lens.inverse_start import start_from, undo_tilt
 from kcal.lens.model import LensModel
 from kcal.lens.newton import TOLERANCE
 from kcal.lens.projection import from_pixels
+from kcal.lens.zernike import ZernikeModes
 from kcal.nets.inverse import InverseNetOptions, train_inverse
 from scripts.bench.lens import LENS, SIZE
 from scripts.bench.lens import build as build_hd
@@ -46,8 +47,9 @@ FOLDING = [-0.2535, 0.0924, -0.0006, 0.0007, -0.0191]
 
 def hybrid() -> Camera:
     """A lens between pinhole and stereographic with all default modes, decaying with their degree as real ones do."""
-    form = HybridForm(shape=0.7, radius=0.8)
-    degree = torch.tensor([mode[-1] for mode in form.modes.real_modes], dtype=torch.float64)
+    modes = ZernikeModes()
+    form = HybridForm(shape=0.7, radius=0.8, modes=modes)
+    degree = torch.tensor([mode[-1] for mode in modes.real_modes], dtype=torch.float64)
     noise = torch.randn(len(degree), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     weights = (3e-4 * torch.exp(-0.5 * (degree - 3)) * noise).tolist()
     return Camera.build(

@@ -14,7 +14,6 @@ import cv2
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.compare import compare_models
-from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
@@ -33,6 +32,7 @@ MODELS = {
     "22": "ext22",
     "24": "ext24",
 }
+ALL = {**MODELS, "hybrid": "hybrid"}
 NAN = math.nan
 # What ends one model and not the whole run; the page lists it.
 REFUSED = (KcalError, RuntimeError)
@@ -72,11 +72,9 @@ class _Run:
         self.result["bound"] = bound(self.scene)
         self.result["targets"] = self.scene.targets.enu.tolist()
         self.result["target_pixels"] = self.scene.target_marks.true_left.tolist()
-        for label, model in MODELS.items():
+        for label, model in ALL.items():
             if label not in self.result["located"]:
                 self._model(label, model)
-        if "hybrid" not in self.result["located"]:
-            self._hybrid()
         if not self.result["held_out"]:
             self._held_out()
         if not {"OpenCV", "OpenCV, kcal's rig"} <= set(self.result["located"]):
@@ -93,29 +91,15 @@ class _Run:
                 self.result["failed"].append(f"{label}: {error}")
         self._locate(label, pair)
 
-    def _hybrid(self) -> None:
-        pair = None
-        with self._stage("calibrate, hybrid"):
-            try:
-                found = {
-                    side: fit_hybrid(seen.board.points, seen.pixels(), seen.image_size)
-                    for side, seen in self.seen.items()
-                }
-                pair = {side: (each.camera, each.rms) for side, each in found.items()}
-            except REFUSED as error:
-                self.result["failed"].append(f"hybrid: {error}")
-        self._locate("hybrid", pair)
-
     def _held_out(self) -> None:
         """RMS of views that were held out, of both cameras together."""
-        models = {**MODELS, "hybrid": "hybrid"}
         with self._stage("compare, all"):
             # Poses are drawn and have no neighbors: every view may be held out for itself.
             found = [
-                compare_models(seen, tuple(models.values()), groups="views", options=CalibrationOptions())
+                compare_models(seen, tuple(ALL.values()), groups="views", options=CalibrationOptions())
                 for seen in self.seen.values()
             ]
-        for label, model in models.items():
+        for label, model in ALL.items():
             squared = sum(each.rms[model] ** 2 for each in found) / len(found)
             self.result["held_out"][label] = math.sqrt(squared) if math.isfinite(squared) else NAN
         self._keep()

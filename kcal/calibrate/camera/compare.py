@@ -22,10 +22,10 @@ from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.options import HYBRID, CalibrationOptions
-from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
+from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
 
@@ -99,8 +99,8 @@ def compare_models(
             views that differ from the others as the groups differ from each other.
         parts: the groups are dealt into so many parts, each of which is held out once. As many parts as groups leave
             out one group at a time.
-        options: for the parametric models; not given: with the board's warp. Of these, `board`, `weighted`, `focal` and
-            `field_of_view` also apply to the hybrid.
+        options: for the parametric models; not given: with the board's warp. The hybrid takes
+            `board`, `analog`, `weighted`, `focal` and `field_of_view` of them.
         progress: called after each fit.
 
     Returns:
@@ -149,14 +149,14 @@ def compare_models(
         for number, model in enumerate(models):
             progress(f"{names[number]}, part {part + 1} of {parts}")
             try:
-                found = _fit_model(train, model, options)
+                found = calibrate_camera(train, _options(model, options))
             except KcalError as error:
                 failures[names[number]] = error
                 continue
             covariances = observations.covariances() if options.weighted else None
             if covariances is not None and not weighted:
                 weights, weighted = whitening(covariances, 0.5 * found.rms**2), True
-            by_view = _held_out(found, observations.pixels()[out], weights[out])
+            by_view = _held_out(found.camera, found.board_points, observations.pixels()[out], weights[out])
             for g in held:
                 costs[number, g] = by_view[[out.index(i) for i in members[g]]].sum()
     if not bool(costs.isfinite().any()) and failures:
@@ -170,17 +170,12 @@ def compare_models(
     )
 
 
-def _fit_model(
-    observations: Observations, model: str | LensModel, options: CalibrationOptions
-) -> CameraCalibrationResult:
-    own = (
-        dataclasses.replace(options, model=model)
-        if model != HYBRID
-        else CalibrationOptions(
-            board=options.board, weighted=options.weighted, focal=options.focal, field_of_view=options.field_of_view
-        )
-    )
-    return calibrate_camera(observations, own)
+def _options(model: str | LensModel, options: CalibrationOptions) -> CalibrationOptions:
+    """The options for one model; the hybrid takes those that are its own."""
+    if model != HYBRID:
+        return dataclasses.replace(options, model=model, board="printed", analog=False)
+    own = ("board", "analog", "weighted", "focal", "field_of_view")
+    return CalibrationOptions(model=HYBRID, **{name: getattr(options, name) for name in own})
 
 
 def _groups(
@@ -203,9 +198,8 @@ def _groups(
     return found
 
 
-def _held_out(found: CameraCalibrationResult, pixels: Tensor, weights: Tensor) -> Tensor:
+def _held_out(camera: Camera, board: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
     """(V,) weighted squared residuals of views whose poses alone are solved; infinite where the lens has no image."""
-    camera, board = found.camera, found.board_points
     rays, valid = camera.unproject(torch.nan_to_num(pixels))
     used = torch.isfinite(pixels).all(-1) & valid & (rays[..., 2] > 0)
     ideal = torch.where(used[..., None], rays[..., :2] / rays[..., 2:], torch.nan)

@@ -12,6 +12,7 @@ prior on h (type-II maximum likelihood, MacKay 1992; restricted maximum likeliho
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,16 +22,18 @@ from torch import Tensor
 
 from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.board_modes import KNOWN, BoardModes
+from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.zernike import ASPECT, RADIAL
+from kcal.lens.zernike import ZernikeModes
 
-# ln amplitude of the four families of fields (in units of R), decays per degree of radial and of other fields,
-# pupil (in units of the board's range), board: bending, stretch, print (in units of its extent): mean and sd of ln.
-_MEAN = np.log([5e-4, 3e-4, 5e-5, 4e-5, 0.5, 0.6, 2e-4, 5e-4, 5e-4, 2e-4])
-_SD = np.array([1.75, 1.5, 1.75, 1.75, 0.7, 0.5, 2.0, 1.5, 1.5, 1.5])
-_DECAY, _PUPIL, BOARD = 4, 6, 7
-# Degree at which each family of fields begins: amplitudes refer to it.
-_FIRST_DEGREE = torch.tensor([5.0, 2.0, 3.0, 2.0, 1.0], dtype=torch.float64)
+# After the hyperparameters of the modes: ln amplitudes of the pupil (in units of the board's range) and of the board:
+# bending, stretch, print (in units of its extent): mean and sd of ln.
+_MEAN = np.log([2e-4, 5e-4, 5e-4, 2e-4])
+_SD = np.array([2.0, 1.5, 1.5, 1.5])
+# Where the amplitudes of the board stand among the hyperparameters: the last three.
+BOARD = -3
+# Where the pupil stands among the unknowns.
+_PUPIL = 4
 # Unequal and skewed axes, in units of R: pixels are square.
 SQUARE, ANALOG = 1e-4, 2e-3
 # Of the principal point about the middle, in diagonals.
@@ -47,11 +50,6 @@ class Hyperprior(NamedTuple):
 
     mean: Tensor
     sd: Tensor
-
-
-def typical_hyperprior() -> Hyperprior:
-    """That of a camera and a board of which nothing is known."""
-    return Hyperprior(torch.from_numpy(_MEAN.copy()), torch.from_numpy(_SD.copy()))
 
 
 class PriorFamilies(NamedTuple):
@@ -81,7 +79,7 @@ class PriorFamilies(NamedTuple):
     def with_board(self, board: BoardModes) -> PriorFamilies:
         """The same camera, and another board, or the same in other variables."""
         lens = len(self.mean) - len(board.unit)
-        family = torch.where(board.family == KNOWN, -1, BOARD + board.family)
+        family = torch.where(board.family == KNOWN, -1, self.amplitude[_PUPIL] + 1 + board.family)
         return self._replace(
             log_unit=torch.cat([self.log_unit[:lens], board.unit.log()]),
             amplitude=torch.cat([self.amplitude[:lens], family]),
@@ -126,26 +124,31 @@ def prior_families(
     leading = [focal, _CENTER * diagonal, _CENTER * diagonal, 1.0 + 0.5 / corner**2, distance, distance]
     mean = torch.zeros(len(leading) + len(form.modes) + len(board.unit), dtype=torch.float64)
     mean[:4] = torch.tensor([focal, (size[0] - 1) / 2, (size[1] - 1) / 2, 0.5 - form.shape])
-    _, _, family, degree = torch.tensor(form.modes.real_modes).T
-    above = (degree - _FIRST_DEGREE[family]).clamp_min(-1.0)
-    field_unit = torch.full((len(family),), math.log(form.radius), dtype=torch.float64)
-    field_unit[family == ASPECT] += math.log(square)
-    none = torch.full((len(leading),), -1)
-    pupils = torch.tensor([-1, -1, -1, -1, _PUPIL, _PUPIL])
-    zeros = torch.zeros(len(leading), dtype=torch.float64)
-    board_family = torch.where(board.family == KNOWN, -1, BOARD + board.family)
+    amplitude, decay, degree = zip(*form.modes.weight_priors, strict=True)
+    by_pupil = len(form.modes.hyperprior)
+    # Without an amplitude: how surely pixels are square.
+    field_unit = [math.log(form.radius) + (math.log(square) if own is None else 0.0) for own in amplitude]
+    none = [-1] * len(leading)
+    board_family = torch.where(board.family == KNOWN, -1, by_pupil + 1 + board.family)
     return PriorFamilies(
         mean,
-        torch.cat([torch.tensor(leading, dtype=torch.float64).log(), field_unit, board.unit.log()]),
-        torch.cat([pupils, torch.where(family == ASPECT, -1, family), board_family]),
-        torch.cat(
-            [
-                none,
-                torch.where(family == ASPECT, -1, torch.where(family == RADIAL, _DECAY, _DECAY + 1)),
-                torch.full_like(board.family, -1),
-            ]
-        ),
-        torch.cat([zeros, torch.where(family == ASPECT, 0.0, above), torch.zeros_like(board.unit)]),
+        torch.cat([torch.tensor([*map(math.log, leading), *field_unit], dtype=torch.float64), board.unit.log()]),
+        torch.cat([torch.tensor([*none[:-2], by_pupil, by_pupil, *_numbers(amplitude)]), board_family]),
+        torch.cat([torch.tensor([*none, *_numbers(decay)]), torch.full_like(board.family, -1)]),
+        torch.cat([torch.tensor([0.0] * len(leading) + [*degree], dtype=torch.float64), torch.zeros_like(board.unit)]),
+    )
+
+
+def _numbers(indices: Sequence[int | None]) -> list[int]:
+    return [-1 if index is None else index for index in indices]
+
+
+def typical_hyperprior(modes: FieldModes | None = None) -> Hyperprior:
+    """That of a camera and a board of which nothing is known; without modes, for the default field."""
+    mean, sd = np.array((modes or ZernikeModes()).hyperprior).T
+    return Hyperprior(
+        torch.from_numpy(np.concatenate([mean, _MEAN])),
+        torch.from_numpy(np.concatenate([sd, _SD])),
     )
 
 
@@ -175,7 +178,7 @@ def negative_log_evidence(data: Quadratic, families: PriorFamilies, v: np.ndarra
     A.diagonal().add_(1.0)
     root, info = torch.linalg.cholesky_ex(A)
     if int(info):
-        return 1e30, np.zeros_like(v)
+        return math.inf, np.zeros_like(v)
     inverse = torch.linalg.solve_triangular(root, torch.eye(len(g), dtype=A.dtype), upper=False).numpy()
     y = inverse.T @ (inverse @ (d * g / s2))
     kept = (inverse**2).sum(0)
@@ -206,19 +209,26 @@ def maximize_evidence(
         families: the priors.
         h: start.
         variance: start.
-        hyperprior: of h; the typical one if not given.
+        hyperprior: of h; the typical one of the default field if not given.
     """
     data = Quadratic(K, g, c, freedom)
     mean, sd = (part.numpy() for part in hyperprior or typical_hyperprior())
 
+    values: list[float] = []
+
     def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = negative_log_evidence(data, families, v)
+        if not math.isfinite(value):
+            # Priors are far too wide for this precision: worse than any trial before, so that a shorter step follows.
+            return max(values, default=1e30) + 1.0, slope
         z = (v[:-1] - mean) / sd
-        return value + 0.5 * float(z @ z), slope + np.append(z / sd, 0.0)
+        values.append(value + 0.5 * float(z @ z))
+        return values[-1], slope + np.append(z / sd, 0.0)
 
     start = np.append(h.numpy(), math.log(variance))
-    bounds = [(m - 5 * s, m + 5 * s) for m, s in zip(mean, sd, strict=True)]
-    bounds.append((max(start[-1] - 8, 2.0 * math.log(LEAST_NOISE)), start[-1] + 8))
+    # The last bound is open: where all are closed, L-BFGS-B makes its first trial at the bounds.
+    bounds: list[tuple[float, float | None]] = [(m - 5 * s, m + 5 * s) for m, s in zip(mean, sd, strict=True)]
+    bounds.append((max(start[-1] - 8, 2.0 * math.log(LEAST_NOISE)), None))
     found = lbfgs(
         objective,
         start,

@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
-from kcal.calibrate.bundle.views import LEAST_NOISE
+from kcal.calibrate.lensfit.base_fit import Estimate, cauchy_weights, fit_base
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
 from kcal.calibrate.lensfit.board_prior import BoardPrior
 from kcal.calibrate.lensfit.evidence import (
@@ -19,30 +18,23 @@ from kcal.calibrate.lensfit.evidence import (
     Hyperprior,
     PriorFamilies,
     maximize_evidence,
-    prior_families,
     typical_hyperprior,
 )
 from kcal.calibrate.lensfit.fleet import LensPrior
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, hybrid_unknowns
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
-from kcal.errors import DegenerateError, InputError
-from kcal.lens.base_map import angle_over_radius, radius_over_angle
+from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid_terms import LEADING, HybridForm
-from kcal.lens.model import LensModel
+from kcal.lens.field_modes import FieldModes
+from kcal.lens.hybrid_terms import LEADING
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions, minimize
 
-# R in half diagonals: the disc on which fields live reaches a little beyond the image's corners.
-_REACH = 1.08
 _ROUNDS = 6
 # Pixels that a mode can move any point by, below which it is left out.
 _UNFELT = 1e-6
 # Unknowns before the field's weights: focal length, principal point, shape, pupil.
 _LEADING = 6
-# Shapes and angles of the image's corner from which the base projection is begun.
-_SHAPES = (1.0, 0.25, 0.0)
-_CORNERS = (12.0, 20.0, 30.0, 42.0, 55.0, 68.0, 80.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,7 +126,7 @@ def fit_hybrid(
     pixels: Tensor,
     size: tuple[int, int],
     weights: Tensor | None = None,
-    modes: ZernikeModes | None = None,
+    modes: FieldModes | None = None,
     board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
     square: float = SQUARE,
     focal: float | None = None,
@@ -167,7 +159,14 @@ def fit_hybrid(
         DegenerateError: the board is seen from one side only, or from too few, so that no projection is found.
     """
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
-    hyperprior = hyperprior or typical_hyperprior()
+    if start is not None:
+        form = start.camera.model.hybrid
+        assert form is not None
+        modes = form.modes
+    elif lens is not None:
+        modes = lens.form.modes
+    modes = modes or ZernikeModes()
+    hyperprior = hyperprior or typical_hyperprior(modes)
     if isinstance(board, MeasuredBoard):
         board = board.prior_for(points)
     ordered, own = points, board_modes(points)
@@ -175,8 +174,8 @@ def fit_hybrid(
     seen = torch.isfinite(pixels).all(-1) & (weights > 0)
     freedom = 2 * int(seen.sum()) - 6 * len(pixels)
     if start is None:
-        estimate, spent = _base_alone(
-            points, pixels, size, weights, modes or ZernikeModes(), shown, square, focal, robust, hyperprior.mean, lens
+        estimate, spent = fit_base(
+            points, pixels, size, weights, modes, shown, square, focal, robust, hyperprior.mean, lens
         )
         progress("base projection")
     else:
@@ -184,7 +183,7 @@ def fit_hybrid(
         if isinstance(board, BoardPrior):
             state = state._replace(board=torch.zeros_like(board.mean))
         families, h = start.families.with_board(shown), start.hyperparameters
-        estimate = _Estimate(start.camera.model, families, state, h, start.sigma**2, start.tempering)
+        estimate = Estimate(start.camera.model, families, state, h, start.sigma**2, start.tempering)
         spent = start.iterations
     model, families, state, h, variance, tempering = estimate
     never = torch.zeros_like(families.mean, dtype=torch.bool)
@@ -195,7 +194,7 @@ def fit_hybrid(
         precision = torch.where(never, torch.inf, variance / families.deviation(h).square())
         problem = HybridProblem(points, shown.shapes, pixels, weights, model, families.mean, precision)
         if robust:
-            problem = problem.with_weights(_cauchy_weights(problem, state, weights))
+            problem = problem.with_weights(cauchy_weights(problem, state, weights))
         options = LMOptions(max_iterations=steps, tolerance=gain / freedom, initial_damping=1e-6)
         result = minimize(problem, state, options)
         return problem, HybridState(*result.state), int(result.iterations)
@@ -224,10 +223,8 @@ def fit_hybrid(
             converged = True
             break
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
-    form = model.hybrid
-    assert form is not None
-    degree = torch.tensor([mode[-1] for mode in form.modes.real_modes])
-    shift = families.deviation(h)[_LEADING : -len(shown.unit)] * float(state.params[0]) * (degree + 1).sqrt()
+    peaks = torch.tensor(modes.peaks, dtype=torch.float64)
+    shift = families.deviation(h)[_LEADING : -len(shown.unit)] * float(state.params[0]) * peaks
     never[_LEADING : -len(shown.unit)] |= shift < _UNFELT
     mean = families.mean[_LEADING : -len(shown.unit)]
     state.params[5 + len(LEADING) :] = torch.where(shift < _UNFELT, mean, state.params[5 + len(LEADING) :])
@@ -265,87 +262,6 @@ def fit_hybrid(
     )
 
 
-class _Estimate(NamedTuple):
-    model: LensModel
-    families: PriorFamilies
-    state: HybridState
-    hyperparameters: Tensor
-    variance: float
-    tempering: float
-
-
-def _base_alone(
-    points: Tensor,
-    pixels: Tensor,
-    size: tuple[int, int],
-    weights: Tensor,
-    modes: ZernikeModes,
-    board: BoardModes,
-    square: float,
-    known_focal: float | None,
-    robust: bool,
-    h: Tensor,
-    lens: LensPrior | None,
-) -> tuple[_Estimate, int]:
-    """Fit the base projection alone: its focal length and shape become constants of the lens. Also the trial steps."""
-    focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal, lens)
-    radius = _REACH * 0.5 * math.hypot(*size)
-    distance = float(translation.norm(dim=-1).median())
-    spent = 0
-
-    def constants(focal: float, shape: float) -> tuple[LensModel, PriorFamilies]:
-        if lens is not None:
-            usual = prior_families(lens.form, lens.focal, board, size, distance, square)
-            return LensModel(hybrid=lens.form), lens.families(usual)
-        form = HybridForm(shape=shape, radius=radius / focal, modes=modes)
-        return LensModel(hybrid=form), prior_families(form, focal, board, size, distance, square)
-
-    model, families = constants(focal, shape)
-    held = torch.ones(len(families.mean), dtype=torch.bool)
-    held[:4] = False
-    params = torch.zeros(5 + model.size, dtype=torch.float64)
-    params[:4] = torch.tensor([focal, focal, families.mean[1], families.mean[2]])
-    if lens is not None:
-        params[[0, 2, 3, *range(5, len(params))]] = lens.mean
-        params[1] = params[0]
-    state = HybridState(params, torch.zeros_like(board.unit), rotation, translation)
-    for _ in range(6):
-        precision = torch.where(held, torch.inf, families.deviation(h).square().reciprocal())
-        problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision)
-        if robust:
-            problem = problem.with_weights(_cauchy_weights(problem, state, weights))
-        result = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
-        spent += int(result.iterations)
-        state = HybridState(*result.state)
-        if lens is not None:
-            break
-        scale, bend = float(state.params[0]) / focal - 1.0, float(state.params[5])
-        focal, shape = float(state.params[0]), shape + min(max(bend, -1.0), 1.0)
-        if not (0 < focal < math.inf and abs(shape) <= 10):
-            raise DegenerateError(
-                "the views do not determine the focal length: they are parallel to the image or too similar; add views "
-                "with the board tilted by 30 to 45 degrees in different directions"
-            )
-        model, families = constants(focal, shape)
-        params = state.params.clone()
-        params[5] = 0.0
-        state = state._replace(params=params)
-        if not robust and abs(scale) < 1e-3 and abs(bend) < 1e-3 * (1 + abs(shape)):
-            break
-    freedom = 2 * int(problem.seen.sum()) - 6 * len(pixels)
-    variance = max(2.0 * float(result.cost) / freedom, LEAST_NOISE**2)
-    return _Estimate(model, families, state, h, variance, 1.0), spent
-
-
-def _cauchy_weights(problem: HybridProblem, state: HybridState, weights: Tensor) -> Tensor:
-    """(V, N) weights of a Cauchy loss at a state, its scale three robust standard deviations; 0 without an image."""
-    length = (problem.errors(state) * weights[:, None]).norm(dim=1)
-    shown = torch.isfinite(length) & problem.seen
-    # Of two normal components, the median length is 1.18 standard deviations.
-    scale = max(3.0 * float(length[shown].median()) / 1.18, LEAST_NOISE)
-    return torch.where(shown, weights / torch.sqrt(1.0 + (length / scale) ** 2), 0.0)
-
-
 def _quadratic(off: Tensor, x: Tensor) -> tuple[Tensor, Tensor, float]:
     """K, g, c of chi²(x) = c - 2 gᵀx + xᵀKx for absolute x, from rows off the poses at x."""
     flat = off.transpose(0, 1).flatten(1)
@@ -368,40 +284,3 @@ def _overdispersion(off: Tensor, K: Tensor, deviation: Tensor, variance: float) 
     effective = len(K) - float(inverse.square().sum())
     scattered = float((inverse @ (score * deviation / variance).T).square().sum()) * len(off) / (len(off) - 1)
     return max(1.0, scattered / effective)
-
-
-def _base_start(
-    points: Tensor, pixels: Tensor, size: tuple[int, int], weights: Tensor, known: float | None, lens: LensPrior | None
-) -> tuple[float, float, Tensor, Tensor]:
-    """Focal length, shape and poses: the base projection, among several, under which homographies fit best."""
-    seen = torch.isfinite(pixels).all(-1) & (weights > 0)
-    middle = torch.tensor([(size[0] - 1) / 2, (size[1] - 1) / 2], dtype=torch.float64)
-    offset = torch.where(seen[..., None], pixels - middle, 0.0)
-    away = offset.norm(dim=-1)
-    half = 0.5 * math.hypot(*size)
-    pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    best: tuple[float, float, float, Tensor, Tensor] | None = None
-    angles = torch.tensor(_CORNERS, dtype=torch.float64).deg2rad()
-    radii = [(s, m) for s in _SHAPES for m in (angles * radius_over_angle(s * angles**2)).tolist()]
-    usual = dict.fromkeys((s, known or half / m) for s, m in radii)
-    for shape, focal in usual if lens is None else [(lens.form.shape, lens.focal)]:
-        s = torch.tensor(shape, dtype=torch.float64)
-        theta = away / focal * angle_over_radius(s * (away / focal) ** 2)
-        usable = seen & (theta < math.radians(80.0))
-        ideal = offset * (torch.tan(theta) / away.clamp_min(1e-9))[..., None]
-        ideal = torch.where(usable[..., None], ideal, torch.nan)
-        if bool((usable.sum(-1) < 6).any()):
-            continue
-        rotation, translation = poses_from_homographies(homographies(points, ideal), pinhole)
-        cam = points @ rotation.transpose(-1, -2) + translation[:, None]
-        there = torch.atan2(cam[..., :2].norm(dim=-1), cam[..., 2])
-        direction = cam[..., :2] / cam[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-12)
-        turned = theta[..., None] * offset / away.clamp_min(1e-9)[..., None]
-        error = torch.where(usable, (there[..., None] * direction - turned).norm(dim=-1) * focal, 0.0)
-        # By the median view: a few wrong views do not decide.
-        value = float((error.square().sum(-1) / usable.sum(-1)).median())
-        if math.isfinite(value) and (best is None or value < best[0]):
-            best = value, focal, shape, rotation, translation
-    if best is None:
-        raise InputError("no start explains the corners: are all views of this board and from this camera?")
-    return best[1:]

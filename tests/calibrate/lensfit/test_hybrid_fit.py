@@ -214,13 +214,12 @@ def test_evidence_is_that_of_the_linear_model() -> None:
     h, variance, loss = maximize_evidence(K, g, c, 400.0, families, typical_hyperprior().mean, 0.09)
 
     def value(h: Tensor, variance: float) -> float:
-        from kcal.calibrate.lensfit.evidence import _MEAN, _SD
-
         d = families.deviation(h)
         A = K * d[:, None] * d / variance + torch.eye(len(d), dtype=torch.float64)
         b = d * g / variance
         fit = c / variance - float(b @ torch.linalg.solve(A, b))
-        z = (h.numpy() - _MEAN) / _SD
+        mean, sd = typical_hyperprior()
+        z = ((h - mean) / sd).numpy()
         return 0.5 * (400.0 * math.log(variance) + fit + float(torch.logdet(A))) + 0.5 * float(z @ z)
 
     assert loss == pytest.approx(value(h, variance), rel=1e-9)
@@ -231,6 +230,24 @@ def test_evidence_is_that_of_the_linear_model() -> None:
             assert value(h + step, variance) > loss - 1e-3
     assert value(h, 1.2 * variance) > loss
     assert value(h, variance / 1.2) > loss
+
+
+def test_evidence_is_found_where_a_trial_cannot_be_factorized() -> None:
+    """Data that determine few directions very well: at the bounds the matrix cannot be factorized."""
+    _, _, _, families = linear_case()
+    h = typical_hyperprior().mean
+    generator = torch.Generator().manual_seed(2)
+    wide = families.deviation(h)
+    few = 1e2 * torch.randn(400, 5, generator=generator, dtype=torch.float64)
+    rows = few @ torch.randn(5, len(wide), generator=generator, dtype=torch.float64) / wide
+    truth = 30.0 * wide * torch.randn(len(wide), generator=generator, dtype=torch.float64)
+    target = rows @ truth + 0.3 * torch.randn(400, generator=generator, dtype=torch.float64)
+    data = rows.T @ rows, rows.T @ target, float(target @ target), 400.0
+    found, variance, loss = maximize_evidence(*data, families, h, 100.0)
+    assert float((found - h).abs().max()) > 0.5
+    assert variance < 1.0
+    _, _, again = maximize_evidence(*data, families, found, variance)
+    assert loss == pytest.approx(again, abs=0.5)
 
 
 def test_rows_are_derivatives_of_residuals() -> None:

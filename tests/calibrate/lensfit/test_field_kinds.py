@@ -1,0 +1,125 @@
+"""Fits of a simulated camera with fields of every kind; the evidence sets their amplitudes."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.calibrate.lensfit.evidence import ANALOG, SQUARE, prior_families, typical_hyperprior
+from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
+from kcal.corners.board import Board
+from kcal.lens.camera import Camera
+from kcal.lens.field_modes import FieldModes
+from kcal.lens.gaussian_modes import GaussianModes
+from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.network_modes import NetworkModes
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.zernike import ZernikeModes
+from kcal.nets.field_features import train_features
+
+BOARD = Board(columns=8, rows=6, square=0.05)
+SIZE, NOISE = (1280, 960), 0.05
+KINDS: dict[str, FieldModes] = {
+    "zernike": ZernikeModes(radial=9, decentered=4, astigmatic=3, other=2),
+    "gaussian": GaussianModes(widths=(1.0, 0.5)),
+    "network": NetworkModes.random(40),
+}
+
+
+def truth() -> Camera:
+    coefficients = [-0.12, 0.03, 4e-4, -3e-4, 0.0]
+    return Camera.build(focal=(800, 800), center=(645, 476), size=SIZE, coefficients=coefficients, model="opencv5")
+
+
+def capture(count: int = 20) -> Tensor:
+    generator, middle, found = torch.Generator().manual_seed(11), BOARD.points.mean(0), []
+    while len(found) < count:
+        u = 2.0 * torch.rand(6, generator=generator, dtype=torch.float64) - 1.0
+        turn = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], math.pi * u[2]]))
+        shift = torch.stack([0.35 * u[3], 0.25 * u[4], 0.6 + 0.1 * u[5]])
+        pixels, valid = truth().project((BOARD.points - middle) @ turn.T + shift)
+        if bool((valid & truth().inside(pixels)).all()):
+            found.append(pixels + NOISE * torch.randn(pixels.shape, generator=generator, dtype=torch.float64))
+    return torch.stack(found)
+
+
+def fitted(modes: FieldModes) -> HybridFit:
+    return fit_hybrid(BOARD.points, capture(), SIZE, modes=modes, exact_board=True)
+
+
+def off(camera: Camera) -> float:
+    """RMS over the middle of the image of the error at infinity, pixels, after the best rotation (Kabsch)."""
+    pixels = 0.8 * (truth().grid(13, 9).reshape(-1, 2) - truth().center) + truth().center
+    rays, _ = truth().unproject(pixels)
+    found, valid = camera.unproject(pixels)
+    assert bool(valid.all())
+    u, _, v = torch.linalg.svd(rays.T @ found)
+    seen, valid = camera.project_rays(rays @ u @ v)
+    assert bool(valid.all())
+    return float((seen - pixels).square().sum(-1).mean().sqrt())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_camera_is_found_with_each(kind: str) -> None:
+    found = fitted(KINDS[kind])
+    assert found.camera.names[8:] == KINDS[kind].names
+    # Corners of 0.05 px on both axes; each view takes six numbers, the lens some tens.
+    assert found.rms == pytest.approx(NOISE * math.sqrt(2.0), rel=0.12)
+    assert found.sigma == pytest.approx(NOISE, rel=0.12)
+    # Only Zernike fields know that lenses are round: others leave more between field, focal length and pupil.
+    assert off(found.camera) < (2.5 if kind == "zernike" else 6.0) * NOISE
+    assert len(found.hyperparameters) == len(KINDS[kind].hyperprior) + 4
+    assert 8 < found.effective < 80
+
+
+def test_trained_features() -> None:
+    """Corrections of a first fit train the hidden layer; the last layer is fitted again with everything else."""
+    first = fitted(KINDS["zernike"])
+    form = first.camera.model.hybrid
+    assert form is not None
+    x, y = 0.7 * torch.rand(2, 400, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 0.35
+    corrections = torch.stack(form.modes.field(first.camera.coefficients[3:], x, y, slopes=False), -1)
+    modes = train_features(torch.stack([x, y], -1), corrections, count=12)
+    again = train_features(torch.stack([x, y], -1), corrections, count=12)
+    assert modes.hidden == again.hidden
+    columns = modes.columns(x, y).flatten(1).T
+    solution = torch.linalg.lstsq(columns, corrections.T.flatten()[:, None], driver="gelsd").solution
+    left = (columns @ solution)[:, 0] - corrections.T.flatten()
+    assert float(left.norm()) < 0.02 * float(corrections.norm())
+    assert off(fitted(modes).camera) < 6 * NOISE
+
+
+def test_priors_of_gaussian_units_fall_by_octaves() -> None:
+    form = HybridForm(shape=0.5, radius=0.9, modes=GaussianModes(widths=(1.0, 0.5, 0.25)))
+    board = board_modes(BOARD.points)
+    families = prior_families(form, 800.0, board, SIZE, 0.6)
+    h = typical_hyperprior(form.modes).mean.clone()
+    h[0], h[1] = math.log(1e-3), math.log(2.0)
+    deviation = families.deviation(h)[6 : 6 + len(form.modes)]
+    wide, middle, fine = (deviation[form.names.index(f"g{i}.0x") - 3] for i in (0, 1, 2))
+    assert float(wide) == pytest.approx(0.9e-3)
+    assert float(middle / wide) == pytest.approx(math.exp(-2.0))
+    assert float(fine / middle) == pytest.approx(math.exp(-2.0))
+    # What comes after the field's own hyperparameters moves the pupil and the board.
+    shifted = h.clone()
+    shifted[2] += 1.0
+    changed = (families.deviation(shifted) / families.deviation(h) - 1.0).abs() > 1e-12
+    assert changed.nonzero()[:, 0].tolist() == [4, 5]
+    shifted = h.clone()
+    shifted[3:] += 1.0
+    changed = (families.deviation(shifted) / families.deviation(h) - 1.0).abs() > 1e-12
+    assert changed.nonzero()[:, 0].tolist() == list(range(6 + len(form.modes), len(families.mean)))
+
+
+def test_pixels_are_square_only_as_surely_as_asked() -> None:
+    board = board_modes(BOARD.points)
+    form = HybridForm(shape=0.5, radius=0.9, modes=KINDS["zernike"])
+    h = typical_hyperprior(form.modes).mean
+    place = 3 + form.names.index("z1-1")
+    for square in (SQUARE, ANALOG):
+        families = prior_families(form, 800.0, board, SIZE, 0.6, square)
+        assert float(families.deviation(h)[place]) == pytest.approx(0.9 * square)
