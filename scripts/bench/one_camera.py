@@ -2,10 +2,15 @@
 
     KCAL_DATA=DATA python -m scripts.bench.one_camera --split blocks20        # the wide lens, whole blocks held out
     KCAL_DATA=DATA python -m scripts.bench.one_camera --split evenodd
+    KCAL_DATA=DATA python -m scripts.bench.one_camera --views 8               # fitted to 8 of its views, three draws
     KCAL_DATA=DATA python -m scripts.bench.one_camera --stereo                # OpenCV's images, one view left out
+    KCAL_DATA=DATA python -m scripts.bench.one_camera --epipolar              # the same, 9 pairs fitted and 4 held out
+
+With --write the table goes into docs/measured/one-camera.md.
 
 On each held-out view only its pose is solved again; camera and board stay as fitted. Measure: sqrt(sum w² |r|² / count)
-over all folds, with the weights of the file (OpenCV's images: all one).
+over all folds, with the weights of the file (OpenCV's images: all one). Epipolar error:
+Sampson's distance of held-out corners in pixels, which needs no board.
 """
 
 from __future__ import annotations
@@ -14,7 +19,7 @@ import argparse
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +27,17 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.lensfit.cameras_fit import measure_board
 from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
+from kcal.calibrate.rig.from_boards import calibrate_rig
+from kcal.calibrate.rig.solve import RigOptions
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_images
 from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
+from kcal.lens.rig import StereoRig
+from scripts.shared.page import write_section
 from scripts.shared.timing import row, show
 from scripts.shared.wide_lens import folds, held_out, load, warped
 
@@ -74,28 +84,93 @@ def measure(name: str, seen: Observations, weight: Tensor, parts: list[np.ndarra
     return row(name, f"{math.sqrt(total / count):.4f}", f"{seconds / len(parts):.1f}")
 
 
+def epipolar(rig: StereoRig, left: Tensor, right: Tensor) -> Tensor:
+    """Sampson's distances (N,) in pixels of matched corners (N, 2) from coplanarity."""
+    pixels = torch.cat([left, right], -1).requires_grad_(True)
+    rays = [camera.unproject(part)[0] for camera, part in zip((rig.left, rig.right), pixels.split(2, -1), strict=True)]
+    turned = rays[0] @ rig.right_from_left_rotation.T
+    volume = (torch.linalg.cross(turned, rays[1]) * rig.right_from_left_translation).sum(-1)
+    (slope,) = torch.autograd.grad(volume.sum(), pixels)
+    return (volume / slope.norm(dim=-1)).detach()
+
+
+def rig_of(model: str, sides: list[Observations]) -> StereoRig:
+    """Both cameras and the rig, from the same pairs."""
+    if model == "hybrid":
+        board = measure_board(sides)
+        options = CalibrationOptions(board=board[0] if len(board) == 1 else "printed")
+    else:
+        name, _, prior = model.partition(", ")
+        options = CalibrationOptions(model=name, weak_prior=0.3 if prior else None)
+    cameras = [calibrate_camera(seen, options).camera for seen in sides]
+    pairs = list(zip(sides[0].names, sides[1].names, strict=True))
+    return calibrate_rig(cameras[0], cameras[1], sides[0], sides[1], pairs, RigOptions(reject=False)).stereo()
+
+
+def measure_epipolar(name: str, sides: list[Observations]) -> float:
+    """RMS over all rotations of 9 pairs fitted and 4 held out."""
+    count, errors = len(sides[0].views), []
+    for begin in range(count):
+        out = [(begin + 3 * i) % count for i in range(4)]
+        train = [[seen.names[i] for i in range(count) if i not in out] for seen in sides]
+        rig = rig_of(name, [seen.subset(names) for seen, names in zip(sides, train, strict=True)])
+        left, right = (seen.pixels()[out].reshape(-1, 2) for seen in sides)
+        both = torch.isfinite(left).all(-1) & torch.isfinite(right).all(-1)
+        errors.append(epipolar(rig, left[both], right[both]))
+    return float(torch.cat(errors).square().mean().sqrt())
+
+
+def stereo_images() -> list[Observations]:
+    """OpenCV's stereo images."""
+    paths = expand_images([str(Path(os.environ["KCAL_DATA"], "opencv_stereo"))])
+    board = Board(columns=9, rows=6, square=0.025)
+    sides = ("left", "right")
+    return [detect_images([path for path in paths if path.name.startswith(side)], board) for side in sides]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--split", choices=["blocks20", "evenodd"], help="of the wide lens")
+    parser.add_argument("--views", type=int, help="fitted of the wide lens, all others held out")
     parser.add_argument("--stereo", action="store_true", help="OpenCV's stereo images, both cameras")
+    parser.add_argument("--epipolar", action="store_true", help="OpenCV's stereo images, pairs")
     parser.add_argument("--models", nargs="*", default=list(MODELS), choices=list(MODELS))
+    parser.add_argument("--write", action="store_true", help="write the tables into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     head = [row("model", "held out, RMS px", "CPU s per fit"), row("---", "---", "---")]
+
+    def tell(name: str, title: str, head: list[str], rows: Iterable[str]) -> None:
+        lines = [title, "", *head]
+        show(lines)
+        for line in rows:
+            show([line])
+            lines.append(line)
+        if arguments.write:
+            write_section("one-camera.md", name, "\n".join(lines))
+
     if arguments.split:
         seen, weights = load()
-        show([f"Wide lens, {arguments.split}", "", *head])
-        for name in arguments.models:
-            show([measure(name, seen, torch.from_numpy(weights), folds(arguments.split, len(seen.views)))])
+        parts = folds(arguments.split, len(seen.views))
+        rows = (measure(name, seen, torch.from_numpy(weights), parts) for name in arguments.models)
+        tell(arguments.split, f"Wide lens of 150 degrees, `{arguments.split}`:", head, rows)
+    if arguments.views:
+        seen, weights = load()
+        draws = [
+            np.random.default_rng(seed).permutation(len(seen.views))[arguments.views :] for seed in (100, 101, 102)
+        ]
+        rows = (measure(name, seen, torch.from_numpy(weights), draws) for name in arguments.models)
+        tell(f"random{arguments.views}", f"Wide lens, {arguments.views} views fitted, three draws:", head, rows)
     if arguments.stereo:
-        folder = Path(os.environ["KCAL_DATA"], "opencv_stereo")
-        for side in ("left", "right"):
-            paths = [path for path in expand_images([str(folder)]) if path.name.startswith(side)]
-            seen = detect_images(paths, Board(columns=9, rows=6, square=0.025))
+        for side, seen in zip(("left", "right"), stereo_images(), strict=True):
             weight = torch.isfinite(seen.pixels()).all(-1).double()
-            show(["", f"OpenCV's stereo images, {side}, one view left out", "", *head])
-            for name in arguments.models:
-                show([measure(name, seen, weight, [np.array([i]) for i in range(len(seen.views))])])
+            each = [np.array([i]) for i in range(len(seen.views))]
+            rows = (measure(name, seen, weight, each) for name in arguments.models)
+            tell(side, f"OpenCV's stereo images, {side}, one view left out:", head, rows)
+    if arguments.epipolar:
+        sides = stereo_images()
+        rows = (row(name, f"{measure_epipolar(name, sides):.4f}") for name in arguments.models)
+        tell("epipolar", "OpenCV's pairs, 9 fitted and 4 held out:", [row("model", "RMS px"), row("---", "---")], rows)
 
 
 if __name__ == "__main__":
