@@ -32,7 +32,7 @@ def batch_command(
         str | None,
         typer.Option("--square", metavar="LENGTH", help="Side of a square with its unit: 25mm.", show_default=False),
     ] = None,
-    model: Annotated[str, typer.Option(metavar="NAME", help="Lens model, see `kcal calibrate`.")] = "opencv5",
+    model: Annotated[str, typer.Option(metavar="NAME", help="Lens model, see `kcal calibrate`.")] = "hybrid",
     refine: Annotated[
         Refine, typer.Option("--refine", metavar="METHOD", help="erf (most accurate), saddle, opencv, skimage or none.")
     ] = Refine.erf,
@@ -72,7 +72,8 @@ def batch_command(
     if (size is None) != (square is None):
         raise InputError("--board and --square belong together: give both")
     board = Board.parse(size, square) if size is not None and square is not None else None
-    LensModel.named(model)
+    if model != "hybrid":
+        LensModel.named(model)
     jobs = read_jobs(cameras, board, model)
     options = BatchOptions(refine=refine.value, board_warp=board_warp, time_limit=time_limit)
     try:

@@ -1,18 +1,25 @@
-"""`kcal board`: a board to print."""
+"""`kcal board`: a board to print, and a printed board measured."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from kcal.cli.console import out
+from kcal.cli.console import out, print_wrote, steps, warn
+from kcal.cli.groups import group_with_default
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 
+app = typer.Typer(
+    cls=group_with_default("print"), rich_markup_mode="markdown", help="Draw a board to print, and measure it later."
+)
 
-def board_command(
+
+@app.command("print")
+def print_command(
     size: Annotated[
         str,
         typer.Option(
@@ -39,6 +46,8 @@ def board_command(
     Print it at 100 % ("actual size"), check the printed ruler, and glue the board to something flat and stiff. Choose
     one odd and one even number (9x6, 7x6): such a board looks different when it is turned by 180°.
 
+    `kcal board measure` finds later how the printed board differs from this drawing.
+
     **Examples**
 
     `kcal board --board 9x6 --square 25mm --page A4 -o board.pdf`
@@ -63,3 +72,61 @@ def board_command(
         out.print(f"note: only {sheet.quiet:.1f} squares of white around the board; keep the background light")
     if not pattern.unambiguous:
         out.print("note: this board looks the same turned by 180°; for stereo use one odd and one even number")
+
+
+@app.command("measure")
+def measure_command(
+    observations: Annotated[
+        list[Path], typer.Argument(metavar="OBS...", help="Observations files of one or several cameras.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Board file to write.")],
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG file to write: heights as colors, print errors as arrows.")
+    ] = None,
+) -> None:
+    """Measure a printed board: how it bends, and how its print errs, each with its σ.
+
+    Fits each camera and its board, as `kcal calibrate` does. Cameras that saw the same board share it, and measure it
+    together; the evidence tells whether they did. Tilt and roll the board in many directions: without rolls, stretch
+    and keystone of the board cannot be told from the camera's.
+
+    **Examples**
+
+    `kcal board measure left.obs.json right.obs.json -o plate.board.json --picture plate.png`
+    """
+    from kcal.calibrate.lensfit.cameras_fit import fit_cameras
+    from kcal.calibrate.lensfit.measured_board import save_measured_board
+    from kcal.corners.observations import Observations
+    from kcal.report.board import board_text, save_board_picture
+    from kcal.report.figures import check_picture
+
+    check_writable(output, *observations)
+    if picture is not None:
+        check_picture(picture)
+    sets = [Observations.load(path) for path in observations]
+    names = [path.name.split(".")[0] for path in observations]
+    if len(set(names)) < len(names):
+        names = [str(path) for path in observations]
+    with steps("measuring", 2 * len(sets) if len(sets) > 1 else 1) as advance:
+        found = fit_cameras(sets, names=names, advance=advance)
+    board = dataclasses.replace(found.boards[0], name=output.name.split(".")[0])
+    save_measured_board(board, output)
+    if picture is not None:
+        save_board_picture(picture, board)
+    out.print(f"{board.board}, {len(board.observations)} of {len(sets)} observations: {', '.join(board.observations)}")
+    for line in board_text(board):
+        out.print(f"  {line}")
+    out.print(f"evidence against the board as ordered: {board.log_evidence:.0f} nats")
+    for name, camera in zip(names, found.cameras, strict=True):
+        if turned := int((camera.turns > 0).sum()):
+            out.print(f"{name}: {turned} of {len(camera.turns)} views were read from another end of the board")
+    if len(board.observations) > 1:
+        least = min(camera.nats for camera in found.cameras if camera.board == 0)
+        out.print(f"evidence that they saw one board: {least:.0f} nats")
+    if len(found.boards) > 1:
+        others = ", ".join(name for name, camera in zip(names, found.cameras, strict=True) if camera.board != 0)
+        warn(
+            f"these observations show {len(found.boards)} boards, not one: {output} is the board of "
+            f"{', '.join(board.observations)}. Two prints of one pattern are two boards; measure {others} apart"
+        )
+    print_wrote(output, picture)

@@ -11,7 +11,7 @@ from rich.markup import escape
 import kcal
 from kcal.cli.bake import bake_command
 from kcal.cli.batch import batch_command
-from kcal.cli.board import board_command
+from kcal.cli.board import app as board
 from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.compare import compare_command
@@ -49,7 +49,7 @@ def _global_options(
 
 
 app.command("demo")(demo_command)
-app.command("board")(board_command)
+app.add_typer(board, name="board")
 app.command("detect")(detect_command)
 app.command("calibrate")(calibrate_command)
 app.command("compare")(compare_command)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from typer.core import TyperGroup
 
+from kcal.cli.groups import group_with_default
 from kcal.cli.rig_check import check
 from kcal.errors import InputError
 
@@ -17,16 +17,7 @@ if TYPE_CHECKING:
     from kcal.lens.rig import StereoRig
 
 
-class _RigGroup(TyperGroup):
-    """`kcal rig LEFT RIGHT ...` solves a rig; `kcal rig check ...` is a command of its own."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if not args or args[0] not in self.commands:
-            args = ["solve", *args]
-        return super().parse_args(ctx, args)
-
-
-app = typer.Typer(cls=_RigGroup, rich_markup_mode="markdown", help="Solve a rig, and check it later.")
+app = typer.Typer(cls=group_with_default("solve"), rich_markup_mode="markdown", help="Solve a rig, and check it later.")
 
 
 def solve_command(

@@ -66,6 +66,8 @@ class CalibrationRecord:
         stop_reason: why the solver stopped.
         iterations: of the solver.
         noise: of a corner along an axis, pixels; None if it was not estimated.
+        board_deviation: x, y, z in meters of each corner of the board, as measured, from where it was ordered; None if
+            it was not measured.
         tempering: by how much the corners count less because residuals repeat within views; None if not estimated.
         observations: name of the observations file, if there was one.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
@@ -81,9 +83,10 @@ class CalibrationRecord:
     board_warp: tuple[float, float] | None = None
     stop_reason: str
     iterations: int
+    observations: str | None = None
     noise: float | None = None
     tempering: float | None = None
-    observations: str | None = None
+    board_deviation: tuple[tuple[float, float, float], ...] | None = None
     kcal_version: str
     created: datetime.datetime
 

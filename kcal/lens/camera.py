@@ -14,6 +14,8 @@ from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration, UntilChanged
 from kcal.lens.camera_parameters import CameraParameters
 from kcal.lens.distortion import distort_components
+from kcal.lens.hybrid_points import map_points
+from kcal.lens.hybrid_points_fit import FittedPolynomials, worth_fitting
 from kcal.lens.inverse import InverseStart, PreparedInverse, prepare_inverse, undistort_components
 from kcal.lens.model import LensModel
 from kcal.lens.outline import image_outline, polygon_area
@@ -67,6 +69,7 @@ class Camera(CameraParameters):
 
     def __init__(self, parameters: Tensor, *, size: tuple[int, int], model: LensModel | str = "opencv5") -> None:
         super().__init__(parameters, size, LensModel.named(model))
+        self._fitted = FittedPolynomials()
         # They follow from the parameters, so they are not part of the saved state.
         for name, value in self._measured_region().items():
             self.register_buffer(name, value, persistent=False)
@@ -149,6 +152,13 @@ class Camera(CameraParameters):
             InputError: a wrong shape or an integer dtype.
         """
         points = as_points("points_cam", points_cam, 3)
+        if worth_fitting(points, self.params, self.model):
+            polynomials = self._fitted.forward(self.params.detach(), self.model, self.valid_region)
+            if polynomials is not None:
+                return map_points(polynomials, self._project_by_formulas, points, 2)
+        return self._project_by_formulas(points)
+
+    def _project_by_formulas(self, points: Tensor) -> tuple[Tensor, Tensor]:
         values = self.values
         coefficients, center = values[..., 5:], values[..., None, 2:4]
 
@@ -259,13 +269,14 @@ class Camera(CameraParameters):
             InputError: a wrong shape or an integer dtype.
         """
         pixels = as_points("pixels", pixels, 2)
+        if self.model.wide:
+            rays, valid = self.unproject(pixels, start=start)
+            valid = valid & (math.cos(math.radians(89.0)) < rays[..., 2])
+            depth = torch.where(valid, rays[..., 2], 1.0)
+            return torch.where(valid[..., None], rays[..., :2], 0.0) / depth[..., None], valid
 
         def one(pixels: Tensor) -> tuple[Tensor, Tensor]:
             x, y, valid = self._to_plane(pixels, start)
-            if self.model.wide:
-                X, Y, Z = rays_from_plane(x, y, self.model)
-                valid = valid & (math.cos(math.radians(89.0)) < Z)
-                x, y = (torch.where(valid, value, 0.0) / torch.where(valid, Z, 1.0) for value in (X, Y))
             return torch.stack([x, y], -1), valid
 
         return self._in_chunks(one, pixels)
@@ -287,7 +298,14 @@ class Camera(CameraParameters):
             InputError: a wrong shape or an integer dtype.
         """
         pixels = as_points("pixels", pixels, 2)
+        if start is None and worth_fitting(pixels, self.params, self.model):
+            ready = PreparedInverse(self.valid_region, self.inverse_start)
+            polynomials = self._fitted.backward(self.params.detach(), self.model, ready)
+            if polynomials is not None:
+                return map_points(polynomials, self._unproject_by_formulas, pixels, 3)
+        return self._unproject_by_formulas(pixels, start)
 
+    def _unproject_by_formulas(self, pixels: Tensor, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
         def one(pixels: Tensor) -> tuple[Tensor, Tensor]:
             x, y, valid = self._to_plane(pixels, start)
             return torch.stack(rays_from_plane(x, y, self.model), -1), valid

@@ -30,7 +30,7 @@ _HARMONICS = 6
 # Largest reach of the region, relative to the largest disc; tried in this order until the lens is one-to-one inside.
 _CAPS = (math.inf, 8.0, 4.0, 2.5, 1.7, 1.3, 1.15, 1.05, 1.0, 0.8, 0.6, 0.4, 0.2)
 # The limit is smooth along the directions: within this fraction of the smallest limit, no fold lies between two.
-_SURE = 0.95
+SURE = 0.95
 
 
 class Region(NamedTuple):
@@ -208,4 +208,4 @@ def in_region(
 
 def surely_in_region(x: Tensor, y: Tensor, region: Region) -> Tensor:
     """Whether points (..., N) lie so far inside that no further check is needed."""
-    return region.covers(x, y, _SURE)
+    return region.covers(x, y, SURE)

@@ -53,10 +53,10 @@ def pixel_covariance(
     places = as_points("pixels", pixels, 2)
     flat = places.reshape(-1, 2)
     wanted = covariance.diagonal().nonzero()[:, 0].tolist()
-    by_camera, by_turn, good = _slopes(camera, camera.grid(*grid).reshape(-1, 2), wanted)
+    by_camera, by_turn, good = _slopes_at_infinity(camera, camera.grid(*grid).reshape(-1, 2), wanted)
     # The turn that best undoes each parameter's effect.
     undo = torch.linalg.lstsq(by_turn[good].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
-    by_camera, by_turn, good = _slopes(camera, flat, wanted)
+    by_camera, by_turn, good = _slopes_at_infinity(camera, flat, wanted)
     by_camera = by_camera - by_turn @ undo
     found = by_camera @ covariance[wanted][:, wanted] @ by_camera.transpose(-1, -2)
     return torch.where(good[:, None, None], found, torch.nan).reshape(*places.shape[:-1], 2, 2)
@@ -67,6 +67,14 @@ def image_sigma(camera: Camera, columns: int = 33, rows: int = 25) -> Tensor:
 
     On a grid whose outermost points are the outermost pixels, after the best turn (`pixel_covariance`); NaN where the
     camera has no ray.
+
+    Example:
+        >>> from kcal.lens.calibration import CameraCalibration
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
+        >>> longer = torch.diag(torch.tensor([1.0, 0, 0, 0, 0], dtype=torch.float64))  # fx ± 1 px
+        >>> camera.calibration = CameraCalibration(covariance=longer)
+        >>> [round(float(value), 2) for value in image_sigma(camera, 3, 3)[1]]
+        [0.4, 0.0, 0.4]
     """
     found = pixel_covariance(camera, camera.grid(columns, rows).reshape(-1, 2))
     good = found.isfinite().all(-1).all(-1)
@@ -74,7 +82,7 @@ def image_sigma(camera: Camera, columns: int = 33, rows: int = 25) -> Tensor:
     return torch.where(good, largest.clamp_min(0.0).sqrt(), torch.nan).reshape(rows, columns)
 
 
-def _slopes(camera: Camera, pixels: Tensor, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+def _slopes_at_infinity(camera: Camera, pixels: Tensor, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     """Derivatives of far directions' pixels by parameters (N, 2, C) and by a turn (N, 2, 3), and which have them."""
     rays, valid = camera.unproject(pixels)
     rays = torch.where(valid[:, None], rays, rays.new_tensor([0.0, 0.0, 1.0]))

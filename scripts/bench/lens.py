@@ -3,15 +3,18 @@
     python -m scripts.bench.lens [--quick] [--markdown docs/measured/lens.md]
 
 Tables: throughput of project and unproject (100, 10 000 and 1 000 000 points, float64, one thread and two, eager and
-compiled), what the three answer where a pixel has no ray, and undistortion of 1080p images. Within a round every side
-runs once, in turn; ratios are taken within a round: median (smallest to largest), above 1 kcal is faster.
+compiled; the hybrid camera beside opencv14), what the three answer where a pixel has no ray, and undistortion of 1080p
+images. Within a round every side runs once, in turn; ratios are taken within a round: median (smallest to largest),
+above 1 kcal is faster.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import os
 import platform
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,10 +26,13 @@ from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
 import kcal
+from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort
+from kcal.lens.hybrid_points import FEWEST
 from kcal.lens.modules import Unproject
 from scripts.bench import undistort
+from scripts.shared import wide_lens
 from scripts.shared.page import CONCLUSIONS
 from scripts.shared.timing import ratios, row, show, spread, times
 
@@ -106,6 +112,49 @@ def throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
 
 
 @torch.no_grad()
+def hybrid_throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
+    """Rows of both directions for the hybrid camera, beside 14 coefficients and OpenCV with these."""
+    if "KCAL_DATA" not in os.environ:
+        return show(["Not measured: `KCAL_DATA` is not set."])
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    seen, weights = wide_lens.load()
+    fitted = fit_hybrid(seen.board.points, seen.pixels(), seen.image_size, torch.from_numpy(weights)).camera
+    lines = show(
+        [
+            "| direction | points | hybrid | first call, ms | opencv14 | OpenCV | opencv14 / hybrid | OpenCV / hybrid "
+            "| largest difference to the formulas, px |",
+            "|---|---|---|---|---|---|---|---|---|",
+        ]
+    )
+    plain = build("opencv14")
+    for direction, count in itertools.product(("project", "unproject"), counts):
+        # A new camera, so that its first call fits the polynomials.
+        hybrid = fitted.with_parameters(fitted.params)
+        points, others = _points(fitted, count), _points(plain, count)
+        pixels, other_pixels = hybrid._project_by_formulas(points)[0], plain.project(others)[0]
+        calls: list[Call]
+        if direction == "project":
+            calls = [lambda: hybrid.project(points), lambda: plain.project(others)]  # noqa: B023
+            calls.append(peers_project(plain, others)[0])
+        else:
+            calls = [lambda: hybrid.unproject(pixels), lambda: plain.unproject(other_pixels)]  # noqa: B023
+            calls.append(peers_unproject(plain, other_pixels)[0])
+        start = time.perf_counter()
+        calls[0]()
+        first = f"{1e3 * (time.perf_counter() - start):.0f}"
+        found = times(calls, rounds)
+        rate = [spread([1e-6 * count / s for s in side]) for side in found]
+        again = (
+            hybrid.project(points)[0] if direction == "project" else hybrid.project_rays(hybrid.unproject(pixels)[0])[0]
+        )
+        worst = f"{float((again - pixels).abs().max()):.1e}"
+        faster = [ratios(found[0], other) for other in found[1:]]
+        lines += show([row(direction, f"{count:.0e}", rate[0], first, *rate[1:], *faster, worst)])
+    return lines
+
+
+@torch.no_grad()
 def accuracy(count: int = 100_000) -> list[str]:
     """Largest error of each direction over the image, in pixels."""
     lines = show(["| | kcal | OpenCV | kornia |", "|---|---|---|---|"])
@@ -169,7 +218,7 @@ def _answer(normalized: Tensor, camera: Camera, pixels: Tensor) -> tuple[str, st
 def _points(camera: Camera, count: int) -> Tensor:
     """Points 1 to 50 m deep that are seen in pixels spread over the image."""
     generator = torch.Generator().manual_seed(1)
-    pixels = torch.rand(count, 2, generator=generator, dtype=torch.float64) * torch.tensor(SIZE)
+    pixels = torch.rand(count, 2, generator=generator, dtype=torch.float64) * torch.tensor(camera.size)
     depth = 1 + 49 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
     rays, _ = camera.unproject(pixels)
     return rays / rays[:, 2:] * depth
@@ -202,6 +251,15 @@ def main() -> None:
         ]
     )
     lines += throughput(rounds, counts)
+    lines += show(
+        [
+            "",
+            "The hybrid camera of the real wide lens (`scripts/bench/one_camera.py`), eager, one thread. From "
+            f"{FEWEST:,} points on, it is evaluated by polynomials fitted in the first call.",
+            "",
+        ]
+    )
+    lines += hybrid_throughput(rounds, counts)
     lines += show(["", "## Accuracy", "", "The same camera with 14 coefficients, over the whole image.", ""])
     lines += accuracy()
     lines += show(["", "## Where iterations diverge, or no ray exists", ""])

@@ -166,7 +166,20 @@ class TestCalibrate:
     def test_parameters_by_name(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        arguments = ["calibrate", "left.obs.json", "-o", "named.json", "--fov", "65", "--fix", "cx=321", "--fix", "k3"]
+        arguments = [
+            "calibrate",
+            "left.obs.json",
+            "-o",
+            "named.json",
+            "--model",
+            "opencv5",
+            "--fov",
+            "65",
+            "--fix",
+            "cx=321",
+            "--fix",
+            "k3",
+        ]
         arguments += ["--tie", "fx=fy", "--prior", "cy=240+-1", "--free", "skew"]
         assert run(monkeypatch, *arguments) == 0
         rows = {words[0]: words[1:] for words in map(str.split, capsys.readouterr().out.splitlines()) if words}
@@ -197,7 +210,9 @@ class TestCalibrate:
         arguments: list[str],
         message: str,
     ) -> None:
-        text = refuse(folder, monkeypatch, capsys, "calibrate", "left.obs.json", "-o", "a.json", *arguments)
+        text = refuse(
+            folder, monkeypatch, capsys, "calibrate", "left.obs.json", "-o", "a.json", "--model", "opencv5", *arguments
+        )
         assert message in text
 
     def test_board_warp_and_a_warning(
@@ -207,7 +222,9 @@ class TestCalibrate:
         for i, pixel in enumerate(content["views"][2]["pixels"]):
             content["views"][2]["pixels"][i] = [pixel[0] + 4 * (i % 2), pixel[1] - 3 * (i % 3)]
         (folder / "bad.obs.json").write_text(json.dumps(content))
-        assert run(monkeypatch, "calibrate", "bad.obs.json", "-o", "bad.json", "--board-warp") == 0
+        assert (
+            run(monkeypatch, "calibrate", "bad.obs.json", "-o", "bad.json", "--model", "opencv5", "--board-warp") == 0
+        )
         printed = capsys.readouterr()
         assert "mm along its rows" in printed.out
         assert "warning: view left02.png: RMS" in printed.err
@@ -380,6 +397,12 @@ class TestRig:
             "left,right\n" + "".join(f"left{i:02}.png,right{i:02}.png\n" for i in (1, 3, 4))
         )
         arguments = ["left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json", "--match", "pairs.csv"]
+        text = refuse(cameras, monkeypatch, capsys, "rig", *arguments, "--refine-cameras")
+        assert "hybrid" in text
+        for side in ("left", "right"):
+            plain = [f"{side}.obs.json", "-o", f"{side}.camera.json", "--model", "opencv5"]
+            assert run(monkeypatch, "calibrate", *plain) == 0
+        capsys.readouterr()
         assert run(monkeypatch, "rig", *arguments, "--refine-cameras", "--board-warp") == 0
         printed = capsys.readouterr().out
         assert "3 of 3 pairs used, 6 views without partner" in printed

@@ -53,7 +53,7 @@ class CameraJob:
     name: str
     images: tuple[Path, ...] = ()
     board: Board | None = None
-    model: str = "opencv5"
+    model: str = "hybrid"
     error: str = ""
 
 

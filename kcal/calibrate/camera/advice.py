@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import torch
+from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from kcal.corners.observations import Observations
@@ -33,13 +33,17 @@ def reached(observations: Observations, columns: int, rows: int) -> Tensor:
         True
     """
     width, height = observations.image_size
-    scale = np.array([columns / width, rows / height])
-    found = np.zeros((rows, columns), dtype=np.uint8)
+    x = (np.arange(columns) + 0.5) * (width / columns) - 0.5
+    y = (np.arange(rows) + 0.5) * (height / rows) - 0.5
+    places = np.stack(np.meshgrid(x, y), -1)
+    found = np.zeros((rows, columns), dtype=bool)
     for view in observations.pixels().numpy():
-        corners = (view[np.isfinite(view).all(-1)] + 0.5) * scale - 0.5
+        corners = view[np.isfinite(view).all(-1)]
         if len(corners) >= 3:
-            cv2.fillConvexPoly(found, cv2.convexHull(np.round(corners).astype(np.int32)), 1)
-    return torch.from_numpy(found.astype(bool))
+            # Half planes a x + b y + c <= 0 of the convex hull.
+            sides = ConvexHull(corners).equations
+            found |= (places @ sides[:, :2].T + sides[:, 2] <= 0).all(-1)
+    return torch.from_numpy(found)
 
 
 def unreached_share(observations: Observations) -> float:

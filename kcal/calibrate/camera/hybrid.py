@@ -15,7 +15,6 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.camera.advice import what_to_photograph
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
 from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection
@@ -49,67 +48,63 @@ def calibrate_hybrid(
     """As `kcal.calibrate.camera.calibrate.calibrate_camera`, for the hybrid lens."""
     board, pixels, names = observations.board.points, observations.pixels(), observations.names
     check_views(board, pixels, names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
-    fit = _fit(observations, pixels, torch.ones_like(pixels[..., 0]), None, options, progress)
+    if options.reject is not None:
+        return _without_outliers(observations, options, options.reject, progress)
+    fit = _fit_views(observations, pixels, torch.ones_like(pixels[..., 0]), None, options, progress)
     if options.weighted and observations.covariances() is not None:
-        fit = _fit(observations, pixels, _weights(observations, fit), fit, options, progress)
-    if options.reject is None:
-        return _result(observations, fit, options)
-    return _without_outliers(observations, fit, options, options.reject, progress)
+        fit = _fit_views(observations, pixels, _weights(observations, fit.residuals), fit, options, progress)
+    return _result(observations, fit, options)
 
 
-def _fit(
+def _fit_views(
     observations: Observations,
     pixels: Tensor,
     weights: Tensor,
     start: HybridFit | None,
     options: CalibrationOptions,
     progress: Progress,
+    robust: bool = False,
 ) -> HybridFit:
     return fit_hybrid(
         observations.board.points,
         pixels,
         observations.image_size,
         weights,
-        exact_board=options.board == "exact",
+        board=options.board,
         square=ANALOG if options.analog else SQUARE,
         focal=options.start_focal(observations.image_size),
         start=start,
+        robust=robust,
         progress=progress,
     )
 
 
-def _weights(observations: Observations, fit: HybridFit) -> Tensor:
+def _weights(observations: Observations, residuals: Tensor) -> Tensor:
     """(V, N) by the corners' covariances, and by what residuals have beyond these, which is the same for all.
 
     Normalized to a mean information of one; 0 where a corner was not seen.
     """
     covariances = observations.covariances()
-    seen = torch.isfinite(fit.residuals).all(-1)
+    seen = torch.isfinite(observations.pixels()).all(-1)
     if covariances is None:
         return seen.double()
     own = 0.5 * covariances.diagonal(dim1=-2, dim2=-1).sum(-1)
-    total = 0.5 * fit.rms**2
-    information = 1.0 / (own + max(total - float(own[seen].mean()), 0.0))
+    total = float(noise_scale(residuals.flatten(0, 1))) ** 2
+    information = 1.0 / (own + max(total - float(own[seen].median()), 0.0))
     return torch.where(seen, information / information[seen].mean(), 0.0).sqrt()
 
 
 def _without_outliers(
-    observations: Observations,
-    fit: HybridFit,
-    options: CalibrationOptions,
-    reject: OutlierRejection,
-    progress: Progress,
+    observations: Observations, options: CalibrationOptions, reject: OutlierRejection, progress: Progress
 ) -> CameraCalibrationResult:
     """Leave out corners and views that noise cannot explain, and fit again until nothing changes."""
     pixels, names = observations.pixels(), observations.names
     seen = torch.isfinite(pixels).all(-1)
-    own = _weights(observations, fit) if options.weighted else seen.double()
-    # A few wrong corners bend the first fit towards them; bounded weights let them stand out.
-    for _ in range(_CAUCHY_ROUNDS):
-        weighted = fit.residuals_of(pixels) * own[..., None]
-        scale = max(_CAUCHY_SCALE * float(noise_scale(weighted.flatten(0, 1))), LEAST_NOISE)
-        bounded = own / torch.sqrt(1.0 + (weighted.norm(dim=-1) / scale) ** 2)
-        fit = _fit(observations, pixels, torch.where(seen, bounded, 0.0), fit, options, progress)
+    own = seen.double()
+    # A few wrong corners bend a plain fit towards them; bounded weights let them stand out.
+    fit = _fit_views(observations, pixels, own, None, options, progress, robust=True)
+    if options.weighted:
+        own = _weights(observations, fit.residuals)
     left = list(range(len(pixels)))
     rejected = torch.zeros_like(seen)
     views: list[RejectedView] = []
@@ -131,7 +126,7 @@ def _without_outliers(
         progress(f"{int(rejected.sum())} corners and {len(views)} views left out")
         weights = torch.where(rejected, 0.0, own)[left]
         used = observations.subset([names[i] for i in left])
-        fit = _fit(used, pixels[left], weights, None, options, progress).among(left, len(pixels))
+        fit = _fit_views(used, pixels[left], weights, None, options, progress).among(left, len(pixels))
     plain = fit.residuals_of(pixels)
     weighted = plain * own[..., None]
     limits = corner_limits(torch.where(rejected[..., None], torch.nan, weighted))

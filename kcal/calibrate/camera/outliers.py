@@ -169,7 +169,8 @@ def noise_scale(residuals: Tensor) -> Tensor:
         >>> 0.9 < float(noise_scale(residuals)) < 1.1
         True
     """
-    return (_MAD * residuals.abs().flatten(-2).nanmedian(-1).values).nan_to_num(0.0)
+    # Where the lens does not reach most corners, the others tell nothing.
+    return (_MAD * residuals.abs().flatten(-2).nanmedian(-1).values).nan_to_num(0.0, posinf=0.0)
 
 
 def corner_limits(residuals: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from kcal.lens.uncertainty import image_sigma
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CalibrationSummary:
-    """What to read first.
+    """The figures of a calibration to read first.
 
     Args:
         center: px, standard deviation of a far direction in the middle of the image, after the best turn of the camera
@@ -26,6 +26,10 @@ class CalibrationSummary:
         pupil: meters by which the entrance pupil of the image's farthest corner lies before that of its middle; None
             without a hybrid lens.
         pupil_sigma: its standard deviation.
+
+    Example:
+        >>> CalibrationSummary(center=0.05, border=0.2, worst=0.5, unreached=0.1).pupil is None
+        True
     """
 
     center: float
@@ -37,7 +41,25 @@ class CalibrationSummary:
 
 
 def summarize(result: CameraCalibrationResult) -> CalibrationSummary:
-    """The figures of one calibration."""
+    """Sum up one calibration.
+
+    Example:
+        >>> from kcal.calibrate.camera.calibrate import calibrate_camera
+        >>> from kcal.corners.board import Board
+        >>> from kcal.corners.observations import Observations, View
+        >>> from kcal.lens.camera import Camera
+        >>> from kcal.lens.pose import rotation_from_vector
+        >>> board, views = Board(columns=7, rows=6, square=0.05), []
+        >>> truth = Camera.build(focal=(800, 800), center=(322, 238), size=(640, 480), model="pinhole")
+        >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)
+        >>> for i, rotation in enumerate(rotation_from_vector(tilts)):
+        ...     points = board.points @ rotation.T + torch.tensor([-0.15, -0.12, 0.6], dtype=torch.float64)
+        ...     views.append(View(name=str(i), pixels=truth.project(points)[0].tolist()))
+        >>> result = calibrate_camera(Observations(board=board, image_size=(640, 480), views=views))
+        >>> brief = summarize(result)
+        >>> 0 < brief.center < brief.border < brief.worst, 0 < brief.unreached < 1
+        (True, True)
+    """
     camera = result.camera
     center = border = worst = math.nan
     if camera.calibration is not None and camera.calibration.covariance is not None:

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 BENDING, STRETCH, PRINT = range(3)
+# Of modes whose amplitudes have a prior of their own.
+KNOWN = -1
 
 
 class BoardModes(NamedTuple):
@@ -21,7 +23,13 @@ class BoardModes(NamedTuple):
     Attributes:
         shapes: (B, 3, N) displacement of each corner by a mode of amplitude one.
         unit: (B,) meters; amplitudes of a family are this times the same number.
-        family: (B,) `BENDING`, `STRETCH` (with shear) or `PRINT`.
+        family: (B,) `BENDING`, `STRETCH` (with shear) or `PRINT`; `KNOWN` where the unit is the standard deviation.
+
+    Example:
+        >>> grid = torch.cartesian_prod(torch.arange(7.0), torch.arange(6.0)).double()
+        >>> modes = board_modes(torch.cat([grid, torch.zeros(42, 1).double()], 1))
+        >>> modes.family.bincount().tolist(), float(modes.unit.max())  # twelve of bending; the extent is 6
+        ([12, 2, 14], 6.0)
     """
 
     shapes: Tensor
@@ -69,3 +77,15 @@ def board_modes(points: Tensor) -> BoardModes:
             unit += [0.5 ** (degree - 1)] * 2
             family += [PRINT] * 2
     return BoardModes(torch.stack(shapes), extent * torch.tensor(unit, dtype=points.dtype), torch.tensor(family))
+
+
+def undetermined_modes(points: Tensor) -> Tensor:
+    """(7, 3, N) displacements that cameras cannot tell: shifts in x, y, z, two tilts, a turn, and the scale.
+
+    Args:
+        points: (N, 3) meters, z = 0.
+    """
+    x, y = (points[:, :2] - points[:, :2].mean(0)).unbind(-1)
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    modes = [(one, zero, zero), (zero, one, zero), (zero, zero, one), (zero, zero, x), (zero, zero, y)]
+    return torch.stack([torch.stack(mode) for mode in [*modes, (-y, x, zero), (x, y, zero)]])

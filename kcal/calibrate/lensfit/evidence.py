@@ -21,7 +21,7 @@ from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
 from kcal.calibrate.bundle.views import LEAST_NOISE
-from kcal.calibrate.lensfit.board_modes import BoardModes
+from kcal.calibrate.lensfit.board_modes import KNOWN, BoardModes
 from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.zernike import ZernikeModes
@@ -30,6 +30,10 @@ from kcal.lens.zernike import ZernikeModes
 # bending, stretch, print (in units of its extent): mean and sd of ln.
 _MEAN = np.log([2e-4, 5e-4, 5e-4, 2e-4])
 _SD = np.array([2.0, 1.5, 1.5, 1.5])
+# Where the amplitudes of the board stand among the hyperparameters: the last three.
+BOARD = -3
+# Where the pupil stands among the unknowns.
+_PUPIL = 4
 # Unequal and skewed axes, in units of R: pixels are square.
 SQUARE, ANALOG = 1e-4, 2e-3
 # Of the principal point about the middle, in diagonals.
@@ -57,6 +61,13 @@ class PriorFamilies(NamedTuple):
         amplitude: (S,) index of the log amplitude, -1 where the standard deviation is the unit.
         decay: (S,) index of the log decay, -1 where there is none.
         degree: (S,) x above.
+
+    Example:
+        >>> one = torch.ones(1, dtype=torch.float64)
+        >>> families = PriorFamilies(0 * one, 0 * one, torch.tensor([0]), torch.tensor([1]), 2 * one)
+        >>> h = torch.tensor([0.3, 0.5], dtype=torch.float64).log()
+        >>> round(float(families.deviation(h)), 4)  # 0.3 exp(-0.5 * 2)
+        0.1104
     """
 
     mean: Tensor
@@ -64,6 +75,15 @@ class PriorFamilies(NamedTuple):
     amplitude: Tensor
     decay: Tensor
     degree: Tensor
+
+    def with_board(self, board: BoardModes) -> PriorFamilies:
+        """The same camera, and another board, or the same in other variables."""
+        lens = len(self.mean) - len(board.unit)
+        family = torch.where(board.family == KNOWN, -1, self.amplitude[_PUPIL] + 1 + board.family)
+        return self._replace(
+            log_unit=torch.cat([self.log_unit[:lens], board.unit.log()]),
+            amplitude=torch.cat([self.amplitude[:lens], family]),
+        )
 
     def deviation(self, h: Tensor) -> Tensor:
         """(S,) prior standard deviations."""
@@ -109,10 +129,11 @@ def prior_families(
     # Without an amplitude: how surely pixels are square.
     field_unit = [math.log(form.radius) + (math.log(square) if own is None else 0.0) for own in amplitude]
     none = [-1] * len(leading)
+    board_family = torch.where(board.family == KNOWN, -1, by_pupil + 1 + board.family)
     return PriorFamilies(
         mean,
         torch.cat([torch.tensor([*map(math.log, leading), *field_unit], dtype=torch.float64), board.unit.log()]),
-        torch.cat([torch.tensor([*none[:-2], by_pupil, by_pupil, *_numbers(amplitude)]), by_pupil + 1 + board.family]),
+        torch.cat([torch.tensor([*none[:-2], by_pupil, by_pupil, *_numbers(amplitude)]), board_family]),
         torch.cat([torch.tensor([*none, *_numbers(decay)]), torch.full_like(board.family, -1)]),
         torch.cat([torch.tensor([0.0] * len(leading) + [*degree], dtype=torch.float64), torch.zeros_like(board.unit)]),
     )
@@ -129,6 +150,43 @@ def typical_hyperprior(modes: FieldModes | None = None) -> Hyperprior:
         torch.from_numpy(np.concatenate([mean, _MEAN])),
         torch.from_numpy(np.concatenate([sd, _SD])),
     )
+
+
+class Quadratic(NamedTuple):
+    """Data near a solution: chi²(x) = c - 2 gᵀx + xᵀKx, poses eliminated.
+
+    Attributes:
+        K: (S, S).
+        g: (S,).
+        c: number.
+        freedom: ν, residuals without those that poses take up.
+    """
+
+    K: Tensor
+    g: Tensor
+    c: float
+    freedom: float
+
+
+def negative_log_evidence(data: Quadratic, families: PriorFamilies, v: np.ndarray) -> tuple[float, np.ndarray]:
+    """The negative logarithm of the evidence of v = (h, ln σ²), (H + 1,), and its gradient."""
+    K, g, c, freedom = data.K.numpy(), data.g.numpy(), data.c, data.freedom
+    here, log_variance = torch.from_numpy(v[:-1]), v[-1]
+    s2 = math.exp(log_variance)
+    d = families.deviation(here).numpy()
+    A = torch.from_numpy(K * d[:, None] * d / s2)
+    A.diagonal().add_(1.0)
+    root, info = torch.linalg.cholesky_ex(A)
+    if int(info):
+        return math.inf, np.zeros_like(v)
+    inverse = torch.linalg.solve_triangular(root, torch.eye(len(g), dtype=A.dtype), upper=False).numpy()
+    y = inverse.T @ (inverse @ (d * g / s2))
+    kept = (inverse**2).sum(0)
+    x = d * y
+    rss = c - 2 * g @ x + x @ (K @ x)
+    value = 0.5 * (freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
+    by_h = families.slopes(here).numpy() @ (0.5 * (1 - y * y - kept))
+    return value, np.append(by_h, 0.5 * (freedom - (len(g) - kept.sum()) - rss / s2))
 
 
 def maximize_evidence(
@@ -153,37 +211,23 @@ def maximize_evidence(
         variance: start.
         hyperprior: of h; the typical one of the default field if not given.
     """
-    K_, g_, S = K.numpy(), g.numpy(), len(g)
-    h_mean, h_sd = (part.numpy() for part in hyperprior or typical_hyperprior())
+    data = Quadratic(K, g, c, freedom)
+    mean, sd = (part.numpy() for part in hyperprior or typical_hyperprior())
 
     values: list[float] = []
 
     def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
-        here, log_variance = torch.from_numpy(v[:-1]), v[-1]
-        s2 = math.exp(log_variance)
-        d = families.deviation(here).numpy()
-        A = torch.from_numpy(K_ * d[:, None] * d / s2)
-        A.diagonal().add_(1.0)
-        root, info = torch.linalg.cholesky_ex(A)
-        if int(info):
+        value, slope = negative_log_evidence(data, families, v)
+        if not math.isfinite(value):
             # Priors are far too wide for this precision: worse than any trial before, so that a shorter step follows.
-            return max(values, default=1e30) + 1.0, np.zeros_like(v)
-        inverse = torch.linalg.solve_triangular(root, torch.eye(S, dtype=A.dtype), upper=False).numpy()
-        y = inverse.T @ (inverse @ (d * g_ / s2))
-        kept = (inverse**2).sum(0)
-        x = d * y
-        rss = c - 2 * g_ @ x + x @ (K_ @ x)
-        value = 0.5 * (freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
-        by_variance = 0.5 * (1 - y * y - kept)
-        by_h = families.slopes(here).numpy() @ by_variance
-        z = (v[:-1] - h_mean) / h_sd
-        by_noise = 0.5 * (freedom - (S - kept.sum()) - rss / s2)
+            return max(values, default=1e30) + 1.0, slope
+        z = (v[:-1] - mean) / sd
         values.append(value + 0.5 * float(z @ z))
-        return values[-1], np.append(by_h + z / h_sd, by_noise)
+        return values[-1], slope + np.append(z / sd, 0.0)
 
     start = np.append(h.numpy(), math.log(variance))
     # The last bound is open: where all are closed, L-BFGS-B makes its first trial at the bounds.
-    bounds: list[tuple[float, float | None]] = [(m - 5 * s, m + 5 * s) for m, s in zip(h_mean, h_sd, strict=True)]
+    bounds: list[tuple[float, float | None]] = [(m - 5 * s, m + 5 * s) for m, s in zip(mean, sd, strict=True)]
     bounds.append((max(start[-1] - 8, 2.0 * math.log(LEAST_NOISE)), None))
     found = lbfgs(
         objective,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import NamedTuple
 
 import torch
@@ -21,13 +22,18 @@ _CHUNK = 2_000_000
 
 
 class HybridState(NamedTuple):
-    """What is solved for.
+    """Camera, board and poses: what is solved for.
 
     Attributes:
         params: (5 + P,) of the camera.
         board: (B,) amplitudes of the board's modes, meters.
         rotation: (V, 3, 3) cam_from_board.
         translation: (V, 3) meters.
+
+    Example:
+        >>> state = HybridState(torch.zeros(9), torch.zeros(28), torch.eye(3).expand(4, 3, 3), torch.zeros(4, 3))
+        >>> len(state.rotation)
+        4
     """
 
     params: Tensor
@@ -78,6 +84,12 @@ class HybridProblem:
         self.precision = torch.where(self.free, precision, 0.0)
         self.residual_count = 2 * int(self.seen.sum())
 
+    def with_weights(self, weights: Tensor) -> HybridProblem:
+        """The same problem with other weights (V, N) of its corners."""
+        changed = copy.copy(self)
+        changed.weights = torch.where(self.seen, weights, 0.0)[:, None]
+        return changed
+
     def shared(self, state: HybridState) -> Tensor:
         """(S,) unknowns of the camera and the board, relative to the prior's mean."""
         own = state.params[[0, 2, 3, *range(5, len(state.params))]]
@@ -88,13 +100,16 @@ class HybridProblem:
         rotated = state.rotation[views] @ flat
         return rotated, rotated + state.translation[views, :, None]
 
-    def residuals(self, state: HybridState) -> Tensor:
-        """(V, 2, N); NaN where a seen corner has no image."""
+    def errors(self, state: HybridState) -> Tensor:
+        """(V, 2, N) projected minus seen, pixels; NaN where a seen corner has no image, 0 where none was seen."""
         _, points = self._board(state)
         seen = project_components(points, state.params, self.model)
-        error = (seen.pixels - self.target) * self.weights
         bad = torch.where(seen.regular, 0.0, torch.nan)[:, None]
-        return torch.where(self.seen[:, None], error + bad, 0.0)
+        return torch.where(self.seen[:, None], seen.pixels - self.target + bad, 0.0)
+
+    def residuals(self, state: HybridState) -> Tensor:
+        """(V, 2, N); NaN where a corner of any weight has no image."""
+        return torch.where(self.weights > 0, self.errors(state) * self.weights, 0.0)
 
     def cost(self, state: HybridState) -> Tensor:
         """See `Problem.cost`."""
@@ -109,7 +124,7 @@ class HybridProblem:
         board = torch.einsum("vkun,vkl,bln->vbun", seen.by_point, state.rotation[views], self.shapes)
         error = (seen.pixels - self.target[views])[:, None]
         rows = torch.cat([step_rows(seen.by_point, rotated), by_camera, board, error], 1)
-        return torch.where(self.seen[views, None, None], rows * self.weights[views, None], 0.0).flatten(-2)
+        return torch.where(self.weights[views, None] > 0, rows * self.weights[views, None], 0.0).flatten(-2)
 
     def linearize(self, state: HybridState) -> SchurLinearization:
         """See `Problem.linearize`."""

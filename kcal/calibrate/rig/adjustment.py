@@ -93,7 +93,7 @@ class Adjustment:
         data, found = self.data, list[Block]()
         if data.boards and masks.boards.any():
             pixels, white = (value[masks.boards] for value in (data.boards.pixels, self.corner_whitening()))
-            found.append(BoardBlock(pixels, white, data.boards.board.points, free_warp=free_warp))
+            found.append(BoardBlock(pixels, white, data.boards.points, free_warp=free_warp))
         if data.landmarks and masks.landmarks.any():
             surveyed = data.landmarks.points[masks.landmarks], data.landmarks.sigma[masks.landmarks]
             found.append(LandmarkBlock(*_weighted(data.landmarks, masks.landmarks), *surveyed))

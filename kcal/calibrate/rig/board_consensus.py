@@ -103,7 +103,7 @@ def check_cameras(data: RigData, good: Tensor, rms: Sequence[float], solver: LMO
         one, other = pair
         if data.cameras[one].size != data.cameras[other].size or not bool(good[:, pair].any(0).all()):
             continue
-        points = boards.board.points
+        points = boards.points
         swapped = [
             pose_alone(points, boards.pixels[good[:, a], a], data.cameras[b], solver)[1] for a, b in (pair, pair[::-1])
         ]

@@ -70,6 +70,6 @@ def calibrate_rig(
         if min(counts) < MINIMUM_CORNERS:
             raise InputError(f"pair {pair[0]}, {pair[1]}: at least {MINIMUM_CORNERS} corners are needed in each view")
     for side in (0, 1):
-        for i in (~spread_out(boards.board.points, boards.pixels[:, side])).nonzero()[:, 0].tolist():
+        for i in (~spread_out(boards.points, boards.pixels[:, side])).nonzero()[:, 0].tolist():
             raise InputError(f"{pairs[i][side]}: all its corners, or all but one, lie on one line; leave the pair out")
     return solve_rig(RigData(cameras=(left, right), names=("left", "right"), boards=boards), options)

@@ -227,7 +227,7 @@ class _BoardViews:
         boards = data.boards
         if boards is None:
             return
-        points, good = boards.board.points, []
+        points, good = boards.points, []
         for c, camera in enumerate(data.cameras):
             _, valid = camera.normalize(boards.pixels[:, c])
             enough = valid.sum(-1) >= MINIMUM_CORNERS
@@ -268,7 +268,7 @@ class _BoardViews:
         cameras = self.data.cameras[first], self.data.cameras[second]
         one, two = (Poses(self._alone[c].rotation[both], self._alone[c].translation[both]) for c in (first, second))
         pixels = boards.pixels[both][:, [first, second]]
-        relative, turned, error = consensus(boards.board.points, pixels, cameras, one, two)
+        relative, turned, error = consensus(boards.points, pixels, cameras, one, two)
         if bool(turned.any()):
             self._turn(boards, both[turned], second)
         limit = max(_FOREIGN_TIMES * float(error.median()), _FOREIGN_PX)
@@ -288,7 +288,7 @@ class _BoardViews:
             self.data, boards=dataclasses.replace(boards, pixels=pixels, covariance=covariance)
         )
         alone = self._alone[camera]
-        new = Poses(alone.rotation[views], alone.translation[views]).after(half_turn(boards.board.points))
+        new = Poses(alone.rotation[views], alone.translation[views]).after(half_turn(boards.points))
         alone.rotation[views], alone.translation[views] = new.rotation, new.translation
         self.flipped += [TurnedBoard(boards.names[i], self.data.names[camera]) for i in views.tolist()]
 

@@ -81,7 +81,7 @@ def _each_camera_alone(work: Adjustment, mask: Tensor) -> tuple[Tensor, Tensor]:
             continue
         pixels = torch.full_like(boards.pixels[some], torch.nan)
         pixels[:, c] = boards.pixels[some, c]
-        block = BoardBlock(pixels, whitening[some], boards.board.points)
+        block = BoardBlock(pixels, whitening[some], boards.points)
         problem = RigProblem(cameras, [block], (), [FreeParameters((), ())] * len(cameras), held, held)
         start = work.part(work.none()._replace(boards=some))
         found = RigState(*minimize(problem, start, _POSES).state)

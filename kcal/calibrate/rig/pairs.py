@@ -9,10 +9,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from kcal.calibrate.rig.sources import Boards
+from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError
+from kcal.lens.calibration import BoardRecord
 from kcal.lens.camera import Camera
 
 Pair = tuple[str, str]
@@ -114,6 +117,26 @@ def read_pairs(path: str | Path, left: Sequence[str], right: Sequence[str]) -> l
     return pairs
 
 
+def _deviation(cameras: Sequence[Camera], board: Board) -> Tensor | None:
+    """(N, 3) meters by which the corners lie elsewhere than ordered, as the calibrations of the cameras found.
+
+    The mean of what the cameras found. A board that looks alike after half a turn may have been read from either end:
+    what follows the first camera's deviation better counts.
+    """
+    found: list[Tensor] = []
+    same = BoardRecord(columns=board.columns, rows=board.rows, square=board.square)
+    for camera in cameras:
+        record = None if camera.calibration is None else camera.calibration.record
+        if record is None or record.board_deviation is None or record.board != same:
+            continue
+        own = torch.tensor(record.board_deviation, dtype=torch.float64)
+        turned = own.flip(0) * torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
+        if found and not board.unambiguous and (turned - found[0]).norm() < (own - found[0]).norm():
+            own = turned
+        found.append(own)
+    return torch.stack(found).mean(0) if found else None
+
+
 def paired_boards(
     cameras: tuple[Camera, Camera], observations: tuple[Observations, Observations], pairs: Sequence[Pair]
 ) -> Boards:
@@ -139,5 +162,6 @@ def paired_boards(
         board=boards[0],
         pixels=torch.stack([side.pixels() for side in sides], 1),
         names=tuple(" ".join(dict.fromkeys(pair)) for pair in pairs),
+        deviation=_deviation(cameras, boards[0]),
         covariance=torch.stack(known, 1) if len(known) == 2 else None,
     )

@@ -158,7 +158,7 @@ def places(work: Adjustment) -> dict[Source, dict[str, Tensor]]:
     """Positions (3,) of boards (their middle), landmarks and features in the local frame, by name."""
     data, state, found = work.data, work.state, dict[Source, dict[str, Tensor]]()
     if data.boards is not None:
-        middle = data.boards.board.points.mean(0)
+        middle = data.boards.points.mean(0)
         where = state.board_rotation @ middle + state.board_translation
         found["boards"] = dict(zip(data.boards.names, where, strict=True))
     if data.landmarks is not None:

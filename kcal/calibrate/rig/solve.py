@@ -93,6 +93,11 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     if options.board_warp and data.boards is None:
         raise InputError("the board's warp cannot be estimated without boards")
     refuse_same_camera(data)
+    if options.intrinsics == "free" and any(camera.model.hybrid for camera in data.cameras):
+        raise InputError(
+            "hybrid cameras cannot be refined without what their own calibrations know: hold them, take their "
+            "covariances as priors, or calibrate parametric cameras"
+        )
     if not options.weighted and data.boards is not None:
         data = dataclasses.replace(data, boards=dataclasses.replace(data.boards, covariance=None))
     data, warnings = _without_rayless(data)

@@ -49,6 +49,7 @@ class Boards:
         board: the board.
         pixels: (V, C, N, 2) its corners.
         names: one for each moment.
+        deviation: (N, 3) meters of each corner, as measured, from where it should be by the order; zero if left out.
         covariance: (V, C, N, 2, 2) px² of corners, by which they weigh; all alike if left out.
         sigma: of a corner along an axis, px; estimated from the residuals if left out.
     """
@@ -56,10 +57,20 @@ class Boards:
     board: Board
     pixels: Tensor
     names: tuple[str, ...]
+    deviation: Tensor | None = None
     covariance: Tensor | None = None
     sigma: float | None = None
 
+    @property
+    def points(self) -> Tensor:
+        """(N, 3) meters: the board's corners as measured, or as ordered."""
+        return self.board.points if self.deviation is None else self.board.points + self.deviation
+
     def __post_init__(self) -> None:
+        if self.deviation is not None and self.deviation.shape != (self.board.corners, 3):
+            raise InputError(
+                f"boards: a deviation ({self.board.corners}, 3) is needed, got {tuple(self.deviation.shape)}"
+            )
         if self.pixels.ndim != 4 or self.pixels.shape[2:] != (self.board.corners, 2):
             raise InputError(
                 f"boards: pixels (V, C, {self.board.corners}, 2) are needed, got {tuple(self.pixels.shape)}"

@@ -214,7 +214,7 @@ class TestWhatCannotBeComputed:
         _uncertainty = assess._uncertainty
         monkeypatch.setattr(assess, "_uncertainty", count)
         monkeypatch.setattr(BoardProblem, "linearize", folded)
-        result = calibrate_camera(seen, CalibrationOptions(model="opencv14"))
+        result = calibrate_camera(seen, CalibrationOptions(weak_prior=None, model="opencv14"))
         assert calls
         assert set(result.sigma.values()) == {None}
         assert bool(result.covariance.diagonal()[:4].isnan().all())

@@ -41,7 +41,7 @@ def values(result: CameraCalibrationResult) -> dict[str, float]:
 def test_the_end_is_the_dense_optimum_and_sigma_its_inverse(options: dict[str, Any], groups: list[list[str]]) -> None:
     """A dense Gauss-Newton step from the result, by autograd and lstsq over the unknowns and all poses, is nothing."""
     pixels = scene()
-    result = calibrate_camera(observe(pixels), CalibrationOptions(**options))
+    result = calibrate_camera(observe(pixels), CalibrationOptions(**{"model": "opencv5", **options}))
     names, model = result.camera.names, result.camera.model
     base, count = result.camera.params, len(groups)
     spread = torch.zeros(count, len(base), dtype=torch.float64)
@@ -80,7 +80,7 @@ def test_the_end_is_the_dense_optimum_and_sigma_its_inverse(options: dict[str, A
 def test_rules_hold_through_richer_models() -> None:
     """Over the ladder, on folded views (more than a thousand corners), with values of the last model's coefficients."""
     fixed = {"k6": 0.004, "s2": 0.0}
-    options = CalibrationOptions(model="opencv12", fixed=fixed, tied=(("fx", "fy"), ("s1", "s3")))
+    options = CalibrationOptions(weak_prior=None, model="opencv12", fixed=fixed, tied=(("fx", "fy"), ("s1", "s3")))
     result = calibrate_camera(observe(scene(25)), options)
     found = values(result)
     assert (found["k6"], found["s2"]) == (0.004, 0.0)
@@ -88,17 +88,17 @@ def test_rules_hold_through_richer_models() -> None:
     assert found["s1"] == pytest.approx(found["s3"], rel=1e-12)
     assert result.sigma["s1"] == result.sigma["s3"]
     assert (result.sigma["k6"], result.sigma["s2"]) == (None, None)
-    whole = calibrate_camera(observe(scene(25)), CalibrationOptions(model="opencv12"))
+    whole = calibrate_camera(observe(scene(25)), CalibrationOptions(weak_prior=None, model="opencv12"))
     assert whole.rms < result.rms
 
 
 def test_a_narrow_prior_fixes_and_a_wide_one_does_nothing() -> None:
     seen = observe(scene())
     plain, narrow, wide = (
-        calibrate_camera(seen, CalibrationOptions(priors=priors))
+        calibrate_camera(seen, CalibrationOptions(model="opencv5", priors=priors))
         for priors in ({}, {"cx": (330.0, 1e-6)}, {"cx": (330.0, 1e6)})
     )
-    fixed = calibrate_camera(seen, CalibrationOptions(fixed={"cx": 330.0}))
+    fixed = calibrate_camera(seen, CalibrationOptions(model="opencv5", fixed={"cx": 330.0}))
     for name, value in values(plain).items():
         assert values(wide)[name] == pytest.approx(value, rel=1e-6, abs=1e-6)
         assert values(narrow)[name] == pytest.approx(values(fixed)[name], rel=1e-5, abs=1e-6)
@@ -107,9 +107,12 @@ def test_a_narrow_prior_fixes_and_a_wide_one_does_nothing() -> None:
 def test_a_field_of_view_is_a_start() -> None:
     truth = camera()
     degrees = 2.0 * math.degrees(math.atan(0.5 * SIZE[0] / float(truth.focal[0])))
-    options = CalibrationOptions(field_of_view=degrees)
+    options = CalibrationOptions(model="opencv5", field_of_view=degrees)
     assert options.start_focal(SIZE) == pytest.approx(float(truth.focal[0]))
-    hinted, plain = calibrate_camera(observe(scene()), options), calibrate_camera(observe(scene()))
+    hinted, plain = (
+        calibrate_camera(observe(scene()), options),
+        calibrate_camera(observe(scene()), CalibrationOptions(model="opencv5")),
+    )
     assert values(hinted) == pytest.approx(values(plain), rel=1e-5, abs=1e-6)
 
 
@@ -133,12 +136,12 @@ def test_a_field_of_view_is_a_start() -> None:
 )
 def test_refusals(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        CalibrationOptions(**options)
+        CalibrationOptions(**{"model": "opencv5", **options})
 
 
 def test_a_focal_length_has_no_natural_value() -> None:
     with pytest.raises(InputError, match="fx has no natural value"):
-        calibrate_camera(observe(scene()), CalibrationOptions(fixed={"fx": None}))
+        calibrate_camera(observe(scene()), CalibrationOptions(model="opencv5", fixed={"fx": None}))
 
 
 @pytest.mark.parametrize("views", [1, 6])

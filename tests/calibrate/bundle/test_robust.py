@@ -32,12 +32,14 @@ def test_wrong_corners_hardly_matter(kind: str) -> None:
     truth = camera()
     poses = motions(truth, 12, 5)
     pixels = pixels_of(truth, poses, noise=0.1, seed=2)
-    clean = calibrate_camera(observe(pixels)).camera.params
+    clean = calibrate_camera(observe(pixels), CalibrationOptions(model="opencv5")).camera.params
     generator = torch.Generator().manual_seed(3)
     wrong = torch.rand(pixels.shape[:2], generator=generator) < 0.02
     pixels[wrong] += 15.0
-    spoilt = calibrate_camera(observe(pixels)).camera.params
-    result = calibrate_camera(observe(pixels), CalibrationOptions(loss=RobustLoss(kind=kind, scale=0.4)))
+    spoilt = calibrate_camera(observe(pixels), CalibrationOptions(model="opencv5")).camera.params
+    result = calibrate_camera(
+        observe(pixels), CalibrationOptions(model="opencv5", loss=RobustLoss(kind=kind, scale=0.4))
+    )
     robust = result.camera.params
     assert float((robust - clean)[:4].norm()) < 0.1 * float((spoilt - clean)[:4].norm())
     assert result.weighted_rms is not None
@@ -69,16 +71,16 @@ def test_the_solver_stops_where_the_robust_cost_is_flat(kind: str) -> None:
 def test_a_focal_hint_is_tried_first_and_changes_nothing_else() -> None:
     truth = camera()
     seen = observe(pixels_of(truth, motions(truth, 10, 5), noise=0.1, seed=2))
-    plain = calibrate_camera(seen)
+    plain = calibrate_camera(seen, CalibrationOptions(model="opencv5"))
     for focal in (350.0, 500.0, 800.0):
-        hinted = calibrate_camera(seen, CalibrationOptions(focal=focal))
+        hinted = calibrate_camera(seen, CalibrationOptions(model="opencv5", focal=focal))
         assert hinted.rms == pytest.approx(plain.rms, rel=1e-9)
         torch.testing.assert_close(hinted.camera.focal, plain.camera.focal, rtol=1e-6, atol=0)
 
 
 def test_refusals() -> None:
     with pytest.raises(InputError, match="focal must be positive"):
-        CalibrationOptions(focal=-3.0)
+        CalibrationOptions(model="opencv5", focal=-3.0)
     with pytest.raises(InputError, match="kind must be"):
         RobustLoss(kind="l1")
     with pytest.raises(InputError, match="scale must be positive"):

@@ -43,8 +43,8 @@ def test_weights_follow_the_covariances():
 def test_equal_covariances_change_nothing():
     truth = camera()
     seen = observe(pixels_of(truth, motions(truth, 6, 1), noise=0.1))
-    plain = calibrate_camera(seen)
-    weighted = calibrate_camera(with_covariance(seen, torch.full((6,), 0.05)))
+    plain = calibrate_camera(seen, CalibrationOptions(model="opencv5"))
+    weighted = calibrate_camera(with_covariance(seen, torch.full((6,), 0.05)), CalibrationOptions(model="opencv5"))
     # Both stop at a minimum found to 1e-12 of its cost, which is flat: parameters to 1e-6 of their σ.
     torch.testing.assert_close(weighted.camera.params, plain.camera.params, rtol=1e-6, atol=1e-6)
     assert weighted.rms == pytest.approx(plain.rms, rel=1e-12)
@@ -58,7 +58,7 @@ def test_weights_beat_no_weights_and_know_their_error():
     for seed in range(4):
         truth, seen = mixed(seed)
         for weighted in (True, False):
-            result = calibrate_camera(seen, CalibrationOptions(weighted=weighted))
+            result = calibrate_camera(seen, CalibrationOptions(model="opencv5", weighted=weighted))
             away = result.camera.params[:4] - truth.params[:4]
             error[weighted].append(away)
             if weighted:

@@ -21,7 +21,7 @@ from kcal.solve.result import SolverStatus
 
 
 def solve(pixels: Tensor, model: str = "opencv5", **options: object) -> CameraCalibrationResult:
-    return calibrate_camera(observe(pixels), CalibrationOptions(model=model, **options))
+    return calibrate_camera(observe(pixels), CalibrationOptions(**{"model": model, "weak_prior": None, **options}))
 
 
 def fitted(result: CameraCalibrationResult) -> dict[str, float]:
@@ -63,7 +63,7 @@ class TestNoiseFree:
         result = calibrate_camera(
             observe(pixels),
             # Residuals below 1e-7 px tell nothing more, and the last steps of 20 coefficients are endless.
-            CalibrationOptions(model=model, solver=LMOptions(max_iterations=150, residual_floor=1e-7)),
+            CalibrationOptions(weak_prior=None, model=model, solver=LMOptions(max_iterations=150, residual_floor=1e-7)),
         )
         assert result.rms < 1e-4
         # Within the outermost corner: beyond it a few corners of eight boards do not determine 20 coefficients.
@@ -262,7 +262,7 @@ class TestFlips:
 class TestDegenerate:
     def test_no_view(self) -> None:
         with pytest.raises(InputError, match="no view with a board"):
-            calibrate_camera(observe(torch.zeros(0, BOARD.corners, 2).double()))
+            calibrate_camera(observe(torch.zeros(0, BOARD.corners, 2).double()), CalibrationOptions(model="opencv5"))
 
     @pytest.mark.parametrize("views", [1, 2])
     def test_too_few_views(self, views: int) -> None:
@@ -385,7 +385,7 @@ def test_progress_is_told_each_model() -> None:
     truth = camera("opencv8")
     told: list[str] = []
     seen = observe(pixels_of(truth, motions(truth, 6, 2)))
-    calibrate_camera(seen, CalibrationOptions(model="opencv8"), told.append)
+    calibrate_camera(seen, CalibrationOptions(weak_prior=None, model="opencv8"), told.append)
     assert told == ["start (opencv5)", "opencv8"]
 
 

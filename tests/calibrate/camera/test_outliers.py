@@ -11,7 +11,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibratio
 from kcal.calibrate.camera.outliers import OutlierRejection, corners_beyond
 from kcal.errors import InputError
 
-REJECT = CalibrationOptions(reject=OutlierRejection())
+REJECT = CalibrationOptions(model="opencv5", reject=OutlierRejection())
 NOISE = 0.1
 
 
@@ -53,7 +53,7 @@ def assert_same_solution(one: CameraCalibrationResult, other: CameraCalibrationR
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_clean_data_keep_all_corners_and_the_same_result(seed: int) -> None:
     seen = observe(scene(seed=seed))
-    result, plain = calibrate_camera(seen, REJECT), calibrate_camera(seen)
+    result, plain = calibrate_camera(seen, REJECT), calibrate_camera(seen, CalibrationOptions(model="opencv5"))
     assert result.rejected_corners == ()
     assert result.rejected_views == ()
     assert result.rejected_share == 0.0
@@ -67,9 +67,9 @@ def test_gross_outliers_are_found_and_move_nothing(model: str, views: int, seed:
     clean = scene(views)
     pixels, wrong = spoil(clean, seed)
     assert len(wrong) >= 5
-    options = CalibrationOptions(model=model, reject=OutlierRejection())
+    options = CalibrationOptions(weak_prior=None, model=model, reject=OutlierRejection())
     result = calibrate_camera(observe(pixels), options)
-    reference = calibrate_camera(observe(clean), CalibrationOptions(model=model))
+    reference = calibrate_camera(observe(clean), CalibrationOptions(weak_prior=None, model=model))
     assert listed(result) == wrong
     assert result.rejected_share == pytest.approx(len(wrong) / (views * 42))
     before, after = (dict(zip(r.camera.names, r.camera.params.tolist(), strict=True)) for r in (reference, result))
@@ -88,7 +88,7 @@ def test_the_result_is_that_of_the_data_that_are_left() -> None:
     result = calibrate_camera(observe(pixels), REJECT)
     for i, n in wrong:
         pixels[i, n] = torch.nan
-    again = calibrate_camera(observe(pixels))
+    again = calibrate_camera(observe(pixels), CalibrationOptions(model="opencv5"))
     assert_same_solution(result, again)
     assert result.sigma == pytest.approx(again.sigma, rel=1e-5)
 
@@ -123,6 +123,6 @@ def test_too_much_is_refused() -> None:
 def test_without_rejection_a_warning_names_the_worst_corner() -> None:
     pixels = scene()
     pixels[3, 17] += 5.0
-    result = calibrate_camera(observe(pixels))
+    result = calibrate_camera(observe(pixels), CalibrationOptions(model="opencv5"))
     assert any("corner 17 of view v03" in text for text in result.warnings)
     assert result.rejected_corners == ()

@@ -59,7 +59,7 @@ def solved(seen: dict[str, Observations]) -> Solve:
 
     def solve(side: str, model: str) -> CameraCalibrationResult:
         if (side, model) not in known:
-            known[side, model] = calibrate_camera(seen[side], CalibrationOptions(model=model))
+            known[side, model] = calibrate_camera(seen[side], CalibrationOptions(weak_prior=None, model=model))
         return known[side, model]
 
     return solve

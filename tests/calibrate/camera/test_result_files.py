@@ -18,7 +18,7 @@ def test_all_that_is_known_is_in_the_file(tmp_path: Path) -> None:
     pixels = pixels + 0.1 * torch.randn(pixels.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
     pixels[2, 7] += 30.0
     seen = observe(pixels)
-    result = calibrate_camera(seen, CalibrationOptions(reject=OutlierRejection()))
+    result = calibrate_camera(seen, CalibrationOptions(model="opencv5", reject=OutlierRejection()))
     assert [corner.view for corner in result.rejected_corners] == [seen.names[2]]
 
     path = result.save(tmp_path / "left.camera.json", name="left", source="left.obs.json")

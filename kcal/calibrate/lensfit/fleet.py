@@ -1,0 +1,134 @@
+"""What cameras of one type have in common, learned from each other: first amplitudes, then the lens itself.
+
+Each camera's data are a Gaussian likelihood of its unknowns x: hyperparameters near their best, or lens coefficients.
+Over the cameras x is normal with unknown mean and spread, found by expectation maximization (empirical Bayes: Efron
+and Morris 1973). What the next camera may expect has the spread of Student's t, as a variance from few samples asks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.evidence import Hyperprior, PriorFamilies, Quadratic, negative_log_evidence
+from kcal.lens.hybrid_terms import HybridForm
+
+# Fewer tell no spread.
+LEAST_CAMERAS = 4
+_ITERATIONS = 50
+# One camera more, that deviates by this share of the typical spread, keeps the spread above zero.
+_LEAST_SPREAD = 0.1
+# Focal lengths of one type of camera, relative.
+_FOCAL = 0.05
+
+
+class Likelihood(NamedTuple):
+    """exp(-½ xᵀ information x + vectorᵀ x) of a camera's unknowns.
+
+    Attributes:
+        information: (X, X).
+        vector: (X,).
+    """
+
+    information: Tensor
+    vector: Tensor
+
+
+class LensPrior(NamedTuple):
+    """What is known of a camera's lens before it is calibrated.
+
+    Attributes:
+        form: constants of the lens.
+        focal: F₀, pixels.
+        mean: (L,) of the unknowns: focal length, principal point, coefficients.
+        sd: (L,) standard deviations.
+    """
+
+    form: HybridForm
+    focal: float
+    mean: Tensor
+    sd: Tensor
+
+    def families(self, usual: PriorFamilies) -> PriorFamilies:
+        """Priors with this lens, and the board of others."""
+        own = torch.arange(len(usual.mean)) < len(self.mean)
+        mean, log_unit = usual.mean.clone(), usual.log_unit.clone()
+        mean[own], log_unit[own] = self.mean, self.sd.log()
+        amplitude, decay = (torch.where(own, -1, index) for index in (usual.amplitude, usual.decay))
+        return PriorFamilies(mean, log_unit, amplitude, decay, usual.degree)
+
+
+def hyper_likelihood(data: Quadratic, families: PriorFamilies, h: Tensor, variance: float) -> Likelihood:
+    """What the data of a camera say about its hyperparameters, near h (H,); the noise is maximized over.
+
+    Args:
+        data: of the camera.
+        families: its priors.
+        h: of largest evidence.
+        variance: of the noise there.
+    """
+    at = np.append(h.numpy(), math.log(variance))
+    step = 0.02
+    steps = step * np.eye(len(at))
+    up, down = (
+        np.stack([negative_log_evidence(data, families, at + sign * row)[1] for row in steps]) for sign in (1, -1)
+    )
+    hessian = torch.from_numpy((up - down) / (2 * step))
+    hessian = 0.5 * (hessian + hessian.T)
+    information = hessian[:-1, :-1] - torch.outer(hessian[:-1, -1], hessian[-1, :-1]) / hessian[-1, -1]
+    # Far from where the data say anything the likelihood bends the wrong way: nothing is known there.
+    values, vectors = torch.linalg.eigh(information)
+    information = (vectors * values.clamp_min(0.0)) @ vectors.T
+    slope = torch.from_numpy(negative_log_evidence(data, families, at)[1][:-1])
+    slope = (vectors * (values > 0)) @ (vectors.T @ slope)
+    return Likelihood(information, information @ h - slope)
+
+
+def fleet_priors(cameras: Sequence[Likelihood], typical: Hyperprior) -> tuple[Hyperprior, list[Hyperprior]]:
+    """The prior of the next camera of a type, and that of each camera from all others.
+
+    Args:
+        cameras: that are known.
+        typical: what is expected of any camera.
+    """
+    unit, count = typical.sd, len(cameras)
+    information = torch.stack([camera.information for camera in cameras]) * unit[:, None] * unit
+    vector = torch.stack([camera.vector - camera.information @ typical.mean for camera in cameras]) * unit
+    # In units of the typical spread, about the typical mean.
+    mean, variance = torch.zeros_like(unit), torch.ones_like(unit)
+    for _ in range(_ITERATIONS):
+        covariance = torch.linalg.inv(information + torch.diag(1.0 / variance))
+        each = torch.einsum("gij,gj->gi", covariance, vector + mean / variance)
+        mean = each.sum(0) / (count + variance)
+        squares = (each - mean).square() + covariance.diagonal(dim1=1, dim2=2)
+        variance = ((_LEAST_SPREAD**2 + squares.sum(0)) / count).clamp_max(1.0)
+
+    def prior(total: Tensor, squares: Tensor, count: int) -> Hyperprior:
+        if count < LEAST_CAMERAS - 1:
+            return typical
+        variance = ((_LEAST_SPREAD**2 + squares) / count).clamp_max(1.0)
+        # Variance of Student's t of `count` degrees of freedom; the mean is known from `count` cameras.
+        wide = (variance * (1.0 + 1.0 / count) * count / (count - 2.0)).clamp_max(1.0)
+        return Hyperprior(typical.mean + unit * total / (count + variance), unit * wide.sqrt())
+
+    without = [prior(each.sum(0) - x, squares.sum(0) - s, count - 1) for x, s in zip(each, squares, strict=True)]
+    return prior(each.sum(0), squares.sum(0), count), without
+
+
+def typical_lens(form: HybridForm, families: PriorFamilies, h: Tensor) -> Hyperprior:
+    """What is expected of a lens with these amplitudes, from a type of which no other camera is known.
+
+    Args:
+        form: constants of the lens.
+        families: priors that belong to these.
+        h: (H,).
+    """
+    count = 6 + len(form.modes)
+    mean, sd = families.mean[:count].clone(), families.deviation(h)[:count].clone()
+    sd[0] = _FOCAL * mean[0]
+    return Hyperprior(mean, sd)

@@ -1,0 +1,219 @@
+"""A board as cameras measured it, with its covariance, and its file."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import pydantic
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.board_modes import board_modes, undetermined_modes
+from kcal.calibrate.lensfit.board_prior import BoardPrior
+from kcal.corners.board import Board
+from kcal.errors import InputError
+from kcal.files import NativeFile
+
+
+class Measured(NamedTuple):
+    """A value and its standard deviation."""
+
+    value: float
+    sigma: float
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class MeasuredBoard:
+    """How a printed board differs from the one that was ordered.
+
+    Convention: the frame is the ordered board's (`Board`). Size, place and tilt of a board cannot be measured by
+    cameras: what differs is bending, stretch, shear and print errors.
+
+    Args:
+        name: of the board.
+        board: as it was ordered.
+        amplitudes: (B,) of the modes of `board_modes`, meters.
+        half: (B, B) upper part of their covariance: halfᵀ half.
+        log_evidence: nats by which the data prefer a printed board over one that is exactly as ordered.
+        observations: names of the observations that it was measured from.
+
+    Raises:
+        InputError: shapes or values that do not fit the board.
+    """
+
+    name: str
+    board: Board
+    amplitudes: Tensor
+    half: Tensor
+    log_evidence: float
+    observations: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        size = len(board_modes(self.board.points).unit)
+        if self.amplitudes.shape != (size,) or self.half.shape != (size, size):
+            raise InputError(f"measured board: {size} amplitudes and a root of {size} x {size} are needed")
+        if not bool(self.amplitudes.isfinite().all() & self.half.isfinite().all()):
+            raise InputError("measured board: amplitudes and their covariance must be finite")
+
+    def prior_for(self, points: Tensor) -> BoardPrior:
+        """The prior of the amplitudes, for a camera that saw a board with these corners as ordered, (N, 3) meters.
+
+        Raises:
+            InputError: they are not this board's.
+        """
+        if not torch.equal(points, self.board.points):
+            raise InputError(f"the measured board {self.name!r} is {self.board}; the observations show another board")
+        return BoardPrior(self.amplitudes, self.half)
+
+    @property
+    def points(self) -> Tensor:
+        """(N, 3) the corners as they are, meters."""
+        return self.board.points + torch.einsum("b,bkn->nk", self.amplitudes, board_modes(self.board.points).shapes)
+
+    @property
+    def points_covariance(self) -> Tensor:
+        """(N, 3, 3) covariance of each corner, meters²."""
+        spread = torch.einsum("rb,bkn->rnk", self.half, board_modes(self.board.points).shapes)
+        return torch.einsum("rnk,rnl->nkl", spread, spread)
+
+    @property
+    def bending(self) -> Measured:
+        """Height of the corner farthest from the best plane, meters."""
+        heights = self._fitted()[1][:, 2]
+        at = int((self.amplitudes @ heights).abs().argmax())
+        value, sigma = self._measured(heights[:, at])
+        return Measured(abs(value), sigma)
+
+    @property
+    def stretch(self) -> Measured:
+        """Width over height, relative to the ordered board, less one."""
+        return self._measured(2.0 * self._fitted()[0][:, -2])
+
+    @property
+    def shear(self) -> Measured:
+        """Cosine of the angle between rows and columns."""
+        return self._measured(2.0 * self._fitted()[0][:, -1])
+
+    @property
+    def print_error(self) -> Measured:
+        """RMS distance of the corners, in the plane, from the best stretched and sheared board, meters."""
+        rows = self._fitted()[1][:, :2].flatten(1) / math.sqrt(self.board.corners)
+        rms = float((self.amplitudes @ rows).norm())
+        noise = self.half @ rows
+        slope = noise @ (self.amplitudes @ rows) / max(rms, 1e-12)
+        # An RMS no larger than its own noise has no slope to speak of.
+        return Measured(rms, float(slope.norm() if rms > float(noise.norm()) else noise.norm()))
+
+    def displacements(self, places: Tensor | None = None) -> Tensor:
+        """(M, 3) how far places of the board lie from where they were ordered, at the best shift, turn and scale.
+
+        Args:
+            places: (M, 3) of the ordered board, meters, z = 0; the corners if not given.
+        """
+        coefficients, rest = self._fitted(places)
+        points = self.board.points if places is None else places
+        x, y = (points[:, :2] - self.board.points[:, :2].mean(0)).unbind(-1)
+        stretch, shear = (self.amplitudes @ coefficients[:, -2:]).tolist()
+        plane = torch.stack([stretch * x + shear * y, shear * x - stretch * y, torch.zeros_like(x)])
+        return (torch.einsum("b,bkn->kn", self.amplitudes, rest) + plane).T
+
+    def _measured(self, row: Tensor) -> Measured:
+        return Measured(float(self.amplitudes @ row), float((self.half @ row).norm()))
+
+    def _fitted(self, places: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """For each mode: what shifts, turns, scale, stretch and shear fit of it (B, 9), and the rest (B, 3, M)."""
+        corners = self.board.points
+        points = corners if places is None else torch.cat([corners, places])
+        x, y = (points[:, :2] - corners[:, :2].mean(0)).unbind(-1)
+        zero = torch.zeros_like(x)
+        affine = torch.stack([torch.stack([x, -y, zero]), torch.stack([y, x, zero])])
+        basis = torch.cat([undetermined_modes(points), affine])
+        shapes, count = board_modes(points).shapes, len(corners)
+        fitted = torch.linalg.lstsq(basis[..., :count].flatten(1).T, shapes[..., :count].flatten(1).T).solution.T
+        rest = shapes - torch.einsum("bg,gkn->bkn", fitted, basis)
+        return fitted, rest if places is None else rest[..., count:]
+
+
+class BoardFile(NativeFile):
+    """A measured board (file kind `board`, version 1).
+
+    Args:
+        name: of the board.
+        board: as it was ordered.
+        amplitudes: of the modes of bending and print, meters; see `kcal.calibrate.lensfit.board_modes`.
+        half: rows of a matrix whose transpose times itself is their covariance.
+        log_evidence: nats by which the data prefer this board over the ordered one.
+        observations: names of the observations that it was measured from.
+    """
+
+    KIND: ClassVar[str] = "board"
+    VERSION: ClassVar[int] = 1
+
+    name: str
+    board: Board
+    amplitudes: tuple[float, ...]
+    half: tuple[tuple[float, ...], ...]
+    log_evidence: float
+    observations: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self) -> BoardFile:
+        if any(len(row) != len(self.amplitudes) for row in self.half):
+            raise ValueError("the root of the covariance must have as many columns as there are amplitudes")
+        self.measured()
+        return self
+
+    def measured(self) -> MeasuredBoard:
+        """The board, equal to the stored one to the last bit."""
+        return MeasuredBoard(
+            name=self.name,
+            board=self.board,
+            amplitudes=torch.tensor(self.amplitudes, dtype=torch.float64),
+            half=torch.tensor(self.half, dtype=torch.float64),
+            log_evidence=self.log_evidence,
+            observations=self.observations,
+        )
+
+
+def save_measured_board(board: MeasuredBoard, path: str | Path) -> Path:
+    """Write a measured board to a JSON file, losslessly and atomically.
+
+    Raises:
+        FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> size = 28
+        >>> half = 1e-5 * torch.eye(size, dtype=torch.float64)
+        >>> plate = Board(columns=9, rows=6, square=0.025)
+        >>> flat = MeasuredBoard(name="A", board=plate, amplitudes=0 * half[0], half=half, log_evidence=0.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = save_measured_board(flat, Path(folder, "a.board.json"))
+        ...     bool((load_measured_board(path).points == plate.points).all())
+        True
+    """
+    return BoardFile(
+        name=board.name,
+        board=board.board,
+        amplitudes=tuple(board.amplitudes.tolist()),
+        half=tuple(map(tuple, board.half.tolist())),
+        log_evidence=board.log_evidence,
+        observations=board.observations,
+    ).save(path)
+
+
+def load_measured_board(path: str | Path) -> MeasuredBoard:
+    """Read a measured board.
+
+    Raises:
+        FileError: missing, another kind of file, or content that is wrong.
+
+    Example:
+        >>> load_measured_board("no-such-file.json")
+        Traceback (most recent call last):
+        kcal.errors.FileError: no-such-file.json: cannot read: No such file or directory
+    """
+    return BoardFile.load(path).measured()

@@ -1,0 +1,126 @@
+"""Fit one camera of several: views turned to one order, and what its data say about board, amplitudes and lens."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.board_orders import find_turns, turned_corners
+from kcal.calibrate.lensfit.board_prior import BoardMessage, BoardPrior, message_from_rows, printed_prior
+from kcal.calibrate.lensfit.evidence import BOARD, Quadratic
+from kcal.calibrate.lensfit.fleet import LensPrior, Likelihood, hyper_likelihood
+from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
+from kcal.calibrate.lensfit.hybrid_problem import HybridProblem
+from kcal.corners.observations import Observations
+from kcal.lens.zernike import ZernikeModes
+
+# How a board differs from the one that was ordered: as printers err, not at all, or as others tell.
+Shape = Literal["printed", "exact"] | BoardPrior
+
+# Until no view is to be turned: two are enough as a rule.
+_MOST_FITS = 5
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class CameraFit:
+    """One of several cameras.
+
+    Args:
+        fit: the camera, with poses of the corners as they are turned.
+        turns: (V,) quarter turns of the board by which the corners of each view were read from another end.
+        message: what its data say about the board.
+        hyper: what its data say about the amplitudes of lenses.
+        lens: what they say about its lens, in the form of the fit.
+        board: which of the boards it saw; -1 for an exact one.
+        nats: log evidence that it shares its board with the others of that board, against a board of its own. Of a
+            camera that shares none: the same with the board that is most like its own, negative. With a measured board:
+            that it is this one. NaN if there is nothing to compare.
+    """
+
+    fit: HybridFit
+    turns: Tensor
+    message: BoardMessage
+    hyper: Likelihood
+    lens: Likelihood
+    board: int = -1
+    nats: float = math.nan
+
+
+def fit_turned(
+    seen: Observations,
+    weights: Tensor | None,
+    modes: ZernikeModes | None,
+    turns: Tensor | None,
+    shape: Shape,
+    lens: LensPrior | None = None,
+    start: HybridFit | None = None,
+) -> CameraFit:
+    """Fit one camera, turn its views that were read from another end, and fit again until none is left.
+
+    Args:
+        seen: what it saw.
+        weights: (V, N) of the corners; one if not given.
+        modes: of the field.
+        turns: (V,) quarter turns that are known already.
+        shape: of the board.
+        lens: what is known of the lens.
+        start: an earlier fit of the views with these turns, to begin with.
+    """
+    board, pixels = seen.board, seen.pixels()
+    weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
+    turns = torch.zeros(len(pixels), dtype=torch.long) if turns is None else turns
+    for attempt in range(_MOST_FITS):
+        ordered, weighted = (turned_corners(values, board, turns) for values in (pixels, weights))
+        fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, modes, shape, lens=lens, start=start)
+        rows = _absolute_rows(fit, board.points, ordered, weighted)
+        deviation = fit.families.deviation(fit.hyperparameters)[: -len(fit.state.board)]
+        if shape == "exact" or attempt == _MOST_FITS - 1:
+            break
+        prior = printed_prior(fit.board_shapes, fit.hyperparameters[BOARD:]) if shape == "printed" else shape
+        more = find_turns(rows, board, prior, deviation, fit.sigma**2)
+        if not bool(more.any()):
+            break
+        turns, start = (turns + more) % 4, None
+    flat = rows.transpose(1, 2).flatten(0, 1)
+    freedom = 2 * int((torch.isfinite(ordered).all(-1) & (weighted > 0)).sum()) - 6 * len(pixels)
+    message = message_from_rows(flat, deviation, fit.sigma**2)
+    by_lens, by_board, target = flat.split([len(deviation), len(fit.state.board), 1], 1)
+    # The board in units of its prior, about its mean.
+    if shape == "exact":
+        by_board = torch.zeros_like(by_board)
+    elif shape == "printed":
+        by_board = by_board * fit.families.deviation(fit.hyperparameters)[len(deviation) :]
+    else:
+        by_board, target = by_board @ shape.half.T, target - by_board @ shape.mean[:, None]
+    unit = torch.ones(by_board.shape[1], dtype=by_board.dtype)
+    about_lens = message_from_rows(torch.cat([by_board, by_lens, target], 1), unit, fit.sigma**2)
+    information = about_lens.root.T @ about_lens.root
+    vector = about_lens.root.T @ about_lens.target + information @ fit.families.mean[: len(deviation)]
+    if shape == "printed":
+        by_board = flat[:, len(deviation) : -1]
+    tempered = torch.cat([by_lens, by_board, target], 1) / math.sqrt(fit.tempering)
+    hyper = _about_hyperparameters(fit, tempered, freedom / fit.tempering)
+    return CameraFit(fit=fit, turns=turns, message=message, hyper=hyper, lens=Likelihood(information, vector))
+
+
+def _absolute_rows(fit: HybridFit, points: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
+    """(V, S + 1, 2 N) derivatives by lens and board off the poses, and the target of these rows, pixels."""
+    count = len(fit.state.board)
+    mean = torch.cat([fit.families.mean[:-count], torch.zeros_like(fit.state.board)])
+    problem = HybridProblem(
+        points, fit.board_shapes.shapes, pixels, weights, fit.camera.model, mean, torch.zeros_like(mean)
+    )
+    rows = problem.without_poses(fit.state)
+    rows[:, -1] = torch.einsum("s,vsn->vn", problem.shared(fit.state), rows[:, :-1]) - rows[:, -1]
+    return rows
+
+
+def _about_hyperparameters(fit: HybridFit, rows: Tensor, freedom: float) -> Likelihood:
+    """What the rows (R, S + 1) say, in the variables of the fit's priors."""
+    A, target = rows[:, :-1], rows[:, -1]
+    data = Quadratic(A.T @ A, A.T @ target, float(target @ target), freedom)
+    return hyper_likelihood(data, fit.families, fit.hyperparameters, fit.sigma**2 / fit.tempering)

@@ -1,0 +1,42 @@
+"""Simulated captures of printed boards that the tests share."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.corners.board import Board
+from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector
+
+
+def printed_points(board: Board, seed: int, share: float = 5e-4) -> Tensor:
+    """(N, 3) corners of a board whose modes are drawn with `share` of their units."""
+    modes = board_modes(board.points)
+    draw = torch.randn(len(modes.unit), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return board.points + torch.einsum("b,bkn->nk", share * modes.unit * draw, modes.shapes)
+
+
+def printed_views(
+    camera: Camera, board: Board, points: Tensor, count: int, seed: int, *, noise: float, pupil: float = 0.0
+) -> Tensor:
+    """Corners (V, N, 2) of a board in random poses, rolled all around, seen through a wandering pupil (m / rad²)."""
+    generator = torch.Generator().manual_seed(seed)
+    middle = board.points.mean(0)
+    reach = float((board.points - middle).norm(dim=1).max()) / 0.24
+    out: list[Tensor] = []
+    while len(out) < count:
+        u = 2.0 * torch.rand(6, generator=generator, dtype=torch.float64) - 1.0
+        tilt = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], torch.zeros_like(u[0])]))
+        rotation = tilt @ rotation_from_vector(torch.stack([*torch.zeros(2, dtype=torch.float64), math.pi * u[2]]))
+        center = torch.stack([0.4 * u[3], 0.3 * u[4], torch.ones_like(u[0])]) * (0.55 + 0.15 * u[5]) * reach
+        cam = (points - middle) @ rotation.T + center
+        from_pupil = torch.zeros_like(cam)
+        from_pupil[:, 2] = pupil * torch.atan2(cam[:, :2].norm(dim=-1), cam[:, 2]) ** 2
+        pixels, valid = camera.project(cam - from_pupil)
+        if bool(valid.all()) and bool((pixels > 5).all()) and bool((pixels < torch.tensor(camera.size) - 6).all()):
+            out.append(pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64))
+    return torch.stack(out)
