@@ -10,7 +10,12 @@ from scripts.shared.timing import row
 DOCS = Path(__file__).parents[2] / "docs" / "measured"
 # What to conclude from each page that one script writes whole. Check it against the figures when they are made anew.
 CONCLUSIONS = {
-    "fields.md": "**Conclusion.** TO DO",
+    "fields.md": (
+        "**Conclusion.** Keep Zernike modes. Fields of every kind predict held-out views equally well to 3 %. "
+        "Zernike modes are best on the wide lens and cost the least there. Four widths of Gaussian units gain 1 % on "
+        "one of the two small cameras, at six times the time; there are no simulations here that would show local "
+        "structure. Random features are nearly as good as trained ones."
+    ),
     "lens.md": (
         "**Conclusion.** For many points, compile the camera. From 10,000 points on, compiled kcal projects 5 to 18 "
         "times as fast as OpenCV and finds rays 5 to 8 times as fast; for 100 points OpenCV is faster. `cv2.remap` is "
