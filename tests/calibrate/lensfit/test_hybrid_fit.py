@@ -18,6 +18,8 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
+from kcal.lens.zernike import ZernikeModes
+from kcal.sim.captures import capture_corners, drawn_lens
 from kcal.solve.lm import LMOptions, minimize
 
 BOARD = Board(columns=9, rows=7, square=0.04)
@@ -289,3 +291,14 @@ def test_normal_equations_without_poses() -> None:
     matrix, scale = problem.linearize(state).information()
     reduced = matrix / scale[:, None] / scale - 1e-3 * torch.eye(count, dtype=torch.float64)
     torch.testing.assert_close(off @ off.T, reduced, rtol=1e-6, atol=1e-6 * float(reduced.diagonal().max()))
+
+
+@pytest.mark.parametrize("seed", [60, 63])
+def test_the_start_of_a_narrow_lens(seed: int) -> None:
+    """Five views of 60 degrees: projections of 160 degrees, whose angles hardly differ, must not win the start."""
+    lens = drawn_lens("machine-vision", 1.0, seed)
+    capture = capture_corners(lens, 5, sigma=0.1, seed=seed)
+    modes = ZernikeModes(radial=7, decentered=4, astigmatic=3, other=3)
+    found = fit_hybrid(capture.points, capture.pixels, lens.size, modes=modes)
+    assert float(found.camera.focal[0]) == pytest.approx(1600.0, rel=0.03)
+    assert found.sigma == pytest.approx(0.1, rel=0.15)
