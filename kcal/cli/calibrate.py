@@ -151,13 +151,14 @@ def calibrate_command(
 
     from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
     from kcal.calibrate.camera.outliers import OutlierRejection
+    from kcal.calibrate.lensfit.measured_board import load_measured_board
     from kcal.corners.observations import Observations
     from kcal.solve.robust import RobustLoss
 
     options = CalibrationOptions(
         model=model,
         # An unknown kind is refused by the options themselves, and that of a loss by the loss.
-        board=board,  # type: ignore[arg-type]
+        board=load_measured_board(board) if Path(board).suffix else board,  # type: ignore[arg-type]
         analog=analog,
         board_warp=board_warp,
         focal=focal,
@@ -204,6 +205,14 @@ def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: boo
         out.print(f"focal length {f:.3f} ± {sf:.3f} px; principal point {cx:.2f} ± {sx:.2f}, {cy:.2f} ± {sy:.2f} px")
     if brief.pupil is not None and brief.pupil_sigma is not None:
         out.print(f"entrance pupil: {1e3 * brief.pupil:+.2f} ± {1e3 * brief.pupil_sigma:.2f} mm at the image's corner")
+    if (board := result.measured_board) is not None and bool(board.amplitudes.any()):
+        (bend, bend_s), (wide, wide_s), (skew, skew_s), (rest, rest_s) = (
+            board.bending, board.stretch, board.shear, board.print_error,
+        )  # fmt: skip
+        out.print(
+            f"board: bends by {1e3 * bend:.2f} ± {1e3 * bend_s:.2f} mm; "
+            f"stretch {100 * wide:+.3f} ± {100 * wide_s:.3f} %, shear {100 * skew:+.3f} ± {100 * skew_s:.3f} %, print {1e3 * rest:.3f} ± {1e3 * rest_s:.3f} mm"
+        )
     if verbose:
         print_table([["parameter", "value", "± σ"], *_parameters(result)])
     if result.board_warp is not None:

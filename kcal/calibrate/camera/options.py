@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Literal
 
 from kcal.calibrate.bundle.parameters import ParameterConstraints, natural_value
+from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -42,7 +43,8 @@ class CalibrationOptions:
             themselves determine (`kcal.calibrate.camera.hybrid`). Or a parametric lens model, by name or as a
             `LensModel`, for exchange with other programs.
         board: "printed", the default: bending and print errors of the board are estimated with a hybrid lens. "exact":
-            the board is a metrology plate.
+            the board is a metrology plate. Or a `MeasuredBoard` (`measure_board`, `kcal board measure`), which is used
+            as known, with what is not known of it.
         analog: the pixels may not be square (an analog camera behind a frame grabber). Hybrid lens only.
         board_warp: with a parametric model, estimate how the board bends (two more parameters).
         weighted: weight corners by their covariances where all views have them (`kcal.calibrate.bundle.weights`);
@@ -73,7 +75,7 @@ class CalibrationOptions:
     """
 
     model: LensModel | str = HYBRID
-    board: Literal["printed", "exact"] = "printed"
+    board: Literal["printed", "exact"] | MeasuredBoard = "printed"
     analog: bool = False
     board_warp: bool = False
     weighted: bool = True
@@ -100,7 +102,7 @@ class CalibrationOptions:
             raise InputError("CalibrationOptions: focal and field_of_view are alternatives; give one")
         if self.weak_prior is not None and not 0 < self.weak_prior < float("inf"):
             raise InputError(f"CalibrationOptions: weak_prior must be positive, got {self.weak_prior}")
-        if self.board not in ("printed", "exact"):
+        if not isinstance(self.board, MeasuredBoard) and self.board not in ("printed", "exact"):
             raise InputError(f"CalibrationOptions: board must be 'printed' or 'exact', got {self.board!r}")
         if self.camera is not None and (self.fixed or self.focal is not None or self.field_of_view is not None):
             raise InputError(

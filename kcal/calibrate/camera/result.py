@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcal.calibrate.bundle.board_problem import warp_shape
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
+from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.corners.observations import Observations
 from kcal.io.camera_file import CameraFile, camera_to_file, provenance
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, Exclusion
@@ -140,6 +141,23 @@ class CameraCalibrationResult:
         if self.board_warp is not None:
             points[:, 2] = self.board_warp @ warp_shape(points)
         return points
+
+    @property
+    def measured_board(self) -> MeasuredBoard | None:
+        """The board that the hybrid camera saw, with its covariance, to be used as known; None for parametric models.
+
+        Its evidence against a board that is exactly as ordered is not computed here (`measure_board` does).
+        """
+        if self.hybrid is None:
+            return None
+        own = self.hybrid.half[:, -len(self.hybrid.state.board) :]
+        return MeasuredBoard(
+            name="",
+            board=self.observations.board,
+            amplitudes=self.hybrid.state.board,
+            half=torch.linalg.qr(own, mode="r").R,
+            log_evidence=0.0,
+        )
 
     @property
     def noise(self) -> float:

@@ -48,7 +48,7 @@ def capture(count: int = 20) -> Tensor:
 
 
 def fitted(modes: FieldModes) -> HybridFit:
-    return fit_hybrid(BOARD.points, capture(), SIZE, modes=modes, exact_board=True)
+    return fit_hybrid(BOARD.points, capture(), SIZE, modes=modes, board="exact")
 
 
 def off(camera: Camera) -> float:
