@@ -137,6 +137,7 @@ def _base_start(
         cam = points @ rotation.transpose(-1, -2) + translation[:, None]
         there = torch.atan2(cam[..., :2].norm(dim=-1), cam[..., 2])
         direction = cam[..., :2] / cam[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        # In pixels: angles near 80 degrees hardly differ, and such a projection would win for a narrow lens.
         found = (focal * there * radius_over_angle(s * there**2))[..., None] * direction
         error = torch.where(usable, (found - offset).norm(dim=-1), 0.0)
         # By the median view: a few wrong views do not decide.
