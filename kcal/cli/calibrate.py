@@ -29,7 +29,8 @@ def calibrate_command(
         str,
         typer.Option(
             metavar="KIND",
-            help="printed: bending and print errors are estimated. exact: the board is a metrology plate.",
+            help="printed: bending and print errors are estimated. exact: a metrology plate. Or the file of a "
+            "board that `kcal board measure` wrote.",
         ),
     ] = "printed",
     analog: Annotated[
@@ -211,7 +212,8 @@ def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: boo
         )  # fmt: skip
         out.print(
             f"board: bends by {1e3 * bend:.2f} ± {1e3 * bend_s:.2f} mm; "
-            f"stretch {100 * wide:+.3f} ± {100 * wide_s:.3f} %, shear {100 * skew:+.3f} ± {100 * skew_s:.3f} %, print {1e3 * rest:.3f} ± {1e3 * rest_s:.3f} mm"
+            f"stretch {100 * wide:+.3f} ± {100 * wide_s:.3f} %, shear {100 * skew:+.3f} ± {100 * skew_s:.3f} %, "
+            f"print {1e3 * rest:.3f} ± {1e3 * rest_s:.3f} mm"
         )
     if verbose:
         print_table([["parameter", "value", "± σ"], *_parameters(result)])
