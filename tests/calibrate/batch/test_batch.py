@@ -90,7 +90,9 @@ class TestResults:
         for name in ("east", "west"):
             single = tmp_path / f"{name}.obs.json"
             assert kcal("detect", folder / name, *WHAT, "-o", single).exit_code == 0
-            assert kcal("calibrate", single, "-o", tmp_path / f"{name}.camera.json").exit_code == 0
+            assert (
+                kcal("calibrate", single, "-o", tmp_path / f"{name}.camera.json", "--model", "opencv5").exit_code == 0
+            )
             seen = Observations.load(tmp_path / "out" / f"{name}.obs.json")
             assert seen == Observations.load(single)
             ours = CameraFile.load(tmp_path / "out" / f"{name}.camera.json")
@@ -233,7 +235,7 @@ def test_every_piece_comes_back_when_workers_die(folder):
 
 def test_a_killed_run_continues_and_gives_the_same_table(folder, tmp_path):
     out, whole = tmp_path / "out", tmp_path / "whole"
-    command = [sys.executable, "-m", "kcal", "batch", str(folder), *WHAT, "--workers", "1", "-o"]
+    command = [sys.executable, "-m", "kcal", "batch", str(folder), *WHAT, "--model", "opencv5", "--workers", "1", "-o"]
     # A session of its own, so that the workers die with it: one that lived on could still finish a piece.
     running = subprocess.Popen(
         [*command, str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
@@ -287,7 +289,8 @@ def test_dask(folder, tmp_path):
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
     ) as cluster:
-        result = kcal("batch", folder, *WHAT, "-o", tmp_path / "out", "--scheduler", cluster.scheduler_address)
+        plain = [*WHAT, "--model", "opencv5"]
+        result = kcal("batch", folder, *plain, "-o", tmp_path / "out", "--scheduler", cluster.scheduler_address)
     assert result.exit_code == 0, result.exception
     expected, _ = run(folder, tmp_path / "whole")
     rows = list(csv.DictReader((tmp_path / "out" / "summary.csv").open()))
