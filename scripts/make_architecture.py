@@ -29,18 +29,18 @@ LOOKS = {
     "cli": (2.6, "commands"),
     "report": (1.6, "pictures and maps"),
     "calibrate/batch": (4.6, "many cameras"),
-    "calibrate/lensfit": (3.4, "hybrid lens"),
+    "calibrate/lensfit": (2.15, "hybrid lens"),
     "locate": (1.0, "pixels to positions"),
-    "calibrate/camera": (3.2, "one camera"),
+    "calibrate/camera": (2.8, "one camera"),
     "calibrate/rig": (1.0, "several cameras"),
-    "calibrate/search": (3.4, "several minima"),
+    "calibrate/search": (3.5, "several minima"),
     "nets": (4.6, "the paper's networks"),
     "sim": (0.0, "simulated truth"),
     "io": (1.0, "files"),
     "corners": (2.15, "boards, detection"),
     "calibrate/bundle": (3.4, "what is minimized"),
     "lens": (2.15, "cameras and rigs"),
-    "solve": (4.0, "least squares"),
+    "solve": (4.2, "least squares"),
 }
 
 
