@@ -28,7 +28,7 @@ def calibration_figure(result: CameraCalibrationResult) -> Figure:
     observations = result.observations
     figure = new_figure(13.0, 9.2)
     grid = figure.add_gridspec(
-        2, 2, height_ratios=[1.35, 1.0], left=0.05, right=0.97, top=0.92, bottom=0.07, hspace=0.22, wspace=0.12
+        2, 2, height_ratios=[1.35, 1.0], left=0.05, right=0.94, top=0.92, bottom=0.07, hspace=0.22, wspace=0.12
     )
     _draw_coverage(figure.add_subplot(grid[0, 0]), observations, result)
     _draw_uncertainty(figure.add_subplot(grid[0, 1]), observations, result)
