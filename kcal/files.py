@@ -73,12 +73,14 @@ def dump_json(value: Any) -> str:
 class NativeFile(pydantic.BaseModel):
     """Base of kcal's files: a pydantic model that is stored with its `kind` and `version`.
 
-    Subclasses set `KIND` and `VERSION`. The JSON text begins `{"kcal": KIND, "version": VERSION, ...}`.
+    Subclasses set `KIND`, `VERSION`, and in `OLDER` the versions that they read as well. The JSON text begins
+    `{"kcal": KIND, "version": VERSION, ...}`.
     """
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     KIND: ClassVar[str]
     VERSION: ClassVar[int]
+    OLDER: ClassVar[tuple[int, ...]] = ()
 
     def dump(self) -> dict[str, Any]:
         """The content as it is stored: plain dicts, lists and numbers, kind and version first."""
@@ -97,8 +99,9 @@ class NativeFile(pydantic.BaseModel):
         kind, version = content.pop("kcal"), content.pop("version", None)
         if kind != cls.KIND:
             raise FileError(f"{source}: this is a kcal {kind} file; a kcal {cls.KIND} file is needed here")
-        if version != cls.VERSION:
-            raise FileError(f"{source}: version {version} of the {kind} format; this kcal reads version {cls.VERSION}")
+        if version not in (*cls.OLDER, cls.VERSION):
+            reads = " or ".join(str(known) for known in (*cls.OLDER, cls.VERSION))
+            raise FileError(f"{source}: version {version} of the {kind} format; this kcal reads version {reads}")
         try:
             return cls.model_validate(content)
         except pydantic.ValidationError as error:

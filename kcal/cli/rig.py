@@ -10,7 +10,6 @@ import typer
 
 from kcal.cli.groups import group_with_default
 from kcal.cli.rig_check import check
-from kcal.errors import InputError
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.result import RigResult
@@ -61,13 +60,13 @@ def solve_command(
     ] = None,
     mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks and matches along each axis.")] = 0.3,
     intrinsics: Annotated[
-        Literal["fixed", "prior", "free"],
-        typer.Option(help="Cameras as they are, held by their files' sigmas, or free."),
-    ] = "fixed",
+        Literal["prior", "fixed", "free"],
+        typer.Option(
+            help="Refine the cameras within what their calibrations know, hold them as if they were exact, or let them "
+            "free."
+        ),
+    ] = "prior",
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Leave nothing out; only warn.")] = False,
-    refine_cameras: Annotated[
-        bool, typer.Option("--refine-cameras", help="Solve for intrinsics and lenses too: --intrinsics free.")
-    ] = False,
     board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
     picture: Annotated[Path | None, typer.Option(help="A .png file: residuals by source and a plan.")] = None,
 ) -> None:
@@ -108,11 +107,7 @@ def solve_command(
         check_picture(picture)
     if not any((pairs, landmarks, marks, features, positions, baseline)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
-    if refine_cameras:
-        if intrinsics == "prior":
-            raise InputError("--refine-cameras lets the cameras free, --intrinsics prior does not; choose one")
-        intrinsics = "free"
-    data, frame, unpaired = read_sources((load_camera(left), load_camera(right)), sources, prior=intrinsics == "prior")
+    data, frame, unpaired = read_sources((load_camera(left), load_camera(right)), sources)
     with steps("solving the rig", 1) as advance:
         result = solve_rig(data, RigOptions(intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all))
         advance("done")

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData
     from kcal.lens.camera import Camera
     from kcal.lens.mounting import Origin
@@ -65,7 +63,7 @@ def parse_baseline(text: str) -> Baseline:
     return Baseline(first=0, second=1, length=length, sigma=sigma)
 
 
-def read_sources(cameras: tuple[Camera, Camera], sources: Sources, *, prior: bool) -> RigInput:
+def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
     """Read everything; warnings about it are printed."""
     from kcal.calibrate.rig.pairs import pair_by_name, paired_boards, read_pairs
     from kcal.calibrate.rig.sources import RigData
@@ -103,25 +101,10 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources, *, prior: boo
     data = RigData(
         cameras=cameras,
         names=CAMERAS,
-        covariances=tuple(map(_prior_covariance, cameras, CAMERAS)) if prior else None,
         boards=boards,
         landmarks=landmarks,
         features=None if sources.features is None else read_features(sources.features, sources.mark_sigma),
         baselines=() if sources.baseline is None else (parse_baseline(sources.baseline),),
         positions=positions,
     )
-    if prior:
-        err.print(
-            "[yellow]warning:[/] the sigmas of the camera files are taken as independent: the priors are looser in "
-            "some directions and tighter in others than the calibrations were"
-        )
     return RigInput(data, origin, unpaired)
-
-
-def _prior_covariance(camera: Camera, name: str) -> Tensor:
-    import torch
-
-    if camera.calibration is None or camera.calibration.sigma is None:
-        raise InputError(f"the {name} camera file has no standard deviations to hold its parameters with")
-    sigma = [camera.calibration.sigma[key] or 0.0 for key in camera.names]
-    return torch.diag(torch.tensor(sigma, dtype=torch.float64) ** 2)

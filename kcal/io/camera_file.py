@@ -1,7 +1,7 @@
 """kcal's own camera file: every parameter by its name, its error bars, and where it came from.
 
-JSON, `"kcal": "camera"`, version 1. Numbers are float64 and read back to the last bit. Parameters are stored by name,
-so that a value cannot slip into another one's place.
+JSON, `"kcal": "camera"`, version 2; version 1, of kcal 0.1, had no `information`. Numbers are float64 and read back to
+the last bit. Parameters are stored by name, so that a value cannot slip into another one's place.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import torch
 import kcal
 from kcal.errors import InputError
 from kcal.files import NativeFile
+from kcal.io.information_record import InformationRecord
 from kcal.io.lens_record import LensOrders
 from kcal.io.record import CovarianceRecord, Record
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration
@@ -51,7 +52,7 @@ class ValidRegion(Record):
 
 
 class CameraFile(NativeFile):
-    """One camera (file kind `camera`, version 1).
+    """One camera (file kind `camera`, version 2).
 
     Convention: pixels as in `Camera`: (0, 0) is the center of the first pixel, y down. Coefficients are stored by
     name in the order of `LensModel.names`; a reader goes by the names, since JSON objects have no order of their own.
@@ -64,7 +65,9 @@ class CameraFile(NativeFile):
         coefficients: name -> value, exactly the names of the model.
         standard_deviations: name -> one sigma of the parameter, None where it was held fixed; the whole is None
             when none was computed.
-        covariance: of all parameters together; None when none was computed.
+        covariance: of all parameters together, where that is all that is known of them; files of version 0.1 have it.
+        information: what the calibration says of all parameters together, and of its board; None if that was not
+            computed.
         valid_region: where the lens is valid; None if whoever wrote the file did not say.
         calibration: how the camera was calibrated, if it was.
 
@@ -79,7 +82,8 @@ class CameraFile(NativeFile):
     """
 
     KIND: ClassVar[str] = "camera"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
+    OLDER: ClassVar[tuple[int, ...]] = (1,)
 
     name: str
     image_size: tuple[pydantic.PositiveInt, pydantic.PositiveInt]
@@ -88,6 +92,7 @@ class CameraFile(NativeFile):
     coefficients: dict[str, float]
     standard_deviations: dict[str, pydantic.NonNegativeFloat | None] | None = None
     covariance: CovarianceRecord | None = None
+    information: InformationRecord | None = None
     valid_region: ValidRegion | None = None
     calibration: CalibrationRecord | None = None
 
@@ -126,22 +131,38 @@ class CameraFile(NativeFile):
             raise ValueError(f"covariance: {unknown[0]} is unknown; the lens model has {_listed(names)}")
         return value
 
+    @pydantic.field_validator("information")
+    @classmethod
+    def _on_model(cls, value: InformationRecord | None, info: pydantic.ValidationInfo) -> InformationRecord | None:
+        if value is not None and "model" in info.data:
+            names = (*INTRINSICS, *info.data["model"].model().names)
+            unknown = [name for group in value.unknowns for name in group if name not in names]
+            if unknown:
+                raise ValueError(f"information: {unknown[0]} is unknown; the lens model has {_listed(names)}")
+        return value
+
     def covariance_matrix(self) -> torch.Tensor | None:
-        """(5 + P, 5 + P) in the order of `Camera.names`, zero for what is exact; None if the file has no covariance."""
+        """(5 + P, 5 + P) in the order of `Camera.names`, zero for what is exact; None if the file has none."""
+        if self.information is not None:
+            return self.information.information(self._values()).covariance()
         if self.covariance is None:
             return None
         return self.covariance.expand((*INTRINSICS, *self.coefficients))
 
+    def _values(self) -> dict[str, float]:
+        """All parameters by name, in the order of `Camera.names`."""
+        return {name: getattr(self.intrinsics, name) for name in INTRINSICS} | self.coefficients
+
     def camera(self) -> Camera:
         """The camera, equal to the stored one to the last bit, with its `calibration` if the file has one."""
-        values = [*(getattr(self.intrinsics, name) for name in INTRINSICS), *self.coefficients.values()]
-        parameters = torch.tensor(values, dtype=torch.float64)
+        parameters = torch.tensor(list(self._values().values()), dtype=torch.float64)
         camera = Camera(parameters, size=self.image_size, model=self.model.model())
-        if self.name or self.standard_deviations or self.covariance or self.calibration:
+        if self.name or self.standard_deviations or self.covariance or self.information or self.calibration:
             camera.calibration = CameraCalibration(
                 name=self.name,
                 sigma=self.standard_deviations,
-                covariance=self.covariance_matrix(),
+                covariance=None if self.covariance is None else self.covariance.expand(camera.names),
+                information=None if self.information is None else self.information.information(self._values()),
                 record=self.calibration,
             )
         return camera
@@ -217,6 +238,7 @@ def camera_to_file(
             coefficients={key: stored[key] for key in camera.model.names},
             standard_deviations=standard_deviations,
             covariance=None if covariance is None else CovarianceRecord.of(covariance.detach(), camera.names),
+            information=None if known.information is None else InformationRecord.of(known.information, camera.names),
             valid_region=ValidRegion(
                 radius=float(camera.valid_radius),
                 polygon=tuple((round(u, 3), round(v, 3)) for u, v in camera.valid_polygon().tolist()),

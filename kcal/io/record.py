@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
+import math
+
+import numpy as np
 import pydantic
 import torch
 
@@ -12,6 +17,46 @@ class Record(pydantic.BaseModel):
     """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused."""
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Packed(Record):
+    """Many numbers in little space: `float64` is the base64 text of little-endian doubles, row by row.
+
+    Args:
+        shape: of the array.
+        float64: its bytes.
+    """
+
+    shape: tuple[pydantic.NonNegativeInt, ...]
+    float64: str
+
+    @pydantic.model_validator(mode="after")
+    def _filled(self) -> Packed:
+        values = self._values()
+        if len(values) != math.prod(self.shape):
+            raise ValueError(f"{len(values)} numbers do not fill the shape {list(self.shape)}")
+        if not np.isfinite(values).all():
+            raise ValueError("packed numbers must be finite")
+        return self
+
+    def _values(self) -> np.ndarray:
+        try:
+            data = base64.b64decode(self.float64, validate=True)
+        except binascii.Error as error:
+            raise ValueError(f"float64 is not base64 text: {error}") from None
+        if len(data) % 8:
+            raise ValueError(f"float64 has {len(data)} bytes, which are no whole doubles")
+        return np.frombuffer(data, dtype="<f8")
+
+    @classmethod
+    def of(cls, tensor: torch.Tensor) -> Packed:
+        """A tensor, as it is stored."""
+        values = tensor.detach().cpu().to(torch.float64).contiguous().numpy().astype("<f8")
+        return cls(shape=tuple(tensor.shape), float64=base64.b64encode(values.tobytes()).decode("ascii"))
+
+    def tensor(self) -> torch.Tensor:
+        """The tensor, equal to the stored one to the last bit."""
+        return torch.from_numpy(self._values().astype(np.float64)).reshape(self.shape)
 
 
 class CovarianceRecord(Record):

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kcal.checks import as_covariance
 from kcal.errors import InputError
+from kcal.lens.information import CameraInformation
 
 
 def _refuse_negative(where: object, names: Iterable[str]) -> None:
@@ -107,8 +108,9 @@ class CameraCalibration:
         name: free text that tells cameras apart, for example `"left"`.
         sigma: parameter name -> one sigma, in the order of `Camera.names`; None for a parameter that was held fixed or
             is not determined. The whole is None if no sigmas were computed.
-        covariance: (P, P) of the parameters in the order of `Camera.names`, zero for those held fixed; None if it was
-            not computed.
+        covariance: (P, P) of the parameters in the order of `Camera.names`, zero for those held fixed, where that is
+            all that is known; None otherwise.
+        information: what the calibration says of the camera (`CameraInformation`); None if that was not computed.
         record: how the camera was calibrated, if it was.
 
     Example:
@@ -119,11 +121,20 @@ class CameraCalibration:
     name: str = ""
     sigma: Mapping[str, float | None] | None = None
     covariance: Tensor | None = None
+    information: CameraInformation | None = None
     record: CalibrationRecord | None = None
 
     def check(self, count: int) -> None:
-        """Raise `InputError` unless the covariance is one of `count` parameters."""
+        """Raise `InputError` unless covariance and information are those of `count` parameters."""
         as_covariance("the camera's covariance", self.covariance, count)
+        if self.information is not None and len(self.information.slots) != count:
+            raise InputError(f"information on {len(self.information.slots)} parameters; the camera has {count}")
+
+    def known(self, params: Tensor) -> CameraInformation | None:
+        """What is known of a camera with these parameters (5 + P,): its information, or that of its covariance."""
+        if self.information is not None or self.covariance is None:
+            return self.information
+        return CameraInformation.from_covariance(params, self.covariance)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

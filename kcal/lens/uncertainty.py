@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.checks import as_covariance, as_points
+from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.information import CameraInformation
 from kcal.lens.projection import project_components
 
 # Rays are continued to this distance, meters: far beyond what the entrance pupil matters for.
@@ -45,20 +46,22 @@ def pixel_covariance(
     params = camera.params.detach()
     if params.ndim != 1:
         raise InputError("pixel_covariance: a single camera is needed, not a batch")
-    if covariance is None:
-        covariance = camera.calibration.covariance if camera.calibration is not None else None
-        if covariance is None:
-            raise InputError("pixel_covariance: the camera has no covariance: calibrate it with kcal, or give one")
-    as_covariance("pixel_covariance: covariance", covariance, len(params))
+    known = None if camera.calibration is None else camera.calibration.known(params)
+    if covariance is not None:
+        known = CameraInformation.from_covariance(params, covariance)
+    if known is None:
+        raise InputError("pixel_covariance: the camera has no covariance: calibrate it with kcal, or give one")
     places = as_points("pixels", pixels, 2)
     flat = places.reshape(-1, 2)
-    wanted = covariance.diagonal().nonzero()[:, 0].tolist()
+    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
+    half = known.by_parameter(known.half())[:, wanted]
     by_camera, by_turn, good = _slopes_at_infinity(camera, camera.grid(*grid).reshape(-1, 2), wanted)
     # The turn that best undoes each parameter's effect.
     undo = torch.linalg.lstsq(by_turn[good].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
     by_camera, by_turn, good = _slopes_at_infinity(camera, flat, wanted)
     by_camera = by_camera - by_turn @ undo
-    found = by_camera @ covariance[wanted][:, wanted] @ by_camera.transpose(-1, -2)
+    spread = by_camera @ half.T
+    found = spread @ spread.transpose(-1, -2)
     return torch.where(good[:, None, None], found, torch.nan).reshape(*places.shape[:-1], 2, 2)
 
 

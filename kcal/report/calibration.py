@@ -70,7 +70,7 @@ def _draw_uncertainty(axes: Axes, observations: Observations, result: CameraCali
     frame_image(axes, observations.image_size, margin=0.03)
     axes.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor=INK, linewidth=1.2))
     known = result.camera.calibration
-    if known is None or known.covariance is None:
+    if known is None or known.known(result.camera.params) is None:
         axes.set_title("No error bars", fontsize=10, loc="left")
         return
     columns, rows = 65, max(2, round(65 * height / width))

@@ -107,6 +107,14 @@ class SchurLinearization:
         return -along * column / self._shared_scale[..., None, None, :], inverse
 
 
+def without_local(rows: Tensor, local_size: int) -> Tensor:
+    """(V, S + 1, R): rows (V, L + S + 1, R) off what each view's L local parameters can do, by QR."""
+    local = rows[:, :local_size].transpose(-1, -2)
+    basis, _ = torch.linalg.qr(local * _inverse_root(local.square().sum(1, keepdim=True)))
+    others = rows[:, local_size:]
+    return others - (others @ basis) @ basis.transpose(-1, -2)
+
+
 def _inverse_root(diagonal: Tensor) -> Tensor:
     """Scale of each column; the parameter of a zero column never moves."""
     return torch.where(diagonal > 0, diagonal, 1.0).rsqrt()

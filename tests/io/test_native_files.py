@@ -158,7 +158,7 @@ class TestCamera:
         camera = Camera.build(focal=(800, 801), center=(320, 240), size=(640, 480), coefficients=[0.1], model="opencv4")
         assert camera_to_file(camera, name="left").dump() == {
             "kcal": "camera",
-            "version": 1,
+            "version": 2,
             "name": "left",
             "image_size": [640, 480],
             "model": {
@@ -173,6 +173,7 @@ class TestCamera:
             "coefficients": {"k1": 0.1, "k2": 0.0, "p1": 0.0, "p2": 0.0},
             "standard_deviations": None,
             "covariance": None,
+            "information": None,
             "valid_region": {
                 "radius": math.tan(math.radians(89.0)),
                 "polygon": [[-0.5, 479.5], [-0.5, -0.5], [639.5, -0.5], [639.5, 479.5]],

@@ -24,7 +24,7 @@ from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import project_components
 from kcal.solve.result import Result, State
 from kcal.solve.robust import RobustLoss
-from kcal.solve.schur import SchurLinearization, SchurProblem
+from kcal.solve.schur import SchurLinearization, SchurProblem, without_local
 
 _ALL = slice(None)
 # Numbers in the rows of derivatives that are formed at a time: as many as fit into the cache of one core.
@@ -284,6 +284,20 @@ class BoardProblem(SchurProblem[BoardState]):
             rows = self.rows(state.views(views), views)
             out.append(rows @ rows.transpose(-1, -2))
         return torch.cat(out, -3)
+
+    def rows_off_poses(self, state: BoardState) -> Tensor:
+        """(R, S + 1) derivatives of weighted residuals by the shared parameters, and residuals, off what poses can do.
+
+        Triangular for each chunk of views, so that R does not grow with the corners; terms are not among them.
+        """
+        count = state.rotation.shape[-3]
+        size = max(1, _CHUNK // (2 * self._board.shape[-1] * (6 + self.shared_size + 1)))
+        out = []
+        for start in range(0, count, size):
+            views = slice(start, start + size)
+            flat = without_local(self.rows(state.views(views), views), 6).transpose(0, 1).flatten(1).T
+            out.append(torch.linalg.qr(flat, mode="r")[1])
+        return torch.cat(out)
 
     def whiten(self, vectors: Tensor, views: slice = _ALL) -> Tensor:
         """Vectors (..., V, Q, 2, N) of pixels, multiplied by the corners' weights."""

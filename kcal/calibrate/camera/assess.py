@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardState
+from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.covariance import Uncertainty, uncertainty_of
 from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.priors import GaussianPrior
@@ -24,6 +25,7 @@ from kcal.calibrate.camera.warnings import (
 )
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
+from kcal.lens.information import CameraInformation, triangular
 from kcal.solve.result import SolverStatus
 from kcal.solve.robust import RobustLoss
 
@@ -43,7 +45,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
     squared, count = problem.pixel_errors(state).square().sum(-2), problem.seen.sum(-1)
     per_view, rms = torch.sqrt(squared.sum(-1) / count), float(torch.sqrt(squared.sum() / count.sum()))
 
-    uncertainty = _uncertainty(observations, solution, state, options.loss)
+    uncertainty, information = _uncertainty(observations, solution, state, options.loss)
     free = problem.free
     slot = {camera.names[i]: k for i, k in zip(free.indices, free.slots, strict=True)}
     unknowns = [" = ".join(name for name in slot if slot[name] == k) for k in range(len(free))]
@@ -78,6 +80,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
         status=status,
         iterations=solution.spent,
         covariance=_by_parameter(uncertainty, free, len(camera.names)),
+        information=information,
         warnings=(
             *general_warnings(observations.names, camera, rms, per_view, lost, status),
             *doubts,
@@ -90,16 +93,52 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
 
 def _uncertainty(
     observations: Observations, solution: Solution, state: BoardState, loss: RobustLoss | None
-) -> Uncertainty:
-    """Covariance of the unknowns."""
+) -> tuple[Uncertainty, CameraInformation | None]:
+    """Covariance of the unknowns, and what is said of the camera; None where that is not finite."""
     if not solution.problem.shared_size:
         # Under a known camera and a flat board nothing is shared by the views.
-        return Uncertainty(state.parameters.new_zeros(0, 0), torch.zeros(0, dtype=torch.bool))
+        return Uncertainty(state.parameters.new_zeros(0, 0), torch.zeros(0, dtype=torch.bool)), None
     # Barriers before folds are no information about the lens.
     known = [term for term in solution.minimum.terms if isinstance(term, GaussianPrior)]
     plain = solution.problem_for(observations.pixels(), observations.covariances(), loss, known)
-    count = plain.shared_size + 6 * len(state.translation)
-    return uncertainty_of(plain.linearize(state), plain.residual_count + plain.prior_count, count)
+    linear = plain.linearize(state)
+    count, residuals = plain.shared_size + 6 * len(state.translation), plain.residual_count + plain.prior_count
+    found = uncertainty_of(linear, residuals, count)
+    variance = 2.0 * float(linear.cost) / max(residuals - count, 1)
+    if not found.computed or not variance > 0:
+        return found, None
+    return found, _information(plain, state, known, math.sqrt(variance))
+
+
+def _information(
+    problem: BoardProblem, state: BoardState, priors: Sequence[GaussianPrior], noise: float
+) -> CameraInformation | None:
+    """What the corners, with `noise` px, and priors say of the camera."""
+    free, size = problem.free, problem.shared_size
+    if not len(free):
+        return None
+    slot = dict(zip(free.indices, free.slots, strict=True))
+    estimate, mean = state.parameters.new_zeros(2, size)
+    for index, place in slot.items():
+        estimate[place] = state.parameters[index]
+    estimate[len(free) :] = state.warp[: size - len(free)]
+    precision = torch.zeros_like(mean)
+    for term in priors:
+        for index, at, weight in zip(term.index.tolist(), term.mean.tolist(), term.weight.tolist(), strict=True):
+            # Parameters that are equal may have a prior each: the product of both.
+            precision[slot[index]] += (weight / noise) ** 2
+            mean[slot[index]] += at * (weight / noise) ** 2
+    mean = torch.where(precision > 0, mean / precision, 0.0)
+    triangle = triangular(problem.rows_off_poses(state) / noise)[:-1]
+    known = CameraInformation(
+        slots=tuple(slot.get(i, -1) for i in range(len(state.parameters))),
+        estimate=estimate,
+        rows=triangle[:, :-1],
+        residuals=triangle[:, -1],
+        mean=mean,
+        sigma=precision.rsqrt(),
+    )
+    return known.without_board()
 
 
 def _led_by_prior(

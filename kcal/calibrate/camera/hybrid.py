@@ -170,6 +170,7 @@ def _result(observations: Observations, fit: HybridFit, options: CalibrationOpti
         board_warp=None,
         sigma=sigma,
         covariance=covariance,
+        information=fit.information,
         status=status,
         iterations=fit.iterations,
         hybrid=fit,

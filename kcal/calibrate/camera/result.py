@@ -16,6 +16,7 @@ from kcal.corners.observations import Observations
 from kcal.io.camera_file import CameraFile, camera_to_file, provenance
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, Exclusion
 from kcal.lens.camera import Camera
+from kcal.lens.information import CameraInformation
 from kcal.solve.result import SolverStatus
 
 
@@ -73,6 +74,8 @@ class CameraCalibrationResult:
         covariance: (5 + P, 5 + P) of all parameters in the order of `Camera.names`, poses free; its diagonal is σ².
             Zero for what was held. What the data leave open has a large variance, which only rounding limits (σ is None
             there). NaN, except for what was held, where it cannot be computed.
+        information: the same before anything was inverted, with which a rig refines the camera; None where it cannot be
+            computed and where nothing was estimated.
         status: why the solver stopped.
         iterations: trial steps of the solver, all starts and models together.
         warnings: what the user should doubt, and what to do about it.
@@ -100,6 +103,7 @@ class CameraCalibrationResult:
     iterations: int
     warnings: tuple[str, ...]
     observations: Observations
+    information: CameraInformation | None = None
     hybrid: HybridFit | None = None
     advice: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
@@ -109,8 +113,9 @@ class CameraCalibrationResult:
 
     def __post_init__(self) -> None:
         """Give the camera its error bars and history, which it keeps until its parameters change."""
-        known = self.covariance if bool(self.covariance.isfinite().all()) else None
-        self.camera.calibration = CameraCalibration(sigma=self.sigma, covariance=known, record=self._record())
+        self.camera.calibration = CameraCalibration(
+            sigma=self.sigma, information=self.information, record=self._record()
+        )
 
     def _record(self) -> CalibrationRecord:
         board, warp = self.observations.board, self.board_warp

@@ -62,7 +62,7 @@ def summarize(result: CameraCalibrationResult) -> CalibrationSummary:
     """
     camera = result.camera
     center = border = worst = math.nan
-    if camera.calibration is not None and camera.calibration.covariance is not None:
+    if camera.calibration is not None and camera.calibration.known(camera.params) is not None:
         sigma = image_sigma(camera)
         rows, columns = sigma.shape
         edge = torch.cat([sigma[0], sigma[-1], sigma[1:-1, 0], sigma[1:-1, -1]])

@@ -27,6 +27,8 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import LEADING
+from kcal.lens.information import CameraInformation, triangular
+from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions, minimize
 
@@ -45,6 +47,7 @@ class HybridFit:
         camera: the camera.
         state: parameters, board, poses.
         half: (S, S); halfᵀ half is the covariance of parameters and board.
+        information: the same before anything was inverted, with data and priors apart.
         sigma: px, of a corner of weight one, tempering included.
         tempering: T, by which the data count less because residuals repeat within views.
         hyperparameters: (H,).
@@ -73,6 +76,7 @@ class HybridFit:
     camera: Camera
     state: HybridState
     half: Tensor
+    information: CameraInformation
     sigma: float
     tempering: float
     hyperparameters: Tensor
@@ -240,13 +244,17 @@ def fit_hybrid(
             "of outliers leaves wrong views out"
         )
     half = inverse * deviation
+    information = _information(off, problem.shared(state), families.mean, deviation, variance, model)
     if isinstance(board, BoardPrior):
+        # Its modes are not the board's own: what is said of the camera, whatever the board is within its covariance.
+        information = information.without_board()
         state = state._replace(board=board.mean + state.board @ board.half)
         half = torch.cat([half[:, : -len(board.mean)], half[:, -len(board.mean) :] @ board.half], 1)
     return HybridFit(
         camera=Camera(state.params, size=size, model=model),
         state=state,
         half=half,
+        information=information,
         sigma=math.sqrt(variance),
         tempering=tempering,
         hyperparameters=h,
@@ -259,6 +267,25 @@ def fit_hybrid(
         weighted_rms=math.sqrt(float((errors * problem.weights).square().sum()) / int(seen.sum())),
         iterations=spent + steps,
         converged=converged,
+    )
+
+
+def _information(
+    off: Tensor, x: Tensor, mean: Tensor, deviation: Tensor, variance: float, model: LensModel
+) -> CameraInformation:
+    """What rows off the poses (V, S + 1, R), at unknowns x (S,) less their mean, say of all that is not held."""
+    kept = deviation.nonzero()[:, 0]
+    rows = off.transpose(0, 1).flatten(1)[[*kept.tolist(), -1]].T / math.sqrt(variance)
+    triangle = triangular(rows)[:-1]
+    unknowns, place = hybrid_unknowns(model), {int(k): slot for slot, k in enumerate(kept)}
+    slots = dict(zip(unknowns.indices, unknowns.slots, strict=True))
+    return CameraInformation(
+        slots=tuple(place.get(slots.get(i, -1), -1) for i in range(5 + model.size)),
+        estimate=(x + mean)[kept],
+        rows=triangle[:, :-1],
+        residuals=triangle[:, -1],
+        mean=mean[kept],
+        sigma=deviation[kept],
     )
 
 

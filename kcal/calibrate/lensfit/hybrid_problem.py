@@ -14,7 +14,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from kcal.solve.result import State
-from kcal.solve.schur import SchurLinearization
+from kcal.solve.schur import SchurLinearization, without_local
 
 _LOCAL = 6
 # Rows of derivatives that are formed at a time: as many as the cache of one core holds.
@@ -161,9 +161,5 @@ class HybridProblem:
         out = []
         size = max(1, _CHUNK // ((len(self.mean) + _LOCAL + 1) * 2 * self.points.shape[-1]))
         for start in range(0, len(state.rotation), size):
-            rows = self.rows(state, slice(start, start + size))
-            pose = rows[:, :_LOCAL].transpose(-1, -2)
-            basis, _ = torch.linalg.qr(pose / pose.norm(dim=1, keepdim=True))
-            others = rows[:, _LOCAL:]
-            out.append(others - (others @ basis) @ basis.transpose(-1, -2))
+            out.append(without_local(self.rows(state, slice(start, start + size)), _LOCAL))
         return torch.cat(out)

@@ -5,23 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import FreeParameters
-from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, Kind, LandmarkBlock, PerKind, RigState
 from kcal.calibrate.rig.initial_poses import Start
-from kcal.calibrate.rig.problem import DistanceTerm, ParameterTerm, PlaceTerm, RigProblem, SharedTerm
+from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedTerm
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
-from kcal.errors import InputError
+from kcal.calibrate.rig.unknowns import SharedUnknowns
+from kcal.calibrate.rig.unknowns import held as nothing
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import Result
 from kcal.solve.robust import RobustLoss
 
-Intrinsics = Literal["fixed", "prior", "free"]
 # px, of a corner: noise-free corners would otherwise weigh infinitely much.
 _LEAST_SIGMA = 1e-3
 
@@ -43,9 +40,8 @@ class Adjustment:
     Args:
         data: what is known.
         start: poses to begin with.
-        intrinsics: whether parameters are held, solved with priors, or free.
+        unknowns: what may change of lenses and board.
         sigma_corner: of a board's corner along an axis, px.
-        board_warp: whether the board's warp is estimated.
         turning: which cameras' rotations are unknown; left out: all, but the one that is the frame.
         moving: likewise their centers.
     """
@@ -54,25 +50,25 @@ class Adjustment:
         self,
         data: RigData,
         start: Start,
-        intrinsics: Intrinsics,
+        unknowns: SharedUnknowns,
         sigma_corner: float,
         *,
-        board_warp: bool = False,
         turning: Sequence[bool] | None = None,
         moving: Sequence[bool] | None = None,
     ) -> None:
-        self.data, self.sigma_corner, self._board_warp = data, sigma_corner, board_warp
+        self.data, self.sigma_corner, self.unknowns = data, sigma_corner, unknowns
         loose = [data.absolute or c > 0 for c in range(len(data.cameras))]
         self._turning, self._moving = turning or loose, moving or loose
         self.anchor = start.center.mean(0)
-        self.free = [_free(data, c, intrinsics) for c in range(len(data.cameras))]
-        self._terms = _terms(data, self.free if intrinsics == "prior" else None)
+        self._terms: list[SharedTerm] = [DistanceTerm(b.first, b.second, b.length, b.sigma) for b in data.baselines]
+        self._terms += [PlaceTerm(p.camera, p.point, p.sigma) for p in data.positions]
         direction, inverse_range = _feature_start(data, start, self.anchor)
         self.state = RigState(
             parameters=torch.cat([camera.params.detach() for camera in data.cameras]),
+            unknown=unknowns.begin,
             rotation=start.rotation,
             center=start.center,
-            warp=torch.zeros(2, dtype=torch.float64),
+            board=torch.zeros(len(unknowns.shapes), dtype=torch.float64),
             board_rotation=start.board_rotation,
             board_translation=start.board_translation,
             points=data.landmarks.points if data.landmarks else torch.empty(0, 3, dtype=torch.float64),
@@ -81,19 +77,19 @@ class Adjustment:
         )
 
     def problem(self, masks: PerKind, loss: RobustLoss | None = None, *, held: bool = False) -> RigProblem:
-        """The problem of the items in the masks; `held`: of these alone, with the cameras and the warp as they are."""
+        """The problem of the items in the masks; `held`: of these alone, with cameras and board as they are."""
         cameras = self.data.cameras
-        free = [FreeParameters((), ())] * len(cameras) if held else self.free
+        unknowns = nothing(cameras) if held else self.unknowns
         turning, moving = ([not held and one for one in each] for each in (self._turning, self._moving))
-        blocks = self._blocks(masks, free_warp=self._board_warp and not held)
-        return RigProblem(cameras, blocks, () if held else self._terms, free, turning, moving, loss)
+        blocks = self._blocks(masks, unknowns.board)
+        return RigProblem(cameras, blocks, () if held else self._terms, unknowns, turning, moving, loss)
 
-    def _blocks(self, masks: PerKind, *, free_warp: bool) -> list[Block]:
+    def _blocks(self, masks: PerKind, by_unknown: Tensor) -> list[Block]:
         """A block of each kind that has items in the masks."""
         data, found = self.data, list[Block]()
         if data.boards and masks.boards.any():
             pixels, white = (value[masks.boards] for value in (data.boards.pixels, self.corner_whitening()))
-            found.append(BoardBlock(pixels, white, data.boards.points, free_warp=free_warp))
+            found.append(BoardBlock(pixels, white, data.boards.points, self.unknowns.shapes, by_unknown))
         if data.landmarks and masks.landmarks.any():
             surveyed = data.landmarks.points[masks.landmarks], data.landmarks.sigma[masks.landmarks]
             found.append(LandmarkBlock(*_weighted(data.landmarks, masks.landmarks), *surveyed))
@@ -176,7 +172,8 @@ class Adjustment:
             problem = self.problem(masks)
             # Where there is nothing but boards, they determine the shared unknowns too.
             alone = len(problem.blocks) == 1 and not self._terms
-            ratio = float(squares.sum()) / max(dof - alone * problem.shared_size, 1)
+            free = problem.shared_size - int(self.unknowns.known.sum())
+            ratio = float(squares.sum()) / max(dof - alone * free, 1)
         if 0 < ratio < math.inf:
             self.sigma_corner = max(self.sigma_corner * math.sqrt(ratio), _LEAST_SIGMA)
 
@@ -184,7 +181,7 @@ class Adjustment:
 def _masks_of_fields(masks: PerKind) -> RigState:
     """For each tensor of a state the mask of its items; None for what all items share."""
     boards, landmarks, features = masks
-    return RigState(None, None, None, None, boards, boards, landmarks, features, features)  # type: ignore[arg-type]
+    return RigState(None, None, None, None, None, boards, boards, landmarks, features, features)  # type: ignore[arg-type]
 
 
 def _weighted(source: Landmarks | Features, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -207,45 +204,6 @@ def typical_ratio(squares: Tensor, freedom: Tensor) -> float:
     if int(known.sum()) < 4:
         return 1.0
     return float((squares[known] / chi2_quantile(freedom[known].double(), 0.5)).median())
-
-
-def _free(data: RigData, camera: int, intrinsics: Intrinsics) -> FreeParameters:
-    model = data.cameras[camera].model
-    if intrinsics == "fixed":
-        return FreeParameters((), ())
-    if intrinsics == "free":
-        return FreeParameters.of(free_parameters(model))
-    covariance = None if data.covariances is None else data.covariances[camera]
-    if covariance is None:
-        raise InputError(f"{data.names[camera]}: a prior needs the covariance of the camera's parameters")
-    size = len(data.cameras[camera].names)
-    if covariance.shape != (size, size):
-        raise InputError(
-            f"{data.names[camera]}: a covariance ({size}, {size}) is needed, {tuple(covariance.shape)} given"
-        )
-    if not bool(torch.isfinite(covariance).all()):
-        raise InputError(f"{data.names[camera]}: the covariance of its parameters is not finite; calibrate it anew")
-    return FreeParameters.of((covariance.diagonal() > 0).nonzero()[:, 0].tolist())
-
-
-def _terms(data: RigData, priors: list[FreeParameters] | None) -> list[SharedTerm]:
-    terms: list[SharedTerm] = [DistanceTerm(b.first, b.second, b.length, b.sigma) for b in data.baselines]
-    terms += [PlaceTerm(p.camera, p.point, p.sigma) for p in data.positions]
-    for c, free in enumerate(priors or ()):
-        index = list(free)
-        if not index:
-            continue
-        covariance = (data.covariances or ())[c]
-        assert covariance is not None
-        part = covariance[index][:, index]
-        scale = part.diagonal().sqrt()
-        factor, info = torch.linalg.cholesky_ex(part / scale[:, None] / scale)
-        if int(info) != 0:
-            raise InputError(f"{data.names[c]}: the covariance of its parameters is not positive definite")
-        identity = torch.eye(len(index), dtype=torch.float64)
-        white = torch.linalg.solve_triangular(factor, identity, upper=False) / scale
-        terms.append(ParameterTerm(c, data.cameras[c].params.detach(), white))
-    return terms
 
 
 def _feature_start(data: RigData, start: Start, anchor: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,8 +16,6 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import warp_shape
-from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.twist import apply_twist
 from kcal.lens.camera import Camera
 from kcal.lens.pose import side_axes, step_rows
@@ -42,9 +40,10 @@ class RigState(NamedTuple):
 
     Attributes:
         parameters: of all cameras, one after the other.
+        unknown: (K,) of cameras and board together; see `kcal.calibrate.rig.unknowns`.
         rotation: (C, 3, 3) cam_from_world.
         center: (C, 3) meters, in the world.
-        warp: (2,) meters, of the board; see `kcal.calibrate.bundle.board_problem.warp_shape`.
+        board: (B,) amplitudes of the board's displacements.
         board_rotation: (V, 3, 3) world_from_board.
         board_translation: (V, 3) meters.
         points: (L, 3) meters, adjusted positions of landmarks.
@@ -53,9 +52,10 @@ class RigState(NamedTuple):
     """
 
     parameters: Tensor
+    unknown: Tensor
     rotation: Tensor
     center: Tensor
-    warp: Tensor
+    board: Tensor
     board_rotation: Tensor
     board_translation: Tensor
     points: Tensor
@@ -64,14 +64,17 @@ class RigState(NamedTuple):
 
 
 class PosedCamera(NamedTuple):
-    """A camera as it stands during a solve, and where its unknowns are in a step (None: held)."""
+    """A camera as it stands during a solve, and where its unknowns are in a step (None: held).
+
+    Attributes:
+        by_unknown: (5 + P, K) its parameters by the K unknowns of cameras and board, the first of a step.
+    """
 
     camera: Camera
     parameters: Tensor
     rotation: Tensor
     center: Tensor
-    free: FreeParameters
-    inner: slice
+    by_unknown: Tensor
     turn: slice | None
     shift: slice | None
 
@@ -86,8 +89,6 @@ class Block(ABC):
 
     kind: Kind
     size: int
-    # Whether the last two shared unknowns are the board's warp.
-    free_warp = False
 
     def __init__(self, pixels: Tensor, whitening: Tensor) -> None:
         self.seen = torch.isfinite(pixels).all(-1)
@@ -119,9 +120,9 @@ class Block(ABC):
     def retract(self, state: RigState, step: Tensor) -> RigState:
         """Apply a step (V, L) to this block's part of the state."""
 
-    def _by_warp(self, state: RigState, by_q: Tensor) -> Tensor:
-        """Derivatives (V, 2, 2, N) of pixels by the board's warp, where that is free."""
-        raise NotImplementedError
+    def _by_board(self, state: RigState, by_q: Tensor) -> Tensor | None:
+        """Derivatives (V, K, 2, N) of pixels by the unknowns through the board's shape; None where they have none."""
+        return None
 
     def _prior(self, state: RigState) -> Tensor | None:
         """(V, L + 1, Q): derivatives of Q residuals of what is known beforehand; the last row holds the residuals."""
@@ -133,7 +134,7 @@ class Block(ABC):
         y, w = self._place(state)
         for c, posed in enumerate(cameras):
             q = posed.rotation @ (y - w * posed.center[:, None])
-            wanted = posed.free.indices if derivatives else None
+            wanted = posed.by_unknown.any(1).nonzero()[:, 0].tolist() if derivatives else None
             found = project_components(q, posed.parameters, posed.camera.model, wanted)
             # NaN where a seen point has no projection, so that such a pose is never accepted.
             bad = torch.where(found.regular, 0.0, torch.nan)[..., None, :]
@@ -158,13 +159,17 @@ class Block(ABC):
             by_q = torch.einsum("vkun,kj->vjun", found.by_point, posed.rotation)
             rows[:, : self.size] = self._by_local(state, by_q, posed.center)
             shared = rows[:, self.size : -1]
-            shared[:, posed.inner] = posed.free.collapse(found.by_camera, -3)
+            count = posed.by_unknown.shape[1]
+            if count:
+                wanted = posed.by_unknown.any(1)
+                shared[:, :count] = torch.einsum("vpun,pk->vkun", found.by_camera, posed.by_unknown[wanted])
+                by_board = self._by_board(state, by_q)
+                if by_board is not None:
+                    shared[:, :count] += by_board
             if posed.turn is not None:
                 shared[:, posed.turn] = step_rows(found.by_point, q)[:, :3]
             if posed.shift is not None:
                 shared[:, posed.shift] = -w[..., None] * by_q
-            if self.free_warp:
-                shared[:, -2:] = self._by_warp(state, by_q)
             rows[:, -1] = error
             rows = torch.where(self.seen[:, c, None, None, :], rows, 0.0)
             out.append(torch.einsum("vuwn,vpwn->vpun", self.whitening[:, c], rows).flatten(-2))
@@ -177,30 +182,49 @@ class Block(ABC):
 
 
 class BoardBlock(Block):
-    """Boards, of which each has a pose of its own; all have the same warp, which is a shared unknown if it is free."""
+    """Boards, of which each has a pose of its own; all have the same shape.
+
+    Args:
+        pixels: see `Block`.
+        whitening: see `Block`.
+        board_points: (N, 3) meters.
+        shapes: (B, 3, N) by which the state's amplitudes displace the corners.
+        by_unknown: (B, K) these amplitudes by the unknowns.
+    """
 
     kind: Kind = "boards"
     size = 6
 
-    def __init__(self, pixels: Tensor, whitening: Tensor, board_points: Tensor, *, free_warp: bool = False) -> None:
+    def __init__(
+        self,
+        pixels: Tensor,
+        whitening: Tensor,
+        board_points: Tensor,
+        shapes: Tensor | None = None,
+        by_unknown: Tensor | None = None,
+    ) -> None:
         super().__init__(pixels, whitening)
-        self._board, self._shape, self.free_warp = board_points.T.contiguous(), warp_shape(board_points), free_warp
+        self._board, self._shapes, self._by_unknown = board_points.T.contiguous(), shapes, by_unknown
 
-    def _bent(self, state: RigState) -> Tensor:
-        return torch.cat([self._board[:2], self._board[2:] + state.warp @ self._shape])
+    def _shaped(self, state: RigState) -> Tensor:
+        if self._shapes is None or not len(self._shapes):
+            return self._board
+        return self._board + torch.einsum("b,bkn->kn", state.board, self._shapes)
 
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
-        points = state.board_rotation @ self._bent(state) + state.board_translation[..., None]
+        points = state.board_rotation @ self._shaped(state) + state.board_translation[..., None]
         return points, points.new_ones(len(self), 1, 1)
 
     def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
         # By ω through ω × (R x), then by v.
-        return step_rows(by_q, state.board_rotation @ self._bent(state))
+        return step_rows(by_q, state.board_rotation @ self._shaped(state))
 
-    def _by_warp(self, state: RigState, by_q: Tensor) -> Tensor:
-        # Along the board's normal.
-        along = torch.einsum("vkun,vk->vun", by_q, state.board_rotation[..., 2])
-        return along[:, None] * self._shape[:, None]
+    def _by_board(self, state: RigState, by_q: Tensor) -> Tensor | None:
+        if self._shapes is None or self._by_unknown is None or not self._by_unknown.any():
+            return None
+        moved = torch.einsum("bk,bln->kln", self._by_unknown, self._shapes)
+        by_point = torch.einsum("vjun,vjl->vlun", by_q, state.board_rotation)
+        return torch.einsum("vlun,kln->vkun", by_point, moved)
 
     def retract(self, state: RigState, step: Tensor) -> RigState:
         """See `Block.retract`."""

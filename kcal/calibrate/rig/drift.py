@@ -21,6 +21,7 @@ from kcal.calibrate.rig.records import item_records
 from kcal.calibrate.rig.result import ItemResidual
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, relative_rows, turn_rows
+from kcal.calibrate.rig.unknowns import held
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import vector_from_rotation
@@ -136,7 +137,7 @@ def measure_drift(
         landmarks = dataclasses.replace(landmarks, pixels=torch.cat([unseen, landmarks.pixels], 1))
     cameras = (rig.left, rig.right, rig.left, rig.right)
     data = RigData(cameras=cameras, names=_NAMES, features=features, landmarks=landmarks)
-    work = Adjustment(data, start, "fixed", 1.0, turning=[False, False, loose, True], moving=[False] * 4)
+    work = Adjustment(data, start, held(cameras), 1.0, turning=[False, False, loose, True], moving=[False] * 4)
     masks = _telling(data)
     few = "too few of the images have a mark of it"
     reasons = {

@@ -11,10 +11,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.rig.adjustment import Adjustment, chi2_quantile, typical_ratio
 from kcal.calibrate.rig.blocks import LOCAL_SIZE, BoardBlock, PerKind, RigState
 from kcal.calibrate.rig.problem import RigProblem
+from kcal.calibrate.rig.unknowns import held
 from kcal.solve.lm import LMOptions, minimize
 
 # Probability that any good item at all is taken for a wrong one.
@@ -74,15 +74,15 @@ def _each_camera_alone(work: Adjustment, mask: Tensor) -> tuple[Tensor, Tensor]:
     squares = torch.full(mask.shape, torch.nan, dtype=torch.float64)
     squares[mask] = 0.0
     further = torch.zeros(mask.shape, dtype=torch.int64)
-    whitening, held = work.corner_whitening(), [False] * len(cameras)
+    whitening, still = work.corner_whitening(), [False] * len(cameras)
     for c in range(len(cameras)):
         some = mask & (torch.isfinite(boards.pixels[:, c]).all(-1).sum(-1) >= _CORNERS)
         if not bool(some.any()):
             continue
         pixels = torch.full_like(boards.pixels[some], torch.nan)
         pixels[:, c] = boards.pixels[some, c]
-        block = BoardBlock(pixels, whitening[some], boards.points)
-        problem = RigProblem(cameras, [block], (), [FreeParameters((), ())] * len(cameras), held, held)
+        block = BoardBlock(pixels, whitening[some], boards.points, work.unknowns.shapes)
+        problem = RigProblem(cameras, [block], (), held(cameras), still, still)
         start = work.part(work.none()._replace(boards=some))
         found = RigState(*minimize(problem, start, _POSES).state)
         squares[some] += problem.item_squares(found)[0]

@@ -163,5 +163,6 @@ def paired_boards(
         pixels=torch.stack([side.pixels() for side in sides], 1),
         names=tuple(" ".join(dict.fromkeys(pair)) for pair in pairs),
         deviation=_deviation(cameras, boards[0]),
+        views=tuple(tuple(pair[side] for pair in pairs) for side in (0, 1)),
         covariance=torch.stack(known, 1) if len(known) == 2 else None,
     )

@@ -1,7 +1,7 @@
 """The least-squares problem of a rig: cameras that move or are held, what they see, and what was measured besides.
 
-Shared unknowns: for each camera its free parameters, its rotation, its center; then the board's warp, if that is free.
-Those of boards, landmarks and features are eliminated item by item (`kcal.solve.schur`).
+Shared unknowns: those of lenses and board (`kcal.calibrate.rig.unknowns`), then for each camera its rotation and its
+center. Those of boards, landmarks and features are eliminated item by item (`kcal.solve.schur`).
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.rig.blocks import LOCAL_SIZE, Block, PosedCamera, RigState
+from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation, rotation_from_vector
 from kcal.solve.result import State
@@ -64,21 +64,6 @@ class PlaceTerm(SharedTerm):
         return out
 
 
-class ParameterTerm(SharedTerm):
-    """Known camera parameters: whitening (K, F) times (free parameters - mean)."""
-
-    def __init__(self, camera: int, mean: Tensor, whitening: Tensor) -> None:
-        self._camera, self._mean, self._whitening = camera, mean, whitening
-
-    def rows(self, cameras: Sequence[PosedCamera], shared_size: int) -> Tensor:
-        """See `SharedTerm.rows`."""
-        posed = cameras[self._camera]
-        out = self._mean.new_zeros((shared_size + 1, len(self._whitening)))
-        out[posed.inner] = self._whitening.T
-        out[-1] = self._whitening @ (posed.parameters - self._mean)[list(posed.free)]
-        return out
-
-
 class RigProblem:
     """Everything that a rig is solved from, as one problem whose state is a `RigState`.
 
@@ -86,7 +71,7 @@ class RigProblem:
         cameras: the cameras; what is not free keeps the state's values.
         blocks: what is seen, one block for each kind.
         terms: what was measured of the cameras besides.
-        free: free parameters of each camera.
+        unknowns: what may change of lenses and board.
         turning: which cameras' rotations are unknown.
         moving: which cameras' centers are unknown.
         loss: of the root of each item's mean square, in sigmas; None: plain least squares.
@@ -100,22 +85,19 @@ class RigProblem:
         cameras: Sequence[Camera],
         blocks: Sequence[Block],
         terms: Sequence[SharedTerm],
-        free: Sequence[FreeParameters],
+        unknowns: SharedUnknowns,
         turning: Sequence[bool],
         moving: Sequence[bool],
         loss: RobustLoss | None = None,
     ) -> None:
-        self.cameras, self.blocks, self.free, self.loss = tuple(cameras), tuple(blocks), tuple(free), loss
+        self.cameras, self.blocks, self.unknowns, self.loss = tuple(cameras), tuple(blocks), unknowns, loss
         self._terms = tuple(terms)
-        self.inner: list[slice] = []
         self.turn: list[slice | None] = []
         self.shift: list[slice | None] = []
-        end = 0
-        for unknown, turns, moves in zip(self.free, turning, moving, strict=True):
-            self.inner.append(slice(end, end := end + len(unknown)))
+        end = len(unknowns)
+        for turns, moves in zip(turning, moving, strict=True):
             self.turn.append(slice(end, end := end + 3) if turns else None)
             self.shift.append(slice(end, end := end + 3) if moves else None)
-        self.warp = slice(end, end := end + 2) if any(block.free_warp for block in self.blocks) else None
         self.shared_size = end
         self.residual_count = int(sum(int(block.counts.sum()) for block in self.blocks)) + 1
 
@@ -126,7 +108,7 @@ class RigProblem:
     def posed(self, state: RigState) -> list[PosedCamera]:
         """The cameras as they stand, with the places of their unknowns in a step."""
         columns = self.cameras, self.parameters(state), state.rotation, state.center
-        slots = self.free, self.inner, self.turn, self.shift
+        slots = self.unknowns.cameras, self.turn, self.shift
         return [PosedCamera(*values) for values in zip(*columns, *slots, strict=True)]
 
     def item_squares(self, state: RigState) -> list[Tensor]:
@@ -138,7 +120,11 @@ class RigProblem:
         """(S + 1, Q) of what was measured of the cameras besides."""
         posed = self.posed(state)
         rows = [term.rows(posed, self.shared_size) for term in self._terms]
-        return torch.cat([state.center.new_zeros((self.shared_size + 1, 0)), *rows], -1)
+        known = self.unknowns.known.nonzero()[:, 0]
+        prior = state.center.new_zeros((self.shared_size + 1, len(known)))
+        prior[known, range(len(known))] = 1.0
+        prior[-1] = state.unknown[known] if len(known) else 0.0
+        return torch.cat([prior, *rows], -1)
 
     def cost(self, state: State) -> Tensor:
         """See `Problem.cost`."""
@@ -207,17 +193,22 @@ class RigProblem:
         """See `Problem.retract`."""
         state = RigState(*state)
         shared, local = step
-        moved = []
-        for values, unknown, inner in zip(self.parameters(state), self.free, self.inner, strict=True):
-            index = torch.tensor(unknown.indices, dtype=torch.int64)
-            moved.append(values.index_add(0, index, unknown.expand(shared[inner])))
+        change = shared[: len(self.unknowns)]
         turns = torch.stack([shared.new_zeros(3) if slot is None else shared[slot] for slot in self.turn])
         shifts = torch.stack([shared.new_zeros(3) if slot is None else shared[slot] for slot in self.shift])
+        if len(change):
+            parameters = [
+                values + by_unknown @ change
+                for values, by_unknown in zip(self.parameters(state), self.unknowns.cameras, strict=True)
+            ]
+            state = state._replace(
+                parameters=torch.cat(parameters),
+                unknown=state.unknown + change,
+                board=state.board + self.unknowns.board @ change,
+            )
         state = state._replace(
-            parameters=torch.cat(moved),
             rotation=rotation_from_vector(turns) @ state.rotation,
             center=state.center + shifts,
-            warp=state.warp if self.warp is None else state.warp + shared[self.warp],
         )
         for block, part in zip(self.blocks, local.split([len(block) for block in self.blocks]), strict=True):
             state = block.retract(state, part[:, LOCAL_SIZE - block.size :])

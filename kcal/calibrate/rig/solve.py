@@ -5,19 +5,23 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+from typing import Literal
 
 import torch
 
-from kcal.calibrate.rig.adjustment import Adjustment, Intrinsics
+from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import KINDS, PerKind
 from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
+from kcal.calibrate.rig.knowledge import gathered, joint_unknowns
 from kcal.calibrate.rig.mixups import cost_of_features_behind, refuse_same_camera, swap_warnings
 from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible, without_wrong
 from kcal.calibrate.rig.records import Reasons, item_records, places, source_records
+from kcal.calibrate.rig.repeated_views import without_repeated
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, relative_rows
+from kcal.calibrate.rig.unknowns import SharedUnknowns, free, held
 from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import provenance
 from kcal.solve.lm import LMOptions
@@ -38,15 +42,16 @@ class RigOptions:
     """Options of `solve_rig` and `calibrate_rig`.
 
     Args:
-        intrinsics: "fixed": as the cameras have them; "prior": solved, held by the covariances of `RigData`; "free":
-            solved, starting from the given cameras.
-        board_warp: estimate how the board bends.
+        intrinsics: "prior": solved together with everything else, held by what the cameras' calibrations know of
+            lenses and board; "fixed": cameras are taken as exact, and the covariance of the rig knows no error of
+            theirs; "free": solved as if nothing were known of them.
+        board_warp: estimate two parabolas by which the board bends, where no calibration knows its shape.
         weighted: let corners count by their covariances where all views have them.
         reject: leave out what contradicts the rest; otherwise warnings name it. Left out or not, it is listed.
         solver: options of the Levenberg-Marquardt solver; residuals are in sigmas.
     """
 
-    intrinsics: Intrinsics = "fixed"
+    intrinsics: Literal["prior", "fixed", "free"] = "prior"
     board_warp: bool = False
     weighted: bool = True
     reject: bool = True
@@ -93,17 +98,14 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     if options.board_warp and data.boards is None:
         raise InputError("the board's warp cannot be estimated without boards")
     refuse_same_camera(data)
-    if options.intrinsics == "free" and any(camera.model.hybrid for camera in data.cameras):
-        raise InputError(
-            "hybrid cameras cannot be refined without what their own calibrations know: hold them, take their "
-            "covariances as priors, or calibrate parametric cameras"
-        )
     if not options.weighted and data.boards is not None:
         data = dataclasses.replace(data, boards=dataclasses.replace(data.boards, covariance=None))
     data, warnings = _without_rayless(data)
+    data, unknowns, doubts = _unknowns(data, options)
+    warnings += doubts
     initial = first_poses(data, options.solver)
     masks, reasons = _first_masks(initial, reject=options.reject)
-    work = _robust(initial, masks, options)
+    work = _robust(initial, masks, unknowns)
     if options.reject:
         masks = without_wrong(work, masks, options.solver)
     else:
@@ -171,13 +173,36 @@ def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reaso
     return masks, reasons
 
 
-def _robust(initial: InitialPoses, masks: PerKind, options: RigOptions) -> Adjustment:
+def _unknowns(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns, list[str]]:
+    """What may change of cameras and board, the data with the board as it is expected, and warnings."""
+    boards, warnings = data.boards, list[str]()
+    if options.intrinsics == "prior":
+        known = []
+        for number, (camera, name) in enumerate(zip(data.cameras, data.names, strict=True)):
+            own = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
+            if own is None:
+                warnings.append(f"nothing is known of how well {name} is calibrated: it is taken as exact")
+            elif boards is not None:
+                own = without_repeated(own, camera, boards, number, options.solver)
+            known.append(own)
+        board = None if boards is None else boards.board
+        unknowns, deviation = joint_unknowns(data.cameras, gathered(data.cameras, known, board), board)
+        if boards is not None and deviation is not None:
+            data = dataclasses.replace(data, boards=dataclasses.replace(boards, deviation=deviation))
+    else:
+        unknowns = held(data.cameras) if options.intrinsics == "fixed" else free(data.cameras, data.names)
+    if options.board_warp and boards is not None and not len(unknowns.shapes):
+        unknowns = unknowns.and_warp(boards.points)
+    return data, unknowns, warnings
+
+
+def _robust(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> Adjustment:
     """The best robust solution from all starts."""
     boards = initial.data.boards
     sigma = _CORNER_SIGMA if boards is None or boards.sigma is None else boards.sigma
     best: tuple[float, Adjustment, PerKind] | None = None
     for start in initial.starts:
-        work = Adjustment(initial.data, start, options.intrinsics, sigma, board_warp=options.board_warp)
+        work = Adjustment(initial.data, start, unknowns, sigma)
         here = possible(work, masks)
         work.fit_corners(here, robust=True)
         problem, result = work.solve(here, _SCREENING, LOSS)
@@ -243,7 +268,7 @@ def _rig_result(
     warnings += swap_warnings(data, problem, state, covariance)
     items = item_records(work, masks, reasons)
     cameras = data.cameras
-    if any(len(free) for free in problem.free):
+    if any(bool(part.any()) for part in problem.unknowns.cameras):
         solved = zip(data.cameras, problem.parameters(state), strict=True)
         cameras = tuple(camera.with_parameters(parameters) for camera, parameters in solved)
     return RigResult(
@@ -251,7 +276,7 @@ def _rig_result(
         cameras=cameras,
         rotation=state.rotation,
         center=state.center,
-        board_warp=None if problem.warp is None else state.warp,
+        board_warp=state.board if len(problem.unknowns.shapes) == 2 else None,
         sources=source_records(work, masks, items),
         items=items,
         flipped=tuple(initial.flipped),

@@ -50,6 +50,8 @@ class Boards:
         pixels: (V, C, N, 2) its corners.
         names: one for each moment.
         deviation: (N, 3) meters of each corner, as measured, from where it should be by the order; zero if left out.
+        views: for each camera the names of its views, where that is known: those that its calibration used as well are
+            taken out of what it knows, so that they do not count twice.
         covariance: (V, C, N, 2, 2) px² of corners, by which they weigh; all alike if left out.
         sigma: of a corner along an axis, px; estimated from the residuals if left out.
     """
@@ -58,6 +60,7 @@ class Boards:
     pixels: Tensor
     names: tuple[str, ...]
     deviation: Tensor | None = None
+    views: tuple[tuple[str, ...], ...] | None = None
     covariance: Tensor | None = None
     sigma: float | None = None
 
@@ -76,6 +79,8 @@ class Boards:
                 f"boards: pixels (V, C, {self.board.corners}, 2) are needed, got {tuple(self.pixels.shape)}"
             )
         _names("boards", self.names, len(self.pixels))
+        if self.views is not None and [len(own) for own in self.views] != [len(self.pixels)] * self.pixels.shape[1]:
+            raise InputError("boards: a name of each camera's view is needed for every moment")
         if self.covariance is not None and self.covariance.shape != (*self.pixels.shape, 2):
             raise InputError(
                 f"boards: a covariance {(*self.pixels.shape, 2)} is needed, got {tuple(self.covariance.shape)}"
@@ -206,7 +211,6 @@ class RigData:
     Args:
         cameras: two or more, calibrated; unlike sizes and models are welcome.
         names: of the cameras.
-        covariances: (5 + P, 5 + P) of each camera's parameters, where intrinsics are solved with priors.
         boards: see `Boards`.
         landmarks: see `Landmarks`.
         features: see `Features`.
@@ -224,7 +228,6 @@ class RigData:
 
     cameras: tuple[Camera, ...]
     names: tuple[str, ...]
-    covariances: tuple[Tensor | None, ...] | None = None
     boards: Boards | None = None
     landmarks: Landmarks | None = None
     features: Features | None = None
@@ -238,8 +241,6 @@ class RigData:
         _names("cameras", self.names, count)
         if not all(isinstance(camera, Camera) and camera.params.ndim == 1 for camera in self.cameras):
             raise InputError("a rig is made of single cameras")
-        if self.covariances is not None and len(self.covariances) != count:
-            raise InputError(f"covariances: one for each camera is needed, got {len(self.covariances)} for {count}")
         for kind, source in (("boards", self.boards), ("landmarks", self.landmarks), ("features", self.features)):
             if source is not None and source.pixels.shape[1] != count:
                 raise InputError(f"{kind}: pixels of {source.pixels.shape[1]} cameras, the rig has {count}")

@@ -144,22 +144,17 @@ def _named_motions(
                 motion[slot] = axis
                 out.append((label, motion))
     single = torch.eye(problem.shared_size, dtype=torch.float64)
-    return out + [(label, axis) for label, axis in zip(_labels(problem, names), single, strict=True) if label]
+    return out + [(label, axis) for label, axis in zip(_labels(problem), single, strict=True) if label]
 
 
-def _labels(problem: RigProblem, names: Sequence[str]) -> list[str]:
+def _labels(problem: RigProblem) -> list[str]:
     """A name for each unknown that has one by itself; empty for turns and shifts."""
-    labels = [""] * problem.shared_size
-    for c, name in enumerate(names):
-        for index, slot in zip(problem.free[c].indices, problem.free[c].slots, strict=True):
-            labels[problem.inner[c].start + slot] = f"{problem.cameras[c].names[index]} of {name}"
-    if problem.warp is not None:
-        labels[problem.warp] = ["the board's warp along its rows", "the board's warp along its columns"]
-    return labels
+    known = list(problem.unknowns.labels)
+    return known + [""] * (problem.shared_size - len(known))
 
 
 def _largest_parts(problem: RigProblem, direction: Tensor, names: Sequence[str]) -> str:
-    labels = _labels(problem, names)
+    labels = _labels(problem)
     for c, name in enumerate(names):
         turn_slot, shift_slot = problem.turn[c], problem.shift[c]
         if turn_slot is not None:
@@ -204,8 +199,7 @@ def _slot_rows(problem: RigProblem, slot: slice | None) -> Tensor:
 
 def parameter_rows(problem: RigProblem, camera: int) -> Tensor:
     """(5 + P, S): all parameters of a camera, held ones with zeros."""
-    free = problem.free[camera]
-    rows = torch.zeros(len(problem.cameras[camera].names), problem.shared_size, dtype=torch.float64)
-    for index, slot in zip(free.indices, free.slots, strict=True):
-        rows[index, problem.inner[camera].start + slot] = 1.0
+    by_unknown = problem.unknowns.cameras[camera]
+    rows = by_unknown.new_zeros(len(by_unknown), problem.shared_size)
+    rows[:, : by_unknown.shape[1]] = by_unknown
     return rows

@@ -1,0 +1,99 @@
+"""Square roots of information: covariances, priors, boards that are integrated out."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from kcal.errors import InputError
+from kcal.lens.information import CameraInformation, posterior_half, triangular
+
+
+def information(board: int = 2, scale: float = 1.0) -> CameraInformation:
+    """Five unknowns of a camera of seven parameters, and some of a board."""
+    generator = torch.Generator().manual_seed(1)
+    count = 5 + board
+    sigma = torch.full((count,), math.inf, dtype=torch.float64)
+    sigma[3:] = torch.rand(count - 3, generator=generator, dtype=torch.float64) + 0.1
+    units = scale ** torch.arange(count, dtype=torch.float64)
+    return CameraInformation(
+        slots=(0, 0, 1, 2, -1, 3, 4),
+        estimate=torch.randn(count, generator=generator, dtype=torch.float64),
+        rows=torch.randn(40, count, generator=generator, dtype=torch.float64) * units,
+        residuals=torch.randn(40, generator=generator, dtype=torch.float64),
+        mean=torch.zeros(count, dtype=torch.float64),
+        sigma=sigma,
+    )
+
+
+def test_covariance_of_data_and_prior() -> None:
+    """(RᵀR + 1/σ²)⁻¹, tied parameters alike and held ones zero."""
+    known = information()
+    inverse = torch.linalg.inv(known.rows.T @ known.rows + torch.diag(known.sigma**-2))
+    torch.testing.assert_close(known.half().T @ known.half(), inverse, rtol=1e-12, atol=1e-14)
+    found = known.covariance()
+    assert found.shape == (7, 7)
+    assert torch.equal(found[0], found[1])
+    assert not found[4].any()
+    torch.testing.assert_close(found[5, 2], inverse[3, 1], rtol=1e-11, atol=1e-14)
+
+
+def test_without_board_is_the_marginal() -> None:
+    """Integrating the board out leaves the camera's block of the covariance, and the pull of what is left."""
+    known = information()
+    alone = known.without_board()
+    assert alone.board_size == 0
+    torch.testing.assert_close(alone.covariance(), known.covariance(), rtol=1e-11, atol=1e-14)
+    # The same best camera: the step to the minimum of everything is that of the camera alone.
+    whole, part = known.all_rows(), alone.all_rows()
+    step = torch.linalg.lstsq(whole[:, :-1], -whole[:, -1:]).solution[:5]
+    torch.testing.assert_close(torch.linalg.lstsq(part[:, :-1], -part[:, -1:]).solution, step, rtol=1e-11, atol=1e-12)
+
+
+def test_from_covariance_and_back() -> None:
+    """Parameters without variance are held; the rest comes back."""
+    root = torch.randn(5, 7, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    matrix = root.T @ root + 0.1 * torch.eye(7).double()
+    matrix[3], matrix[:, 3] = 0.0, 0.0
+    found = CameraInformation.from_covariance(torch.arange(7.0), matrix)
+    assert found.slots == (0, 1, 2, -1, 3, 4, 5)
+    torch.testing.assert_close(found.covariance(), matrix, rtol=1e-11, atol=1e-13)
+
+
+def test_nearly_undetermined_directions_survive() -> None:
+    """Columns of units 1e-4 apart and a valley 1e-10 wide: normal equations would lose it."""
+    rows = torch.tensor([[1.0, 1.0], [0.0, 1e-10]]).double()
+    half = posterior_half(rows)
+    # x = (1, -1) / 1e-10 moves the rows by one.
+    sigma = torch.linalg.vector_norm(half, dim=0)
+    torch.testing.assert_close(sigma, torch.full((2,), 1e10).double(), rtol=1e-5, atol=0)
+
+
+def test_undetermined_is_large() -> None:
+    """What no row determines gets a very large variance, not NaN."""
+    half = posterior_half(torch.tensor([[1.0, 0.0]]).double())
+    sigma = torch.linalg.vector_norm(half, dim=0)
+    assert float(sigma[0]) == pytest.approx(1.0)
+    assert 1e10 < float(sigma[1]) < math.inf
+
+
+def test_triangular_keeps_products() -> None:
+    """Also of fewer rows than columns."""
+    for count in (2, 9):
+        rows = torch.randn(count, 4, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
+        found = triangular(rows)
+        assert found.shape == (4, 4)
+        torch.testing.assert_close(found.T @ found, rows.T @ rows, rtol=1e-12, atol=1e-13)
+
+
+def test_refused() -> None:
+    """Shapes and values that cannot be."""
+    known = information()
+    for change in ({"mean": known.mean[:3]}, {"sigma": -known.sigma}, {"residuals": known.residuals * math.nan}):
+        fields = {name: getattr(known, name) for name in ("slots", "estimate", "rows", "residuals", "mean", "sigma")}
+        with pytest.raises(InputError, match="information"):
+            CameraInformation(**fields | change)
+    with pytest.raises(InputError, match="finite"):
+        CameraInformation.from_covariance(torch.ones(2), torch.full((2, 2), math.nan).double())
