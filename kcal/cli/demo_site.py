@@ -121,8 +121,9 @@ def _write_summary(output: Path, scene: DemoScene, table: list[list[str]], comma
 
     found = sum(len(Observations.load(output / f"{side}.near.obs.json").views) for side in SIDES)
     rig = RigFile.load(output / "rig.json")
-    assert rig.covariance is not None
-    yaw = math.degrees(math.sqrt(rig.covariance[-5][-5]))
+    known = rig.rig().covariance
+    assert known is not None
+    yaw = math.degrees(float(known.half[:, -5].norm()))
     cameras = zip(SIDES, (rig.left.calibration, rig.right.calibration), strict=True)
     rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
     pairs = 0 if rig.calibration is None else rig.calibration.pairs

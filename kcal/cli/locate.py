@@ -147,8 +147,7 @@ def locate_command(
     if yaw_sigma:
         yaw = torch.zeros(6, 6, dtype=torch.float64)
         yaw[1, 1] = math.radians(yaw_sigma) ** 2
-        more = RigCovariance.of(solved, pose=yaw)
-        calibration = more if calibration is None else RigCovariance(matrix=calibration.matrix + more.matrix)
+        calibration = (calibration or RigCovariance.of(solved)).with_pose(yaw)
     mounting = mounting_covariance(origin_m=[origin_sigma] * 3, attitude_deg=(0.0, 0.0, heading_sigma))
     if place is None or heading is None:
         stored = solved.mounting

@@ -134,13 +134,13 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
     boards, mounting = result.data.boards, rig.mounting
-    exact = all(found is given for found, given in zip(result.cameras, result.data.cameras, strict=True))
+    exact = f" with {' and '.join(result.exact)} taken as exact" if result.exact else ""
     pitch, yaw, roll = (math.degrees(value) for value in result.sigma_rotation.tolist())
     lines += [
         f"RMS [bold]{result.rms:.4f} px[/] (left {result.rms_px[0]:.4f}, right {result.rms_px[1]:.4f}); "
         f"{result.status.message}",
         f"baseline [bold]{float(rig.baseline):.6f} m[/] ± {result.sigma_baseline:.6f}; σ of yaw {yaw:.5f}°, pitch "
-        f"{pitch:.5f}°, roll {roll:.5f}°{' with both cameras taken as exact' if exact else ''}",
+        f"{pitch:.5f}°, roll {roll:.5f}°{exact}",
     ]
     if boards is not None:
         lines.append(f"{len(result.pairs)} of {len(boards.names)} pairs used, {unpaired} views without partner")

@@ -1,7 +1,8 @@
 """kcal's own rig file: two whole cameras, where the second stands, and how that was found.
 
-JSON, `"kcal": "rig"`, version 1. The cameras are embedded, not referred to: relative yaw of 0.01° is 436 m at 5 km,
-so a rig must never be combined with cameras that were solved again after it.
+JSON, `"kcal": "rig"`, version 2; version 1, of kcal 0.1, had the covariance as a matrix. The cameras are embedded, not
+referred to: relative yaw of 0.01° is 436 m at 5 km, so a rig must never be combined with cameras that were solved again
+after it.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from kcal.checks import as_covariance
 from kcal.errors import InputError
 from kcal.files import NativeFile
 from kcal.io.camera_file import CameraFile, camera_to_file
-from kcal.io.record import Record
+from kcal.io.record import Packed, Record
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.projection import INTRINSICS
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import RigCovariance, StereoRig, half_of_covariance
 
 Triple = tuple[float, float, float]
 
@@ -122,14 +123,15 @@ class RigMounting(Record):
 
 
 class RigFile(NativeFile):
-    """A stereo rig (file kind `rig`, version 1).
+    """A stereo rig (file kind `rig`, version 2).
 
     Args:
         left: the first camera, whole; its frame is the rig's.
         right: the second camera, whole.
         right_from_left: where the right camera stands.
         covariance: of both cameras' parameters and the relative pose together, in the order of
-            `RigCovariance`; what was held has zeros.
+            `RigCovariance`; what was held has zeros. Files of version 1 have it.
+        half: (K, P) root of it: halfᵀ half is the covariance.
         mounting: where the rig stands on the Earth, if that was solved.
         calibration: how the rig was solved, if it was.
 
@@ -142,45 +144,54 @@ class RigFile(NativeFile):
     """
 
     KIND: ClassVar[str] = "rig"
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
+    OLDER: ClassVar[tuple[int, ...]] = (1,)
 
     left: CameraFile
     right: CameraFile
     right_from_left: RigPose
     covariance: Matrix | None = None
+    half: Packed | None = None
     mounting: RigMounting | None = None
     calibration: RigCalibration | None = None
 
     @pydantic.model_validator(mode="after")
     def _measured(self) -> RigFile:
-        link = None if self.mounting is None else self.mounting.link
+        link, size = None if self.mounting is None else self.mounting.link, self._size()
         if self.covariance is not None:
-            size = len(self.left.coefficients) + len(self.right.coefficients) + 2 * len(INTRINSICS) + 6
-            matrix = _tensor(self.covariance, size, size, "the rig's covariance")
-            as_covariance("the rig's covariance", matrix, size)
-            if link is not None:
-                if self.mounting is None or self.mounting.covariance is None:
-                    raise ValueError("the mounting's link needs the mounting's covariance")
-                mounted = torch.tensor(self.mounting.covariance, dtype=torch.float64)
-                RigCovariance(matrix=matrix).checked_link(mounted, _tensor(link, size, 6, "the mounting's link"))
-        elif link is not None:
-            raise ValueError("the mounting's link needs the rig's covariance")
+            as_covariance("the rig's covariance", _tensor(self.covariance, size, size, "the rig's covariance"), size)
+        if self.half is not None and (len(self.half.shape) != 2 or self.half.shape[1] != size):
+            raise ValueError(f"half: a root (K, {size}) is needed, got the shape {list(self.half.shape)}")
+        known = self.joint_covariance()
+        if link is not None:
+            if known is None:
+                raise ValueError("the mounting's link needs the rig's covariance")
+            if self.mounting is None or self.mounting.covariance is None:
+                raise ValueError("the mounting's link needs the mounting's covariance")
+            mounted = torch.tensor(self.mounting.covariance, dtype=torch.float64)
+            known.checked_link(mounted, _tensor(link, size, 6, "the mounting's link"))
         length = math.hypot(*self.right_from_left.translation)
         # A thousandth of a millimeter in a meter: more is not rounding but another rig.
         if self.calibration and not math.isclose(self.calibration.baseline_m, length, rel_tol=1e-6):
             raise ValueError(f"baseline_m is {self.calibration.baseline_m:g}, but the translation is {length:g} m long")
         return self
 
-    def joint_covariance(self) -> Tensor | None:
-        """The stored covariance, float64."""
-        return _loaded(self.covariance)
+    def _size(self) -> int:
+        return len(self.left.coefficients) + len(self.right.coefficients) + 2 * len(INTRINSICS) + 6
+
+    def joint_covariance(self) -> RigCovariance | None:
+        """The stored covariance."""
+        if self.half is not None:
+            return RigCovariance(half=self.half.tensor())
+        matrix = _loaded(self.covariance)
+        return None if matrix is None else RigCovariance(half=half_of_covariance(matrix))
 
     def rig(self) -> StereoRig:
         """The rig, equal to the stored one to the last bit, with its covariance, mounting and calibration."""
-        pose, joint = self.right_from_left, self.joint_covariance()
+        pose = self.right_from_left
         translation = torch.tensor(pose.translation, dtype=torch.float64)
         rig = StereoRig(self.left.camera(), self.right.camera(), pose.matrix(), translation)
-        rig.covariance = None if joint is None else RigCovariance(matrix=joint)
+        rig.covariance = self.joint_covariance()
         rig.mounting = None if self.mounting is None else self.mounting.mounting()
         rig.calibration = self.calibration
         return rig
@@ -191,7 +202,7 @@ def rig_to_file(
     *,
     left: CameraFile | None = None,
     right: CameraFile | None = None,
-    covariance: Tensor | None = None,
+    covariance: RigCovariance | None = None,
     mounting: RigMounting | None = None,
     calibration: RigCalibration | None = None,
 ) -> RigFile:
@@ -218,8 +229,7 @@ def rig_to_file(
     for name, file, camera in (("left", left, rig.left), ("right", right, rig.right)):
         if file is not None and file.camera().fingerprint != camera.fingerprint:
             raise InputError(f"the {name} camera file contains another camera than the rig; pass the file it came from")
-    if covariance is None and rig.covariance is not None:
-        covariance = rig.covariance.matrix
+    covariance = rig.covariance if covariance is None else covariance
     try:
         if mounting is None and rig.mounting is not None:
             mounting = RigMounting.of(rig.mounting)
@@ -232,7 +242,7 @@ def rig_to_file(
                     "translation": rig.right_from_left_translation.tolist(),
                 }
             ),
-            covariance=_stored(covariance),
+            half=None if covariance is None else Packed.of(covariance.half),
             mounting=mounting,
             calibration=calibration or rig.calibration,
         )

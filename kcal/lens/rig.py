@@ -45,7 +45,7 @@ class StereoRig(nn.Module):
 
     right_from_left_rotation: Tensor
     right_from_left_translation: Tensor
-    covariance = UntilChanged["RigCovariance"](lambda rig, value: RigCovariance.of(rig, joint=value.matrix))
+    covariance = UntilChanged["RigCovariance"](lambda rig, value: value.check(rig))
     mounting = UntilChanged[Mounting]()
     calibration = UntilChanged[RigCalibration]()
 
@@ -105,18 +105,19 @@ class RigCovariance:
     (3 meters), as in `kcal.lens.pose`.
 
     Args:
-        matrix: (P, P) float64, P = the two cameras' parameters + 6.
+        half: (K, P) float64, P = the two cameras' parameters + 6: halfᵀ half is the covariance. As a root it loses
+            nothing where coefficients are hardly determined one by one and their sum is.
 
     Example:
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> sigma = torch.tensor([0, 1e-4, 0, 0, 0, 0], dtype=torch.float64)  # relative yaw
         >>> known = RigCovariance.of(rig, pose=torch.diag(sigma**2))
-        >>> tuple(known.matrix.shape)
-        (16, 16)
+        >>> tuple(known.half.shape), tuple(known.matrix.shape)
+        ((1, 16), (16, 16))
     """
 
-    matrix: Tensor
+    half: Tensor
 
     @classmethod
     def of(
@@ -128,7 +129,10 @@ class RigCovariance:
         pose: Tensor | None = None,
         joint: Tensor | None = None,
     ) -> RigCovariance:
-        """Put parts together, each independent of the others and exact where left out; or check a `joint` matrix.
+        """Put parts together, each independent of the others and exact where left out; or take a `joint` matrix.
+
+        Cameras and pose of a rig that was solved are not independent: errors of a lens are undone by the pose for all
+        that was seen. Parts of a joint covariance taken as independent give intervals that are far too wide.
 
         Args:
             rig: the rig that they belong to.
@@ -144,18 +148,28 @@ class RigCovariance:
         if joint is not None:
             if not (left is None and right is None and pose is None):
                 raise InputError("rig covariance: give the joint matrix or its parts, not both")
-            return cls(matrix=as_covariance("joint covariance", joint, sum(sizes)))
+            return cls(half=half_of_covariance(as_covariance("joint covariance", joint, sum(sizes))))
         names = ("left camera's covariance", "right camera's covariance", "pose covariance")
         parts = [as_covariance(*item) for item in zip(names, (left, right, pose), sizes, strict=True)]
-        return cls(matrix=torch.block_diag(*parts))
+        return cls(half=torch.block_diag(*map(half_of_covariance, parts)))
 
-    def factor(self) -> Tensor:
-        """(P, K) with factor @ factor.T = matrix, K being its rank."""
-        scale = self.matrix.diagonal().sqrt()
-        safe = torch.where(scale > 0, scale, 1.0)
-        values, vectors = torch.linalg.eigh(self.matrix / safe[:, None] / safe[None, :])
-        kept = values > 1e-14 * values[-1].clamp_min(1e-300)
-        return scale[:, None] * vectors[:, kept] * values[kept].sqrt()
+    @property
+    def matrix(self) -> Tensor:
+        """(P, P) the covariance."""
+        return self.half.T @ self.half
+
+    def check(self, rig: StereoRig) -> None:
+        """Raise `InputError` unless it has the size of this rig's quantities, and is finite."""
+        size = rig.left.values.shape[-1] + rig.right.values.shape[-1] + 6
+        if self.half.ndim != 2 or self.half.shape[1] != size:
+            raise InputError(f"joint covariance: a root (K, {size}) is needed, got {tuple(self.half.shape)}")
+        require_finite("joint covariance", self.half)
+
+    def with_pose(self, covariance: Tensor) -> RigCovariance:
+        """This, and an independent error (6, 6) of the relative pose."""
+        more = half_of_covariance(as_covariance("pose covariance", covariance, 6)).to(self.half)
+        zero = more.new_zeros(len(more), self.half.shape[1] - 6)
+        return RigCovariance(half=torch.cat([self.half, torch.cat([zero, more], 1)]))
 
     def checked_link(self, mounting: Tensor, link: Tensor) -> Tensor:
         """`link` (P, 6) as float64, after checking that it fits this covariance and that of the mounting (6, 6).
@@ -163,9 +177,19 @@ class RigCovariance:
         Raises:
             InputError: a wrong shape, or the three together are no covariance.
         """
-        size = len(self.matrix)
+        size = self.half.shape[1]
         if not isinstance(link, Tensor) or tuple(link.shape) != (size, 6):
             raise InputError(f"link: a covariance of the calibration with the mounting, ({size}, 6), is needed")
-        link, mounting = link.to(self.matrix), mounting.to(self.matrix)
-        whole = torch.cat([torch.cat([self.matrix, link], 1), torch.cat([link.T, mounting], 1)])
+        matrix = self.matrix
+        link, mounting = link.to(matrix), mounting.to(matrix)
+        whole = torch.cat([torch.cat([matrix, link], 1), torch.cat([link.T, mounting], 1)])
         return as_covariance("covariance of calibration and mounting", whole, size + 6)[:size, size:]
+
+
+def half_of_covariance(matrix: Tensor) -> Tensor:
+    """(K, P) with halfᵀ half = matrix (P, P), K being its rank."""
+    scale = matrix.diagonal().sqrt()
+    safe = torch.where(scale > 0, scale, 1.0)
+    values, vectors = torch.linalg.eigh(matrix / safe[:, None] / safe[None, :])
+    kept = values > 1e-14 * values[-1:].sum().clamp_min(1e-300)
+    return (scale[:, None] * vectors[:, kept] * values[kept].sqrt()).T

@@ -175,8 +175,8 @@ class StereoLocalizer(nn.Module):
         self.register_buffer("geodetic_of_origin", origin.geodetic.to(device))
         factor = None
         if calibration is not None:
-            known = RigCovariance.of(rig, joint=calibration.matrix).factor()
-            factor = known.to(device) if known.shape[1] else None
+            calibration.check(rig)
+            factor = calibration.half.T.to(device) if bool(calibration.half.any()) else None
         self.register_buffer("calibration_factor", factor)
         standing = None if mounting is None else as_covariance("mounting", mounting, 6).to(device)
         self.register_buffer("mounting", standing)

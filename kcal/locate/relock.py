@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.drift import Drift, measure_drift
 from kcal.calibrate.rig.sources import Features, Landmarks
-from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.lens.rig import StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.mounting import attitude
 
@@ -73,9 +73,7 @@ def relocked(rig: StereoRig, drift: Drift, note: str) -> StereoRig:
     """
     new = StereoRig(rig.left, rig.right, drift.rig.right_from_left_rotation, drift.rig.right_from_left_translation)
     if rig.covariance is not None:
-        joint = rig.covariance.matrix.clone()
-        joint[-6:, -6:] += drift.pose_covariance
-        new.covariance = RigCovariance(matrix=joint)
+        new.covariance = rig.covariance.with_pose(drift.pose_covariance)
     new.mounting = rig.mounting
     if rig.mounting is not None and drift.cam_from_local is not None and drift.left_covariance is not None:
         rotation, covariance = drift.cam_from_local, rig.mounting.covariance

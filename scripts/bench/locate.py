@@ -177,7 +177,7 @@ def coverage(draws: int) -> list[str]:
     there, known = rig(), known_to()
     plain = StereoLocalizer(there, origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1)
     wide = StereoLocalizer(there, origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1, calibration=known)
-    factor, generator = known.factor(), torch.Generator().manual_seed(7)
+    factor, generator = known.half.T, torch.Generator().manual_seed(7)
     for i, distance in enumerate(RANGES):
         angle = -0.3 + 0.1 * i
         point = distance * torch.tensor([[math.sin(angle), 0.02 * i - 0.06, math.cos(angle)]], dtype=torch.float64)

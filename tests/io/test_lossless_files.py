@@ -13,6 +13,7 @@ import torch
 
 from kcal.errors import FileError, InputError
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
+from kcal.io.record import Packed
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
@@ -25,7 +26,9 @@ SAMPLE = ROOT / "assets" / "sample-rig.json"
 
 def assert_same(before: Any, after: Any, where: str = "") -> None:
     """Equal to the last bit; what is derived on writing (the valid region) to rounding."""
-    if isinstance(before, dict):
+    if where == ".version":
+        assert after == 2
+    elif isinstance(before, dict):
         # Later versions have further fields, which are empty for files of earlier ones.
         assert [key for key in after if key in before] == list(before), where
         assert all(after[key] is None for key in after if key not in before), where
@@ -43,7 +46,16 @@ def assert_same(before: Any, after: Any, where: str = "") -> None:
 
 def test_rig_file_of_version_01(tmp_path: Path) -> None:
     again = save_rig(load_rig(SAMPLE), tmp_path / "rig.json")
-    assert_same(json.loads(SAMPLE.read_text()), json.loads(again.read_text()))
+    before, after = json.loads(SAMPLE.read_text()), json.loads(again.read_text())
+    # The covariance is stored as its root now.
+    matrix, half = before.pop("covariance"), Packed.model_validate(after.pop("half")).tensor()
+    sigma = half.norm(dim=0).clamp_min(1e-300)
+    stored = torch.tensor(matrix, dtype=torch.float64)
+    torch.testing.assert_close(
+        half.T @ half / sigma / sigma[:, None], stored / sigma / sigma[:, None], rtol=0, atol=1e-12
+    )
+    assert_same(before, after)
+    assert save_rig(load_rig(again), tmp_path / "third.json").read_bytes() == again.read_bytes()
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -117,8 +129,8 @@ def test_it_does_not_outlive_the_parameters() -> None:
 
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     rig = load_rig(SAMPLE)
-    with pytest.raises(InputError, match=r"\(26, 26\) is needed"):
-        rig.covariance = RigCovariance(matrix=torch.eye(6, dtype=torch.float64))
+    with pytest.raises(InputError, match=r"\(K, 26\) is needed"):
+        rig.covariance = RigCovariance(half=torch.eye(6, dtype=torch.float64))
     camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
     with pytest.raises(InputError, match=r"\(5, 5\) is needed"):
         camera.calibration = CameraCalibration(covariance=torch.eye(6, dtype=torch.float64))

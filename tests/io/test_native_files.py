@@ -222,7 +222,7 @@ class TestCamera:
             (["standard_deviations", "fx"], -1.0, "greater than or equal to 0"),
             (["calibration", "views"], 3, "per_view_rms has 2"),
             (["calibration", "created"], "2026-01-01T00:00:00", "timezone"),
-            (["version"], 2, "version 2"),
+            (["version"], 3, "version 3"),
             (["color"], "red", "Extra"),
         ],
     )

@@ -96,7 +96,7 @@ def test_errors_of_the_calibration_are_in_the_interval(z: float) -> None:
     root = torch.diag(sigma)
     root[20, 1] = root[19, 18] = 2e-5  # the rig's rotation leans on the cameras, as after a joint solve
     known = RigCovariance.of(rig, joint=root @ root.T)
-    assert torch.allclose(known.factor() @ known.factor().T, known.matrix, rtol=1e-9, atol=1e-18)
+    assert torch.allclose(known.matrix, root @ root.T, rtol=1e-9, atol=1e-18)
     count = 4000
     draws = noise(1.0, count, len(sigma), seed=8) @ root.T
     point = z * tensor([0.15, 0.1, 1.0])
@@ -338,7 +338,7 @@ def test_bad_arguments() -> None:
         ({"pixel_sigma": 0.0}, "pixel_sigma"),
         ({"refraction": 13.0}, "refraction"),
         ({"mounting": torch.eye(3)}, "mounting"),
-        ({"calibration": RigCovariance(matrix=torch.eye(3))}, "joint covariance"),
+        ({"calibration": RigCovariance(half=torch.eye(3))}, "joint covariance"),
         ({"heading_deg": math.nan}, "heading"),
     ):
         with pytest.raises(InputError, match=message):

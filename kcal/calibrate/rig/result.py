@@ -141,6 +141,12 @@ class RigResult:
         return self.data.absolute
 
     @property
+    def exact(self) -> tuple[str, ...]:
+        """Names of the cameras that were taken as exact: errors of their lenses are in no covariance."""
+        maps = self._problem.unknowns.cameras
+        return tuple(name for name, by_unknown in zip(self.names, maps, strict=True) if not bool(by_unknown.any()))
+
+    @property
     def left_out(self) -> tuple[ItemResidual, ...]:
         """What is not part of the solution."""
         return tuple(item for item in self.items if not item.used)
@@ -195,9 +201,9 @@ class RigResult:
         rotation = self.rotation[second] @ self.rotation[first].T
         translation = self.rotation[second] @ (self.center[first] - self.center[second])
         rig = StereoRig(self.cameras[first], self.cameras[second], rotation, translation)
-        joint = self.joint_covariance(first, second)
-        if bool(torch.isfinite(joint).all()):
-            rig.covariance = RigCovariance(matrix=joint)
+        half = self._covariance.half_of(self._joint_rows(first, second))
+        if half is not None:
+            rig.covariance = RigCovariance(half=half)
         rms = [0.0 if math.isnan(self.rms_px[camera]) else self.rms_px[camera] for camera in (first, second)]
         rig.calibration = RigCalibration(
             rms=self.rms,

@@ -8,6 +8,7 @@ import math
 from typing import Literal
 
 import torch
+from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import KINDS, PerKind
@@ -20,10 +21,12 @@ from kcal.calibrate.rig.records import Reasons, item_records, places, source_rec
 from kcal.calibrate.rig.repeated_views import without_repeated
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, relative_rows
+from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, parameter_rows, relative_rows
 from kcal.calibrate.rig.unknowns import SharedUnknowns, free, held
 from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import provenance
+from kcal.lens.calibration import CameraCalibration
+from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, SolverStatus
 
@@ -43,8 +46,9 @@ class RigOptions:
 
     Args:
         intrinsics: "prior": solved together with everything else, held by what the cameras' calibrations know of
-            lenses and board; "fixed": cameras are taken as exact, and the covariance of the rig knows no error of
-            theirs; "free": solved as if nothing were known of them.
+            lenses and board (a camera without a calibration is held: `RigResult.exact`); "fixed": cameras are taken as
+            exact, and the covariance of the rig knows no error of theirs; "free": solved as if nothing were known of
+            them.
         board_warp: estimate two parabolas by which the board bends, where no calibration knows its shape.
         weighted: let corners count by their covariances where all views have them.
         reject: leave out what contradicts the rest; otherwise warnings name it. Left out or not, it is listed.
@@ -101,8 +105,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     if not options.weighted and data.boards is not None:
         data = dataclasses.replace(data, boards=dataclasses.replace(data.boards, covariance=None))
     data, warnings = _without_rayless(data)
-    data, unknowns, doubts = _unknowns(data, options)
-    warnings += doubts
+    data, unknowns = _unknowns(data, options)
     initial = first_poses(data, options.solver)
     masks, reasons = _first_masks(initial, reject=options.reject)
     work = _robust(initial, masks, unknowns)
@@ -173,16 +176,14 @@ def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reaso
     return masks, reasons
 
 
-def _unknowns(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns, list[str]]:
-    """What may change of cameras and board, the data with the board as it is expected, and warnings."""
-    boards, warnings = data.boards, list[str]()
+def _unknowns(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns]:
+    """What may change of cameras and board, and the data with the board as it is expected."""
+    boards = data.boards
     if options.intrinsics == "prior":
         known = []
-        for number, (camera, name) in enumerate(zip(data.cameras, data.names, strict=True)):
+        for number, camera in enumerate(data.cameras):
             own = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
-            if own is None:
-                warnings.append(f"nothing is known of how well {name} is calibrated: it is taken as exact")
-            elif boards is not None:
+            if own is not None and boards is not None:
                 own = without_repeated(own, camera, boards, number, options.solver)
             known.append(own)
         board = None if boards is None else boards.board
@@ -193,7 +194,7 @@ def _unknowns(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknow
         unknowns = held(data.cameras) if options.intrinsics == "fixed" else free(data.cameras, data.names)
     if options.board_warp and boards is not None and not len(unknowns.shapes):
         unknowns = unknowns.and_warp(boards.points)
-    return data, unknowns, warnings
+    return data, unknowns
 
 
 def _robust(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> Adjustment:
@@ -230,6 +231,18 @@ def _suspicions(work: Adjustment, masks: PerKind, reasons: Reasons, solver: LMOp
         for item in item_records(trial, kept, reasons)
         if not item.used and (item.source, item.name) not in named
     ]
+
+
+def _refined(camera: Camera, parameters: Tensor, covariance: Tensor) -> Camera:
+    """The camera as the rig found it, with new sigmas; all that is known of it together is the rig's covariance."""
+    out, known = camera.with_parameters(parameters), camera.calibration
+    spread = covariance.diagonal().sqrt()
+    sigma = {
+        name: float(value) if 0 < value < math.inf else None for name, value in zip(camera.names, spread, strict=True)
+    }
+    name, record = ("", None) if known is None else (known.name, known.record)
+    out.calibration = CameraCalibration(name=name, sigma=sigma, record=record)
+    return out
 
 
 def _rig_result(
@@ -269,8 +282,10 @@ def _rig_result(
     items = item_records(work, masks, reasons)
     cameras = data.cameras
     if any(bool(part.any()) for part in problem.unknowns.cameras):
-        solved = zip(data.cameras, problem.parameters(state), strict=True)
-        cameras = tuple(camera.with_parameters(parameters) for camera, parameters in solved)
+        cameras = tuple(
+            _refined(camera, problem.parameters(state)[c], covariance.of(parameter_rows(problem, c))[0])
+            for c, camera in enumerate(data.cameras)
+        )
     return RigResult(
         data=data,
         cameras=cameras,

@@ -76,6 +76,11 @@ class SharedCovariance:
         matrix = torch.where(lost[:, None] | lost[None, :], 0.0, 0.5 * (matrix + matrix.T))
         return matrix + torch.diag(torch.where(lost, torch.inf, 0.0)), ~lost
 
+    def half_of(self, rows: Tensor) -> Tensor | None:
+        """(S, K) root of the covariance of K linear functions (K, S) of a step; None where one is not determined."""
+        _, determined = self.of(rows)
+        return (rows @ self._root).T if bool(determined.all()) else None
+
     def open_directions(self, names: Sequence[str], *, absolute: bool) -> tuple[str, ...]:
         """Names of what the data leave open, plainest first."""
         left, found = self._open, []

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,10 +14,11 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 
 
-class SharedUnknowns(NamedTuple):
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class SharedUnknowns:
     """Unknowns y (K,): parameters of camera c change with them by cameras[c] y, the board by shapes · (board y).
 
-    Attributes:
+    Args:
         cameras: (5 + P, K) of each.
         shapes: (B, 3, N) displacements of the board's corners, meters.
         board: (B, K).
@@ -87,7 +88,8 @@ def free(cameras: Sequence[Camera], names: Sequence[str]) -> SharedUnknowns:
             labels.append(f"{camera.names[index]} of {name}")
         end += len(own)
         maps.append(part)
-    return held(cameras)._replace(
+    return dataclasses.replace(
+        held(cameras),
         cameras=tuple(maps),
         board=torch.zeros(0, count, dtype=torch.float64),
         begin=torch.zeros(count, dtype=torch.float64),

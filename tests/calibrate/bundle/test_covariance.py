@@ -15,8 +15,6 @@ from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.camera import assess
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.warnings import check_focal
-from kcal.calibrate.rig import adjustment
-from kcal.calibrate.rig.sources import RigData
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.projection import project_components
@@ -221,11 +219,3 @@ class TestWhatCannotBeComputed:
         assert any("no error bars" in text for text in result.warnings)
         assert not any("do not determine" in text for text in result.warnings)
         assert result.file(name="left", source="left.json").covariance is None
-
-    def test_a_rig_takes_no_such_prior(self) -> None:
-        cameras = (camera(), camera())
-        size = len(cameras[0].names)
-        unknown = torch.full((size, size), torch.nan, dtype=torch.float64)
-        data = RigData(cameras=cameras, names=("left", "right"), covariances=(unknown, unknown))
-        with pytest.raises(InputError, match="not finite"):
-            adjustment._free(data, 0, "prior")

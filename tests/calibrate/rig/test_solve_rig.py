@@ -26,15 +26,16 @@ from rig_scenes import (
 )
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.rig import limits
 from kcal.calibrate.rig.blocks import BoardBlock, FeatureBlock, LandmarkBlock, RigState
-from kcal.calibrate.rig.problem import DistanceTerm, ParameterTerm, PlaceTerm, RigProblem
+from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem
 from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData, inverse_range_beyond
+from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.errors import DegenerateError, InputError
+from kcal.lens.calibration import CameraCalibration
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.solve.result import SolverStatus
 
@@ -84,32 +85,34 @@ def mixed_problem() -> tuple[RigProblem, RigState]:
     sigma = far.inverse_range_sigma.clone()
     sigma[1] = math.inf
     anchor = CENTER.mean(0)
+    # Unknowns that move two cameras at once, and all of them the board.
+    maps = [1e-2 * normal((len(camera.names), 5), 11 + c) for c, camera in enumerate(CAMERAS)]
+    maps[0][:4] *= 100.0
+    maps[2][:] = 0.0
+    maps[1][[1, 3, 5]] = 0.0
+    unknowns = SharedUnknowns(
+        cameras=tuple(maps),
+        shapes=0.01 * normal((3, 3, len(BOARD.points)), 21),
+        board=normal((3, 5), 22),
+        begin=torch.zeros(5, dtype=torch.float64),
+        known=torch.tensor([True, True, False, True, False]),
+        labels=("",) * 5,
+    )
     blocks = [
-        BoardBlock(shown.pixels, white(shown.pixels), BOARD.points, free_warp=True),
+        BoardBlock(shown.pixels, white(shown.pixels), BOARD.points, unknowns.shapes, unknowns.board),
         LandmarkBlock(marks.pixels, white(marks.pixels), marks.points, marks.sigma),
         FeatureBlock(far.pixels, white(far.pixels), far.inverse_range, sigma, anchor),
     ]
-    index = [0, 2, 4, 6]
-    terms = [
-        DistanceTerm(0, 1, 10.0, 0.01),
-        PlaceTerm(1, CENTER[1] + 0.1, tensor(0.1, 0.2, 0.3)),
-        ParameterTerm(1, CAMERAS[1].params + 0.1, normal((4, 4), 7)),
-    ]
-    problem = RigProblem(
-        CAMERAS,
-        blocks,
-        terms,
-        [FreeParameters((0, 1, 7), (0, 0, 1)), FreeParameters.of(index), FreeParameters((), ())],
-        [True, True, False],
-        [False, True, True],
-    )
+    terms = [DistanceTerm(0, 1, 10.0, 0.01), PlaceTerm(1, CENTER[1] + 0.1, tensor(0.1, 0.2, 0.3))]
+    problem = RigProblem(CAMERAS, blocks, terms, unknowns, [True, True, False], [False, True, True])
     towards = spread_points(4, 8000.0, 40_000.0, 9) - anchor
     length = towards.norm(dim=-1)
     state = RigState(
         torch.cat([camera.params for camera in CAMERAS]),
+        tensor(0.3, -0.2, 0.1, 0.5, 0.0),
         ROTATION,
         CENTER,
-        tensor(0.02, -0.01),
+        tensor(0.02, -0.01, 0.03),
         ROTATION[0].T @ rotation_from_vector(tensor([0.3, 0.1, 0.0], [0.1, -0.3, 0.1])),
         CENTER[0] + tensor([3.0, 1.0, 20.0], [5.0, -1.0, 25.0]) @ ROTATION[0],
         marks.points + 0.01,
@@ -307,8 +310,10 @@ class TestIntrinsics:
         sources = data(
             landmarks=landmarks(count=30, noise=0.1, error=0.02), boards=boards(noise=0.1)
         )  # fmt: skip
-        sources = dataclasses.replace(sources, cameras=cameras, covariances=(torch.diag(spread**2),) * 2)
-        held = solve_rig(sources)
+        for camera in cameras:
+            camera.calibration = CameraCalibration(covariance=torch.diag(spread**2))
+        sources = dataclasses.replace(sources, cameras=cameras)
+        held = solve_rig(sources, RigOptions(intrinsics="fixed"))
         prior = solve_rig(sources, RigOptions(intrinsics="prior"))
         free = solve_rig(sources, RigOptions(intrinsics="free"))
         assert held.cameras == cameras
@@ -323,9 +328,10 @@ class TestIntrinsics:
         yaw = [float(found.relative_covariance()[1, 1]) for found in (held, prior, free)]
         assert yaw[0] / held.variance < yaw[1] / prior.variance < yaw[2] / free.variance
 
-    def test_a_prior_needs_a_covariance(self) -> None:
-        with pytest.raises(InputError, match="left: a prior needs the covariance"):
-            solve_rig(data(landmarks=landmarks()), RigOptions(intrinsics="prior"))
+    def test_a_camera_of_which_nothing_is_known_is_held_and_named(self) -> None:
+        found = solve_rig(data(landmarks=landmarks()))
+        assert found.cameras == CAMERAS[:2]
+        assert found.exact == NAMES[:2]
 
 
 class TestCovariance:
