@@ -397,13 +397,13 @@ class TestRig:
             "left,right\n" + "".join(f"left{i:02}.png,right{i:02}.png\n" for i in (1, 3, 4))
         )
         arguments = ["left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json", "--match", "pairs.csv"]
-        text = refuse(cameras, monkeypatch, capsys, "rig", *arguments, "--refine-cameras")
+        text = refuse(cameras, monkeypatch, capsys, "rig", *arguments, "--intrinsics", "free")
         assert "hybrid" in text
         for side in ("left", "right"):
             plain = [f"{side}.obs.json", "-o", f"{side}.camera.json", "--model", "opencv5"]
             assert run(monkeypatch, "calibrate", *plain) == 0
         capsys.readouterr()
-        assert run(monkeypatch, "rig", *arguments, "--refine-cameras", "--board-warp") == 0
+        assert run(monkeypatch, "rig", *arguments, "--intrinsics", "free", "--board-warp") == 0
         printed = capsys.readouterr().out
         assert "3 of 3 pairs used, 6 views without partner" in printed
         assert "mm along its rows" in printed
@@ -445,7 +445,6 @@ class TestRig:
             (["left.camera.json", "left.camera.json", *PAIRS], "the same camera twice"),
             (["left.camera.json", "left.camera.json", "--pairs", "left.obs.json", "left.obs.json"], "camera twice"),
             (["left.camera.json", "right.camera.json", "--pairs", "left.obs.json", "left.obs.json"], "camera twice"),
-            (["left.camera.json", "right.camera.json", *PAIRS, "--refine-cameras", "--intrinsics", "prior"], "choose"),
         ],
     )
     def test_refusals(

@@ -20,23 +20,33 @@ def printed_points(board: Board, seed: int, share: float = 5e-4) -> Tensor:
     return board.points + torch.einsum("b,bkn->nk", share * modes.unit * draw, modes.shapes)
 
 
+def shown(board: Board, points: Tensor, generator: torch.Generator) -> Tensor:
+    """(N, 3) corners in the camera's frame, of a board in a random pose, rolled all around."""
+    middle = board.points.mean(0)
+    reach = float((board.points - middle).norm(dim=1).max()) / 0.24
+    u = 2.0 * torch.rand(6, generator=generator, dtype=torch.float64) - 1.0
+    tilt = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], torch.zeros_like(u[0])]))
+    rotation = tilt @ rotation_from_vector(torch.stack([*torch.zeros(2, dtype=torch.float64), math.pi * u[2]]))
+    center = torch.stack([0.4 * u[3], 0.3 * u[4], torch.ones_like(u[0])]) * (0.55 + 0.15 * u[5]) * reach
+    return (points - middle) @ rotation.T + center
+
+
+def seen_whole(camera: Camera, pixels: Tensor, valid: Tensor) -> bool:
+    """Whether all corners are a little inside the image."""
+    return bool(valid.all()) and bool((pixels > 5).all()) and bool((pixels < torch.tensor(camera.size) - 6).all())
+
+
 def printed_views(
     camera: Camera, board: Board, points: Tensor, count: int, seed: int, *, noise: float, pupil: float = 0.0
 ) -> Tensor:
     """Corners (V, N, 2) of a board in random poses, rolled all around, seen through a wandering pupil (m / rad²)."""
     generator = torch.Generator().manual_seed(seed)
-    middle = board.points.mean(0)
-    reach = float((board.points - middle).norm(dim=1).max()) / 0.24
     out: list[Tensor] = []
     while len(out) < count:
-        u = 2.0 * torch.rand(6, generator=generator, dtype=torch.float64) - 1.0
-        tilt = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], torch.zeros_like(u[0])]))
-        rotation = tilt @ rotation_from_vector(torch.stack([*torch.zeros(2, dtype=torch.float64), math.pi * u[2]]))
-        center = torch.stack([0.4 * u[3], 0.3 * u[4], torch.ones_like(u[0])]) * (0.55 + 0.15 * u[5]) * reach
-        cam = (points - middle) @ rotation.T + center
+        cam = shown(board, points, generator)
         from_pupil = torch.zeros_like(cam)
         from_pupil[:, 2] = pupil * torch.atan2(cam[:, :2].norm(dim=-1), cam[:, 2]) ** 2
         pixels, valid = camera.project(cam - from_pupil)
-        if bool(valid.all()) and bool((pixels > 5).all()) and bool((pixels < torch.tensor(camera.size) - 6).all()):
+        if seen_whole(camera, pixels, valid):
             out.append(pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64))
     return torch.stack(out)

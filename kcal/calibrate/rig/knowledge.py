@@ -183,7 +183,9 @@ def joint_unknowns(
     maps = [onto @ change for onto in selections]
     shapes = torch.zeros(0, 3, 0, dtype=torch.float64) if modes is None else modes.shapes
     by_board = change[lenses:] if modes is not None else change[:0]
-    turn = _felt(cameras, maps, torch.einsum("bk,bcn->kcn", by_board, shapes).flatten(1), known)
+    turn = torch.eye(total, dtype=torch.float64)
+    if any(camera.model.hybrid for camera in cameras):
+        turn = _felt(cameras, maps, torch.einsum("bk,bcn->kcn", by_board, shapes).flatten(1), known)
     found = SharedUnknowns(
         cameras=tuple(onto @ turn for onto in maps),
         shapes=shapes,

@@ -1,0 +1,146 @@
+"""What calibrations know of lenses and board enters a rig once, whole, and leaves it refined."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import pytest
+import torch
+from calibrate_scenes import observe
+from printed_boards import printed_points, seen_whole, shown
+from torch import Tensor
+
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.rig.from_boards import calibrate_rig
+from kcal.calibrate.rig.knowledge import gathered, joint_unknowns, less
+from kcal.calibrate.rig.result import RigResult
+from kcal.calibrate.rig.solve import RigOptions
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations
+from kcal.lens.camera import Camera
+from kcal.lens.information import CameraInformation
+from kcal.lens.pose import rotation_from_vector
+
+BOARD = Board(columns=7, rows=6, square=0.05)
+SIZE = (1280, 960)
+ROTATION = rotation_from_vector(torch.tensor([0.01, -0.05, 0.02], dtype=torch.float64))
+TRANSLATION = torch.tensor([-0.15, 0.01, 0.02], dtype=torch.float64)
+FOCAL, CENTER = (800.0, 810.0), ((640.0, 480.0), (650.0, 470.0))
+
+
+def truth(side: int) -> Camera:
+    return Camera.build(focal=(FOCAL[side],) * 2, center=CENTER[side], size=SIZE, coefficients=[-0.1, 0.02, 0, 0, 0])
+
+
+@functools.cache
+def pairs(count: int) -> tuple[Observations, Observations]:
+    """Boards that both cameras see, as printed."""
+    points, generator = printed_points(BOARD, 3), torch.Generator().manual_seed(9)
+    sides: tuple[list[Tensor], list[Tensor]] = ([], [])
+    while len(sides[0]) < count:
+        cam = shown(BOARD, points, generator)
+        seen = [truth(0).project(cam), truth(1).project(cam @ ROTATION.T + TRANSLATION)]
+        if all(seen_whole(truth(side), *found) for side, found in enumerate(seen)):
+            for side, (pixels, _) in zip(sides, seen, strict=True):
+                side.append(pixels + 0.1 * torch.randn(pixels.shape, generator=generator, dtype=torch.float64))
+    names = [f"{i}.png" for i in range(count)]
+    left, right = (observe(torch.stack(side), board=BOARD, size=SIZE, names=names) for side in sides)
+    return left, right
+
+
+def known(camera: Camera) -> CameraInformation:
+    assert camera.calibration is not None
+    found = camera.calibration.known(camera.params)
+    assert found is not None
+    return found
+
+
+@functools.cache
+def cameras(model: str, names: tuple[str, ...]) -> tuple[Camera, Camera]:
+    left, right = (
+        calibrate_camera(seen.subset(list(names)), CalibrationOptions(model=model, reject=None)).camera
+        for seen in pairs(14)
+    )
+    return left, right
+
+
+def rig(model: str, calibrated: int, paired: int, **options: object) -> RigResult:
+    names = [f"{i}.png" for i in range(14)]
+    both = cameras(model, tuple(names[:calibrated]))
+    return calibrate_rig(*both, *pairs(14), [(n, n) for n in names[:paired]], RigOptions(reject=False, **options))  # type: ignore[arg-type]
+
+
+def test_views_in_both_count_once() -> None:
+    """Cameras calibrated from the rig's own views know nothing more: refining them is solving everything at once."""
+    prior, free = rig("opencv5", 14, 14), rig("opencv5", 14, 14, intrinsics="free")
+    assert prior.rms == pytest.approx(free.rms, rel=1e-6)
+    for one, other in zip(prior.cameras, free.cameras, strict=True):
+        torch.testing.assert_close(one.params, other.params, rtol=1e-4, atol=1e-4)
+    sigma = [found.joint_covariance().diagonal().sqrt() for found in (prior, free)]
+    torch.testing.assert_close(sigma[0], sigma[1], rtol=1e-3, atol=0)
+
+
+def test_further_views_help() -> None:
+    """Eight of the calibration's fourteen views in the rig: better than these alone, no better than all of them."""
+    some, alone, everything = rig("opencv5", 14, 8), rig("opencv5", 8, 8), rig("opencv5", 14, 14)
+    # Of k2, which views near the border tell.
+    bend = [float(found.joint_covariance()[6, 6].sqrt()) for found in (alone, some, everything)]
+    assert bend[0] > 1.5 * bend[1]
+    assert bend[2] < bend[1] < 1.2 * bend[2]
+
+
+def test_hybrid_cameras_are_refined_with_their_board() -> None:
+    """The default of all: lenses, board and pose from 14 pairs, better than with the cameras as they were."""
+    prior, held = rig("hybrid", 14, 14), rig("hybrid", 14, 14, intrinsics="fixed")
+    assert prior.exact == ()
+    assert held.exact == ("left", "right")
+    assert prior.rms < held.rms
+    stereo = prior.stereo()
+    assert stereo.covariance is not None
+    # Uncertain lenses are an uncertain yaw.
+    assert prior.relative_covariance()[1, 1] > 4.0 * held.relative_covariance()[1, 1]
+    error = float((stereo.right_from_left_translation - TRANSLATION).norm())
+    assert error < 4.0 * float(prior.sigma_translation.norm())
+
+
+def test_rows_taken_out_and_put_back() -> None:
+    """`less` is a subtraction of information and of its pull."""
+    whole = known(cameras("hybrid", tuple(f"{i}.png" for i in range(14)))[0])
+    part = torch.cat([whole.rows[::3], whole.residuals[::3, None]], 1)
+    rest = less(whole, part)
+    scale = torch.linalg.vector_norm(whole.all_rows()[:, :-1], dim=0)
+    together = rest.rows.T @ rest.rows + part[:, :-1].T @ part[:, :-1]
+    unit = (together - whole.rows.T @ whole.rows) / scale / scale[:, None]
+    assert float(unit.abs().max()) < 1e-9
+    pull = rest.rows.T @ rest.residuals + part[:, :-1].T @ part[:, -1]
+    # Directions without information left over have no pull either, to the square root of rounding.
+    torch.testing.assert_close(pull / scale, whole.rows.T @ whole.residuals / scale, rtol=0, atol=1e-4)
+
+
+def test_unknowns_have_the_cameras_covariance() -> None:
+    """Unit variances of the unknowns are the calibrations' covariances."""
+    both = cameras("opencv14", tuple(f"{i}.png" for i in range(14)))
+    found, deviation = joint_unknowns(both, gathered(both, [known(camera) for camera in both], None), None)
+    assert deviation is None
+    assert bool(found.known.all())
+    for camera, by_unknown in zip(both, found.cameras, strict=True):
+        sigma = known(camera).covariance().diagonal().sqrt()
+        torch.testing.assert_close(by_unknown.square().sum(1).sqrt(), sigma, rtol=1e-6, atol=1e-12)
+
+
+def test_one_board_is_shared_and_two_are_not() -> None:
+    """By the evidence: both cameras saw this board; the same pattern printed again is another board."""
+    names = tuple(f"{i}.png" for i in range(14))
+    left, right = cameras("hybrid", names)
+    informations = [known(left), known(right)]
+    assert gathered((left, right), informations, BOARD).board == (True, True)
+    # A board that differs by 20 of its standard deviations.
+    own = informations[1]
+    sigma = own.half()[:, own.lens_size :].norm(dim=0)
+    moved = own.estimate.clone()
+    moved[own.lens_size :] += 20.0 * sigma
+    other = dataclasses.replace(own, estimate=moved)
+    assert gathered((left, right), [informations[0], other], BOARD).board == (True, False)
+    # A rig's board of another size is nobody's.
+    assert gathered((left, right), informations, Board(columns=9, rows=6, square=0.1)).board == (False, False)
