@@ -33,7 +33,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -67,12 +67,12 @@ def by_opencv(count: int, *, release: bool = False) -> Callable[[Observations], 
     def calibrate(seen: Observations) -> Camera:
         board = [seen.board.points.numpy().astype(np.float32)] * len(seen.views)
         pixels = [view.numpy().astype(np.float32) for view in seen.pixels()]
-        data, flags = (board, pixels, seen.image_size), FLAGS[count]
+        data, nothing, flags = (board, pixels, seen.image_size), cast(Any, None), FLAGS[count]
         if release:
             # The corner at the other end of the first row sets the scale.
-            _, matrix, lens, *_ = cv2.calibrateCameraRO(*data, seen.board.columns - 1, None, None, flags=flags)
+            _, matrix, lens, *_ = cv2.calibrateCameraRO(*data, seen.board.columns - 1, nothing, nothing, flags=flags)
         else:
-            _, matrix, lens, *_ = cv2.calibrateCamera(*data, None, None, flags=flags)
+            _, matrix, lens, *_ = cv2.calibrateCamera(*data, nothing, nothing, flags=flags)
         return Camera.build(
             focal=(matrix[0, 0], matrix[1, 1]),
             center=(matrix[0, 2], matrix[1, 2]),
@@ -97,7 +97,7 @@ MODELS = {
 HOWS: tuple[How, ...] = ("held", "prior")
 # A chain's name: its model and what the rig does with its cameras.
 CHAINS = {
-    **{f"{m} {h}": (m, h) for m in MODELS if not m.startswith("cv") for h in HOWS},
+    **{f"{m}-{h}": (m, h) for m in MODELS if not m.startswith("cv") for h in HOWS},
     **{m: (m, HOWS[0]) for m in ("cv8", "cv14", "cvRO", "true")},
 }
 
@@ -159,7 +159,7 @@ def main() -> None:
     parser.add_argument("--boards", nargs="+", choices=("exact", "printed"), default=["exact", "printed"])
     parser.add_argument("--pupil", nargs="+", type=float, default=[0.0, 1.0, 3.0], help="mm/rad²")
     parser.add_argument("--noise", nargs="+", type=float, default=[0.05, 0.2], help="of corners, px")
-    parser.add_argument("--chains", nargs="+", choices=CHAINS, default=list(CHAINS), metavar="CHAIN", help="quoted")
+    parser.add_argument("--chains", nargs="+", choices=CHAINS, default=list(CHAINS), metavar="CHAIN")
     parser.add_argument("--write", action="store_true", help="only write the page, from all files")
     arguments = parser.parse_args()
     torch.set_num_threads(1)

@@ -27,6 +27,7 @@ How = Literal["held", "prior"]
 LANDMARKS, NEAR, FAR = 12, 40.0, 400.0  # number, meters
 SURVEY, LANDMARK_MARK, MARK = 0.02, 0.07, 0.1  # meters, px, px
 EDGE = 40.0  # px between landmarks and the edges of the images
+SUMS = ("count", "inside", "total", "share", "meters", "expected", "lost")
 COLUMNS, ROWS = 9, 5  # of the left image's grid, at whose cells' centers there are targets
 ENU_FROM_RIG = enu_from_cam(35.0)
 # mm: with this focal length the entrance pupil of the surveillance lens moves by 3 mm/rad² as `TruthLens` traces it
@@ -38,13 +39,13 @@ class Targets(NamedTuple):
     """Points at all ranges in all directions that both cameras see, T of them.
 
     Attributes:
-        index: (T,) which of `RANGES`.
+        ring: (T,) which of `RANGES`.
         inverse: (T,) one over the distance from the left camera.
         pixels: (2, T, 2) where the left and the right camera truly see them.
         bound: (T,) standard deviation of the inverse range by marks of `MARK` px alone.
     """
 
-    index: Tensor
+    ring: Tensor
     inverse: Tensor
     pixels: Tensor
     bound: Tensor
@@ -79,10 +80,10 @@ def targets(rig: TrueRig) -> Targets:
     points = (torch.tensor(RANGES, dtype=torch.float64)[:, None, None] * rays).reshape(-1, 3)
     left, right, valid = rig(points)
     seen = valid & rig.left.inside(left) & rig.right.inside(right)
-    index = torch.arange(len(RANGES)).repeat_interleave(len(rays))[seen]
+    ring = torch.arange(len(RANGES)).repeat_interleave(len(rays))[seen]
     inverse = 1.0 / points[seen].norm(dim=-1)
     bound = range_sigma(rig, points[seen], MARK) * inverse.square()
-    return Targets(index, inverse, torch.stack([left[seen], right[seen]]), bound)
+    return Targets(ring, inverse, torch.stack([left[seen], right[seen]]), bound)
 
 
 def landmarks(rig: TrueRig, generator: torch.Generator) -> tuple[Landmarks, Landmarks]:
@@ -133,21 +134,6 @@ def localizer(cameras: tuple[Camera, Camera], seen: Landmarks, how: How) -> Ster
     return StereoLocalizer(rig, pixel_sigma=MARK)
 
 
-class Sums:
-    """Sums over runs, for each of `RANGES`."""
-
-    def __init__(self) -> None:
-        self.values: dict[str, Tensor] = {}
-
-    def add(self, name: str, index: Tensor, values: Tensor) -> None:
-        """Add (T,) values to those of their ranges."""
-        sums = torch.zeros(len(RANGES), dtype=torch.float64).index_add(0, index, values.double())
-        self.values[name] = self.values.get(name, 0.0) + sums
-
-    def lists(self) -> dict[str, list[float]]:
-        return {name: value.tolist() for name, value in self.values.items()}
-
-
 def judge(
     cameras: tuple[Camera, Camera], how: How, rig: TrueRig, points: Targets, seed: int, marks: int, exact: int
 ) -> dict[str, Any]:
@@ -171,8 +157,9 @@ def judge(
             its slope, in meters.
         failed: messages, and how many runs ended with each; runs: how many did not.
     """
-    sums, failed, lenses, runs = Sums(), dict[str, int](), list[float](), 0
-    far = points.index == len(RANGES) - 1
+    sums = {name: torch.zeros(len(RANGES), dtype=torch.float64) for name in SUMS}
+    failed, lenses, runs = dict[str, int](), list[float](), 0
+    far = points.ring == len(RANGES) - 1
     for number in range(marks):
         generator = torch.Generator().manual_seed(seed + number)
         noisy, noiseless = landmarks(rig, generator)
@@ -191,13 +178,16 @@ def judge(
             continue
         runs += 1
         there = (found.inverse_range_sigma > 0) & (clean.inverse_range_sigma > 0)
-        sums.add("lost", points.index[~there], torch.ones(int((~there).sum())))
-        index, inverse, bound = points.index[there], points.inverse[there], points.bound[there]
-        inside = (found.range_low[there] <= 1.0 / inverse) & (1.0 / inverse <= found.range_high[there])
-        sums.add("count", index, torch.ones_like(bound))
-        sums.add("inside", index, inside)
-        sums.add("total", index, ((found.inverse_range[there] - inverse) / bound).square())
-        sums.add("share", index, ((clean.inverse_range[there] - inverse) / bound).square())
-        sums.add("meters", index, ((clean.inverse_range[there] - inverse) / inverse.square()).square())
-        sums.add("expected", index, (found.inverse_range_sigma[there] / bound).square())
-    return {"runs": runs, "failed": failed, "lenses_m": lenses, "sums": sums.lists()}
+        true, bound = points.inverse, points.bound
+        values = (
+            torch.ones_like(true),
+            (found.range_low <= 1.0 / true) & (1.0 / true <= found.range_high),
+            ((found.inverse_range - true) / bound).square(),
+            ((clean.inverse_range - true) / bound).square(),
+            ((clean.inverse_range - true) / true.square()).square(),
+            (found.inverse_range_sigma / bound).square(),
+        )
+        for name, value in zip(SUMS, values, strict=False):
+            sums[name].index_add_(0, points.ring[there], value[there].double())
+        sums["lost"].index_add_(0, points.ring[~there], torch.ones_like(true)[~there])
+    return {"runs": runs, "failed": failed, "lenses_m": lenses, "sums": {n: v.tolist() for n, v in sums.items()}}
