@@ -39,7 +39,15 @@ class Capture(NamedTuple):
     points: Tensor
 
 
-def drawn_lens(name: str, strength: float, seed: int, *, focal: float | None = None, wander: float = 0.1) -> TruthLens:
+def drawn_lens(
+    name: str,
+    strength: float,
+    seed: int,
+    *,
+    focal: float | None = None,
+    focal_mm: float = 2.8,
+    wander: float = 0.1,
+) -> TruthLens:
     """Draw a ray-traced lens with errors of assembly: a strength of 1 is ordinary, 3 poor, 0 perfect.
 
     A strength of 1 means one sigma along each axis: glass is decentered by the prescription's tolerance (22 µm of
@@ -51,6 +59,7 @@ def drawn_lens(name: str, strength: float, seed: int, *, focal: float | None = N
         strength: of the misalignment.
         seed: of its draw.
         focal: in pixels; the prescription's own if left out.
+        focal_mm: see `TruthLens`.
         wander: see `TruthLens`.
 
     Example:
@@ -66,6 +75,7 @@ def drawn_lens(name: str, strength: float, seed: int, *, focal: float | None = N
     return TruthLens(
         name,
         focal=focal,
+        focal_mm=focal_mm,
         center=(959.5 + _AXIS * shift[0], 539.5 + _AXIS * shift[1]),
         misalignment=misalignment,
         sensor_tilt=(_SENSOR_TILT * tilt[0], _SENSOR_TILT * tilt[1]),

@@ -25,25 +25,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
 from kcal.lens.uncertainty import pixel_covariance
-from kcal.sim.captures import capture_corners, drawn_lens
+from kcal.sim.captures import drawn_lens
 from kcal.sim.infinity import error_at_infinity
-from kcal.sim.truth import TruthLens
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
+from scripts.shared.traced import BOARD, capture, printed
 
 LENSES = ("webcam", "machine-vision", "surveillance")
 SIGMAS = (0.02, 0.05, 0.1, 0.3)
 VIEWS = (60, 30, 8)
 BOARDS = ("exact", "printed")
-BOARD = Board(columns=7, rows=6, square=0.05)
 MODELS = {
     "hybrid": CalibrationOptions(),
     "opencv5": CalibrationOptions(model="opencv5", board_warp=True),
@@ -55,41 +51,11 @@ PAGE = "one-camera.md"
 CHI2 = -2.0 * math.log(0.05)
 
 
-def printed(points: Tensor, seed: int) -> Tensor:
-    """The board as a printer and a wall leave it."""
-    generator = torch.Generator().manual_seed(5000 + seed)
-    middle, half = points.mean(0), 0.5 * (points.amax(0) - points.amin(0))[:2]
-    a, b = ((points[:, :2] - middle[:2]) / half).unbind(-1)
-    angle, phase = (math.pi * torch.rand(2, generator=generator, dtype=torch.float64)).tolist()
-    across = a * math.cos(angle) + b * math.sin(angle)
-    out = points.clone()
-    out[:, 0] += 1.5e-3 * (points[:, 0] - middle[0]) + 2e-4 * (points[:, 1] - middle[1])
-    out[:, 2] += 0.7e-3 * (1.0 - across**2)
-    waves = 3e-5 * torch.randn(3, 2, generator=generator, dtype=torch.float64)
-    shapes = torch.stack([torch.sin(2 * a + phase), torch.sin(2 * b + phase), torch.cos(2 * (a + b))])
-    out[:, :2] += shapes.T @ waves / math.sqrt(1.5)
-    return out
-
-
-def capture(lens: TruthLens, views: int, sigma: float, seed: int, board: str) -> Observations:
-    """Views of a board by a lens, as an observations file."""
-    found = capture_corners(lens, views, sigma=1.0, seed=1000 + seed)
-    points = found.points if board == "exact" else printed(found.points, seed)
-    seen, valid = lens.project(points @ found.rotation.transpose(-1, -2) + found.translation[:, None])
-    noisy = torch.where(valid[..., None], seen + sigma * (found.pixels - found.true_pixels), torch.nan)
-    corners = [tuple(None if u != u else (u, v) for u, v in view) for view in noisy.tolist()]
-    names = [f"{i:03d}" for i in range(views)]
-    return Observations(
-        board=BOARD,
-        image_size=lens.size,
-        views=tuple(View(name=name, pixels=view) for name, view in zip(names, corners, strict=True)),
-    )
-
-
 def cell(name: str, board: str, views: int, sigma: float, seed: int) -> list[dict[str, Any]]:
     """All models on one capture."""
     lens = drawn_lens(name, 1.0, seed, wander=1.0)
-    seen = capture(lens, views, sigma, seed, board)
+    points = BOARD.points if board == "exact" else printed(BOARD.points, seed)
+    seen = capture(lens, views, sigma, 1000 + seed, points)
     head = {"lens": name, "board": board, "views": views, "sigma": sigma, "seed": seed}
     out = []
     for model, options in MODELS.items():

@@ -23,6 +23,7 @@ from kcal.lens.camera import Camera
 from kcal.locate.triangulate import Triangulate
 from kcal.sim.scene import DemoScene
 from scripts.paper.site import MARK_SIGMA, SURVEY_SIGMA
+from scripts.shared.long_range import range_sigma
 
 SIDES = ("left", "right")
 DRAWS, MARKINGS = 10, 10  # of the landmarks' noise, and of the seven points' marks for each of them
@@ -121,16 +122,7 @@ def pixel_errors(seen: tuple[Tensor, Tensor], true: tuple[Tensor, Tensor]) -> li
 
 def bound(scene: DemoScene) -> list[float]:
     """Standard deviation of each range that the marks' noise alone leaves, with the rig known exactly, meters."""
-    points = scene.points_rig(scene.targets)
-    columns = []
-    for axis in torch.eye(3, dtype=torch.float64):
-        step = 1e-5 * points.norm(dim=-1, keepdim=True) * axis
-        ahead, behind = (torch.cat(scene.rig(points + sign * step)[:2], -1) for sign in (1, -1))
-        columns.append((ahead - behind) / (2e-5 * points.norm(dim=-1, keepdim=True)))
-    jacobian = torch.stack(columns, -1)
-    covariance = torch.linalg.inv(jacobian.transpose(-1, -2) @ jacobian) * MARK_SIGMA**2
-    sight = torch.nn.functional.normalize(points, dim=-1)
-    return torch.einsum("ni,nij,nj->n", sight, covariance, sight).sqrt().tolist()
+    return range_sigma(scene.rig, scene.points_rig(scene.targets), MARK_SIGMA).tolist()
 
 
 def by_kcal(scene: DemoScene, cameras: tuple[Camera, Camera]) -> Orient:

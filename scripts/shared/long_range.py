@@ -1,8 +1,11 @@
-"""A rig with 10 m of baseline, and the ranges at which it is measured."""
+"""A rig with 10 m of baseline, the ranges at which it is measured, and how well marks alone can tell a range."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
+from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
@@ -20,3 +23,23 @@ def rig() -> StereoRig:
     right = Camera.build(focal=(1605, 1601), center=(962, 538), size=size, coefficients=[-0.19, 0.05, -2e-4, 3e-4])
     rotation = rotation_from_vector(torch.tensor([0.003, 0.02, -0.004], dtype=torch.float64))
     return StereoRig(left, right, rotation, rotation @ torch.tensor([-10.0, 0.15, 0.2], dtype=torch.float64))
+
+
+def range_sigma(project: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], points: Tensor, mark: float) -> Tensor:
+    """(N,) meters: standard deviation of each range that noise in the marks leaves, with the rig known exactly.
+
+    Args:
+        project: the rig: its points (N, 3) to pixels_left, pixels_right (N, 2) and whether both see them.
+        points: (N, 3) in the left camera's frame.
+        mark: standard deviation of a mark along each axis, px.
+    """
+    columns = []
+    length = points.norm(dim=-1, keepdim=True)
+    for axis in torch.eye(3, dtype=torch.float64):
+        step = 1e-5 * length * axis
+        ahead, behind = (torch.cat(project(points + sign * step)[:2], -1) for sign in (1, -1))
+        columns.append((ahead - behind) / (2e-5 * length))
+    jacobian = torch.stack(columns, -1)
+    covariance = torch.linalg.inv(jacobian.transpose(-1, -2) @ jacobian) * mark**2
+    sight = points / length
+    return torch.einsum("ni,nij,nj->n", sight, covariance, sight).sqrt()

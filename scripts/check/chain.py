@@ -1,0 +1,188 @@
+"""The whole chain, simulated: corners, cameras, a rig from landmarks, and ranges of targets up to 5 km.
+
+    python -m scripts.check.chain --out cells.jsonl --draws 10 --boards printed --pupil 3   # cells in the file are kept
+    python -m scripts.check.chain --out *.jsonl --write                                     # docs/measured/chain.md
+
+Truth: two ray-traced surveillance lenses (`kcal.sim.prescription`), f 1600 px, 1920 x 1080, each with errors of
+assembly of its own, 10 m apart and nearly parallel. Their entrance pupils move by 0, 1 or 3 mm/rad²: with a focal
+length of 6.163 mm the prescription itself has 3 (`scripts.shared.traced.pupil_of` measures it), and for less its
+movement is scaled down, off-axis parts included (`wander` of `TruthLens`).
+
+Cameras: each calibrated by itself from 60 views of one board of 6 x 7 corners, 5 cm apart, at 0.55 to 1.3 m, with
+Gaussian noise of the corners. Boards are exact, or printed (`scripts.shared.traced.printed`: stretch 0.15 %, shear
+0.02 %, bent along an oblique axis by 0.7 mm, smooth errors of 0.03 mm); each draw has its own board, which both cameras
+see.
+
+Rig: 12 landmarks 40 to 400 m away, surveyed to 2 cm along each axis, marked to 0.07 px, at other places in each draw.
+Targets: 45 directions all over the image at 7 ranges, where both cameras see them, marked to 0.1 px.
+
+Chains: kcal's camera (`default`) or kcal's parametric models, held as exact in the rig or with their calibrations as
+priors; OpenCV's (`cv8`, `cv14`: cv2.calibrateCamera with 8 and 14 coefficients; `cvRO`: cv2.calibrateCameraRO with 8),
+whose rig is solved by kcal too, with the cameras held, because OpenCV has no adjustment of landmarks with errors of a
+survey; and the true lenses (`true`).
+
+Seeds below 100 are for tuning.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import torch
+
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.corners.observations import Observations
+from kcal.errors import KcalError
+from kcal.lens.camera import Camera
+from kcal.sim.true_rig import TrueRig
+from scripts.check.chain_page import conclude, tables
+from scripts.check.chain_rig import How, judge, targets, true_rig
+from scripts.shared.timing import show
+from scripts.shared.traced import BOARD, as_camera, capture, printed, pupil_of
+
+VIEWS = 60
+# Shares of the image that put a board of 5 cm squares at 1.3 to 0.55 m before a lens of f 1600 px.
+FILL = (0.40, 0.94)
+FAILURES = (KcalError, RuntimeError, cv2.error)
+RATIONAL = cv2.CALIB_RATIONAL_MODEL
+FLAGS = {8: RATIONAL, 14: RATIONAL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL}
+
+
+def by_kcal(**options: Any) -> Callable[[Observations], Camera]:
+    return lambda seen: calibrate_camera(seen, CalibrationOptions(**options)).camera
+
+
+def by_opencv(count: int, *, release: bool = False) -> Callable[[Observations], Camera]:
+    """`cv2.calibrateCamera` with so many coefficients; `release`: `cv2.calibrateCameraRO`, which frees the corners."""
+
+    def calibrate(seen: Observations) -> Camera:
+        board = [seen.board.points.numpy().astype(np.float32)] * len(seen.views)
+        pixels = [view.numpy().astype(np.float32) for view in seen.pixels()]
+        data, nothing, flags = (board, pixels, seen.image_size), cast(Any, None), FLAGS[count]
+        if release:
+            # The corner at the other end of the first row sets the scale.
+            _, matrix, lens, *_ = cv2.calibrateCameraRO(*data, seen.board.columns - 1, nothing, nothing, flags=flags)
+        else:
+            _, matrix, lens, *_ = cv2.calibrateCamera(*data, nothing, nothing, flags=flags)
+        return Camera.build(
+            focal=(matrix[0, 0], matrix[1, 1]),
+            center=(matrix[0, 2], matrix[1, 2]),
+            size=seen.image_size,
+            coefficients=lens.ravel()[:count].tolist(),
+            model=f"opencv{count}",
+        )
+
+    return calibrate
+
+
+MODELS = {
+    "default": by_kcal(),
+    "opencv5": by_kcal(model="opencv5"),
+    "opencv14": by_kcal(model="opencv14"),
+    "opencv14-warp": by_kcal(model="opencv14", board_warp=True),
+    "ext20": by_kcal(model="ext20"),
+    "cv8": by_opencv(8),
+    "cv14": by_opencv(14),
+    "cvRO": by_opencv(8, release=True),
+}
+HOWS: tuple[How, ...] = ("held", "prior")
+# A chain's name: its model and what the rig does with its cameras.
+CHAINS = {
+    **{f"{m}-{h}": (m, h) for m in MODELS if not m.startswith("cv") for h in HOWS},
+    **{m: (m, HOWS[0]) for m in ("cv8", "cv14", "cvRO", "true")},
+}
+
+
+def log(text: str) -> None:
+    print(time.strftime("%H:%M:%S"), text, file=sys.stderr, flush=True)
+
+
+def observed(rig: TrueRig, draw: int, board: str, noise: float) -> tuple[Observations, Observations]:
+    """What both cameras saw of the board of this draw."""
+    points = BOARD.points if board == "exact" else printed(BOARD.points, draw)
+    left, right = (
+        capture(lens, VIEWS, noise, 1000 + 2 * draw + side, points, FILL)
+        for side, lens in enumerate((rig.left, rig.right))
+    )
+    return left, right
+
+
+def calibrated(model: str, rig: TrueRig, seen: tuple[Observations, Observations]) -> tuple[Camera, Camera] | str:
+    """Both cameras, or why there are none."""
+    if model == "true":
+        return as_camera(rig.left), as_camera(rig.right)
+    try:
+        return MODELS[model](seen[0]), MODELS[model](seen[1])
+    except FAILURES as error:
+        return f"{type(error).__name__}: {error}"
+
+
+def cell(
+    head: dict[str, Any], chains: list[str], marks: int, exact: int, write: Callable[[dict[str, Any]], None]
+) -> None:
+    """All chains on one draw of lenses, board and corners; each camera is calibrated once."""
+    rig = true_rig(head["draw"], head["pupil"])
+    seen = observed(rig, head["draw"], head["board"], head["noise"])
+    points, zeta = targets(rig), [1e3 * pupil_of(lens) for lens in (rig.left, rig.right)]
+    for model, group in itertools.groupby(chains, lambda chain: CHAINS[chain][0]):
+        start = time.process_time()
+        cameras = calibrated(model, rig, seen)
+        spent = time.process_time() - start
+        for chain in group:
+            start = time.process_time()
+            record = {**head, "chain": chain, "marks": marks, "pupil_measured": zeta, "calibration_s": spent}
+            if isinstance(cameras, str):
+                record |= {"runs": 0, "failed": {cameras: marks}, "lenses_m": [], "sums": {}}
+            else:
+                record |= judge(cameras, CHAINS[chain][1], rig, points, 1_000_000 + 1000 * head["draw"], marks, exact)
+            record["rigs_s"] = time.process_time() - start
+            write(record)
+            log(f"{json.dumps(head)} {chain}: {record['runs']} runs, {spent:.0f} s and {record['rigs_s']:.0f} s")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", nargs="+", type=Path, required=True, help="JSON lines; the first is written to")
+    parser.add_argument("--draws", type=int, default=10, help="of lenses, boards and corners")
+    parser.add_argument("--first", type=int, default=300, help="seed of the first of them")
+    parser.add_argument("--marks", type=int, default=24, help="draws of landmarks and marks for each")
+    parser.add_argument("--exact", type=int, default=4, help="of these also without noise, for the lenses alone")
+    parser.add_argument("--boards", nargs="+", choices=("exact", "printed"), default=["exact", "printed"])
+    parser.add_argument("--pupil", nargs="+", type=float, default=[0.0, 1.0, 3.0], help="mm/rad²")
+    parser.add_argument("--noise", nargs="+", type=float, default=[0.05, 0.2], help="of corners, px")
+    parser.add_argument("--chains", nargs="+", choices=CHAINS, default=list(CHAINS), metavar="CHAIN")
+    parser.add_argument("--write", action="store_true", help="only write the page, from all files")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    records = [json.loads(line) for path in arguments.out if path.exists() for line in path.read_text().splitlines()]
+    if arguments.write:
+        conclude(records)
+        return
+    keys = ("draw", "board", "pupil", "noise", "chain")
+    done = {tuple(record[key] for key in keys) for record in records}
+    draws = range(arguments.first, arguments.first + arguments.draws)
+
+    def write(record: dict[str, Any]) -> None:
+        records.append(record)
+        with arguments.out[0].open("a") as file:
+            file.write(json.dumps(record) + "\n")
+
+    for values in itertools.product(draws, arguments.boards, arguments.pupil, arguments.noise):
+        left = [chain for chain in CHAINS if chain in arguments.chains and (*values, chain) not in done]
+        if left:
+            with torch.no_grad():
+                cell(dict(zip(keys, values, strict=False)), left, arguments.marks, arguments.exact, write)
+    show(tables(records))
+
+
+if __name__ == "__main__":
+    main()
