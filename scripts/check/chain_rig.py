@@ -124,10 +124,7 @@ def localizer(cameras: tuple[Camera, Camera], seen: Landmarks, how: How) -> Ster
     Raises:
         KcalError: the rig cannot be solved, or says nothing about its errors.
     """
-    known = tuple(camera.calibration.covariance if camera.calibration else None for camera in cameras)
-    data = RigData(
-        cameras=cameras, names=("left", "right"), landmarks=seen, covariances=known if how == "prior" else None
-    )
+    data = RigData(cameras=cameras, names=("left", "right"), landmarks=seen)
     rig = placed_rig(solve_rig(data, RigOptions(intrinsics="prior" if how == "prior" else "fixed")), ORIGIN)
     if rig.covariance is None or rig.mounting is None:
         raise KcalError("the solved rig has no covariance or no mounting")

@@ -204,6 +204,9 @@ def _robust(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> 
     best: tuple[float, Adjustment, PerKind] | None = None
     for start in initial.starts:
         work = Adjustment(initial.data, start, unknowns, sigma)
+        if bool(unknowns.known.any()):
+            # From poses that are far off, lenses would bend towards them, beyond their folds even.
+            work.unknowns = held(initial.data.cameras)
         here = possible(work, masks)
         work.fit_corners(here, robust=True)
         problem, result = work.solve(here, _SCREENING, LOSS)
@@ -213,6 +216,7 @@ def _robust(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> 
             best = (cost, work, here)
     assert best is not None
     _, work, here = best
+    work.unknowns = unknowns
     work.fit_corners(here, robust=True)
     work.solve(here, ROUGHLY, LOSS)
     return work
