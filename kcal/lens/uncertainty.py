@@ -8,6 +8,7 @@ from torch import Tensor
 from kcal.checks import as_covariance, as_points
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from kcal.lens.pupil import FAR
 
@@ -85,9 +86,5 @@ def _slopes_at_infinity(camera: Camera, pixels: Tensor, wanted: list[int]) -> tu
     rays, valid = camera.unproject(pixels)
     rays = torch.where(valid[:, None], rays, rays.new_tensor([0.0, 0.0, 1.0]))
     seen = project_components(FAR * rays.T, camera.params.detach(), camera.model, wanted)
-    x, y, z = (FAR * rays).unbind(-1)
-    zero = torch.zeros_like(x)
-    # Derivatives of ω x p by each component of ω.
-    cross = torch.stack([torch.stack(axis) for axis in ((zero, -z, y), (z, zero, -x), (-y, x, zero))])
-    by_turn = torch.einsum("pin,kpn->nik", seen.by_point, cross)
-    return seen.by_camera.permute(2, 1, 0), by_turn, valid & seen.regular
+    by_turn = step_rows(seen.by_point, FAR * rays.T)[:3]
+    return seen.by_camera.permute(2, 1, 0), by_turn.permute(2, 1, 0), valid & seen.regular
