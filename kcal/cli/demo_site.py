@@ -58,14 +58,15 @@ def simulated_site(output: Path, seed: int) -> None:
     write_marks(output / "points.csv", Marks(targets.names, marks.left, marks.right))
     _write_places(output / "truth.csv", targets)
     # The simulated light goes straight.
-    straight = {"refraction": 0.0, "refraction_sigma": 0.0}
     command = locate_again(
         output, "--pixel-sigma", scene.mark_sigma, "--refraction=0", "--refraction-sigma=0",
         "--truth", output / "truth.csv",
     )  # fmt: skip
     rig = load_rig(output / "rig.json")
     located, exact = (
-        locate_points(rig, *pixels, pixel_sigma=scene.mark_sigma, names=targets.names, **straight)
+        locate_points(
+            rig, *pixels, pixel_sigma=scene.mark_sigma, names=targets.names, refraction=0.0, refraction_sigma=0.0
+        )
         for pixels in ((marks.left, marks.right), (marks.true_left, marks.true_right))
     )
     clock.lap("positions and maps")

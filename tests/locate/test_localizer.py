@@ -163,8 +163,9 @@ def test_refraction_of_standard_air_is_the_default() -> None:
 
 def test_heights_are_inside_their_intervals_where_light_bends() -> None:
     """Draws of k and of the marks at 5 km: deviations of the height in its sigmas are those of a normal variable."""
-    points = spread_points(tensor(*[5000.0] * 400))
-    enu = points @ enu_from_cam(*ATTITUDE.values()).T
+    azimuth = math.radians(200.0) + torch.linspace(-0.3, 0.3, 400, dtype=torch.float64)
+    # Level, so that errors of the range do not show in the height.
+    enu = 5000.0 * torch.stack([azimuth.sin(), azimuth.cos(), torch.zeros_like(azimuth)], -1)
     k = 0.13 + 0.1 * torch.randn(len(enu), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     seen = enu + torch.stack([0 * k, 0 * k, k * enu[:, :2].square().sum(-1) / (2 * 6.371e6)], -1)
     left, right, _ = RIG(seen @ enu_from_cam(*ATTITUDE.values()))
