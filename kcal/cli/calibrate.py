@@ -188,7 +188,8 @@ def calibrate_command(
 def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:
     from kcal.calibrate.camera.summary import summarize
 
-    record = result.file().calibration
+    assert result.camera.calibration is not None
+    record = result.camera.calibration.record
     assert record is not None
     width, height = result.observations.image_size
     model = "hybrid" if result.hybrid is not None else str(result.camera.model)

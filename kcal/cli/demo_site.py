@@ -57,10 +57,18 @@ def simulated_site(output: Path, seed: int) -> None:
     marks, targets = scene.target_marks, scene.targets
     write_marks(output / "points.csv", Marks(targets.names, marks.left, marks.right))
     _write_places(output / "truth.csv", targets)
-    command = locate_again(output, "--pixel-sigma", scene.mark_sigma, "--truth", output / "truth.csv")
+    # The simulated light goes straight.
+    command = locate_again(
+        output, "--pixel-sigma", scene.mark_sigma, "--refraction=0", "--refraction-sigma=0",
+        "--truth", output / "truth.csv",
+    )  # fmt: skip
     rig = load_rig(output / "rig.json")
-    located = locate_points(rig, marks.left, marks.right, pixel_sigma=scene.mark_sigma, names=targets.names)
-    exact = locate_points(rig, marks.true_left, marks.true_right, pixel_sigma=scene.mark_sigma, names=targets.names)
+    located, exact = (
+        locate_points(
+            rig, *pixels, pixel_sigma=scene.mark_sigma, names=targets.names, refraction=0.0, refraction_sigma=0.0
+        )
+        for pixels in ((marks.left, marks.right), (marks.true_left, marks.true_right))
+    )
     clock.lap("positions and maps")
     rows = truth_rows(located, exact, targets.enu)
     out.print("\nTrue against estimated positions", markup=False)

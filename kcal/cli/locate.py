@@ -60,8 +60,14 @@ def locate_command(
     ] = 0.0,
     refraction: Annotated[
         float,
-        typer.Option(metavar="K", help="Refraction coefficient: 0.13 in standard air, 0 for straight lines of sight."),
-    ] = 0.0,
+        typer.Option(metavar="K", help="Refraction: 0.13 lowers a point at 5 km by 0.26 m; 0 for straight lines."),
+    ] = 0.13,
+    refraction_sigma: Annotated[
+        float,
+        typer.Option(
+            metavar="K", help="Its standard deviation; 0.5 for lines of sight near hot or cold ground.", min=0
+        ),
+    ] = 0.1,
     geoid: Annotated[
         Path | None, typer.Option(help="Geoid grid file (.tif, .gtx); one that PROJ finds if not given.")
     ] = None,
@@ -93,6 +99,9 @@ def locate_command(
     0.01° of relative yaw is 436 m at 5 km with a baseline of 10 m; `--yaw-sigma` adds such an error. If the parallax is
     below three sigma, only the bearing is given. Heights are ellipsoidal; with a geoid grid the files also contain the
     height of the geoid.
+
+    Light bends: `--refraction` lowers points by K d² / 2R at the level distance d, R being the Earth's radius, and what
+    is not known of K is part of the height's error, but not of the range's.
 
     The rig file of a rig that was solved with landmarks contains its position: `--origin` and `--heading` are then not
     needed.
@@ -171,6 +180,7 @@ def locate_command(
         mounting=mounting if bool(mounting.any()) else None,
         link=link,
         refraction=refraction,
+        refraction_sigma=refraction_sigma,
         geoid=find_geoid(geoid),
     )
     true = None if truth is None else read_truth(truth, located)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kcal.cli.console import err, out, print_table, print_wrote, warn
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
     from kcal.calibrate.rig.sources import Features, Landmarks
     from kcal.lens.rig import StereoRig
     from kcal.locate.marks import Marks
+
+# The exit code of a rig that has turned, apart from errors (1) and wrong usage (2).
+_DRIFTED = 3
 
 
 def check(
@@ -30,17 +34,22 @@ def check(
     ] = None,
     mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks along each axis.")] = 0.3,
     relock: Annotated[
-        bool, typer.Option("--relock", help="Write the corrected rig in place of the old one, which is kept.")
+        bool,
+        typer.Option("--relock", help="If it has turned, write the corrected rig in its place; the old one is kept."),
     ] = False,
 ) -> None:
     """Check whether the cameras have turned since the rig was solved, and what that does to ranges.
 
     Needs things that do not move, marked in new images: either the same things as in old images (`--reference`; what
-    they are and how far away does not matter), or surveyed places (`--landmarks`; the rig must have been solved with
-    some). Forty features marked to 0.1 px determine the yaw to a thousandth of a degree. Things that moved are left out
-    and named.
+    they are and how far away does not matter, and errors of the calibration cancel), or surveyed places (`--landmarks`;
+    the rig must have been solved with some). Forty features marked to 0.1 px determine the yaw to a thousandth of a
+    degree. Things that moved are left out and named.
 
-    With `--relock` the rig file is replaced by one with the present attitudes; the old one is kept beside it.
+    With `--relock` the rig file is replaced by one with the present attitudes, if these have changed beyond chance; the
+    old one is kept beside it.
+
+    The exit code is 3 if a camera has turned beyond chance, relocked or not; 0 if none has; 1 if that could not be
+    measured.
 
     **Examples**
 
@@ -48,7 +57,6 @@ def check(
 
     `kcal rig check rig.json --landmarks survey.csv --marks now.csv --relock`
     """
-    from kcal.cli.console import err, out
     from kcal.files import check_writable
     from kcal.io.rig_file import load_rig
     from kcal.locate.marks import read_marks
@@ -56,6 +64,8 @@ def check(
 
     if reference is None and landmarks is None:
         raise InputError("give --reference (marks of the same things in old images) or --landmarks (a survey)")
+    if reference is not None and landmarks is not None:
+        raise InputError("give --reference or --landmarks, not both: with old marks no survey is needed")
     if relock:
         check_writable(rig, marks, *(path for path in (reference, landmarks) if path is not None))
     old = load_rig(rig)
@@ -63,24 +73,27 @@ def check(
     features = None if reference is None else _features(read_marks(reference, single=True), now, mark_sigma)
     surveyed = None if landmarks is None else _landmarks(old, landmarks, now, mark_sigma)
     drift = check_rig(old, features=features, landmarks=surveyed)
-    for line in _table(old, drift):
-        out.print(line, markup=False)
+    _print_turns(old, drift)
     for item in drift.left_out:
         err.print("[yellow]left out:[/]", f"{item.name}: {item.reason}")
     if drift.variance > 1:
-        err.print(
-            f"[yellow]warning:[/] residuals are {drift.variance**0.5:.1f} times as large as the marks' noise says; "
-            "sigmas were multiplied by that"
-        )
-    out.print(
-        "the relative attitude has [bold]changed[/] beyond chance"
-        if drift.significant
-        else "no change of the relative attitude beyond chance"
-    )
+        times = f"{drift.variance**0.5:.1f} times"
+        warn(f"residuals are {times} as large as the marks' noise says; sigmas were multiplied by that")
+    if drift.significant:
+        out.print("the relative attitude has [bold]changed[/] beyond chance: ranges by the old rig are wrong")
+    else:
+        out.print("no change of the relative attitude beyond chance")
+    if drift.left_significant:
+        out.print("the left camera has [bold]turned[/] beyond chance: directions by the old rig are wrong")
+    if not (drift.significant or drift.left_significant):
+        if relock:
+            out.print("nothing was written")
+        return
     if relock:
         kept = _relock(rig, old, drift, marks)
         out.print(f"kept the old rig as {kept}", markup=False)
-        out.print(f"wrote {rig}", markup=False)
+        print_wrote(rig)
+    raise typer.Exit(_DRIFTED)
 
 
 def _features(then: Marks, now: Marks, sigma: float) -> Features:
@@ -110,7 +123,7 @@ def _landmarks(rig: StereoRig, path: Path, now: Marks, sigma: float) -> Landmark
     return match_landmarks(read_survey(path, rig.mounting.origin), now, sigma).landmarks
 
 
-def _table(rig: StereoRig, drift: Drift) -> list[str]:
+def _print_turns(rig: StereoRig, drift: Drift) -> None:
     import math
 
     from kcal.locate.monitor import drift_effect
@@ -127,17 +140,15 @@ def _table(rig: StereoRig, drift: Drift) -> list[str]:
             continue
         sigma = covariance.diagonal().sqrt()
         cells = [
-            f"{math.degrees(value):+.5f} ± {math.degrees(spread):.5f}"
+            f"{math.degrees(value):+z.5f} ± {math.degrees(spread):.5f}"
             for value, spread in zip(turn.tolist(), sigma.tolist(), strict=True)
         ]
         rows.append([name, *cells, used])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    print_table(rows, left=range(len(rows[0])))
     effect = drift_effect(rig, drift.rig, drift.relative_covariance)
     for distance, found, sigma in zip(*(value.tolist() for value in effect), strict=True):
-        shift = "infinity" if math.isinf(found) else f"{found:.1f} m ({found - distance:+.1f} ± {sigma:.1f} m)"
-        lines.append(f"with the old rig a target at {distance:g} m is found at {shift}")
-    return lines
+        shift = "infinity" if math.isinf(found) else f"{found:.1f} m ({found - distance:+z.1f} ± {sigma:.1f} m)"
+        out.print(f"with the old rig a target at {distance:g} m is found at {shift}")
 
 
 def _relock(path: Path, old: StereoRig, drift: Drift, marks: Path) -> Path:

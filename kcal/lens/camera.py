@@ -21,7 +21,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.outline import image_outline, polygon_area
 from kcal.lens.plane import angle_over_distance, plane_from_points, rays_from_plane
 from kcal.lens.projection import from_pixels, to_pixels
-from kcal.lens.pupil import pupil_depth, ray_starts
+from kcal.lens.pupil import FAR, pupil_depth, ray_starts
 from kcal.lens.region import Region, in_region, surely_in_region
 from kcal.lens.tracing import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
 
@@ -193,8 +193,7 @@ class Camera(CameraParameters):
         Raises:
             InputError: a wrong shape or an integer dtype.
         """
-        # Scaling by a power of two rounds nothing. At 10¹² m an entrance pupil has no effect.
-        return self.project(as_points("rays", rays, 3) * 2.0**40)
+        return self.project(as_points("rays", rays, 3) * FAR)
 
     def ray_origins(self, rays: Tensor) -> Tensor:
         """Find where rays start: (0, 0, ζ₁ θ² + ζ₂ θ⁴) for a hybrid lens (`kcal.lens.pupil`), the origin for others.

@@ -73,6 +73,30 @@ class FieldModes(Protocol):
         """
 
 
+class UnitModes:
+    """What fields of scalar units have in common, which have one weight along x and one along y for each unit.
+
+    Attributes:
+        names: of the weights, those along x first.
+    """
+
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Number of weights."""
+        return len(self.names)
+
+    @property
+    def radial_names(self) -> frozenset[str]:
+        """See `FieldModes`: no unit is symmetric about the axis."""
+        return frozenset()
+
+    @property
+    def peaks(self) -> tuple[float, ...]:
+        """See `FieldModes`."""
+        return (1.0,) * len(self)
+
+
 def vector_columns(values: Tensor) -> Tensor:
     """Columns (2 K, 2, ..., N) of K scalar units (K, ..., N) with weights along x, then with weights along y."""
     zero = torch.zeros_like(values)

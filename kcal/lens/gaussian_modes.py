@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.field_modes import WeightPrior, vector_columns
+from kcal.lens.field_modes import UnitModes, WeightPrior, vector_columns
 
 # Distance between the units of a grid, in widths. Denser units are nearly redundant.
 _SPACING = 0.8
@@ -43,7 +43,7 @@ class _Grid(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class GaussianModes:
+class GaussianModes(UnitModes):
     """Gaussian units on square grids over the unit disc (`kcal.lens.field_modes.FieldModes`).
 
     The weights along x come first, the widest units first, then those along y. Their prior has one amplitude, and one
@@ -88,15 +88,6 @@ class GaussianModes:
         object.__setattr__(self, "_grids", tuple(grids))
         object.__setattr__(self, "names", tuple(name + axis for axis in "xy" for name in names))
 
-    def __len__(self) -> int:
-        """Number of weights."""
-        return len(self.names)
-
-    @property
-    def radial_names(self) -> frozenset[str]:
-        """See `FieldModes`: no unit is symmetric about the axis."""
-        return frozenset()
-
     @property
     def hyperprior(self) -> tuple[tuple[float, float], ...]:
         """See `FieldModes`: amplitude, and decay per octave."""
@@ -107,11 +98,6 @@ class GaussianModes:
         """See `FieldModes`."""
         octaves = [math.log2(self.widths[0] / grid.width) for grid in self._grids for _ in grid.points]
         return tuple(WeightPrior(0, 1, octave) for octave in 2 * octaves)
-
-    @property
-    def peaks(self) -> tuple[float, ...]:
-        """See `FieldModes`."""
-        return (1.0,) * len(self)
 
     def columns(self, x: Tensor, y: Tensor) -> Tensor:
         """See `FieldModes`."""

@@ -17,14 +17,14 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.field_modes import WeightPrior, vector_columns
+from kcal.lens.field_modes import UnitModes, WeightPrior, vector_columns
 
 # Random features: |(a, b)| from one to eight, uniform in its logarithm. At eight, tanh rises within a quarter radius.
 _LOWEST, _OCTAVES = 1.0, 3.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class NetworkModes:
+class NetworkModes(UnitModes):
     """The features of a fixed hidden layer on the unit disc (`kcal.lens.field_modes.FieldModes`).
 
     The weights along x come first, then those along y. Their prior has one amplitude, and one decay per octave of the
@@ -70,15 +70,6 @@ class NetworkModes:
         rows = torch.stack([steep * torch.cos(angle), steep * torch.sin(angle), steep * (2.0 * draw[:, 2] - 1.0)], 1)
         return cls(hidden=tuple((a, b, c) for a, b, c in rows.tolist()))
 
-    def __len__(self) -> int:
-        """Number of weights."""
-        return len(self.names)
-
-    @property
-    def radial_names(self) -> frozenset[str]:
-        """See `FieldModes`: no feature is symmetric about the axis."""
-        return frozenset()
-
     @property
     def hyperprior(self) -> tuple[tuple[float, float], ...]:
         """See `FieldModes`: amplitude, and decay per octave."""
@@ -89,11 +80,6 @@ class NetworkModes:
         """See `FieldModes`."""
         octaves = [math.log2(math.hypot(a, b) / _LOWEST) for a, b, _ in self.hidden]
         return tuple(WeightPrior(0, 1, octave) for octave in 2 * octaves)
-
-    @property
-    def peaks(self) -> tuple[float, ...]:
-        """See `FieldModes`."""
-        return (1.0,) * len(self)
 
     def _features(self, x: Tensor, y: Tensor) -> Tensor:
         """(..., K, N)."""

@@ -21,6 +21,9 @@ from kcal.lens.plane import angle_over_distance
 from kcal.lens.tracing import is_differentiated, known_true
 from kcal.lens.zernike import unbind_last
 
+# Meters at which a point is as good as infinitely far: an entrance pupil has no effect there. Scaling by a power of two
+# rounds nothing.
+FAR = 2.0**40
 # Newton's steps at most, and where all points take the same number. Points at long range need one, those at 1 m two,
 # and those at some five times the movement of the pupil all.
 _STEPS = 5

@@ -9,10 +9,9 @@ from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
+from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
-
-# Rays are continued to this distance, meters: far beyond what the entrance pupil matters for.
-_FAR = 1e9
+from kcal.lens.pupil import FAR
 
 
 def pixel_covariance(
@@ -89,10 +88,6 @@ def _slopes_at_infinity(camera: Camera, pixels: Tensor, wanted: list[int]) -> tu
     """Derivatives of far directions' pixels by parameters (N, 2, C) and by a turn (N, 2, 3), and which have them."""
     rays, valid = camera.unproject(pixels)
     rays = torch.where(valid[:, None], rays, rays.new_tensor([0.0, 0.0, 1.0]))
-    seen = project_components(_FAR * rays.T, camera.params.detach(), camera.model, wanted)
-    x, y, z = (_FAR * rays).unbind(-1)
-    zero = torch.zeros_like(x)
-    # Derivatives of ω x p by each component of ω.
-    cross = torch.stack([torch.stack(axis) for axis in ((zero, -z, y), (z, zero, -x), (-y, x, zero))])
-    by_turn = torch.einsum("pin,kpn->nik", seen.by_point, cross)
-    return seen.by_camera.permute(2, 1, 0), by_turn, valid & seen.regular
+    seen = project_components(FAR * rays.T, camera.params.detach(), camera.model, wanted)
+    by_turn = step_rows(seen.by_point, FAR * rays.T)[:3]
+    return seen.by_camera.permute(2, 1, 0), by_turn.permute(2, 1, 0), valid & seen.regular

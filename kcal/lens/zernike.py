@@ -147,7 +147,7 @@ class ZernikeModes:
         return tuple(math.sqrt(degree + 1) for *_, degree in self.real_modes)
 
     def columns(self, x: Tensor, y: Tensor) -> Tensor:
-        """Evaluate each real mode at places (x, y) (...) of the unit disc: (M, 2, ...)."""
+        """See `FieldModes`."""
         highest: dict[int, int] = {}
         for j, n in self.complex_modes:
             highest[abs(j)] = max(highest.get(abs(j), 0), (n - abs(j)) // 2)
@@ -166,17 +166,7 @@ class ZernikeModes:
         return torch.stack(flat).unflatten(0, (len(self), 2))
 
     def field(self, weights: Tensor, x: Tensor, y: Tensor, slopes: bool = True) -> tuple[Tensor, ...]:
-        """Evaluate the sum of all modes: the displacement (f, g), and if wanted its slopes f_x, f_y, g_x, g_y.
-
-        Args:
-            weights: (..., M), broadcast against the leading shape of the places.
-            x: (..., N) places on the unit disc.
-            y: (..., N).
-            slopes: whether these are needed.
-
-        Returns:
-            Two or six tensors (..., N).
-        """
+        """See `FieldModes`."""
         t = 2.0 * torch.addcmul(x * x, y, y) - 1.0
         coefficients = unbind_last(weights @ self._matrix.to(weights.device))
         reuse = may_overwrite(weights, x, y)

@@ -31,6 +31,11 @@ from kcal.locate.stereo import (
     reprojection_errors,
 )
 
+# Gauss's coefficient of refraction, the mean over land by day. What is not known of it is the gradient of temperature:
+# k = 503 p / T² (0.0342 + dT/dz) in hPa, K and K/m (Brunner 1984), so that 0.1 stands for ± 0.016 K/m. That suits lines
+# of sight some ten meters above the ground; near it k varies by 1 and more (Hirt et al. 2010).
+REFRACTION, REFRACTION_SIGMA = 0.13, 0.1
+
 
 class Localization(NamedTuple):
     """Result of `StereoLocalizer`; nothing in it is NaN, whatever went in. Look at `status` before anything else.
@@ -85,9 +90,13 @@ class StereoLocalizer(nn.Module):
     Geometry runs in float64 whatever the pipeline around it uses. There is no branch on values under `torch.compile`
     and `torch.export`; gradients by pixels, covariances and freed camera parameters are exact and finite.
 
-    The covariance of a position is the sum of three parts: noise in the marks, errors in the calibration
-    (`calibration`, a joint covariance of cameras and rig) and errors in the mounting (`mounting`). Calibration errors
-    move neighboring points together, so that averaging over frames does not reduce them.
+    The covariance of a position is the sum of four parts: noise in the marks, errors in the calibration
+    (`calibration`, a joint covariance of cameras and rig), errors in the mounting (`mounting`) and, upward, what is not
+    known of refraction. All but the noise move neighboring points together, so that averaging over frames does not
+    reduce them.
+
+    Light bends downward: a point at the level distance d is k d² / 2R lower than a straight line of sight says, with R
+    the Earth's radius and k the coefficient of refraction: 0.26 ± 0.20 m at 5 km, 0.01 m at 1 km.
 
     Args:
         rig: two cameras and their relative pose. What is not given below is taken from the rig where it knows it.
@@ -101,7 +110,10 @@ class StereoLocalizer(nn.Module):
             is given.
         link: (P, 6) covariance of the calibration with the mounting, where both come from the same landmarks; that of
             `rig.mounting` if all of origin, calibration and mounting come from the rig.
-        refraction: bending of light as a share of the Earth's curvature, 0.13 in standard air; 0: straight lines.
+        refraction: k, bending of light as a share of the Earth's curvature. For simulations and other straight lines
+            it and its sigma are 0.
+        refraction_sigma: standard deviation of k; 0.1 suits lines of sight some ten meters above the ground, near hot
+            or cold ground 0.5 and more are usual.
 
     Raises:
         InputError: an angle, sigma or covariance that cannot be, or a rig that does not say where it stands.
@@ -115,8 +127,8 @@ class StereoLocalizer(nn.Module):
         ...                            pixel_sigma=0.1)
         >>> left, right = torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]])
         >>> found = localize(left, right)
-        >>> [round(value, 1) for value in found.enu[0].tolist()], round(found.covariance[0, 1, 1].sqrt().item(), 2)
-        ([0.0, 1000.0, 0.0], 8.84)
+        >>> [round(value, 2) for value in found.enu[0].tolist()], round(found.covariance[0, 1, 1].sqrt().item(), 2)
+        ([0.0, 1000.0, -0.01], 8.84)
         >>> round(found.range_low.item(), 1), round(found.range_high.item(), 1), PositionStatus(int(found.status)).name
         (983.0, 1017.6, 'OK')
     """
@@ -141,12 +153,15 @@ class StereoLocalizer(nn.Module):
         calibration: RigCovariance | None = None,
         mounting: Tensor | None = None,
         link: Tensor | None = None,
-        refraction: float = 0.0,
+        refraction: float = REFRACTION,
+        refraction_sigma: float = REFRACTION_SIGMA,
     ) -> None:
         super().__init__()
         self.pixel_sigma = checked_rig(rig, pixel_sigma)
         if not -2.0 <= refraction <= 2.0:
             raise InputError(f"refraction {refraction}: a coefficient such as 0.13 is needed, not beyond ±2")
+        if not 0.0 <= refraction_sigma <= 2.0:
+            raise InputError(f"refraction_sigma {refraction_sigma}: a number from 0 to 2 is needed, such as 0.1")
         stored = rig.covariance
         if origin is None or heading_deg is None:
             if origin is not None or heading_deg is not None or pitch_deg or roll_deg:
@@ -166,7 +181,8 @@ class StereoLocalizer(nn.Module):
         self.attitude_deg = (heading_deg, pitch_deg, roll_deg)
         errors = (("marks", True), ("calibration", calibration is not None), ("mounting", mounting is not None))
         self.included = tuple(name for name, there in errors if there)
-        self.drop = refraction / (2.0 * mean_radius(origin.lat))
+        curvature = 0.5 / mean_radius(origin.lat)
+        self.drop, self.drop_sigma = refraction * curvature, refraction_sigma * curvature
         device = rig.right_from_left_rotation.device
         rotation, translation = anchor(origin, device)
         self.register_buffer("enu_from_rig", enu_from_cam(heading_deg, pitch_deg, roll_deg).to(device))
@@ -203,8 +219,8 @@ class StereoLocalizer(nn.Module):
             >>> with tempfile.TemporaryDirectory() as folder:
             ...     localize = StereoLocalizer.from_file(save_rig(rig, Path(folder, "rig.json")), pixel_sigma=0.1)
             >>> found = localize(torch.tensor([[959.5, 539.5]]), torch.tensor([[943.5, 539.5]]))
-            >>> [round(value, 1) for value in found.enu[0].tolist()]
-            [0.0, 1000.0, 0.0]
+            >>> [round(value, 2) for value in found.enu[0].tolist()]
+            [0.0, 1000.0, -0.01]
         """
         return cls(load_rig(path), **options)
 
@@ -259,9 +275,10 @@ class StereoLocalizer(nn.Module):
         enu = torch.where(ok[..., None], depth[..., None] * (fit.direction.mT @ self.enu_from_rig.mT), 0.0)
         slope = self.enu_from_rig @ position_slope(fit, scale, ok)
         covariance = slope @ symmetric(spread) @ slope.mT
-        if self.drop:
-            level = enu[..., :2]
-            enu = torch.cat([level, enu[..., 2:] - self.drop * (level * level).sum(-1, keepdim=True)], -1)
+        if self.drop or self.drop_sigma:
+            up = torch.stack([*torch.zeros_like(enu[..., :2]).unbind(-1), enu[..., :2].square().sum(-1)], -1)
+            enu = enu - self.drop * up
+            covariance = covariance + self.drop_sigma**2 * up[..., :, None] * up[..., None, :]
         if self.mounting is not None:
             turn = by_mounting(enu)
             covariance = covariance + turn @ self.mounting @ turn.mT

@@ -17,7 +17,7 @@ from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.cep import circular_error
 from kcal.locate.datum import Geoid, geoid_heights
 from kcal.locate.geodesy import azimuth_elevation, enu_to_geodetic
-from kcal.locate.localizer import Localization, StereoLocalizer
+from kcal.locate.localizer import REFRACTION, REFRACTION_SIGMA, Localization, StereoLocalizer
 from kcal.locate.stereo import PositionStatus
 
 # A reprojection error of this many sigma is not noise: two different things were marked, or the rig has moved.
@@ -140,7 +140,8 @@ def locate_points(
     calibration: RigCovariance | None = None,
     mounting: Tensor | None = None,
     link: Tensor | None = None,
-    refraction: float = 0.0,
+    refraction: float = REFRACTION,
+    refraction_sigma: float = REFRACTION_SIGMA,
     geoid: Geoid | None = None,
 ) -> Located:
     """Positions on the Earth of things marked in both images of a stereo rig.
@@ -161,6 +162,7 @@ def locate_points(
         mounting: how well origin and attitude are known, see `mounting_covariance`.
         link: how calibration and mounting go together, see `StereoLocalizer`.
         refraction: bending of light as a share of the Earth's curvature, see `StereoLocalizer`.
+        refraction_sigma: its standard deviation.
         geoid: a grid from `kcal.locate.datum.find_geoid`.
 
     Returns:
@@ -193,6 +195,7 @@ def locate_points(
         localize = StereoLocalizer(
             rig, origin=origin, heading_deg=heading_deg, pitch_deg=pitch_deg, roll_deg=roll_deg,
             pixel_sigma=pixel_sigma, calibration=calibration, mounting=mounting, link=link, refraction=refraction,
+            refraction_sigma=refraction_sigma,
         )  # fmt: skip
         slopes = [slope.tolist() for slope in localize.sensitivity(pixels_left, pixels_right)]
         result = Localization(*(tensor.cpu() for tensor in localize(pixels_left, pixels_right, cov)))

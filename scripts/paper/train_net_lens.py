@@ -25,8 +25,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kcal.calibrate.bundle.closed_form import homographies, intrinsics_candidates, poses_from_homographies
+from kcal.calibrate.bundle.poses import poses_under
+from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.rig.board_consensus import pose_alone
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.nets.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
@@ -121,7 +122,8 @@ def reference(board: Tensor, pixels: Tensor, others: Tensor) -> list[str]:
     clock = time.process_time()
     result = calibrate_camera(observations, CalibrationOptions(model="opencv14"))
     seconds = time.process_time() - clock
-    poses, _ = pose_alone(board, others, result.camera, LMOptions(max_iterations=100))
+    views = Views(board_points=board, pixels=others)
+    poses, _ = poses_under(result.camera, views, LMOptions(max_iterations=100))
     points = board @ poses.rotation.transpose(-1, -2) + poses.translation[:, None]
     error = (result.camera.project(points)[0] - others).norm(dim=-1).square().mean().sqrt()
     cells = ("14 coefficients", "", LM, "", result.iterations, f"{seconds:.1f}", f"{result.rms:.4f}", f"{error:.4f}")

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kcal.calibrate.bundle.board_problem import BoardState, warp_shape
-from kcal.calibrate.bundle.poses import refine_poses
+from kcal.calibrate.bundle.board_problem import warp_shape
+from kcal.calibrate.bundle.poses import poses_under
 from kcal.calibrate.bundle.views import Views
-from kcal.calibrate.rig.board_consensus import Poses, pose_alone
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
@@ -58,12 +57,8 @@ def warped(seen: Observations, warp: torch.Tensor) -> torch.Tensor:
 def held_out(camera: Camera, points: torch.Tensor, seen: Observations, weight: torch.Tensor) -> tuple[float, int]:
     """Sum of w² |r|² over views of a board (N, 3) whose poses are solved again, and how many corners."""
     pixels = torch.where((weight > 0)[..., None], seen.pixels(), torch.nan)
-    alone: Poses
-    alone, _ = pose_alone(points, pixels, camera, LMOptions(max_iterations=50))
-    state = BoardState.flat(camera.params.detach(), alone.rotation, alone.translation)
     whitening = weight[..., None, None] * torch.eye(2, dtype=torch.float64)
-    views = Views(board_points=points, pixels=pixels, whitening=whitening)
-    _, cost = refine_poses(views, camera.model, state, EXACT)
+    _, cost = poses_under(camera, Views(board_points=points, pixels=pixels, whitening=whitening), EXACT)
     return 2.0 * float(torch.nan_to_num(cost, nan=math.inf).sum()), int((weight > 0).sum())
 
 

@@ -13,6 +13,7 @@ from kcal.cli.main import main
 from kcal.io.rig_file import save_rig
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
+from kcal.locate.localizer import REFRACTION, REFRACTION_SIGMA
 
 HEADER = "name,left_u,left_v,right_u,right_v\n"
 ORIGIN = "-33.9,151.2,10"
@@ -59,7 +60,7 @@ def test_options_for_errors_grids_and_formats(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["rig.json", "points.csv", "--origin", "19.07,72.87,14", "--heading", "0.0", "-o", "out.csv"]
-    assert run(monkeypatch, *arguments, "--pixel-sigma", "0.1") == 0
+    assert run(monkeypatch, *arguments, "--pixel-sigma", "0.1", "--refraction", "0") == 0
     plain = next(iter(csv.DictReader((folder / "out.csv").open())))
     more = ["--grid", "EPSG:32643", "--yaw-sigma", "0.05", "--heading-sigma", "0.1", "--refraction", "0.13"]
     outputs = ["-o", "out.kml", "-o", "out.cot"]
@@ -70,6 +71,12 @@ def test_options_for_errors_grids_and_formats(
     # 87 m for 0.05 degrees at 1 km.
     assert float(row["range_high_m"]) - 1000 > 5 * (float(plain["range_high_m"]) - 1000)
     assert float(row["up_m"]) < float(plain["up_m"])
+    # The library's own defaults, which the command states for its help.
+    assert run(monkeypatch, *arguments) == 0
+    usual = (folder / "out.csv").read_text()
+    defaults = ["--refraction", str(REFRACTION), "--refraction-sigma", str(REFRACTION_SIGMA)]
+    assert run(monkeypatch, *arguments, *defaults) == 0
+    assert (folder / "out.csv").read_text() == usual
     printed = capsys.readouterr().out
     assert "noise in the marks and of the errors in calibration and mounting" in printed
     assert "geoid: " in printed

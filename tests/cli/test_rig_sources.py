@@ -148,9 +148,9 @@ def test_check_and_relock(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     before = (site / "rig.json").read_bytes()
     capsys.readouterr()
     check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "now.csv", "--mark-sigma", "0.1"]
-    assert run(monkeypatch, *check) == 0
+    assert run(monkeypatch, *check) == 3
     printed = capsys.readouterr()
-    assert "left out: s3: its marks do not meet" in printed.err
+    assert "left out: s3: it has moved by" in printed.err
     assert "has changed beyond chance" in printed.out
     line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))
     yaw, sigma = float(line.split()[6]), float(line.split()[8])
@@ -158,7 +158,7 @@ def test_check_and_relock(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert "a target at 5000 m is found at" in printed.out
     assert (site / "rig.json").read_bytes() == before
 
-    assert run(monkeypatch, *check, "--relock") == 0
+    assert run(monkeypatch, *check, "--relock") == 3
     (kept,) = site.glob("rig.before-*.json")
     assert kept.read_bytes() == before
     old, new = RigFile.load(kept), RigFile.load(site / "rig.json")
@@ -175,11 +175,68 @@ def test_check_and_relock(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert float(spread[1][-5, -5]) > float(spread[0][-5, -5])
 
 
+def test_check_of_equal_marks(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exactly no drift, no warning, exit code 0, and nothing written, though the rig itself is not exact."""
+    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
+    capsys.readouterr()
+    files = {path.name: path.read_bytes() for path in site.iterdir()}
+    check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "then.csv", "--relock"]
+    # With a hundredth of their true noise, errors of the rig would be seen.
+    assert run(monkeypatch, *check, "--mark-sigma", "0.001") == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    for part in ("left camera", "right camera", "right from left"):
+        (line,) = (line for line in printed.out.splitlines() if line.startswith(part))
+        assert line.split("°")[0].count("+0.00000 ±") == 3
+    assert "at 5000 m is found at 5000.0 m (+0.0 ±" in printed.out
+    assert "no change of the relative attitude beyond chance" in printed.out
+    assert printed.out.endswith("nothing was written\n")
+    assert {path.name: path.read_bytes() for path in site.iterdir()} == files
+
+
+def test_check_without_a_drift(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """New marks with noise of their own, and the marks of the survey from which the rig was solved."""
+    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
+    before = (site / "rig.json").read_bytes()
+    marks_table(site / "now.csv", "s", marked(points(25, 400.0, 6000.0, 33), 8))
+    capsys.readouterr()
+    for *source, now in (("--reference", "then.csv", "now.csv"), ("--landmarks", "survey.csv", "marks.csv")):
+        check = ["rig", "check", "rig.json", *source, "--marks", now, "--mark-sigma", "0.1", "--relock"]
+        assert run(monkeypatch, *check) == 0
+        printed = capsys.readouterr()
+        assert "nothing was written" in printed.out
+        assert "warning" not in printed.err
+        assert (site / "rig.json").read_bytes() == before
+        assert not list(site.glob("rig.before-*.json"))
+
+
+def test_check_of_a_rig_that_turned_as_a_whole(
+    site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
+    heading = RigFile.load(site / "rig.json").mounting.heading_deg
+    where = points(25, 400.0, 6000.0, 33)
+    sine, cosine = math.sin(math.radians(0.05)), math.cos(math.radians(0.05))
+    # Seen from a rig that has turned to the right by 0.05°, things have moved to the left.
+    turn = torch.tensor([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]], dtype=torch.float64)
+    sides = [CAMERAS[c].project((where - CENTER[c]) @ turn.T @ ROTATION[c].T)[0] for c in (0, 1)]
+    now = torch.stack(sides, 1)
+    noise = torch.Generator().manual_seed(8)
+    marks_table(site / "now.csv", "s", now + 0.1 * torch.randn(now.shape, dtype=torch.float64, generator=noise))
+    check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "now.csv", "--mark-sigma", "0.1"]
+    capsys.readouterr()
+    assert run(monkeypatch, *check, "--relock") == 3
+    printed = capsys.readouterr()
+    assert "no change of the relative attitude beyond chance" in printed.out
+    assert "the left camera has turned beyond chance" in printed.out
+    assert RigFile.load(site / "rig.json").mounting.heading_deg == pytest.approx(heading + 0.05, abs=0.005)
+
+
 def test_check_by_landmarks(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
     capsys.readouterr()
     arguments = ["rig", "check", "rig.json", "--landmarks", "survey.csv", "--marks", "later.csv", "--mark-sigma", "0.1"]
-    assert run(monkeypatch, *arguments, "--relock") == 0
+    assert run(monkeypatch, *arguments, "--relock") == 3
     printed = capsys.readouterr()
     line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))
     assert abs(float(line.split()[6]) - 0.02) < 4.5 * float(line.split()[8])
@@ -216,5 +273,8 @@ def test_usage(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
     assert run(monkeypatch, "rig", "check", "rig.json", "--marks", "now.csv") == 1
     assert "--reference" in capsys.readouterr().err
+    both = ["--reference", "then.csv", "--landmarks", "survey.csv"]
+    assert run(monkeypatch, "rig", "check", "rig.json", "--marks", "now.csv", *both) == 1
+    assert "not both" in capsys.readouterr().err
     assert run(monkeypatch, "locate", "rig.json", "points.csv", "--origin", "1,2,3") == 2
     assert run(monkeypatch, "locate", "rig.json", "points.csv", "--pitch", "1") == 2

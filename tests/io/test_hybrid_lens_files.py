@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from lenses import FEW_MODES, hybrid_camera
+from wrong_files import assert_refused
 
 from kcal.errors import FileError
 from kcal.io.camera_file import CameraFile, camera_to_file, load_camera, save_camera
@@ -79,16 +80,7 @@ def test_covariance_and_rig(tmp_path: Path) -> None:
 )
 def test_wrong_field(tmp_path: Path, path_in_file: list[str], value: Any, message: str) -> None:
     content = camera_to_file(hybrid_camera("webcam", modes=FEW_MODES)).dump()
-    block = content
-    for key in path_in_file[:-1]:
-        block = block[key]
-    block[path_in_file[-1]] = value
-    path = tmp_path / "wrong.json"
-    path.write_text(json.dumps(content))
-    with pytest.raises(FileError, match=message) as error:
-        load_camera(path)
-    assert "wrong.json" in str(error.value)
-    assert len(str(error.value)) < 400
+    assert_refused(load_camera, tmp_path, content, path_in_file, value, message)
 
 
 def test_a_long_list_of_names_is_cut(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from wrong_files import assert_refused
 
 from kcal.errors import FileError, InputError
 from kcal.io.camera_file import (
@@ -231,15 +232,7 @@ class TestCamera:
     ) -> None:
         sigma = dict.fromkeys(camera.names, 0.1)
         content = camera_to_file(camera, standard_deviations=sigma, calibration=camera_calibration()).dump()
-        block = content
-        for key in path_in_file[:-1]:
-            block = block[key]
-        block[path_in_file[-1]] = value
-        path = tmp_path / "wrong.json"
-        path.write_text(json.dumps(content))
-        with pytest.raises(FileError, match=message) as error:
-            load_camera(path)
-        assert "wrong.json" in str(error.value)
+        assert_refused(load_camera, tmp_path, content, path_in_file, value, message)
 
     def test_missing_coefficient(self, tmp_path: Path, camera: Camera) -> None:
         content = camera_to_file(camera).dump()
@@ -307,15 +300,7 @@ class TestRig:
         self, tmp_path: Path, rig: StereoRig, path_in_file: list[Any], value: Any, message: str
     ) -> None:
         content = rig_to_file(rig, calibration=rig_calibration(float(rig.baseline))).dump()
-        block: Any = content
-        for key in path_in_file[:-1]:
-            block = block[key]
-        block[path_in_file[-1]] = value
-        path = tmp_path / "wrong.json"
-        path.write_text(json.dumps(content))
-        with pytest.raises(FileError, match=message) as error:
-            load_rig(path)
-        assert "wrong.json" in str(error.value)
+        assert_refused(load_rig, tmp_path, content, path_in_file, value, message)
 
     def test_another_camera_is_refused(self, rig: StereoRig) -> None:
         with pytest.raises(InputError, match="right camera file"):

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
+from wrong_files import assert_refused
 
-from kcal.errors import FileError, InputError
+from kcal.errors import InputError
 from kcal.io.camera_file import camera_to_file, load_camera, save_camera
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
@@ -132,10 +133,7 @@ def test_files(kind: str, tmp_path: Path) -> None:
         ({"modes": zernike}, f"got modes and {kind}"),
         ({kind: {"widths": [0.5, 1.0]} if kind == "gaussian" else {"hidden": [[0, 0, 1]]}}, "widths must|each must"),
     ):
-        content["model"]["hybrid"] = {**hybrid, **change}
-        path.write_text(json.dumps(content))
-        with pytest.raises(FileError, match=complaint):
-            load_camera(path)
+        assert_refused(load_camera, tmp_path, content, ["model", "hybrid"], {**hybrid, **change}, complaint)
 
 
 def test_files_of_zernike_modes_are_as_before() -> None:

@@ -26,7 +26,9 @@ N = 8000
 
 
 def localizer(rig: StereoRig = RIG, **options: object) -> StereoLocalizer:
-    return StereoLocalizer(rig, **{"origin": ORIGIN, **ATTITUDE, **options})
+    """Of a rig that sees along straight lines."""
+    straight = {"refraction": 0.0, "refraction_sigma": 0.0}
+    return StereoLocalizer(rig, **{"origin": ORIGIN, **ATTITUDE, **straight, **options})
 
 
 def noise(sigma: float, *shape: int, seed: int = 3) -> torch.Tensor:
@@ -138,6 +140,41 @@ def test_refraction_lowers_the_point() -> None:
         0.13 * float(straight.enu[0, :2].norm()) ** 2 / 2 / 6.37e6, rel=5e-3
     )
     assert (straight.geodetic - bent.geodetic)[0, 2].item() == pytest.approx(0.255, abs=0.005)
+
+
+def test_refraction_of_standard_air_is_the_default() -> None:
+    """k = 0.13 ± 0.1: the up component alone moves, and what is not known of k is added to its variance."""
+    left, right, _ = RIG(spread_points(tensor(300.0, 1000.0, 5000.0)))
+    straight, found = localizer()(left, right), StereoLocalizer(RIG, origin=ORIGIN, **ATTITUDE)(left, right)
+    bend = straight.enu[:, :2].square().sum(-1) / (2 * 6.371e6)
+    torch.testing.assert_close(found.enu[:, :2], straight.enu[:, :2], rtol=0, atol=0)
+    torch.testing.assert_close(straight.enu[:, 2] - found.enu[:, 2], 0.13 * bend, rtol=5e-3, atol=0)
+    more = found.covariance - straight.covariance
+    torch.testing.assert_close(more[:, 2, 2], (0.1 * bend) ** 2, rtol=1e-2, atol=1e-12)
+    more[:, 2, 2] = 0.0
+    assert more.abs().max() < 1e-9
+    assert torch.equal(found.range_high, straight.range_high)
+    # The sigma counts also where k is 0.
+    vague = localizer(refraction_sigma=0.5)(left, right)
+    assert torch.equal(vague.enu, straight.enu)
+    more = (vague.covariance - straight.covariance)[2, 2, 2]
+    assert float(more.sqrt()) == pytest.approx(0.5 * float(bend[2]), rel=5e-3)
+
+
+def test_heights_are_inside_their_intervals_where_light_bends() -> None:
+    """Draws of k and of the marks at 5 km: deviations of the height in its sigmas are those of a normal variable."""
+    azimuth = math.radians(200.0) + torch.linspace(-0.3, 0.3, 400, dtype=torch.float64)
+    # Level, so that errors of the range do not show in the height.
+    enu = 5000.0 * torch.stack([azimuth.sin(), azimuth.cos(), torch.zeros_like(azimuth)], -1)
+    k = 0.13 + 0.1 * torch.randn(len(enu), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    seen = enu + torch.stack([0 * k, 0 * k, k * enu[:, :2].square().sum(-1) / (2 * 6.371e6)], -1)
+    left, right, _ = RIG(seen @ enu_from_cam(*ATTITUDE.values()))
+    found = StereoLocalizer(RIG, origin=ORIGIN, **ATTITUDE, pixel_sigma=0.05)(
+        left + noise(0.05, 400, 2), right + noise(0.05, 400, 2, seed=4)
+    )
+    error = (found.enu - enu)[:, 2] / found.covariance[:, 2, 2].sqrt()
+    assert abs(float(error.mean())) < 4 / 20
+    assert float(error.square().mean()) == pytest.approx(1.0, abs=4 * (2 / 400) ** 0.5)
 
 
 BAD = [
@@ -337,6 +374,8 @@ def test_bad_arguments() -> None:
     for options, message in (
         ({"pixel_sigma": 0.0}, "pixel_sigma"),
         ({"refraction": 13.0}, "refraction"),
+        ({"refraction_sigma": -0.1}, "refraction_sigma"),
+        ({"refraction_sigma": math.nan}, "refraction_sigma"),
         ({"mounting": torch.eye(3)}, "mounting"),
         ({"calibration": RigCovariance(half=torch.eye(3))}, "joint covariance"),
         ({"heading_deg": math.nan}, "heading"),

@@ -28,6 +28,8 @@ from kcal.locate.stereo import PositionStatus
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 RIG = pinhole_rig()  # f b = 16 000 px m, center (959.5, 539.5)
+# Light that does not bend.
+STRAIGHT = {"refraction": 0.0, "refraction_sigma": 0.0}
 
 
 def one(left: tuple[float, float], right: tuple[float, float], **options: float) -> Position:
@@ -39,13 +41,15 @@ def mixed() -> Located:
     left = tensor([975.5, 539.5], [960.0, 500.0], [955.0, 500.0], [900.0, 500.0], [-5.0, 3.0], [math.nan, 3.0])
     right = tensor([959.5, 539.5], [959.5, 500.0], [955.0, 500.0], [905.0, 500.0], [1.0, 3.0], [1.0, 3.0])
     names = ["mast", "far", "parallel", "mismatch", "outside", "nothing"]
-    return locate_points(RIG, left, right, origin=ORIGIN, heading_deg=90.0, names=names)
+    return locate_points(RIG, left, right, origin=ORIGIN, heading_deg=90.0, names=names, **STRAIGHT)
 
 
 def test_end_to_end_with_real_lenses() -> None:
     rig, truth = real_rig(), spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64))
     left, right, _ = rig(truth)
-    located = locate_points(rig, left, right, origin=ORIGIN, heading_deg=200.0, pitch_deg=3.0, roll_deg=-2.0)
+    located = locate_points(
+        rig, left, right, origin=ORIGIN, heading_deg=200.0, pitch_deg=3.0, roll_deg=-2.0, **STRAIGHT
+    )
     enu = truth @ enu_from_cam(200.0, 3.0, -2.0).T
     assert located.count == 9
     assert (located.enu - enu).norm(dim=-1).max() < 1e-6

@@ -1,13 +1,15 @@
-"""Board poses under a known camera: refine each view alone, and correct those that stopped at the wrong tilt."""
+"""Board poses under a known camera: find and refine each view alone, and correct those that stopped at a wrong tilt."""
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.batching import minimize
 from kcal.calibrate.bundle.board_problem import BoardState
-from kcal.calibrate.bundle.closed_form import flipped_poses
+from kcal.calibrate.bundle.closed_form import flipped_poses, homographies, poses_from_homographies, spread_out
 from kcal.calibrate.bundle.views import Views
+from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
 
@@ -16,6 +18,36 @@ _ROUGH = LMOptions(max_iterations=10, tolerance=1e-4)
 # Most flipped poses are still this many times worse after four steps, and are dropped.
 _FIRST_STEPS = LMOptions(max_iterations=4, tolerance=1e-4)
 _HOPELESS = 30.0
+
+
+def poses_under(camera: Camera, views: Views, options: LMOptions) -> tuple[BoardState, Tensor]:
+    """Find each view's board pose under a known camera: in closed form from its rays, refined, with both tilts tried.
+
+    Args:
+        camera: a single camera; it stays as it is.
+        views: V views of a board.
+        options: of the solver.
+
+    Returns:
+        the state, and the cost of each view (V,) as in `refine_poses`. Both are NaN for a view whose corners with a ray
+        do not determine a homography (`spread_out`).
+    """
+    ideal, valid = camera.normalize(views.pixels)
+    ideal = torch.where(valid[..., None], ideal, torch.nan)
+    good = spread_out(views.board_points, ideal).nonzero()[:, 0]
+    count = len(views.pixels)
+    rotation, translation = ideal.new_full((count, 3, 3), torch.nan), ideal.new_full((count, 3), torch.nan)
+    cost = ideal.new_full((count,), torch.nan)
+    if len(good):
+        some, model = views.some(good), camera.model
+        pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
+        poses = poses_from_homographies(homographies(views.board_points, ideal[good]), pinhole)
+        state, cost[good] = refine_poses(some, model, BoardState.flat(camera.params.detach(), *poses), options)
+        state, flipped = unflip(some, model, state)
+        if flipped:
+            state, cost[good] = refine_poses(some, model, state, options)
+        rotation[good], translation[good] = state.rotation, state.translation
+    return BoardState.flat(camera.params.detach(), rotation, translation), cost
 
 
 def refine_poses(views: Views, model: LensModel, state: BoardState, options: LMOptions) -> tuple[BoardState, Tensor]:

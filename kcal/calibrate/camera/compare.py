@@ -15,9 +15,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardState
-from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies, spread_out
-from kcal.calibrate.bundle.poses import refine_poses, unflip
+from kcal.calibrate.bundle.poses import poses_under
 from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.calibrate import calibrate_camera
@@ -25,7 +23,6 @@ from kcal.calibrate.camera.options import HYBRID, CalibrationOptions
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
-from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
 
@@ -156,7 +153,9 @@ def compare_models(
             covariances = observations.covariances() if options.weighted else None
             if covariances is not None and not weighted:
                 weights, weighted = whitening(covariances, 0.5 * found.rms**2), True
-            by_view = _held_out(found.camera, found.board_points, observations.pixels()[out], weights[out])
+            test = Views(board_points=found.board_points, pixels=observations.pixels()[out], whitening=weights[out])
+            _, by_view = poses_under(found.camera, test, _POSES)
+            by_view = torch.nan_to_num(2.0 * by_view, nan=math.inf)
             for g in held:
                 costs[number, g] = by_view[[out.index(i) for i in members[g]]].sum()
     if not bool(costs.isfinite().any()) and failures:
@@ -196,21 +195,3 @@ def _groups(
     if not 2 <= parts <= len(found):
         raise InputError(f"{len(found)} groups of views cannot be held out in {parts} parts; add views or groups")
     return found
-
-
-def _held_out(camera: Camera, board: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
-    """(V,) weighted squared residuals of views whose poses alone are solved; infinite where the lens has no image."""
-    rays, valid = camera.unproject(torch.nan_to_num(pixels))
-    used = torch.isfinite(pixels).all(-1) & valid & (rays[..., 2] > 0)
-    ideal = torch.where(used[..., None], rays[..., :2] / rays[..., 2:], torch.nan)
-    good = spread_out(board, ideal)
-    costs = torch.full((len(pixels),), torch.inf, dtype=torch.float64)
-    if bool(good.any()):
-        pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-        poses = poses_from_homographies(homographies(board, ideal[good]), pinhole)
-        views = Views(board_points=board, pixels=pixels[good], whitening=weights[good])
-        state, _ = refine_poses(views, camera.model, BoardState.flat(camera.params.detach(), *poses), _POSES)
-        state, _ = unflip(views, camera.model, state)
-        _, cost = refine_poses(views, camera.model, state, _POSES)
-        costs[good] = torch.nan_to_num(2.0 * cost, nan=math.inf)
-    return costs

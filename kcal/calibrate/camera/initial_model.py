@@ -13,9 +13,8 @@ from kcal.calibrate.bundle.closed_form import (
     intrinsics_candidates,
     poses_from_homographies,
     radial_start,
-    spread_out,
 )
-from kcal.calibrate.bundle.poses import refine_poses, unflip
+from kcal.calibrate.bundle.poses import poses_under, unflip
 from kcal.calibrate.bundle.views import CameraViews
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -79,21 +78,13 @@ def first_model(
     return best[1], best[2], spent
 
 
-def poses_under(camera: Camera, views: CameraViews, names: Sequence[str]) -> BoardState:
-    """Board poses under a known camera, refined one by one, with both tilts of each tried."""
-    seen = torch.isfinite(views.pixels).all(-1)
-    camera = Camera(camera.params.detach().double().cpu(), size=camera.size, model=camera.model)
+def known_model(camera: Camera, views: CameraViews, names: Sequence[str]) -> BoardState:
+    """Begin with a known camera and the board poses under it."""
+    camera = Camera(camera.params.detach().cpu(), size=camera.size, model=camera.model)
     if camera.size != views.size:
         raise InputError(f"the known camera is of {camera.size} px, the observations of {views.size} px")
-    rays, valid = camera.unproject(torch.nan_to_num(views.pixels))
-    used = seen & valid & (rays[..., 2] > 0)
-    ideal = torch.where(used[..., None], rays[..., :2] / rays[..., 2:], torch.nan)
-    poor = (~spread_out(views.board_points, ideal)).nonzero()[:, 0].tolist()
+    state, _ = poses_under(camera, views, LMOptions(max_iterations=30))
+    poor = state.translation.isnan().any(-1).nonzero()[:, 0].tolist()
     if poor:
         raise InputError(f"view {names[poor[0]]!r}: the known camera gives too few of its corners a ray")
-    pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    poses = poses_from_homographies(homographies(views.board_points, ideal), pinhole)
-    state = BoardState.flat(camera.params, *poses)
-    state, _ = refine_poses(views, camera.model, state, LMOptions(max_iterations=30))
-    state, _ = unflip(views, camera.model, state)
     return state

@@ -20,8 +20,6 @@ from kcal.solve.lm import LMOptions, minimize
 _STEEPEST = math.radians(80.0)
 # Pixels of misfit in proportion to which the weak prior on coefficients counts; 0.3 as in `CalibrationOptions`.
 _NOISE, _WIDTH = 0.01, 0.3
-# Rays are continued to this distance, meters.
-_FAR = 1e9
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,7 +80,7 @@ def refit_camera(
     good = valid & ((angle < _STEEPEST) if not model.wide else valid)
     if int(good.sum()) < model.size + len(INTRINSICS):
         raise InputError(f"refit_camera: only {int(good.sum())} of {len(good)} directions can be shown by {model}")
-    points, wanted = _FAR * rays[good].T, pixels[good].T
+    points, wanted = rays[good].T, pixels[good].T
     names = parameter_names(model)
     free = torch.tensor([i for i, name in enumerate(names) if name != "skew"])
     reach = float(torch.tan(angle[good].max())) if not model.wide else float(angle[good].max())
@@ -104,7 +102,7 @@ def refit_camera(
     start[:4] = torch.stack([slope, slope, values[2], values[3]])
     result = minimize(DenseProblem(residual, ()), (start,), LMOptions(max_iterations=500, tolerance=1e-10))
     found = Camera(parameters(result.state[0]), size=camera.size, model=model)
-    seen, shown = found.project(_FAR * rays[good])
+    seen, shown = found.project(rays[good])
     error = (seen - pixels[good])[shown].norm(dim=-1)
     if not len(error):
         raise InputError(f"refit_camera: {model} cannot stand for this camera: its fit has no image of any direction")

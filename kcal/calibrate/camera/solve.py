@@ -15,7 +15,7 @@ from kcal.calibrate.bundle.priors import Term
 from kcal.calibrate.bundle.views import CameraViews
 from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
-from kcal.calibrate.camera.initial_model import first_model, poses_under
+from kcal.calibrate.camera.initial_model import first_model, known_model
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.search.direct_solve import solve_directly
 from kcal.calibrate.search.model_ladder import Minimum, Progress, nested_models, solve_ladder
@@ -109,7 +109,7 @@ def solve_corners(
         first, undistorted, spent = first_model(views, models[0], options.start_focal(size), rough)
     else:
         models = [model]
-        first = undistorted = poses_under(options.camera, views, names)
+        first = undistorted = known_model(options.camera, views, names)
         spent = 0
     progress(f"start ({models[0]})")
     if weak_prior is not None:

@@ -20,6 +20,7 @@ from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimize
+from kcal.solve.robust import RobustLoss
 
 # R in half diagonals: the disc on which fields live reaches a little beyond the image's corners.
 _REACH = 1.08
@@ -108,7 +109,7 @@ def cauchy_weights(problem: HybridProblem, state: HybridState, weights: Tensor) 
     shown = torch.isfinite(length) & problem.seen
     # Of two normal components, the median length is 1.18 standard deviations.
     scale = max(3.0 * float(length[shown].median()) / 1.18, LEAST_NOISE)
-    return torch.where(shown, weights / torch.sqrt(1.0 + (length / scale) ** 2), 0.0)
+    return torch.where(shown, weights * RobustLoss(kind="cauchy", scale=scale).weight(length.square()).sqrt(), 0.0)
 
 
 def _base_start(

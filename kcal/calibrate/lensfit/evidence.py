@@ -190,10 +190,7 @@ def negative_log_evidence(data: Quadratic, families: PriorFamilies, v: np.ndarra
 
 
 def maximize_evidence(
-    K: Tensor,
-    g: Tensor,
-    c: float,
-    freedom: float,
+    data: Quadratic,
     families: PriorFamilies,
     h: Tensor,
     variance: float,
@@ -202,16 +199,12 @@ def maximize_evidence(
     """The hyperparameters and the noise variance of largest evidence, and its negative logarithm.
 
     Args:
-        K: (S, S) information of the shared unknowns, poses eliminated.
-        g: (S,), see above.
-        c: likewise.
-        freedom: ν, residuals without those that poses take up.
+        data: what the views say.
         families: the priors.
         h: start.
         variance: start.
         hyperprior: of h; the typical one of the default field if not given.
     """
-    data = Quadratic(K, g, c, freedom)
     mean, sd = (part.numpy() for part in hyperprior or typical_hyperprior())
 
     values: list[float] = []

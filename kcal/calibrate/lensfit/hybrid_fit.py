@@ -17,6 +17,7 @@ from kcal.calibrate.lensfit.evidence import (
     SQUARE,
     Hyperprior,
     PriorFamilies,
+    Quadratic,
     maximize_evidence,
     typical_hyperprior,
 )
@@ -217,9 +218,8 @@ def fit_hybrid(
             # More tempering leaves fewer parameters, over which the scores scatter less, and so on: the mean of both
             # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
             tempering = found if turn < 2 else math.sqrt(tempering * found)
-        h_new, noise, loss = maximize_evidence(
-            K / tempering, g / tempering, c / tempering, freedom / tempering, families, h, variance / former, hyperprior
-        )
+        data = Quadratic(K / tempering, g / tempering, c / tempering, freedom / tempering)
+        h_new, noise, loss = maximize_evidence(data, families, h, variance / former, hyperprior)
         change = float((h_new - h).abs().max())
         h, variance = h_new, noise * tempering
         progress(f"evidence, round {turn + 1}")

@@ -10,9 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardState
-from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
-from kcal.calibrate.bundle.poses import refine_poses, unflip
+from kcal.calibrate.bundle.poses import poses_under
 from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
@@ -62,23 +60,10 @@ class Poses:
 
 
 def pose_alone(board: Tensor, pixels: Tensor, camera: Camera, solver: LMOptions) -> tuple[Poses, float]:
-    """Board poses from one camera alone, both tilts tried, and the median RMS of its views."""
-    normalized, valid = camera.normalize(pixels)
-    # Unseen corners are NaN and thereby not valid.
-    normalized = torch.where(valid[..., None], normalized, torch.nan)
-    if int(valid.sum(-1).min()) < MINIMUM_CORNERS:
-        return Poses(torch.empty(0), torch.empty(0)), math.inf
-    pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    poses = poses_from_homographies(homographies(board, normalized), pinhole)
-    state = BoardState.flat(camera.params.detach(), *poses)
-    views = Views(board_points=board, pixels=pixels)
-    state, _ = refine_poses(views, camera.model, state, solver)
-    state, flipped = unflip(views, camera.model, state)
-    if flipped:
-        state, _ = refine_poses(views, camera.model, state, solver)
-    problem = views.problem(camera.model)
+    """Board poses from one camera alone, and the median RMS of its views; infinite where one of them has no pose."""
+    state, cost = poses_under(camera, Views(board_points=board, pixels=pixels), solver)
     corners = torch.isfinite(pixels).all(-1).sum(-1)
-    rms = float((2.0 * problem.view_cost(state) / corners).sqrt().median())
+    rms = float((2.0 * cost / corners).sqrt().median())
     return Poses(state.rotation, state.translation), rms if math.isfinite(rms) else math.inf
 
 

@@ -8,7 +8,6 @@ unknown here.
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import torch
 from torch import Tensor
@@ -20,15 +19,18 @@ from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, without_wrong
 from kcal.calibrate.rig.records import item_records
 from kcal.calibrate.rig.result import ItemResidual
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
+from kcal.calibrate.rig.turns import camera_turns
 from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, relative_rows, turn_rows
 from kcal.calibrate.rig.unknowns import held
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
-from kcal.lens.pose import vector_from_rotation
+from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import StereoRig
 from kcal.solve.lm import LMOptions
 
-_NAMES = ("left then", "right then", "left", "right")
+_NAMES = ("left", "right")
+# χ² of a turn, with three degrees of freedom, that chance exceeds once in a thousand checks.
+_BEYOND_CHANCE = float(chi2_quantile(torch.tensor(3.0), 0.999))
 _SOLVER = LMOptions(residual_floor=1e-8)
 
 
@@ -67,8 +69,15 @@ class Drift:
 
     @property
     def significant(self) -> bool:
-        """Whether chance alone would show so much in less than one of a thousand checks."""
-        return self.chi2 > float(chi2_quantile(torch.tensor(3.0), 0.999))
+        """Whether chance alone would show so large a relative turn in less than one of a thousand checks."""
+        return self.chi2 > _BEYOND_CHANCE
+
+    @property
+    def left_significant(self) -> bool:
+        """The same of the left camera's turn; False where that cannot be told."""
+        if self.left is None or self.left_covariance is None:
+            return False
+        return float(self.left @ torch.linalg.solve(self.left_covariance, self.left)) > _BEYOND_CHANCE
 
     @property
     def left_out(self) -> tuple[ItemResidual, ...]:
@@ -86,21 +95,24 @@ def measure_drift(
 ) -> Drift:
     """Find how the cameras of a rig have turned.
 
-    From static features that were matched when the rig was good and are matched again (what they are and how far away
-    does not matter), from surveyed landmarks, or from far features of known range; the last tell only how the right
-    camera has turned if the left one has not. Features that moved are left out.
+    From static features that were marked when the rig was good and are marked again (what they are and how far away
+    does not matter): errors of the rig and its lenses cancel, and equal marks give exactly no drift. Or from surveyed
+    landmarks, or from far features of known range; the last tell only how the right camera has turned if the left one
+    has not. What moved, or contradicts the rest, is left out.
 
     Args:
         rig: as it was solved.
-        features: pixels (F, 4, 2): left and right then, left and right now; NaN then where they have no history.
-        landmarks: pixels (L, 2, 2), left and right now.
+        features: pixels (F, 4, 2): left and right then, left and right now. If any has a mark then, only those with a
+            mark then and now in the same camera are used; otherwise those of known range.
+        landmarks: pixels (L, 2, 2), left and right now; not with features that have a mark then.
         pose: rotation cam_from_local (3, 3) and center (3,) of the left camera when the rig was solved, in the frame of
             the landmarks; needed with these.
         before: (3, 3) covariances of the relative turn and of the left camera's attitude (about its own axes) when the
-            rig was solved. Without a history they are part of what a turn is compared with; with one they cancel.
+            rig was solved: part of what a turn is compared with, unless features have marks then.
 
     Raises:
-        InputError: nothing to measure with, or landmarks without a pose.
+        InputError: nothing to measure with, landmarks without a pose or together with features that have marks then, or
+            many features that moved.
         DegenerateError: too little to tell the turn.
 
     Example:
@@ -121,23 +133,63 @@ def measure_drift(
         raise InputError("drift: features or landmarks are needed")
     if landmarks is not None and pose is None:
         raise InputError("drift: landmarks need the left camera's pose in their frame")
-    history = features is not None and bool(torch.isfinite(features.pixels[:, :2]).all(-1).any())
-    # Without anything that ties it to then, the left camera holds the frame.
-    loose = history or landmarks is not None
+    if features is None or not bool(torch.isfinite(features.pixels[:, :2]).all(-1).any()):
+        return _against(rig, features, landmarks, pose, before)
+    if landmarks is not None:
+        raise InputError("drift: features with marks then tell the turn without errors of a survey; give either")
+    return _since(rig, features, None if pose is None else as_points("pose rotation", pose[0], 3))
+
+
+def _since(rig: StereoRig, features: Features, cam_from_local: Tensor | None) -> Drift:
+    """How the cameras have turned since the marks of then, with the left camera's attitude then, if it is known."""
+    (left, right), items, variance = camera_turns((rig.left, rig.right), _NAMES, features)
+    relative, shift = rig.right_from_left_rotation, rig.right_from_left_translation
+    turn = rotation_from_vector(right.vector)
+    change = turn @ rotation_from_vector(-(relative @ left.vector))
+    # By turns of the right and of the left camera, the change and the shift of the relative pose.
+    identity = torch.eye(3, dtype=torch.float64)
+    taken_along = torch.linalg.cross(identity, shift.expand(3, 3)).T
+    slope = torch.cat([torch.cat([identity, -relative], 1), torch.cat([taken_along, torch.zeros_like(identity)], 1)])
+    covariance = slope @ torch.block_diag(right.covariance, left.covariance) @ slope.T
+    drift = vector_from_rotation(change)
+    return Drift(
+        left=left.vector,
+        right=right.vector,
+        relative=drift,
+        left_covariance=left.covariance,
+        right_covariance=right.covariance,
+        relative_covariance=covariance[:3, :3],
+        chi2=float(drift @ torch.linalg.solve(covariance[:3, :3], drift)),
+        rig=StereoRig(rig.left, rig.right, change @ relative, turn @ shift),
+        pose_covariance=covariance,
+        cam_from_local=None if cam_from_local is None else rotation_from_vector(left.vector) @ cam_from_local,
+        items=items,
+        variance=variance,
+    )
+
+
+def _against(
+    rig: StereoRig,
+    features: Features | None,
+    landmarks: Landmarks | None,
+    pose: tuple[Tensor, Tensor] | None,
+    before: tuple[Tensor, Tensor] | None,
+) -> Drift:
+    """How the cameras stand now against how the rig was solved, from landmarks or features of known range."""
+    # Without landmarks the left camera holds the frame.
+    loose = landmarks is not None
     rotation, center = pose or (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
     rotation, center = as_points("pose rotation", rotation, 3), as_points("pose center", center, 3)
-    right = rig.right_from_left_rotation @ rotation
     right_center = center - rotation.T @ rig.right_from_left_rotation.T @ rig.right_from_left_translation
     start = Start(
-        rotation=torch.stack([rotation, right, rotation, right]),
-        center=torch.stack([center, right_center, center, right_center]),
+        rotation=torch.stack([rotation, rig.right_from_left_rotation @ rotation]),
+        center=torch.stack([center, right_center]),
     )
-    if landmarks is not None:
-        unseen = torch.full_like(landmarks.pixels, math.nan)
-        landmarks = dataclasses.replace(landmarks, pixels=torch.cat([unseen, landmarks.pixels], 1))
-    cameras = (rig.left, rig.right, rig.left, rig.right)
+    if features is not None:
+        features = dataclasses.replace(features, pixels=features.pixels[:, 2:])
+    cameras = (rig.left, rig.right)
     data = RigData(cameras=cameras, names=_NAMES, features=features, landmarks=landmarks)
-    work = Adjustment(data, start, held(cameras), 1.0, turning=[False, False, loose, True], moving=[False] * 4)
+    work = Adjustment(data, start, held(cameras), 1.0, turning=[loose, True], moving=[False] * 2)
     masks = _telling(data)
     few = "too few of the images have a mark of it"
     reasons = {
@@ -151,17 +203,16 @@ def measure_drift(
     state = work.part(masks)
     fit = goodness_of_fit(problem, state)
     known = SharedCovariance(problem, state, fit.variance)
-    covariance, determined = known.of(relative_rows(problem, state, 2, 3))
+    covariance, determined = known.of(relative_rows(problem, state, 0, 1))
     if not bool(determined[:3].all()):
         left_open = "; ".join(known.open_directions(_NAMES, absolute=True))
         raise DegenerateError(f"drift: what was seen does not determine how the cameras have turned ({left_open})")
-    turned, places = state.rotation, state.center
-    relative = turned[3] @ turned[2].T
+    relative = state.rotation[1] @ state.rotation[0].T
     drift = vector_from_rotation(relative @ rig.right_from_left_rotation.T)
-    own = [vector_from_rotation(turned[c + 2] @ turned[c].T) for c in (0, 1)]
-    alone = [known.of(turn_rows(problem, c))[0] for c in (2, 3)]
+    own = [vector_from_rotation(now @ then.T) for now, then in zip(state.rotation, start.rotation, strict=True)]
+    alone = [known.of(turn_rows(problem, c))[0] for c in (0, 1)]
     compared = covariance[:3, :3]
-    if before is not None and not history:
+    if before is not None:
         compared = compared + before[0]
         alone = [alone[0] + before[1], alone[1] + before[0] + relative @ before[1] @ relative.T]
     return Drift(
@@ -172,22 +223,20 @@ def measure_drift(
         right_covariance=alone[1] if loose else None,
         relative_covariance=compared,
         chi2=float(drift @ torch.linalg.solve(compared, drift)),
-        rig=StereoRig(rig.left, rig.right, relative, turned[3] @ (places[2] - places[3])),
+        rig=StereoRig(rig.left, rig.right, relative, state.rotation[1] @ (state.center[0] - state.center[1])),
         pose_covariance=covariance,
-        cam_from_local=turned[2] if pose is not None else None,
+        cam_from_local=state.rotation[0] if pose is not None else None,
         items=item_records(work, masks, reasons),
         variance=fit.variance,
     )
 
 
 def _telling(data: RigData) -> PerKind:
-    """Landmarks with a mark now; features seen by both cameras now, or by one then and now."""
+    """Landmarks with a mark; features of known range that both cameras see."""
     nothing = torch.zeros(0, dtype=torch.bool)
     marked = nothing if data.landmarks is None else torch.isfinite(data.landmarks.pixels).all(-1).any(-1)
-    matched = nothing
+    ranged = nothing
     if data.features is not None:
-        seen = torch.isfinite(data.features.pixels).all(-1)
-        known = torch.isfinite(data.features.inverse_range_sigma)
-        past = seen[:, :2].any(-1)
-        matched = seen[:, 2:].any(-1) & (past | (known & seen[:, 2:].all(-1)))
-    return PerKind(nothing, marked, matched)
+        seen = torch.isfinite(data.features.pixels).all(-1).all(-1)
+        ranged = seen & torch.isfinite(data.features.inverse_range_sigma)
+    return PerKind(nothing, marked, ranged)

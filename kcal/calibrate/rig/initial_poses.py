@@ -230,8 +230,8 @@ class _BoardViews:
         points, good = boards.points, []
         for c, camera in enumerate(data.cameras):
             _, valid = camera.normalize(boards.pixels[:, c])
-            enough = valid.sum(-1) >= MINIMUM_CORNERS
-            enough[enough.clone()] &= spread_out(points, boards.pixels[enough, c])
+            with_ray = torch.where(valid[..., None], boards.pixels[:, c], math.nan)
+            enough = (valid.sum(-1) >= MINIMUM_CORNERS) & spread_out(points, with_ray)
             rotation = torch.full((len(enough), 3, 3), math.nan, dtype=torch.float64)
             translation = torch.full((len(enough), 3), math.nan, dtype=torch.float64)
             if bool(enough.any()):

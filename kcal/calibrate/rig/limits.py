@@ -18,7 +18,7 @@ from kcal.calibrate.rig.unknowns import held
 from kcal.solve.lm import LMOptions, minimize
 
 # Probability that any good item at all is taken for a wrong one.
-_FALSE_ALARM = 1e-3
+FALSE_ALARM = 1e-3
 # px along an axis, RMS of a board, that lenses which are not quite their models may add to each of the two parts.
 # Measured: five coefficients on simulated ray-traced wide lenses, ordinarily put together, add 0.04 and 0.017.
 _LENS, _BETWEEN = 0.1, 0.02
@@ -41,7 +41,7 @@ def over_limit(work: Adjustment, masks: PerKind, values: PerKind, probability: f
             nearly always do, and where a kind as a whole fits worse than stated, its items are judged by that.
     """
     squares, freedom = work.squares(masks), work.freedom(masks)
-    level = probability or 1.0 - _FALSE_ALARM / max(sum(int((dof > 0).sum()) for dof in freedom), 1)
+    level = probability or 1.0 - FALSE_ALARM / max(sum(int((dof > 0).sum()) for dof in freedom), 1)
     boards = _boards_over_limit(work, masks.boards, values.boards, squares.boards, freedom.boards, level, probability)
     found = [boards]
     for mask, value, square, dof in list(zip(masks, values, squares, freedom, strict=True))[1:]:

@@ -19,9 +19,9 @@ LOSS = RobustLoss(kind="cauchy", scale=3.0)
 # Robust solutions only tell what is wrong; they need no digits.
 ROUGHLY = LMOptions(max_iterations=100, tolerance=1e-6, residual_floor=1e-8)
 # If more than this share of a source is wrong, it is not a few items that are.
-_MOST_WRONG = 0.4
+MOST_WRONG = 0.4
 # A source whose typical item is off by so many times its sigma is wrong as a whole.
-_WRONG_AS_A_WHOLE = 20.0
+WRONG_AS_A_WHOLE = 20.0
 _ROUNDS = 30
 
 
@@ -41,7 +41,7 @@ def without_wrong(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKin
     """
     squares, freedom = work.squares(masks), work.freedom(masks)
     for kind, square, dof in zip(KINDS, squares, freedom, strict=True):
-        if (times := math.sqrt(typical_ratio(square, dof))) > _WRONG_AS_A_WHOLE:
+        if (times := math.sqrt(typical_ratio(square, dof))) > WRONG_AS_A_WHOLE:
             raise InputError(
                 f"the {kind} contradict each other or the rest: typically they are {times:.0f} times as far off as "
                 "their sigmas say; check names, units, heights, sigmas and that the cameras are these"
@@ -82,7 +82,7 @@ def possible(work: Adjustment, masks: PerKind) -> PerKind:
 def _refuse_many(work: Adjustment, kept: PerKind, masks: PerKind) -> None:
     for kind, after, before in zip(KINDS, kept, masks, strict=True):
         gone, total = int((before & ~after).sum()), int(before.sum())
-        if gone > max(1, _MOST_WRONG * total):
+        if gone > max(1, MOST_WRONG * total):
             names: Sequence[str] = [work.names(kind)[i] for i in (before & ~after).nonzero()[:, 0].tolist()]
             raise InputError(
                 f"{gone} of {total} {kind} contradict the rest ({', '.join(names[:6])}{' ...' if gone > 6 else ''}): "

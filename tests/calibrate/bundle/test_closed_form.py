@@ -16,7 +16,7 @@ from kcal.calibrate.bundle.closed_form import (
     radial_start,
     spread_out,
 )
-from kcal.calibrate.bundle.poses import refine_poses, unflip
+from kcal.calibrate.bundle.poses import poses_under, refine_poses, unflip
 from kcal.calibrate.bundle.views import Views
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
@@ -225,3 +225,23 @@ class TestUnflip:
         assert cost.shape == (4,)
         assert bool((cost[[0, 1, 3]] < 1e-18).all())
         assert float(cost[2]) > 1e-4
+
+
+class TestPosesUnder:
+    def test_poses_are_found_and_views_without_one_are_told(self) -> None:
+        truth = camera()
+        # Boards this small have twins: from closed forms alone, the first pose ends at the wrong tilt.
+        poses = motions(truth, 6, 2, fill=0.04)
+        pixels = pixels_of(truth, poses, noise=0.2)
+        # One row of corners, and nothing at all.
+        pixels[1, 7:] = torch.nan
+        pixels[4] = torch.nan
+        views = Views(board_points=BOARD.points, pixels=pixels)
+        state, cost = poses_under(truth, views, LMOptions())
+        assert cost.isnan().nonzero()[:, 0].tolist() == [1, 4]
+        assert state.rotation.isnan().any(-1).any(-1).tolist() == cost.isnan().tolist()
+        good = [0, 2, 3, 5]
+        best, least = refine_poses(views.some(good), truth.model, state_of(truth, poses).views(good), LMOptions())
+        torch.testing.assert_close(cost[good], least, rtol=1e-6, atol=0)
+        torch.testing.assert_close(state.rotation[good], best.rotation, rtol=0, atol=1e-4)
+        assert poses_under(truth, views.some([4]), LMOptions())[1].isnan().all()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.lensfit.board_modes import BENDING, PRINT, STRETCH, board_modes
-from kcal.calibrate.lensfit.evidence import maximize_evidence, prior_families, typical_hyperprior
+from kcal.calibrate.lensfit.evidence import Quadratic, maximize_evidence, prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.corners.board import Board
@@ -213,7 +213,7 @@ def test_prior_slopes() -> None:
 def test_evidence_is_that_of_the_linear_model() -> None:
     """-ln p of a Gaussian linear model, by the covariance of the data, up to a constant; and it is a maximum."""
     K, g, c, families = linear_case()
-    h, variance, loss = maximize_evidence(K, g, c, 400.0, families, typical_hyperprior().mean, 0.09)
+    h, variance, loss = maximize_evidence(Quadratic(K, g, c, 400.0), families, typical_hyperprior().mean, 0.09)
 
     def value(h: Tensor, variance: float) -> float:
         d = families.deviation(h)
@@ -244,11 +244,11 @@ def test_evidence_is_found_where_a_trial_cannot_be_factorized() -> None:
     rows = few @ torch.randn(5, len(wide), generator=generator, dtype=torch.float64) / wide
     truth = 30.0 * wide * torch.randn(len(wide), generator=generator, dtype=torch.float64)
     target = rows @ truth + 0.3 * torch.randn(400, generator=generator, dtype=torch.float64)
-    data = rows.T @ rows, rows.T @ target, float(target @ target), 400.0
-    found, variance, loss = maximize_evidence(*data, families, h, 100.0)
+    data = Quadratic(rows.T @ rows, rows.T @ target, float(target @ target), 400.0)
+    found, variance, loss = maximize_evidence(data, families, h, 100.0)
     assert float((found - h).abs().max()) > 0.5
     assert variance < 1.0
-    _, _, again = maximize_evidence(*data, families, found, variance)
+    _, _, again = maximize_evidence(data, families, found, variance)
     assert loss == pytest.approx(again, abs=0.5)
 
 

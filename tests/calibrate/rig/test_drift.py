@@ -75,12 +75,56 @@ class TestFeatures:
         assert not still.significant
         assert measure_drift(RIG, features=static(40, 0.1)).significant
 
+    def test_equal_marks_give_exactly_no_drift_whatever_errors_the_rig_has(self) -> None:
+        wrong = rotation_from_vector(tensor(3e-4, -2e-4, 1e-4))
+        rig = StereoRig(
+            RIG.left, RIG.right, wrong @ RIG.right_from_left_rotation, wrong @ RIG.right_from_left_translation
+        )
+        features = static(20, 0.1)
+        features.pixels[:, 2:] = features.pixels[:, :2]
+        found = measure_drift(rig, features=features)
+        assert found.left is not None
+        assert found.right is not None
+        assert not torch.stack([found.left, found.right, found.relative]).any()
+        assert torch.equal(found.rig.right_from_left_rotation, rig.right_from_left_rotation)
+        assert torch.equal(found.rig.right_from_left_translation, rig.right_from_left_translation)
+        assert (found.chi2, found.variance, found.left_out) == (0.0, 1.0, ())
+        assert not found.significant
+        assert not found.left_significant
+        # And a turn is found as with the true rig.
+        turned = measure_drift(rig, features=static(20))
+        assert turned.left is not None
+        assert turned.right is not None
+        torch.testing.assert_close(torch.stack([turned.left, turned.right]), TURN, rtol=0, atol=1e-10)
+
+    def test_the_rig_that_turns_as_a_whole(self) -> None:
+        """Both cameras turn about the vertical: ranges stay, directions do not."""
+        up = tensor(0.0, 0.0, 2e-4)
+        found = measure_drift(RIG, features=static(40, 0.1, turns=torch.stack([side @ up for side in ROTATION[:2]])))
+        assert not found.significant
+        assert found.left_significant
+
+    def test_covariance_of_the_pose_is_the_spread(self) -> None:
+        """12 checks of five free numbers: the right camera turns about its center, which stays on a sphere."""
+        total, shift = 0.0, rotation_from_vector(TURN[1]) @ RIG.right_from_left_translation
+        for seed in range(0, 12_000, 1000):
+            found = measure_drift(RIG, features=static(15, 0.1, seed))
+            turn = vector_from_rotation(
+                found.rig.right_from_left_rotation @ (rotation_from_vector(relative_turn()) @ RELATIVE).T
+            )
+            error = torch.cat([turn, found.rig.right_from_left_translation - shift])
+            total += float(error @ torch.linalg.pinv(found.pose_covariance, rtol=1e-9, hermitian=True) @ error)
+        assert abs(total - 60) < 4 * (2 * 60) ** 0.5
+
     def test_what_moved_is_named(self) -> None:
         features = static(20, 0.1)
         features.pixels[3, 2:] += tensor([6.0, 1.0], [5.0, 1.0])
         features.pixels[8, 3] += tensor(0.0, 4.0)
         found = measure_drift(RIG, features=features)
         assert {item.name for item in found.left_out} == {"s3", "s8"}
+        first = found.left_out[0]
+        assert first.pixels == pytest.approx((37**0.5, 26**0.5), abs=0.5)
+        assert first.reason.startswith(f"it has moved by {first.pixels[0]:.1f} px (left), ")
         error = found.relative - relative_turn()
         assert bool((error.abs() < 4.5 * found.relative_covariance.diagonal().sqrt()).all())
 
@@ -123,6 +167,33 @@ class TestRefusals:
             measure_drift(RIG, landmarks=landmarks())
         with pytest.raises(DegenerateError, match="two features or landmarks"):
             measure_drift(RIG, features=static(1))
+        with pytest.raises(InputError, match="give either"):
+            measure_drift(RIG, features=static(9), landmarks=landmarks(), pose=(ROTATION[0], CENTER[0]))
+
+    def test_marks_of_other_things(self) -> None:
+        features = static(20, 0.1)
+        features.pixels[:9, 2:] += 30.0 * normal((9, 2, 2), 7)
+        with pytest.raises(InputError, match="9 of 20 features have moved against the rest"):
+            measure_drift(RIG, features=features)
+        features.pixels[:, 2:] = features.pixels[torch.arange(20).flip(0), 2:]
+        with pytest.raises(InputError, match=r"no turn explains the marks: typically they are \d+ times"):
+            measure_drift(RIG, features=features)
+
+    def test_marks_that_tell_nothing(self) -> None:
+        one = static(4)
+        one.pixels[:] = one.pixels[:1].clone()
+        with pytest.raises(DegenerateError, match="marks in one place"):
+            measure_drift(RIG, features=one)
+        blind = static(4)
+        blind.pixels[1:, 3] = math.nan
+        with pytest.raises(DegenerateError, match="right has 1 with marks then and now"):
+            measure_drift(RIG, features=blind)
+
+    def test_features_that_have_no_mark_of_then_are_named(self) -> None:
+        features = static(6)
+        features.pixels[2, :2] = math.nan
+        (item,) = measure_drift(RIG, features=features).left_out
+        assert (item.name, item.reason) == ("s2", "no camera has a mark of it both then and now")
 
 
 def test_scene_sees_its_features() -> None:
