@@ -97,6 +97,7 @@ from kcal.lens.rig import StereoRig as StereoRig
 from kcal.lens.spline import Spline as Spline
 from kcal.lens.uncertainty import image_sigma as image_sigma
 from kcal.lens.uncertainty import pixel_covariance as pixel_covariance
+from kcal.lens.uncertainty import projection_sigma as projection_sigma
 from kcal.lens.zernike import ZernikeModes as ZernikeModes
 from kcal.locate.budget import BudgetErrors as BudgetErrors
 from kcal.locate.budget import RangeError as RangeError

@@ -143,6 +143,7 @@ PUBLIC = {
     "pair_by_name",
     "paired_boards",
     "pixel_covariance",
+    "projection_sigma",
     "placed_rig",
     "planned_rig",
     "position_errors",

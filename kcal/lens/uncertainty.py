@@ -1,41 +1,53 @@
-"""How uncertain the image of a far direction is, from the covariance of a camera's parameters."""
+"""How uncertain a camera's image is, from what its calibration knows."""
 
 from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from kcal.lens.pupil import FAR
 
+if TYPE_CHECKING:
+    from kcal.lens.camera import Camera
+
 
 def pixel_covariance(
-    camera: Camera, pixels: Tensor, covariance: Tensor | None = None, *, grid: tuple[int, int] = (25, 17)
+    camera: Camera,
+    places: Tensor,
+    covariance: Tensor | None = None,
+    *,
+    at: float = math.inf,
+    grid: tuple[int, int] = (25, 17),
 ) -> Tensor:
-    """Covariance of where the camera sees what is far away, after the best turn of the whole camera.
+    """Covariance of where the camera sees things, after the best turn of the whole camera.
 
     No board determines how the camera's frame is turned in its housing, and a rig solves its cameras' attitudes anew.
-    So the change of the image that a turn undoes does not count: the turn for which the squared change is smallest,
-    summed over a grid of the image (mrcal calls it the implied rotation at infinity).
+    So the change of the image that a turn undoes does not count: the turn for which the squared change at infinity is
+    smallest, summed over a grid of the image (mrcal calls it the implied rotation at infinity).
 
     Args:
         camera: a single camera.
-        pixels: (..., N, 2).
+        places: (..., N, 2) pixels, or (..., N, 3) rays in the camera's frame.
         covariance: (5 + P, 5 + P) of its parameters; None: that of its calibration.
+        at: distance of the things, meters; lenses whose entrance pupil moves differ near and far.
         grid: columns and rows.
 
     Returns:
         (..., N, 2, 2) px²; NaN where the camera has no ray.
 
     Raises:
-        InputError: a batch of cameras, or a camera without a covariance.
+        InputError: a batch of cameras, a camera without a covariance, or a distance that is not positive.
 
     Example:
+        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
         >>> shifts = torch.diag(torch.tensor([0.0, 0, 1, 1, 0], dtype=torch.float64))  # 1 px of the principal point
         >>> found = pixel_covariance(camera, torch.tensor([[319.5, 239.5], [0.0, 0.0]]), shifts)
@@ -50,44 +62,78 @@ def pixel_covariance(
         known = CameraInformation.from_covariance(params, covariance)
     if known is None:
         raise InputError("pixel_covariance: the camera has no covariance: calibrate it with kcal, or give one")
-    places = as_points("pixels", pixels, 2)
-    flat = places.reshape(-1, 2)
+    if not at > 0:
+        raise InputError(f"pixel_covariance: a positive distance is needed, got {at}")
+    rays = isinstance(places, Tensor) and places.ndim > 0 and places.shape[-1] == 3
+    places = as_points("rays" if rays else "pixels", places, 3 if rays else 2)
+    flat = places.reshape(-1, places.shape[-1])
     wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
     half = known.by_parameter(known.half())[:, wanted]
-    by_camera, by_turn, good = _slopes_at_infinity(camera, camera.grid(*grid).reshape(-1, 2), wanted)
+    by_camera, by_turn, good = _slopes(camera, camera.grid(*grid).reshape(-1, 2), math.inf, wanted)
     # The turn that best undoes each parameter's effect.
     undo = torch.linalg.lstsq(by_turn[good].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
-    by_camera, by_turn, good = _slopes_at_infinity(camera, flat, wanted)
+    by_camera, by_turn, good = _slopes(camera, flat, at, wanted)
     by_camera = by_camera - by_turn @ undo
     spread = by_camera @ half.T
     found = spread @ spread.transpose(-1, -2)
     return torch.where(good[:, None, None], found, torch.nan).reshape(*places.shape[:-1], 2, 2)
 
 
-def image_sigma(camera: Camera, columns: int = 33, rows: int = 25) -> Tensor:
-    """(rows, columns) standard deviation in pixels of far directions, in the direction in which it is largest.
+def projection_sigma(camera: Camera, places: Tensor, *, at: float = math.inf) -> Tensor:
+    """Standard deviation in pixels of where the camera sees things, in the direction in which it is largest.
 
-    On a grid whose outermost points are the outermost pixels, after the best turn (`pixel_covariance`); NaN where the
-    camera has no ray.
+    After the best turn of the camera (`pixel_covariance`); it grows where no board was.
+
+    Args:
+        camera: a single camera, with its calibration.
+        places: (..., N, 2) pixels, or (..., N, 3) rays in the camera's frame.
+        at: distance of the things, meters.
+
+    Returns:
+        (..., N); NaN where the camera has no ray.
+
+    Raises:
+        InputError: see `pixel_covariance`.
 
     Example:
         >>> from kcal.lens.calibration import CameraCalibration
+        >>> from kcal.lens.camera import Camera
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
+        >>> longer = torch.diag(torch.tensor([1.0, 0, 0, 0, 0], dtype=torch.float64))  # fx ± 1 px
+        >>> camera.calibration = CameraCalibration(covariance=longer)
+        >>> [round(float(value), 2) for value in projection_sigma(camera, torch.tensor([[0.0, 239.5], [319.5, 239.5]]))]
+        [0.4, 0.0]
+    """
+    found = pixel_covariance(camera, places, at=at)
+    good = found.isfinite().all(-1).all(-1)
+    largest = torch.linalg.eigvalsh(torch.where(good[..., None, None], found, 0.0))[..., -1]
+    return torch.where(good, largest.clamp_min(0.0).sqrt(), torch.nan)
+
+
+def image_sigma(camera: Camera, columns: int = 33, rows: int = 25) -> Tensor:
+    """(rows, columns) `projection_sigma` at infinity on a grid whose outermost points are the outermost pixels.
+
+    Example:
+        >>> from kcal.lens.calibration import CameraCalibration
+        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
         >>> longer = torch.diag(torch.tensor([1.0, 0, 0, 0, 0], dtype=torch.float64))  # fx ± 1 px
         >>> camera.calibration = CameraCalibration(covariance=longer)
         >>> [round(float(value), 2) for value in image_sigma(camera, 3, 3)[1]]
         [0.4, 0.0, 0.4]
     """
-    found = pixel_covariance(camera, camera.grid(columns, rows).reshape(-1, 2))
-    good = found.isfinite().all(-1).all(-1)
-    largest = torch.linalg.eigvalsh(torch.where(good[:, None, None], found, 0.0))[:, -1]
-    return torch.where(good, largest.clamp_min(0.0).sqrt(), torch.nan).reshape(rows, columns)
+    return projection_sigma(camera, camera.grid(columns, rows))
 
 
-def _slopes_at_infinity(camera: Camera, pixels: Tensor, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Derivatives of far directions' pixels by parameters (N, 2, C) and by a turn (N, 2, 3), and which have them."""
-    rays, valid = camera.unproject(pixels)
+def _slopes(camera: Camera, places: Tensor, at: float, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Derivatives of the pixels of pixels or rays by parameters (N, 2, C) and a turn (N, 2, 3), and which have them."""
+    if places.shape[-1] == 3:
+        length = torch.linalg.vector_norm(places, dim=-1)
+        rays, valid = places / length[:, None], length > 0
+    else:
+        rays, valid = camera.unproject(places)
     rays = torch.where(valid[:, None], rays, rays.new_tensor([0.0, 0.0, 1.0]))
-    seen = project_components(FAR * rays.T, camera.params.detach(), camera.model, wanted)
-    by_turn = step_rows(seen.by_point, FAR * rays.T)[:3]
+    points = FAR * rays if math.isinf(at) else camera.ray_origins(rays) + at * rays
+    seen = project_components(points.T, camera.params.detach(), camera.model, wanted)
+    by_turn = step_rows(seen.by_point, points.T)[:3]
     return seen.by_camera.permute(2, 1, 0), by_turn.permute(2, 1, 0), valid & seen.regular

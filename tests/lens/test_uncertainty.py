@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from lenses import HYBRID, strong
 from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.uncertainty import image_sigma, pixel_covariance
+from kcal.lens.uncertainty import image_sigma, pixel_covariance, projection_sigma
 from kcal.sim.infinity import error_at_infinity
 
 SIZE = (640, 480)
@@ -66,6 +67,30 @@ def dataclass_camera(camera: Camera, covariance: torch.Tensor) -> Camera:
     return camera
 
 
+@pytest.mark.parametrize("at", [0.5, 20.0, math.inf])
+def test_projection_sigma_near_and_far(at: float) -> None:
+    """Pixels and their rays agree; a change of the pupil moves what is near, by f ζ θ² sin θ cos θ / distance."""
+    camera = CAMERAS["hybrid"]
+    pupil = camera.names.index("pupil1")
+    covariance = torch.zeros(len(camera.names), len(camera.names), dtype=torch.float64)
+    covariance[pupil, pupil] = 1e-6
+    known = dataclass_camera(camera.with_parameters(camera.params.detach().clone()), covariance)
+    pixels = torch.tensor([[100.0, 235.0], [325.0, 235.0], [600.0, 400.0]], dtype=torch.float64)
+    rays, valid = known.unproject(pixels)
+    assert bool(valid.all())
+    found = known.projection_sigma(pixels, at=at)
+    torch.testing.assert_close(found, projection_sigma(known, 7.0 * rays, at=at), rtol=1e-6, atol=1e-9)
+    if math.isinf(at):
+        # To the rounding of rays that are followed for 1e12 m.
+        assert float(found.abs().max()) < 1e-9
+        return
+    moved = known.params.detach().clone()
+    moved[pupil] += 1e-3
+    points = known.ray_origins(rays) + at * rays
+    there, _ = known.with_parameters(moved).project(points)
+    torch.testing.assert_close(found, (there - pixels).norm(dim=-1), rtol=0.02 / at, atol=1e-4)
+
+
 def test_refusals() -> None:
     camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=SIZE, model="pinhole")
     pixels = torch.tensor([[1.0, 2.0]], dtype=torch.float64)
@@ -73,6 +98,8 @@ def test_refusals() -> None:
         pixel_covariance(camera, pixels)
     with pytest.raises(InputError, match=r"\(5, 5\)"):
         pixel_covariance(camera, pixels, torch.eye(3, dtype=torch.float64))
+    with pytest.raises(InputError, match="positive distance"):
+        pixel_covariance(camera, pixels, torch.eye(5, dtype=torch.float64), at=0.0)
     many = Camera(camera.params.detach().expand(2, -1).clone(), size=SIZE, model="pinhole")
     with pytest.raises(InputError, match="single camera"):
         pixel_covariance(many, pixels)
