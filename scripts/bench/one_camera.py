@@ -27,7 +27,6 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.lensfit.cameras_fit import measure_board
 from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
 from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.solve import RigOptions
@@ -95,14 +94,10 @@ def epipolar(rig: StereoRig, left: Tensor, right: Tensor) -> Tensor:
 
 
 def rig_of(model: str, sides: list[Observations]) -> StereoRig:
-    """Both cameras and the rig, from the same pairs."""
-    if model == "hybrid":
-        board = measure_board(sides)
-        options = CalibrationOptions(board=board[0] if len(board) == 1 else "printed")
-    else:
-        name, _, prior = model.partition(", ")
-        options = CalibrationOptions(model=name, weak_prior=0.3 if prior else None)
-    cameras = [calibrate_camera(seen, options).camera for seen in sides]
+    """Both cameras and the rig by default, from the same pairs: lenses, board and pose are refined together."""
+    name, _, prior = model.partition(", ")
+    options = CalibrationOptions(model=name, weak_prior=0.3 if prior else None)
+    cameras = [calibrate_camera(seen, options if name != "hybrid" else None).camera for seen in sides]
     pairs = list(zip(sides[0].names, sides[1].names, strict=True))
     return calibrate_rig(cameras[0], cameras[1], sides[0], sides[1], pairs, RigOptions(reject=False)).stereo()
 
