@@ -114,6 +114,13 @@ def test_bad_arguments(arguments: dict, message: str) -> None:
         TruthLens(**arguments)
 
 
+def test_a_larger_lens_has_the_same_image_and_moves_its_pupil_farther() -> None:
+    small, large = (drawn_lens("surveillance", 1.0, 4, focal_mm=focal_mm, wander=1.0) for focal_mm in (2.8, 5.6))
+    assert large.pupil_wander == pytest.approx(2 * small.pupil_wander, rel=1e-6)
+    pixels = torch.tensor([[0.0, 0.0], [1700.0, 300.0]], dtype=torch.float64)
+    torch.testing.assert_close(large.unproject(pixels)[0], small.unproject(pixels)[0], atol=1e-11, rtol=0)
+
+
 def test_captures_are_seeded_and_their_noise_scales() -> None:
     lens = drawn_lens("machine-vision", 1.0, 4)
     one, two = (capture_corners(lens, 6, sigma=sigma, seed=9) for sigma in (0.1, 0.2))
