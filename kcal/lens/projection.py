@@ -39,12 +39,14 @@ class Projection(NamedTuple):
         by_camera: (..., C, 2, N), by the wanted camera parameters.
         regular: (..., N), in front of the camera (for a fisheye: anywhere), before any pole, and not folded
             (det J > 0).
+        by_meter: (..., 2, N), by `meter`; None for a lens without a moving pupil.
     """
 
     pixels: Tensor
     by_point: Tensor
     by_camera: Tensor
     regular: Tensor
+    by_meter: Tensor | None = None
 
 
 def to_pixels(x: Tensor, y: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
@@ -65,19 +67,22 @@ def project_components(
     parameters: Tensor,
     model: LensModel,
     wanted: Sequence[int] | None = None,
+    meter: Tensor | float = 1.0,
 ) -> Projection:
     """Project points given as (..., 3, N), with derivatives by the point and the wanted camera parameters.
 
     Args:
-        points: (..., 3, N) in the camera frame, meters.
+        points: (..., 3, N) in the camera frame, meters, or in units of which a meter is `meter`.
         parameters: (..., 5 + P), broadcast against the leading shape of `points`.
         model: the lens model.
         wanted: indices of the camera parameters of `by_camera`; None: no derivatives, `by_point` and `by_camera` are
             empty.
+        meter: (..., N) of homogeneous points, which are a point times its inverse distance: that inverse distance.
+            Only an entrance pupil that moves depends on it.
     """
     X, Y, Z = points[..., 0, :], points[..., 1, :], points[..., 2, :]
     offset = len(INTRINSICS)
-    pupil = entrance_pupil(X, Y, Z, parameters[..., offset:]) if model.hybrid else None
+    pupil = entrance_pupil(X, Y, Z, parameters[..., offset:], meter) if model.hybrid else None
     if pupil:
         Z = Z - pupil.depth
     x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(X, Y, Z, model)
@@ -106,8 +111,10 @@ def project_components(
         columns = [ux, vx, uy, vy, -(ux * x + uy * y), -(vx * x + vy * y)]
     by_point = torch.stack(torch.broadcast_tensors(*columns), -2).unflatten(-2, (3, 2))
 
+    by_meter = None
     if pupil:
         by_depth = by_point[..., 2, :, :]
+        by_meter = -by_depth * pupil.by_meter(parameters[..., offset:])[..., None, :]
         moved = torch.stack(torch.broadcast_tensors(*pupil.by_point(X, Y, Z)), -2)[..., None, :]
         by_point = by_point - by_depth[..., None, :, :] * moved
 
@@ -129,4 +136,4 @@ def project_components(
         for place, rate in enumerate(pupil.by_coefficients(), offset + 1):
             if place in wanted:
                 by_camera[..., list(wanted).index(place), :, :] = -by_depth * rate[..., None, :]
-    return Projection(pixels, by_point, by_camera, regular)
+    return Projection(pixels, by_point, by_camera, regular, by_meter)

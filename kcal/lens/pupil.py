@@ -40,6 +40,7 @@ class Pupil(NamedTuple):
         square: θ² of the ray.
         rate: derivative of ζ₁ θ² + ζ₂ θ⁴ by d, divided by ρ².
         gain: 1 / (1 - rate ρ²), the derivative of the solution by a shift of the right side.
+        meter: what a meter measures in the units of the points.
     """
 
     depth: Tensor
@@ -47,6 +48,7 @@ class Pupil(NamedTuple):
     square: Tensor
     rate: Tensor
     gain: Tensor
+    meter: Tensor | float
 
     def by_point(self, X: Tensor, Y: Tensor, below: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Derivatives of the depth by X, Y and Z of the point; `below` is Z - d."""
@@ -55,8 +57,12 @@ class Pupil(NamedTuple):
 
     def by_coefficients(self) -> tuple[Tensor, Tensor]:
         """Derivatives of the depth by ζ₁ and ζ₂."""
-        first = self.gain * self.square
+        first = self.meter * self.gain * self.square
         return first, first * self.square
+
+    def by_meter(self, coefficients: Tensor) -> Tensor:
+        """Derivative of the depth by what a meter measures, of points that stay as they are."""
+        return self.gain * pupil_depth(self.square, coefficients)
 
 
 def pupil_depth(square: Tensor, coefficients: Tensor) -> Tensor:
@@ -65,15 +71,19 @@ def pupil_depth(square: Tensor, coefficients: Tensor) -> Tensor:
     return (first + second * square) * square
 
 
-def ray_starts(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+def ray_starts(
+    X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, meter: Tensor | float = 1.0
+) -> tuple[Tensor, Tensor]:
     """Find the depth (..., N) at which the rays to points start, for a hybrid lens (..., P), and whether it was found.
+
+    Points and depth are in units of which a meter is `meter` (..., N). At infinity that is 0, and the pupil stays.
 
     Two of Newton's steps are in the autograd graph; at a solution these have its exact first and second derivatives.
     """
     with torch.no_grad():
         depth = torch.zeros_like(Z)
         for _ in range(_STEPS):
-            wanted, pupil = _pupil_at(X, Y, Z, coefficients, depth)
+            wanted, pupil = _pupil_at(X, Y, Z, coefficients, depth, meter)
             step = (wanted - depth) * pupil.gain
             depth = depth + step
             found = pupil.found & (step * step <= _LAST_STEP**2 * (X * X + Y * Y + Z * Z))
@@ -81,25 +91,27 @@ def ray_starts(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor) -> tuple[T
                 break
     if is_differentiated(X, Y, Z, coefficients):
         for _ in range(2):
-            wanted, pupil = _pupil_at(X, Y, Z, coefficients, depth)
+            wanted, pupil = _pupil_at(X, Y, Z, coefficients, depth, meter)
             depth = depth + (wanted - depth) * pupil.gain
     return depth, found
 
 
-def entrance_pupil(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor) -> Pupil:
+def entrance_pupil(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, meter: Tensor | float = 1.0) -> Pupil:
     """As `ray_starts`, with what closed-form derivatives need."""
-    depth, found = ray_starts(X, Y, Z, coefficients)
-    _, pupil = _pupil_at(X, Y, Z, coefficients, depth)
+    depth, found = ray_starts(X, Y, Z, coefficients, meter)
+    _, pupil = _pupil_at(X, Y, Z, coefficients, depth, meter)
     return pupil._replace(found=found)
 
 
-def _pupil_at(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, depth: Tensor) -> tuple[Tensor, Pupil]:
+def _pupil_at(
+    X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, depth: Tensor, meter: Tensor | float
+) -> tuple[Tensor, Pupil]:
     """The right side of the equation for a ray that starts at `depth`."""
     first, second = unbind_last(coefficients[..., 1:3])
     across, below = X * X + Y * Y, Z - depth
     ratio = angle_over_distance(X, Y, below)
     square = ratio * ratio * across
     # θ² grows by 2 θ ρ / R² with d.
-    rate = 2.0 * (first + 2.0 * second * square) * ratio / (across + below * below)
+    rate = 2.0 * meter * (first + 2.0 * second * square) * ratio / (across + below * below)
     gain = (1.0 - rate * across).reciprocal()
-    return (first + second * square) * square, Pupil(depth, gain > 0, square, rate, gain)
+    return meter * (first + second * square) * square, Pupil(depth, gain > 0, square, rate, gain, meter)

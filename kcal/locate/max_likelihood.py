@@ -82,6 +82,7 @@ class _Fixed(NamedTuple):
     """What stays fixed while (a, b, ρ) moves."""
 
     cameras: Sequence[RelativeCamera]
+    scale: Tensor
     base: Tensor
     sides: Tensor
     shifts: list[Tensor]
@@ -118,7 +119,7 @@ def most_likely(
     sides = torch.stack([side.mT for side in side_axes(start[0].detach())], -3)
     wanted = tuple(tuple(range(s.camera.values.shape[-1])) if by_camera else () for s in cameras)
     shifts = [camera.translation / scale for camera in cameras]
-    fixed = _Fixed(cameras, base, sides, shifts, pixels, usable, weight, tuple(() for _ in cameras))
+    fixed = _Fixed(cameras, scale, base, sides, shifts, pixels, usable, weight, tuple(() for _ in cameras))
     zero = torch.zeros_like(start[1])
     with torch.no_grad():
         theta = torch.stack([zero, zero, torch.where(usable, start[1], 0.0)], -2)
@@ -170,10 +171,16 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
         if not known_true(good):
             # The axis is a harmless stand-in: no NaN in values or gradients.
             seen = torch.where(good[..., None, :], seen, seen.new_tensor([[0.0], [0.0], [1.0]]))
-        projection = project_components(seen, camera.camera.values, camera.camera.model, fixed.wanted[number])
+        # `seen` is the point times ρ / scale, so small that an entrance pupil seems to move too far.
+        meter = inverse[..., 0, :] / fixed.scale
+        projection = project_components(seen, camera.camera.values, camera.camera.model, fixed.wanted[number], meter)
         columns = torch.stack([along, across, shift[:, None].expand_as(along)], -3)
         # (..., 3 unknowns, 3 of the point, 2, N) summed over the point.
-        rows.append((columns[..., None, :] * projection.by_point[..., None, :, :, :]).sum(-3))
+        slopes = (columns[..., None, :] * projection.by_point[..., None, :, :, :]).sum(-3)
+        if projection.by_meter is not None:
+            last = slopes[..., 2:, :, :] + projection.by_meter[..., None, :, :] / fixed.scale
+            slopes = torch.cat([slopes[..., :2, :, :], last], -3)
+        rows.append(slopes)
         predicted.append(projection.pixels)
         projections.append(projection)
         turned.append(ahead)

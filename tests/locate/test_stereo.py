@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lenses import hybrid_camera
 from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turned
 
 from kcal.errors import DegenerateError, InputError
@@ -28,6 +29,18 @@ def test_exact_marks_give_the_point_back_through_real_lenses() -> None:
     assert (result.points - points)[near].norm(dim=-1).max() < 1e-9
     assert ((result.points - points).norm(dim=-1) / points.norm(dim=-1)).max() < 1e-10
     assert result.reprojection.max() < 1e-10
+
+
+def test_pupils_move_by_meters_at_any_range() -> None:
+    left, right = hybrid_camera("wide", 1), hybrid_camera("wide", 2)
+    right = right.with_parameters(right.params.index_put((tensor(6).long(),), tensor(-0.004)))
+    rotation = turned(0.5, 0.3, -1.0)
+    rig = StereoRig(left, right, rotation, rotation @ -tensor(10, 0.1, -0.2))
+    points = spread_points(torch.logspace(0.8, 5, 60, dtype=torch.float64))
+    seen_left, seen_right, seen = rig(points)
+    result = Triangulate(rig)(seen_left[seen], seen_right[seen])
+    assert int(seen.sum()) > 40
+    torch.testing.assert_close(1 / result.points.norm(dim=-1), 1 / points[seen].norm(dim=-1), rtol=0, atol=1e-13)
 
 
 @settings(max_examples=25, deadline=None)
