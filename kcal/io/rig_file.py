@@ -162,7 +162,7 @@ class RigFile(NativeFile):
             as_covariance("the rig's covariance", _tensor(self.covariance, size, size, "the rig's covariance"), size)
         if self.half is not None and (len(self.half.shape) != 2 or self.half.shape[1] != size):
             raise ValueError(f"half: a root (K, {size}) is needed, got the shape {list(self.half.shape)}")
-        known = self.joint_covariance()
+        known = self.known()
         if link is not None:
             if known is None:
                 raise ValueError("the mounting's link needs the rig's covariance")
@@ -179,7 +179,12 @@ class RigFile(NativeFile):
     def _size(self) -> int:
         return len(self.left.coefficients) + len(self.right.coefficients) + 2 * len(INTRINSICS) + 6
 
-    def joint_covariance(self) -> RigCovariance | None:
+    def joint_covariance(self) -> Tensor | None:
+        """The stored covariance as a matrix, float64."""
+        known = self.known()
+        return None if known is None else known.matrix
+
+    def known(self) -> RigCovariance | None:
         """The stored covariance."""
         if self.half is not None:
             return RigCovariance(half=self.half.tensor())
@@ -191,7 +196,7 @@ class RigFile(NativeFile):
         pose = self.right_from_left
         translation = torch.tensor(pose.translation, dtype=torch.float64)
         rig = StereoRig(self.left.camera(), self.right.camera(), pose.matrix(), translation)
-        rig.covariance = self.joint_covariance()
+        rig.covariance = self.known()
         rig.mounting = None if self.mounting is None else self.mounting.mounting()
         rig.calibration = self.calibration
         return rig

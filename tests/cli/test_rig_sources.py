@@ -253,7 +253,6 @@ def test_check_by_landmarks(site: Path, monkeypatch: pytest.MonkeyPatch, capsys:
         (["--features", "far.csv"], "nothing tells where right stands"),
         (["--landmarks", "survey.csv", "--marks", "then.csv"], "names must be the same in both files"),
         (["--landmarks", "survey.csv", "--marks", "marks.csv", "--board-warp"], "cannot be estimated without boards"),
-        (["--landmarks", "survey.csv", "--marks", "marks.csv", "--intrinsics", "prior"], "no standard deviations"),
         (["--landmarks", "survey.csv", "--marks", "marks.csv", "--picture", "a.jpg"], "end with .png"),
     ],
 )

@@ -2,7 +2,8 @@
 
 A camera with rotation R and center c sees the pixel of R q, q = y - w c. For points, w = 1 and y is the point. A
 feature in direction d at inverse range ρ from a place a near the rig has y = d + ρ a and w = ρ, so that
-q = d + ρ (a - c) is as regular at infinity as anywhere (Civera, Davison, Montiel 2008).
+q = d + ρ (a - c) is as regular at infinity as anywhere (Civera, Davison, Montiel 2008). In its units a meter is w,
+which entrance pupils that move depend on.
 
 Residuals are divided by their standard deviations: their squares add up to χ².
 """
@@ -113,8 +114,8 @@ class Block(ABC):
         """Y (V, 3, N) and w (V, 1, 1)."""
 
     @abstractmethod
-    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
-        """Derivatives (V, L, 2, N) of pixels by the unknowns, from those by q (V, 3, 2, N)."""
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
+        """Derivatives (V, L, 2, N) of pixels by the unknowns, from those by q (V, 3, 2, N) and, at a given q, by w."""
 
     @abstractmethod
     def retract(self, state: RigState, step: Tensor) -> RigState:
@@ -135,7 +136,7 @@ class Block(ABC):
         for c, posed in enumerate(cameras):
             q = posed.rotation @ (y - w * posed.center[:, None])
             wanted = posed.by_unknown.any(1).nonzero()[:, 0].tolist() if derivatives else None
-            found = project_components(q, posed.parameters, posed.camera.model, wanted)
+            found = project_components(q, posed.parameters, posed.camera.model, wanted, w[..., 0])
             # NaN where a seen point has no projection, so that such a pose is never accepted.
             bad = torch.where(found.regular, 0.0, torch.nan)[..., None, :]
             error = torch.where(self.seen[:, c, None, :], found.pixels - self.target[:, c] + bad, 0.0)
@@ -157,7 +158,7 @@ class Block(ABC):
         for c, posed, q, w, found, error in self._projected(cameras, state, True):
             rows = q.new_zeros((len(self), self.size + shared_size + 1, 2, q.shape[-1]))
             by_q = torch.einsum("vkun,kj->vjun", found.by_point, posed.rotation)
-            rows[:, : self.size] = self._by_local(state, by_q, posed.center)
+            rows[:, : self.size] = self._by_local(state, by_q, posed.center, found.by_meter)
             shared = rows[:, self.size : -1]
             count = posed.by_unknown.shape[1]
             if count:
@@ -215,7 +216,7 @@ class BoardBlock(Block):
         points = state.board_rotation @ self._shaped(state) + state.board_translation[..., None]
         return points, points.new_ones(len(self), 1, 1)
 
-    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         # By ω through ω × (R x), then by v.
         return step_rows(by_q, state.board_rotation @ self._shaped(state))
 
@@ -248,7 +249,7 @@ class LandmarkBlock(Block):
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         return state.points[..., None], state.points.new_ones(len(self), 1, 1)
 
-    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         return by_q
 
     def _prior(self, state: RigState) -> Tensor | None:
@@ -279,11 +280,14 @@ class FeatureBlock(Block):
         inverse = state.inverse_range[:, None]
         return (state.direction + inverse * self._anchor)[..., None], inverse[..., None]
 
-    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor) -> Tensor:
+    def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         # By two steps across the direction, then by ρ.
         along = (self._anchor - center).expand_as(state.direction)
         moves = torch.stack([*side_axes(state.direction), along], 1)
-        return torch.einsum("vjun,vlj->vlun", by_q, moves)
+        rows = torch.einsum("vjun,vlj->vlun", by_q, moves)
+        if by_w is not None:
+            rows[:, 2] += by_w
+        return rows
 
     def _prior(self, state: RigState) -> Tensor | None:
         # What is known of the range.

@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lenses import hybrid_camera
+from lenses import HYBRID, hybrid_camera, strong
 from rig_scenes import (
     BOARD,
     CAMERAS,
@@ -27,7 +27,7 @@ from rig_scenes import (
 from torch import Tensor
 
 from kcal.calibrate.rig import limits
-from kcal.calibrate.rig.blocks import BoardBlock, FeatureBlock, LandmarkBlock, RigState
+from kcal.calibrate.rig.blocks import BoardBlock, FeatureBlock, LandmarkBlock, PosedCamera, RigState
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem
 from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
 from kcal.calibrate.rig.result import RigResult
@@ -195,6 +195,35 @@ SOURCES = {
         "baselines": BASELINE, "positions": positions(n)[:1],
     },
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("distance", [0.7, 30.0, 5e3, math.inf])
+def test_features_of_hybrid_cameras_are_seen_where_they_are(distance: float) -> None:
+    """Their entrance pupil moves by meters, not by meters per meter of distance; slopes agree with autograd."""
+    head = torch.tensor([520.0, 520.0, 325.0, 235.0, 0.0], dtype=torch.float64)
+    hybrid = Camera(torch.cat([head, 0.2 * strong(HYBRID)]), size=(640, 480), model=HYBRID)
+    assert float(hybrid.coefficients[1].abs()) > 1e-4
+    direction = torch.nn.functional.normalize(tensor([0.3, -0.2, 1.0], [-0.5, 0.1, 1.0]), dim=-1)
+    rays = direction * (1.0 if math.isinf(distance) else distance)
+    pixels, valid = hybrid.project_rays(rays) if math.isinf(distance) else hybrid.project(rays)
+    assert bool(valid.all())
+    inverse = torch.full((2,), 1.0 / distance, dtype=torch.float64)
+    white = torch.eye(2, dtype=torch.float64).expand(2, 1, 2, 2)
+    origin = torch.zeros(3, dtype=torch.float64)
+    block = FeatureBlock(pixels[:, None], white, inverse, torch.full((2,), 1e-3).double(), origin)
+    nothing = torch.zeros(0, 3, dtype=torch.float64)
+    state = RigState(
+        hybrid.params.detach(), origin[:0], torch.eye(3).double()[None], origin[None], origin[:0],
+        nothing, nothing, nothing, direction, inverse,
+    )  # fmt: skip
+    posed = [PosedCamera(hybrid, hybrid.params.detach(), torch.eye(3).double(), origin, nothing.T[:0], None, None)]
+    assert float(block.errors(posed, state).abs().max()) < 1e-9
+    rows = block.rows(posed, state, 0)
+    by_step = torch.func.jacfwd(lambda step: block.residuals(posed, block.retract(state, step)))(
+        torch.zeros(2, 3).double()
+    )
+    for i in range(2):
+        torch.testing.assert_close(rows[i, :3].T, by_step[i, :, i], rtol=1e-9, atol=1e-7)
 
 
 class TestRecovery:
