@@ -36,6 +36,7 @@ from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData, inve
 from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.calibration import CameraCalibration
+from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.solve.result import SolverStatus
 
