@@ -37,6 +37,10 @@ def budget_command(
     of the other sign moves it in, and may move it beyond infinity. The last column is the first-order error, which the
     formula Z² Δd / (f B) gives.
 
+    For a rig file with a covariance, a second table splits the standard deviation of ranges by what to improve: marks;
+    lenses (better calibrated cameras); the relative pose, as it would be with exact lenses (better landmarks and far
+    features). Errors of the mounting move points sideways and leave ranges as they are.
+
     **Examples**
 
     `kcal budget`
@@ -51,8 +55,10 @@ def budget_command(
 
     from kcal.io.rig_file import load_rig
     from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
+    from kcal.locate.range_sigmas import range_sigmas
     from kcal.report.budget import save_budget_picture
     from kcal.report.figures import check_picture
+    from kcal.report.tables import range_sigma_rows
 
     if picture is not None:
         check_picture(picture)
@@ -80,6 +86,9 @@ def budget_command(
         for name, error in found.items():
             rows.append([f"{distance:g}", labels[name], *(_signed_meters(float(value[i])) for value in error)])
     print_table(rows, left=(1,))
+    if chosen.covariance is not None and disparity:
+        out.print(f"\nWhat the rig file knows, and {disparity:g} px of disparity as a standard deviation, in meters:")
+        print_table(range_sigma_rows(range_sigmas(chosen, far, pixel_sigma=disparity / math.sqrt(2.0))))
     if picture is not None:
         sweep = torch.logspace(math.log10(min(far)), math.log10(max(far)), 121, dtype=torch.float64)
         # The ends themselves, which rounding of the logarithm may push out of view.

@@ -102,16 +102,9 @@ def range_errors(
         [-1923, 8333, 3125]
     """
     errors = errors or BudgetErrors()
-    far = torch.as_tensor(distances, dtype=torch.float64).reshape(-1)
-    if not len(far) or not bool(((far > 0) & torch.isfinite(far)).all()):
-        raise InputError("distances: positive numbers of meters are needed")
+    far, points, left, right = points_at(rig, distances, pixel)
+    ray = points[0] / far[0]
     with torch.no_grad():
-        ray = _direction(rig, pixel)
-        points = far[:, None] * ray
-        left, right, seen = rig(points)
-        good = seen & rig.left.inside(left) & rig.right.inside(right)
-        if not bool(good.all()):
-            raise InputError(f"the rig does not see a point at {float(far[~good][0]):g} m there; choose another pixel")
         along = _epipolar_direction(rig, points)
         moved = {
             "disparity": lambda s: (rig, right + s * errors.disparity_px * along),
@@ -128,6 +121,31 @@ def range_errors(
                 torch.minimum(*changes), torch.maximum(*changes), (small[1] - small[0]).abs() / 2e-5
             )
     return found
+
+
+@torch.no_grad()
+def points_at(
+    rig: StereoRig, distances: Tensor | Sequence[float], pixel: Sequence[float] | None = None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points in one direction at several ranges: ranges (D,), points (D, 3) in the rig frame, left and right pixels.
+
+    Args:
+        rig: the rig.
+        distances: (D,) from the left camera, meters.
+        pixel: where in the left image; the direction in which both cameras' axes look, if left out.
+
+    Raises:
+        InputError: a distance that is not positive, or a point that the right camera does not see.
+    """
+    far = torch.as_tensor(distances, dtype=torch.float64).reshape(-1)
+    if not len(far) or not bool(((far > 0) & torch.isfinite(far)).all()):
+        raise InputError("distances: positive numbers of meters are needed")
+    points = far[:, None] * _direction(rig, pixel)
+    left, right, seen = rig(points)
+    good = seen & rig.left.inside(left) & rig.right.inside(right)
+    if not bool(good.all()):
+        raise InputError(f"the rig does not see a point at {float(far[~good][0]):g} m there; choose another pixel")
+    return far, points, left, right
 
 
 def _apart(moved: tuple[StereoRig, Tensor], left: Tensor) -> tuple[StereoRig, Tensor, Tensor]:

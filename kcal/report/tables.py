@@ -8,6 +8,7 @@ from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.locate.positions import Located, Position
+from kcal.locate.range_sigmas import RangeSigmas
 
 
 def position_rows(located: Located, off: list[tuple[float, float, bool] | None] | None = None) -> list[list[str]]:
@@ -73,6 +74,22 @@ def _along_and_across(position: Position, true: Tensor) -> tuple[float, float]:
     sight = true / true.norm()
     along = float(error @ sight)
     return along, float((error - along * sight).norm())
+
+
+def range_sigma_rows(found: RangeSigmas) -> list[list[str]]:
+    """Standard deviations of ranges by their sources, meters; empty where a range cannot be told."""
+    rows = [["at m", "σ of range", "marks", "lenses", "relative pose", "mounting, sideways"]]
+    for distance, marks, lenses, pose, total, ranged, sideways in zip(*(part.tolist() for part in found), strict=True):
+        parts = [total, marks, lenses, pose] if ranged else []
+        cells = [_short(part) for part in parts] or ["bearing only", "", "", ""]
+        rows.append([f"{distance:g}", *cells, _short(sideways)])
+    return rows
+
+
+def _short(value: float) -> str:
+    if value == 0:
+        return "0"
+    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.3f}"
 
 
 def diagonal_rows(located: Located, board: Board) -> list[list[str]]:

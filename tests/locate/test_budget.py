@@ -14,6 +14,7 @@ from kcal.errors import InputError
 from kcal.io.rig_file import save_rig
 from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
 
+SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
 # Disparity in px, ΔZ at 1 km and 5 km as printed in the paper.
 TABLE_2 = [(2.0, 125.0, 3125.0), (1.0, 62.5, 1562.5), (0.5, 31.25, 781.25), (0.1, 6.25, 156.25)]
 
@@ -92,5 +93,14 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     save_rig(real_rig(), "rig.json")
     assert run(monkeypatch, "rig.json", "--distances", "500") == 0
     assert "rig.json: baseline 10.0" in capsys.readouterr().out
+    assert run(monkeypatch, str(SAMPLE), "--distances", "1000,5000") == 0
+    table = capsys.readouterr().out.split("What the rig file knows, and 0.1 px of disparity")[1].splitlines()
+    assert table[1].split("  ")[0] == "at m"
+    distance, total, marks, lenses, pose, sideways = map(float, table[3].split())
+    assert (distance, marks) == (5000.0, pytest.approx(0.1 * 5000**2 / 16_000, rel=0.1))
+    assert total == pytest.approx(math.hypot(marks, lenses, pose), abs=1.0)
+    assert min(pose, sideways) > 0
+    assert run(monkeypatch, str(SAMPLE), "--disparity", "0") == 0
+    assert "What the rig file knows" not in capsys.readouterr().out
     assert run(monkeypatch, "--distances", "near") == 1
     assert "distances 'near'" in capsys.readouterr().err
