@@ -84,7 +84,7 @@ def range_sigmas(
         marks = slope * (variance * found.fit.covariance[5]).sqrt()
         lenses = pose = sideways = torch.zeros_like(far)
         if rig.covariance is not None:
-            factor = rig.covariance.factor()
+            factor = rig.covariance.half.T
             effect = (slope[:, None] * calibration_effect(found.fit, found.scale)[:, 2]) @ factor
             by_lenses = effect @ _row_space(factor[:-6])
             lenses = by_lenses.norm(dim=-1)
