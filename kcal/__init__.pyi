@@ -84,6 +84,7 @@ from kcal.lens.hybrid_terms import HybridForm as HybridForm
 from kcal.lens.images import Undistort as Undistort
 from kcal.lens.images import UndistortMaps as UndistortMaps
 from kcal.lens.images import undistort_maps as undistort_maps
+from kcal.lens.information import CameraInformation as CameraInformation
 from kcal.lens.lookup import LookupCamera as LookupCamera
 from kcal.lens.model import LensModel as LensModel
 from kcal.lens.modules import LearnedStart as LearnedStart

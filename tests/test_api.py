@@ -36,6 +36,7 @@ PUBLIC = {
     "Camera",
     "CameraCalibration",
     "CameraCalibrationResult",
+    "CameraInformation",
     "ComparisonResult",
     "DegenerateError",
     "Detection",

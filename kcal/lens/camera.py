@@ -24,7 +24,6 @@ from kcal.lens.projection import from_pixels, to_pixels
 from kcal.lens.pupil import FAR, pupil_depth, ray_starts
 from kcal.lens.region import Region, in_region, surely_in_region
 from kcal.lens.tracing import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
-from kcal.lens.uncertainty import projection_sigma
 
 
 class Camera(CameraParameters):
@@ -195,13 +194,6 @@ class Camera(CameraParameters):
             InputError: a wrong shape or an integer dtype.
         """
         return self.project(as_points("rays", rays, 3) * FAR)
-
-    def projection_sigma(self, places: Tensor, *, at: float = math.inf) -> Tensor:
-        """Standard deviation (..., N) of pixels (..., N, 2), or of where rays (..., N, 3) are seen, in pixels.
-
-        By the camera's calibration, for things at a distance of `at` meters: see `kcal.projection_sigma`.
-        """
-        return projection_sigma(self, places, at=at)
 
     def ray_origins(self, rays: Tensor) -> Tensor:
         """Find where rays start: (0, 0, ζ₁ θ² + ζ₂ θ⁴) for a hybrid lens (`kcal.lens.pupil`), the origin for others.

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
+from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from kcal.lens.pupil import FAR
-
-if TYPE_CHECKING:
-    from kcal.lens.camera import Camera
 
 
 def pixel_covariance(
@@ -47,7 +44,6 @@ def pixel_covariance(
         InputError: a batch of cameras, a camera without a covariance, or a distance that is not positive.
 
     Example:
-        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
         >>> shifts = torch.diag(torch.tensor([0.0, 0, 1, 1, 0], dtype=torch.float64))  # 1 px of the principal point
         >>> found = pixel_covariance(camera, torch.tensor([[319.5, 239.5], [0.0, 0.0]]), shifts)
@@ -69,10 +65,10 @@ def pixel_covariance(
     flat = places.reshape(-1, places.shape[-1])
     wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
     half = known.by_parameter(known.half())[:, wanted]
-    by_camera, by_turn, good = _slopes(camera, camera.grid(*grid).reshape(-1, 2), math.inf, wanted)
+    by_camera, by_turn, good = _pixel_slopes(camera, camera.grid(*grid).reshape(-1, 2), math.inf, wanted)
     # The turn that best undoes each parameter's effect.
     undo = torch.linalg.lstsq(by_turn[good].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
-    by_camera, by_turn, good = _slopes(camera, flat, at, wanted)
+    by_camera, by_turn, good = _pixel_slopes(camera, flat, at, wanted)
     by_camera = by_camera - by_turn @ undo
     spread = by_camera @ half.T
     found = spread @ spread.transpose(-1, -2)
@@ -97,7 +93,6 @@ def projection_sigma(camera: Camera, places: Tensor, *, at: float = math.inf) ->
 
     Example:
         >>> from kcal.lens.calibration import CameraCalibration
-        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
         >>> longer = torch.diag(torch.tensor([1.0, 0, 0, 0, 0], dtype=torch.float64))  # fx ± 1 px
         >>> camera.calibration = CameraCalibration(covariance=longer)
@@ -115,7 +110,6 @@ def image_sigma(camera: Camera, columns: int = 33, rows: int = 25) -> Tensor:
 
     Example:
         >>> from kcal.lens.calibration import CameraCalibration
-        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
         >>> longer = torch.diag(torch.tensor([1.0, 0, 0, 0, 0], dtype=torch.float64))  # fx ± 1 px
         >>> camera.calibration = CameraCalibration(covariance=longer)
@@ -125,7 +119,7 @@ def image_sigma(camera: Camera, columns: int = 33, rows: int = 25) -> Tensor:
     return projection_sigma(camera, camera.grid(columns, rows))
 
 
-def _slopes(camera: Camera, places: Tensor, at: float, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+def _pixel_slopes(camera: Camera, places: Tensor, at: float, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     """Derivatives of the pixels of pixels or rays by parameters (N, 2, C) and a turn (N, 2, 3), and which have them."""
     if places.shape[-1] == 3:
         length = torch.linalg.vector_norm(places, dim=-1)

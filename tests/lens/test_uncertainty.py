@@ -78,7 +78,7 @@ def test_projection_sigma_near_and_far(at: float) -> None:
     pixels = torch.tensor([[100.0, 235.0], [325.0, 235.0], [600.0, 400.0]], dtype=torch.float64)
     rays, valid = known.unproject(pixels)
     assert bool(valid.all())
-    found = known.projection_sigma(pixels, at=at)
+    found = projection_sigma(known, pixels, at=at)
     torch.testing.assert_close(found, projection_sigma(known, 7.0 * rays, at=at), rtol=1e-6, atol=1e-9)
     if math.isinf(at):
         # To the rounding of rays that are followed for 1e12 m.

@@ -107,10 +107,10 @@ def _uncertainty(
     variance = 2.0 * float(linear.cost) / max(residuals - count, 1)
     if not found.computed or not variance > 0:
         return found, None
-    return found, _information(plain, state, known, math.sqrt(variance))
+    return found, _from_corners(plain, state, known, math.sqrt(variance))
 
 
-def _information(
+def _from_corners(
     problem: BoardProblem, state: BoardState, priors: Sequence[GaussianPrior], noise: float
 ) -> CameraInformation | None:
     """What the corners, with `noise` px, and priors say of the camera."""

@@ -244,7 +244,7 @@ def fit_hybrid(
             "of outliers leaves wrong views out"
         )
     half = inverse * deviation
-    information = _information(off, problem.shared(state), families.mean, deviation, variance, model)
+    information = _from_rows(off, problem.shared(state), families.mean, deviation, variance, model)
     if isinstance(board, BoardPrior):
         # Its modes are not the board's own: what is said of the camera, whatever the board is within its covariance.
         information = information.without_board()
@@ -270,7 +270,7 @@ def fit_hybrid(
     )
 
 
-def _information(
+def _from_rows(
     off: Tensor, x: Tensor, mean: Tensor, deviation: Tensor, variance: float, model: LensModel
 ) -> CameraInformation:
     """What rows off the poses (V, S + 1, R), at unknowns x (S,) less their mean, say of all that is not held."""

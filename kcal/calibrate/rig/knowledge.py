@@ -79,7 +79,7 @@ def _agreeing(first: CameraInformation, other: CameraInformation, board: Board) 
     apart = printed_board(modes, [message])[1] + printed_board(modes, [_message(other)])[1]
     best: tuple[float, CameraInformation] | None = None
     for turns in quarter_turns(board):
-        turned = _turned(other, mode_turn(turns)) if turns else other
+        turned = _board_turned(other, mode_turn(turns)) if turns else other
         nats = printed_board(modes, [message, _message(turned)])[1] - apart
         if best is None or nats > best[0]:
             best = nats, turned
@@ -95,7 +95,7 @@ def _message(known: CameraInformation) -> BoardMessage:
     return BoardMessage(root, root @ known.estimate[lens:] - triangle[:, -1])
 
 
-def _turned(known: CameraInformation, turn: Tensor) -> CameraInformation:
+def _board_turned(known: CameraInformation, turn: Tensor) -> CameraInformation:
     """The same with the board's modes turned: a' = turn a, and turns are orthogonal."""
     lens = known.lens_size
     return dataclasses.replace(

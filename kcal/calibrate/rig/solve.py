@@ -105,7 +105,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     if not options.weighted and data.boards is not None:
         data = dataclasses.replace(data, boards=dataclasses.replace(data.boards, covariance=None))
     data, warnings = _without_rayless(data)
-    data, unknowns = _unknowns(data, options)
+    data, unknowns = _what_may_change(data, options)
     initial = first_poses(data, options.solver)
     masks, reasons = _first_masks(initial, reject=options.reject)
     work = _robust(initial, masks, unknowns)
@@ -176,7 +176,7 @@ def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reaso
     return masks, reasons
 
 
-def _unknowns(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns]:
+def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns]:
     """What may change of cameras and board, and the data with the board as it is expected."""
     boards = data.boards
     if options.intrinsics == "prior":
