@@ -10,6 +10,7 @@ import typer
 
 from kcal.cli.groups import group_with_default
 from kcal.cli.rig_check import check
+from kcal.errors import InputError
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.result import RigResult
@@ -76,8 +77,10 @@ def solve_command(
     positions: any of them, or all together in one adjustment. What contradicts the rest is left out and named. Boards
     are paired by name (left01.jpg with right01.jpg) or by a CSV; one that was read from its other end is turned.
 
-    Watch the σ of the yaw, which limits long ranges: with a baseline of 10 m, 0.01° of yaw is 436 m at 5 km. Landmarks
-    and far features determine it better than boards do.
+    The cameras are refined within what their calibrations know of lenses and board. The table at the end splits the σ
+    of ranges by what to improve: marks; lenses (more views of the board, near the image's borders); relative pose
+    (landmarks and far features, which determine the yaw better than boards do: 0.01° of it is 436 m at 5 km with a
+    baseline of 10 m).
 
     `kcal rig check` tells later whether the cameras have turned since.
 
@@ -89,14 +92,16 @@ def solve_command(
     --baseline 10.02±0.005 -o rig.json --picture rig.png`
     """
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
-    from kcal.cli.console import out, steps
+    from kcal.cli.console import out, print_table, steps, warn
     from kcal.cli.rig_sources import Sources, read_sources
     from kcal.files import check_writable
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
     from kcal.locate.mounting import placed_rig
+    from kcal.locate.range_sigmas import range_sigmas
     from kcal.report.figures import check_picture
     from kcal.report.rig import save_rig_picture
+    from kcal.report.tables import range_sigma_rows
 
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
@@ -118,6 +123,10 @@ def solve_command(
     if picture is not None:
         save_rig_picture(picture, result)
     print_rig(result, lines)
+    try:
+        print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=mark_sigma)))
+    except InputError as error:
+        warn(f"range errors are not split: {error}")
     for path in (output, *([picture] if picture else [])):
         out.print(f"wrote {path}", markup=False)
 
@@ -134,14 +143,13 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
     boards, mounting = result.data.boards, rig.mounting
-    exact = f" with {' and '.join(result.exact)} taken as exact" if result.exact else ""
-    pitch, yaw, roll = (math.degrees(value) for value in result.sigma_rotation.tolist())
     lines += [
         f"RMS [bold]{result.rms:.4f} px[/] (left {result.rms_px[0]:.4f}, right {result.rms_px[1]:.4f}); "
         f"{result.status.message}",
-        f"baseline [bold]{float(rig.baseline):.6f} m[/] ± {result.sigma_baseline:.6f}; σ of yaw {yaw:.5f}°, pitch "
-        f"{pitch:.5f}°, roll {roll:.5f}°{exact}",
+        f"baseline [bold]{float(rig.baseline):.6f} m[/] ± {result.sigma_baseline:.6f}",
     ]
+    if result.exact:
+        lines.append(f"taken as exact, so that errors of these lenses are in no σ: {' and '.join(result.exact)}")
     if boards is not None:
         lines.append(f"{len(result.pairs)} of {len(boards.names)} pairs used, {unpaired} views without partner")
         if result.pairs:
