@@ -252,7 +252,7 @@ def _horner(coefficients: Sequence[Tensor], t: Tensor, slopes: bool, reuse: bool
 def _times_plus(value: _Complex, z: _Complex, added: _Complex, reuse: bool) -> _Complex:
     """Value z + added; `reuse`: the memory of `added` may receive the result."""
     (a, b), (x, y), (p, q) = value, z, added
-    if reuse and p.shape == q.shape == torch.broadcast_shapes(a.shape, x.shape):
+    if reuse and p.shape == q.shape == x.shape and all(part.ndim == 0 or part.shape == x.shape for part in (a, b)):
         return p.addcmul_(a, x).addcmul_(b, y, value=-1.0), q.addcmul_(b, x).addcmul_(a, y)
     return (
         torch.addcmul(torch.addcmul(p, a, x), b, y, value=-1.0),

@@ -109,11 +109,13 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     initial = first_poses(data, options.solver)
     masks, reasons = _first_masks(initial, reject=options.reject)
     work = _robust(initial, masks, unknowns)
+    # With lenses among the unknowns digits are dear, and what is wrong shows without them.
+    looking = ROUGHLY if bool(unknowns.known.any()) else options.solver
     if options.reject:
-        masks = without_wrong(work, masks, options.solver)
+        masks = without_wrong(work, masks, looking)
     else:
         masks = possible(work, masks)
-        warnings += _suspicions(work, masks, reasons, options.solver)
+        warnings += _suspicions(work, masks, reasons, looking)
     for _ in range(3):
         work.solve(masks, options.solver)
         before = work.sigma_corner
