@@ -333,6 +333,8 @@ class TestRig:
         assert run(monkeypatch, "rig", "left.camera.json", "right.camera.json", *PAIRS, *more) == 0
         printed = capsys.readouterr()
         assert printed.out.startswith("source")
+        assert "σ of range" in printed.out
+        assert "taken as exact" not in printed.out
         assert "turned by 180°: left01.png right01.png (right; the board" in printed.out
         assert (cameras / "rig.png").read_bytes().startswith(b"\x89PNG")
         file = RigFile.load(cameras / "joint.json")

@@ -284,6 +284,12 @@ def _rig_result(
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         warnings.append(f"the solver {status.message}")
     warnings += [f"not determined by the data: {text}" for text in undetermined]
+    whole = [parameter_rows(problem, c) for c in range(len(data.cameras))]
+    if not bool(covariance.of(torch.cat(whole))[1].all()):
+        warnings.append(
+            "the data do not determine all parameters of the cameras: the rig has no covariance, and intervals know "
+            "errors of the marks alone"
+        )
     warnings += swap_warnings(data, problem, state, covariance)
     items = item_records(work, masks, reasons)
     cameras = data.cameras

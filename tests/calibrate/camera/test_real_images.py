@@ -166,4 +166,5 @@ class TestRig:
         cameras = [solved(side, "opencv5").camera for side in SIDES]
         result = calibrate_rig(*cameras, seen["left"], right, pairs, RigOptions(reject=False))
         assert [result.pairs.index(turned.board) for turned in result.flipped] == [2, 6, 9]
-        assert float(result.stereo().baseline) == pytest.approx(float(rigs[False].stereo().baseline), rel=1e-7)
+        # The calibrations know nothing but these pairs: refining within them is letting the cameras free.
+        assert float(result.stereo().baseline) == pytest.approx(float(rigs[True].stereo().baseline), rel=1e-7)
