@@ -218,7 +218,9 @@ def camera_to_file(
         raise InputError(f"a camera file contains one camera, got a batch of shape {tuple(values.shape[:-1])}")
     known = camera.calibration or CameraCalibration()
     standard_deviations = known.sigma if standard_deviations is None else standard_deviations
-    covariance = known.covariance if covariance is None else covariance
+    information = known.information if covariance is None else None
+    # What is derived from the information is not stored beside it.
+    covariance = known.covariance if covariance is None and information is None else covariance
     if standard_deviations is not None:
         unknown = [key for key in standard_deviations if key not in camera.names]
         if unknown:
@@ -238,7 +240,7 @@ def camera_to_file(
             coefficients={key: stored[key] for key in camera.model.names},
             standard_deviations=standard_deviations,
             covariance=None if covariance is None else CovarianceRecord.of(covariance.detach(), camera.names),
-            information=None if known.information is None else InformationRecord.of(known.information, camera.names),
+            information=None if information is None else InformationRecord.of(information, camera.names),
             valid_region=ValidRegion(
                 radius=float(camera.valid_radius),
                 polygon=tuple((round(u, 3), round(v, 3)) for u, v in camera.valid_polygon().tolist()),

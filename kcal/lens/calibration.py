@@ -108,8 +108,8 @@ class CameraCalibration:
         name: free text that tells cameras apart, for example `"left"`.
         sigma: parameter name -> one sigma, in the order of `Camera.names`; None for a parameter that was held fixed or
             is not determined. The whole is None if no sigmas were computed.
-        covariance: (P, P) of the parameters in the order of `Camera.names`, zero for those held fixed, where that is
-            all that is known; None otherwise.
+        covariance: (P, P) of the parameters in the order of `Camera.names`, zero for those held fixed; that of the
+            information if that is given, and None if neither was computed.
         information: what the calibration says of the camera (`CameraInformation`); None if that was not computed.
         record: how the camera was calibrated, if it was.
 
@@ -124,10 +124,15 @@ class CameraCalibration:
     information: CameraInformation | None = None
     record: CalibrationRecord | None = None
 
+    def __post_init__(self) -> None:
+        if self.information is not None:
+            object.__setattr__(self, "covariance", self.information.covariance())
+
     def check(self, count: int) -> None:
         """Raise `InputError` unless covariance and information are those of `count` parameters."""
-        as_covariance("the camera's covariance", self.covariance, count)
-        if self.information is not None and len(self.information.slots) != count:
+        if self.information is None:
+            as_covariance("the camera's covariance", self.covariance, count)
+        elif len(self.information.slots) != count:
             raise InputError(f"information on {len(self.information.slots)} parameters; the camera has {count}")
 
     def known(self, params: Tensor) -> CameraInformation | None:
