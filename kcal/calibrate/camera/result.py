@@ -133,9 +133,16 @@ class CameraCalibrationResult:
             iterations=self.iterations,
             noise=self.noise,
             tempering=None if self.hybrid is None else self.hybrid.tempering,
-            board_deviation=tuple((x, y, z) for x, y, z in (self.board_points - board.points).tolist()),
+            board_deviation=self._board_deviation(),
             **provenance(),
         )
+
+    def _board_deviation(self) -> tuple[tuple[float, float, float], ...] | None:
+        """As `CalibrationRecord.board_deviation`."""
+        if self.hybrid is None and self.board_warp is None:
+            return None
+        moved = self.board_points - self.observations.board.points
+        return tuple((x, y, z) for x, y, z in moved.tolist())
 
     @property
     def board_points(self) -> Tensor:

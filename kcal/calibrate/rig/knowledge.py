@@ -8,14 +8,13 @@ out of it first, so that no corner counts twice.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
 from kcal.calibrate.lensfit.board_orders import CLEAR, mode_turn, quarter_turns
 from kcal.calibrate.lensfit.board_prior import BoardMessage, printed_board, printed_prior
 from kcal.calibrate.lensfit.evidence import BOARD, typical_hyperprior
@@ -25,6 +24,7 @@ from kcal.lens.calibration import BoardRecord
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation, triangular, whitened
 from kcal.lens.projection import project_components
+from kcal.lens.pupil import FAR
 
 # px that a direction must move something seen, for it to be an unknown of the rig.
 _FELT = 1e-3
@@ -131,11 +131,12 @@ def less(known: CameraInformation, rows: Tensor) -> CameraInformation:
 
 
 def joint_unknowns(
-    cameras: Sequence[Camera], knowledge: Knowledge, board: Board | None
+    cameras: Sequence[Camera], knowledge: Knowledge, board: Board | None, *, measured: bool = False
 ) -> tuple[SharedUnknowns, Tensor | None]:
     """Unknowns that are standard normal beforehand, and the deviation (N, 3) of the board where they begin.
 
-    A board that no camera knows is one as printers make them, if a camera takes boards so; None: it is as it is given.
+    A board that no camera knows is one as printers make them, if a camera is hybrid and the board was not `measured`
+    otherwise; None: it is as it is given.
     """
     parts = [
         part if part is None or shares else part.without_board()
@@ -144,22 +145,13 @@ def joint_unknowns(
     sizes = [0 if part is None else part.lens_size for part in parts]
     lenses, shared = sum(sizes), [part for part in parts if part is not None and part.board_size]
     modes = None
-    if board is not None and (shared or any(camera.model.hybrid for camera in cameras)):
+    printed = not measured and any(camera.model.hybrid for camera in cameras)
+    if board is not None and (shared or printed):
         modes = board_modes(board.points)
     elif not shared and not lenses:
         return held(cameras), None
-    boards = len(modes.unit) if modes is not None else max((part.board_size for part in shared), default=0)
-    total = lenses + boards
-    if not shared and modes is not None:
-        printed = printed_prior(modes, typical_hyperprior().mean[BOARD:]).half.diagonal()
-        amplitudes, mean, sigma = printed.new_zeros(boards), printed.new_zeros(boards), printed
-    elif shared:
-        # Each camera's evidence set amplitudes of its own; what is in between is as good as either.
-        sigma = torch.stack([part.sigma[part.lens_size :].log() for part in shared]).mean(0).exp()
-        mean = torch.stack([part.mean[part.lens_size :] for part in shared]).mean(0)
-        amplitudes = shared[0].estimate[shared[0].lens_size :]
-    else:
-        amplitudes = mean = sigma = torch.zeros(0, dtype=torch.float64)
+    amplitudes, mean, sigma = _board_beforehand(shared, modes)
+    boards, total = len(sigma), lenses + len(sigma)
     prior = torch.zeros(boards, total + 1, dtype=torch.float64)
     prior[range(boards), range(lenses, total)] = 1.0 / sigma
     prior[:, -1] = (amplitudes - mean) / sigma
@@ -197,14 +189,28 @@ def joint_unknowns(
     return found, None if modes is None else torch.einsum("b,bcn->nc", amplitudes, shapes)
 
 
+def _board_beforehand(shared: Sequence[CameraInformation], modes: BoardModes | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Amplitudes to begin with, and mean and sigma of the prior of a board's modes; empty for no board."""
+    if shared:
+        # Each camera's evidence set amplitudes of its own; what is in between is as good as either.
+        sigma = torch.stack([part.sigma[part.lens_size :].log() for part in shared]).mean(0).exp()
+        mean = torch.stack([part.mean[part.lens_size :] for part in shared]).mean(0)
+        return shared[0].estimate[shared[0].lens_size :], mean, sigma
+    if modes is None:
+        nothing = torch.zeros(0, dtype=torch.float64)
+        return nothing, nothing, nothing
+    sigma = printed_prior(modes, typical_hyperprior().mean[BOARD:]).half.diagonal()
+    return torch.zeros_like(sigma), torch.zeros_like(sigma), sigma
+
+
 def _felt(cameras: Sequence[Camera], maps: Sequence[Tensor], by_corners: Tensor, known: Tensor) -> Tensor:
     """(K, F) orthonormal directions: of the known unknowns those that move anything seen by `_FELT` px, all others."""
     effects = [_PX_PER_METER * by_corners[known]]
     for camera, onto in zip(cameras, maps, strict=True):
         rays, valid = camera.unproject(camera.grid(25, 17).reshape(-1, 2))
         rays = rays[valid]
-        for distance in (math.inf, _NEAR):
-            points = rays * (2.0**40 if math.isinf(distance) else distance)
+        for distance in (FAR, _NEAR):
+            points = rays * distance
             seen = project_components(points.T, camera.params.detach(), camera.model, list(range(len(onto))))
             good = torch.where(seen.regular, seen.by_camera, 0.0).flatten(1)
             effects.append(onto.T[known] @ good)

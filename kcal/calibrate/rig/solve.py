@@ -188,8 +188,9 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
             if own is not None and boards is not None:
                 own = without_repeated(own, camera, boards, number, options.solver)
             known.append(own)
-        board = None if boards is None else boards.board
-        unknowns, deviation = joint_unknowns(data.cameras, gathered(data.cameras, known, board), board)
+        board, measured = (None, False) if boards is None else (boards.board, boards.deviation is not None)
+        knowledge = gathered(data.cameras, known, board)
+        unknowns, deviation = joint_unknowns(data.cameras, knowledge, board, measured=measured)
         if boards is not None and deviation is not None:
             data = dataclasses.replace(data, boards=dataclasses.replace(boards, deviation=deviation))
     else:

@@ -41,6 +41,8 @@ def test_all_that_is_known_is_in_the_file(tmp_path: Path) -> None:
     assert record.excluded == result.excluded
     assert record.excluded[0].name == f"{seen.names[2]} corner 7"
     assert record.observations == "left.obs.json"
+    # A board that was taken as ordered was not measured.
+    assert record.board_deviation is None
 
     # The camera itself carries all of it, until its parameters change.
     carried = load_camera(save_camera(result.camera, tmp_path / "again.camera.json")).calibration

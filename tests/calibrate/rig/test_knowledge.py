@@ -144,3 +144,19 @@ def test_one_board_is_shared_and_two_are_not() -> None:
     assert gathered((left, right), [informations[0], other], BOARD).board == (True, False)
     # A rig's board of another size is nobody's.
     assert gathered((left, right), informations, Board(columns=9, rows=6, square=0.1)).board == (False, False)
+
+
+def test_a_board_that_no_camera_knows() -> None:
+    """Another board in the rig is one as printers make them, unless it was measured; parametric cameras take it flat."""
+    names = tuple(f"{i}.png" for i in range(14))
+    other = Board(columns=9, rows=6, square=0.1)
+    for model, measured, modes in (("hybrid", False, 28), ("hybrid", True, 0), ("opencv5", False, 0)):
+        both = cameras(model, names)
+        knowledge = gathered(both, [known(camera) for camera in both], other)
+        found, deviation = joint_unknowns(both, knowledge, other, measured=measured)
+        assert len(found.shapes) == modes
+        assert (deviation is None) == (modes == 0)
+        if modes:
+            sigma = found.board.square().sum(1).sqrt()
+            # Bending of the board, before any view of it: about half a permille of its length.
+            assert 1e-4 < float(sigma[0]) < 2e-3
