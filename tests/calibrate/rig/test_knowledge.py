@@ -147,7 +147,7 @@ def test_one_board_is_shared_and_two_are_not() -> None:
 
 
 def test_a_board_that_no_camera_knows() -> None:
-    """Another board in the rig is one as printers make them, unless it was measured; parametric cameras take it flat."""
+    """Another board in a rig is as printers make them, unless it was measured; parametric cameras take it flat."""
     names = tuple(f"{i}.png" for i in range(14))
     other = Board(columns=9, rows=6, square=0.1)
     for model, measured, modes in (("hybrid", False, 28), ("hybrid", True, 0), ("opencv5", False, 0)):
