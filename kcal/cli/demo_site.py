@@ -124,14 +124,14 @@ def _write_places(path: Path, points: NamedPoints, sigma: float | None = None) -
 def _write_summary(output: Path, scene: DemoScene, table: list[list[str]], command: str, located: Located) -> None:
     from kcal.corners.observations import Observations
     from kcal.io.rig_file import RigFile
+    from kcal.locate.range_sigmas import range_sigmas
     from kcal.locate.truth import position_errors
     from kcal.report.summary import Part, save_summary
 
     found = sum(len(Observations.load(output / f"{side}.near.obs.json").views) for side in SIDES)
     rig = RigFile.load(output / "rig.json")
-    known = rig.rig().covariance
-    assert known is not None
-    yaw = math.degrees(float(known.half[:, -5].norm()))
+    sigmas = range_sigmas(rig.rig(), [5000.0], pixel_sigma=scene.mark_sigma)
+    calibration = math.hypot(float(sigmas.lenses[0]), float(sigmas.pose[0]))
     cameras = zip(SIDES, (rig.left.calibration, rig.right.calibration), strict=True)
     rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
     pairs = 0 if rig.calibration is None else rig.calibration.pairs
@@ -173,7 +173,8 @@ def _write_summary(output: Path, scene: DemoScene, table: list[list[str]], comma
                 f"A large board seen by both cameras ({pairs} times) and {len(scene.landmarks.names)} "
                 f"landmarks surveyed to {100 * scene.survey_sigma:g} cm tell where the cameras stand and look: "
                 f"baseline {float(rig.rig().baseline):.4f} m (true {float(scene.rig.baseline):.4f} m), "
-                f"relative yaw known to {yaw:.5f} degrees. A hundredth of a degree would be 436 m at 5 km.",
+                f"what is not known of lenses and pose is {calibration:.0f} m of range at 5 km, noise in the marks "
+                f"{float(sigmas.marks[0]):.0f} m (one sigma).",
             ),
             pictures=((output / "rig.png", "What is left over, by source"),),
         ),

@@ -45,10 +45,9 @@ def rig_figure(result: RigResult) -> Figure:
     plan, bars = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
     _draw_plan(plan, result)
     _draw_items(bars, result)
-    rig, sigma = result.stereo(), result.relative_covariance().diagonal().sqrt()
-    yaw = math.degrees(float(sigma[1]))
+    baseline = float(result.stereo().baseline)
     figure.suptitle(
-        f"Rig of {len(result.names)} cameras, baseline {float(rig.baseline):.4f} m, relative yaw ± {yaw:.5f}°",
+        f"Rig of {len(result.names)} cameras, baseline {baseline:.4f} ± {result.sigma_baseline:.4f} m",
         x=0.015,
         ha="left",
         fontsize=14,
