@@ -38,8 +38,6 @@ from kcal.solve.result import SolverStatus
 _UNKNOWNS = 4
 # Largest number of fits with outliers left out; two or three are the rule.
 _ROUNDS = 6
-# Scale of the loss with which outliers are looked for, in units of the noise, and how often its weights are renewed.
-_CAUCHY_SCALE, _CAUCHY_ROUNDS = 3.0, 2
 
 
 def calibrate_hybrid(
