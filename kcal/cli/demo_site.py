@@ -130,7 +130,8 @@ def _write_summary(output: Path, scene: DemoScene, table: list[list[str]], comma
 
     found = sum(len(Observations.load(output / f"{side}.near.obs.json").views) for side in SIDES)
     rig = RigFile.load(output / "rig.json")
-    sigmas = range_sigmas(rig.rig(), [5000.0], pixel_sigma=scene.mark_sigma)
+    solved = rig.rig()
+    sigmas = range_sigmas(solved, [5000.0], pixel_sigma=scene.mark_sigma)
     calibration = math.hypot(float(sigmas.lenses[0]), float(sigmas.pose[0]))
     cameras = zip(SIDES, (rig.left.calibration, rig.right.calibration), strict=True)
     rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
@@ -172,7 +173,7 @@ def _write_summary(output: Path, scene: DemoScene, table: list[list[str]], comma
             text=(
                 f"A large board seen by both cameras ({pairs} times) and {len(scene.landmarks.names)} "
                 f"landmarks surveyed to {100 * scene.survey_sigma:g} cm tell where the cameras stand and look: "
-                f"baseline {float(rig.rig().baseline):.4f} m (true {float(scene.rig.baseline):.4f} m), "
+                f"baseline {float(solved.baseline):.4f} m (true {float(scene.rig.baseline):.4f} m), "
                 f"what is not known of lenses and pose is {calibration:.0f} m of range at 5 km, noise in the marks "
                 f"{float(sigmas.marks[0]):.0f} m (one sigma).",
             ),

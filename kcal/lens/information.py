@@ -170,6 +170,12 @@ def triangular(rows: Tensor) -> Tensor:
     return torch.linalg.qr(padded, mode="r")[1]
 
 
+def unit_scale(rows: Tensor) -> Tensor:
+    """(C,) factors that make the columns of rows (R, C) unit vectors; 1 for columns of zeros."""
+    length = torch.linalg.vector_norm(rows, dim=0)
+    return torch.where(length > 0, 1.0 / torch.where(length > 0, length, 1.0), 1.0)
+
+
 def posterior_half(rows: Tensor) -> Tensor:
     """(U, U) whose product halfᵀ half is the inverse of rowsᵀ rows, from rows (R, U).
 
@@ -205,8 +211,7 @@ def whitened(rows: Tensor, residuals: Tensor) -> Whitened:
         tensor([ True, False])
     """
     triangle = triangular(torch.cat([rows, residuals[:, None]], 1))[: rows.shape[1]]
-    length = torch.linalg.vector_norm(triangle[:, :-1], dim=0)
-    scale = torch.where(length > 0, 1.0 / torch.where(length > 0, length, 1.0), 1.0)
+    scale = unit_scale(triangle[:, :-1])
     left, values, right = torch.linalg.svd(triangle[:, :-1] * scale)
     known = values > _ROUNDING * values[:1].sum()
     change = scale[:, None] * right.T / torch.where(known, values, 1.0)

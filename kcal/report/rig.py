@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import torch
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -45,7 +46,7 @@ def rig_figure(result: RigResult) -> Figure:
     plan, bars = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
     _draw_plan(plan, result)
     _draw_items(bars, result)
-    baseline = float(result.stereo().baseline)
+    baseline = float(torch.linalg.vector_norm(result.center[1] - result.center[0]))
     figure.suptitle(
         f"Rig of {len(result.names)} cameras, baseline {baseline:.4f} ± {result.sigma_baseline:.4f} m",
         x=0.015,

@@ -83,7 +83,7 @@ def uncertainty_of(linear: SchurLinearization, residual_count: int, parameter_co
         parameter_count: all parameters that were free, poses included.
     """
     inverse, scale, determined = _invert(linear)
-    noise = _noise(linear, residual_count, parameter_count)
+    noise = noise_variance(linear, residual_count, parameter_count)
     return Uncertainty(inverse * scale[:, None] * scale * noise, determined)
 
 
@@ -106,7 +106,7 @@ def covariance(linear: SchurLinearization, residual_count: int, parameter_count:
     """
     shared, determined = uncertainty_of(linear, residual_count, parameter_count)
     response, own = linear.local_response()
-    return Covariance(shared, determined, response, own * _noise(linear, residual_count, parameter_count))
+    return Covariance(shared, determined, response, own * noise_variance(linear, residual_count, parameter_count))
 
 
 def projection_covariance(
@@ -165,6 +165,6 @@ def _invert(linear: SchurLinearization) -> tuple[Tensor, Tensor, Tensor]:
     return inverse, scale, undetermined < _UNDETERMINED_SHARE
 
 
-def _noise(linear: SchurLinearization, residual_count: int, parameter_count: int) -> Tensor:
+def noise_variance(linear: SchurLinearization, residual_count: int, parameter_count: int) -> Tensor:
     """Variance of a residual, estimated from the cost."""
     return 2.0 * linear.cost / max(residual_count - parameter_count, 1)

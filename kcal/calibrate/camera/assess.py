@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.covariance import Uncertainty, uncertainty_of
+from kcal.calibrate.bundle.covariance import Uncertainty, noise_variance, uncertainty_of
 from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.priors import GaussianPrior
 from kcal.calibrate.camera.options import CalibrationOptions
@@ -104,7 +104,7 @@ def _uncertainty(
     linear = plain.linearize(state)
     count, residuals = plain.shared_size + 6 * len(state.translation), plain.residual_count + plain.prior_count
     found = uncertainty_of(linear, residuals, count)
-    variance = 2.0 * float(linear.cost) / max(residuals - count, 1)
+    variance = float(noise_variance(linear, residuals, count))
     if not found.computed or not variance > 0:
         return found, None
     return found, _from_corners(plain, state, known, math.sqrt(variance))

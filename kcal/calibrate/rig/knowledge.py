@@ -16,13 +16,13 @@ from torch import Tensor
 
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
 from kcal.calibrate.lensfit.board_orders import CLEAR, mode_turn, quarter_turns
-from kcal.calibrate.lensfit.board_prior import BoardMessage, printed_board, printed_prior
+from kcal.calibrate.lensfit.board_prior import BoardMessage, message_from_rows, printed_board, printed_prior
 from kcal.calibrate.lensfit.evidence import BOARD, typical_hyperprior
 from kcal.calibrate.rig.unknowns import SharedUnknowns, held
 from kcal.corners.board import Board
 from kcal.lens.calibration import BoardRecord
 from kcal.lens.camera import Camera
-from kcal.lens.information import CameraInformation, triangular, whitened
+from kcal.lens.information import CameraInformation, triangular, unit_scale, whitened
 from kcal.lens.projection import project_components
 from kcal.lens.pupil import FAR
 
@@ -75,24 +75,21 @@ def _board_of(record: BoardRecord) -> Board:
 def _agreeing(first: CameraInformation, other: CameraInformation, board: Board) -> CameraInformation | None:
     """The other camera's information with its board turned as the first camera's; None if they saw two boards."""
     modes = board_modes(board.points)
-    message = _message(first)
-    apart = printed_board(modes, [message])[1] + printed_board(modes, [_message(other)])[1]
-    best: tuple[float, CameraInformation] | None = None
-    for turns in quarter_turns(board):
-        turned = _board_turned(other, mode_turn(turns)) if turns else other
-        nats = printed_board(modes, [message, _message(turned)])[1] - apart
-        if best is None or nats > best[0]:
-            best = nats, turned
-    assert best is not None
-    return best[1] if best[0] > -CLEAR else None
+    one, two = _message(first), _message(other)
+    apart = printed_board(modes, [one])[1] + printed_board(modes, [two])[1]
+    together = {
+        turns: printed_board(modes, [one, two.turned(mode_turn(turns))])[1] - apart for turns in quarter_turns(board)
+    }
+    best = max(together, key=lambda turns: together[turns])
+    return _board_turned(other, mode_turn(best)) if together[best] > -CLEAR else None
 
 
 def _message(known: CameraInformation) -> BoardMessage:
     """What a camera's data say of its board, whatever its lens is within its prior."""
-    lens, count = known.lens_size, len(known.estimate)
-    triangle = triangular(torch.cat([known.data_rows(), known.prior_rows(board=False)]))[lens:count]
-    root = triangle[:, lens:-1]
-    return BoardMessage(root, root @ known.estimate[lens:] - triangle[:, -1])
+    lens, at = known.lens_size, known.estimate.clone()
+    at[:lens] -= known.mean[:lens]
+    target = known.rows @ at - known.residuals
+    return message_from_rows(torch.cat([known.rows, target[:, None]], 1), known.sigma[:lens], 1.0)
 
 
 def _board_turned(known: CameraInformation, turn: Tensor) -> CameraInformation:
@@ -115,8 +112,7 @@ def less(known: CameraInformation, rows: Tensor) -> CameraInformation:
         rows: (R, U + 1) of the data that are taken out, in standard deviations, off all other unknowns; the last column
             holds their residuals at the estimate.
     """
-    scale = torch.linalg.vector_norm(known.all_rows()[:, :-1], dim=0)
-    scale = torch.where(scale > 0, 1.0 / torch.where(scale > 0, scale, 1.0), 1.0)
+    scale = unit_scale(known.all_rows()[:, :-1])
     gone, whole = rows[:, :-1] * scale, known.rows * scale
     gradient = whole.T @ known.residuals - gone.T @ rows[:, -1]
     values, vectors = torch.linalg.eigh(whole.T @ whole - gone.T @ gone)
