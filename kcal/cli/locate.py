@@ -59,15 +59,19 @@ def locate_command(
         ),
     ] = 0.0,
     refraction: Annotated[
-        float,
-        typer.Option(metavar="K", help="Refraction: 0.13 lowers a point at 5 km by 0.26 m; 0 for straight lines."),
-    ] = 0.13,
-    refraction_sigma: Annotated[
-        float,
+        float | None,
         typer.Option(
-            metavar="K", help="Its standard deviation; 0.5 for lines of sight near hot or cold ground.", min=0
+            metavar="K",
+            help="Refraction: 0.13, the default, lowers a point at 5 km by 0.26 m; 0 for straight lines. A rig solved "
+            "from landmarks has its own.",
         ),
-    ] = 0.1,
+    ] = None,
+    refraction_sigma: Annotated[
+        float | None,
+        typer.Option(
+            metavar="K", help="Its standard deviation, 0.1; 0.5 for lines of sight near hot or cold ground.", min=0
+        ),
+    ] = None,
     geoid: Annotated[
         Path | None, typer.Option(help="Geoid grid file (.tif, .gtx); one that PROJ finds if not given.")
     ] = None,
@@ -162,7 +166,9 @@ def locate_command(
         stored = solved.mounting
         if stored is None:
             raise InputError(f"{rig}: the file has no position of the rig; give --origin and --heading")
-        mounting = mounting if stored.covariance is None else mounting + stored.covariance
+        if stored.covariance is not None:
+            more = len(stored.covariance) - len(mounting)
+            mounting = torch.nn.functional.pad(mounting, (0, more, 0, more)) + stored.covariance
         link = stored.link
     elif grid is not None:
         heading = true_from_grid(heading, place, grid)

@@ -77,8 +77,10 @@ class RigMounting(Record):
         heading_deg: of its axis, clockwise from true north.
         pitch_deg: of its axis, positive up.
         roll_deg: clockwise as seen from behind.
-        covariance: (6, 6) of east, north, up of the center (meters) and of turns about these axes (radians).
-        link: (P, 6) covariance of the rig's P quantities (`RigFile.covariance`) with these six.
+        covariance: (6, 6) of east, north, up of the center (meters) and of turns about these axes (radians), or (7, 7)
+            with the coefficient of refraction.
+        link: (P, 6) or (P, 7) covariance of the rig's P quantities (`RigFile.covariance`) with these.
+        refraction: the coefficient, if anything was found of it.
     """
 
     lat: float = pydantic.Field(ge=-90, le=90)
@@ -89,11 +91,14 @@ class RigMounting(Record):
     roll_deg: float
     covariance: Matrix | None = None
     link: Matrix | None = None
+    refraction: float | None = pydantic.Field(default=None, ge=-2, le=2)
 
     @pydantic.model_validator(mode="after")
     def _square(self) -> RigMounting:
         if self.covariance is not None:
-            as_covariance("the mounting's covariance", _tensor(self.covariance, 6, 6, "the mounting's covariance"), 6)
+            size = 7 if len(self.covariance) == 7 else 6
+            matrix = _tensor(self.covariance, size, size, "the mounting's covariance")
+            as_covariance("the mounting's covariance", matrix, size)
         self.mounting()
         return self
 
@@ -107,6 +112,7 @@ class RigMounting(Record):
             roll_deg=mounting.roll_deg,
             covariance=_stored(mounting.covariance),
             link=_stored(mounting.link),
+            refraction=mounting.refraction,
         )
 
     def mounting(self) -> Mounting:
@@ -119,6 +125,7 @@ class RigMounting(Record):
             roll_deg=self.roll_deg,
             covariance=covariance,
             link=link,
+            refraction=self.refraction,
         )
 
 
@@ -169,7 +176,7 @@ class RigFile(NativeFile):
             if self.mounting is None or self.mounting.covariance is None:
                 raise ValueError("the mounting's link needs the mounting's covariance")
             mounted = torch.tensor(self.mounting.covariance, dtype=torch.float64)
-            known.checked_link(mounted, _tensor(link, size, 6, "the mounting's link"))
+            known.checked_link(mounted, _tensor(link, size, len(mounted), "the mounting's link"))
         length = math.hypot(*self.right_from_left.translation)
         # A thousandth of a millimeter in a meter: more is not rounding but another rig.
         if self.calibration and not math.isclose(self.calibration.baseline_m, length, rel_tol=1e-6):

@@ -17,7 +17,7 @@ from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.cep import circular_error
 from kcal.locate.datum import Geoid, geoid_heights
 from kcal.locate.geodesy import azimuth_elevation, enu_to_geodetic
-from kcal.locate.localizer import REFRACTION, REFRACTION_SIGMA, Localization, StereoLocalizer
+from kcal.locate.localizer import Localization, StereoLocalizer
 from kcal.locate.stereo import PositionStatus
 
 # A reprojection error of this many sigma is not noise: two different things were marked, or the rig has moved.
@@ -140,8 +140,8 @@ def locate_points(
     calibration: RigCovariance | None = None,
     mounting: Tensor | None = None,
     link: Tensor | None = None,
-    refraction: float = REFRACTION,
-    refraction_sigma: float = REFRACTION_SIGMA,
+    refraction: float | None = None,
+    refraction_sigma: float | None = None,
     geoid: Geoid | None = None,
 ) -> Located:
     """Positions on the Earth of things marked in both images of a stereo rig.

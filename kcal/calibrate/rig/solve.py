@@ -27,6 +27,7 @@ from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import provenance
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, check_refraction
 from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, SolverStatus
 
@@ -52,6 +53,9 @@ class RigOptions:
         board_warp: estimate two parabolas by which the board bends, where no calibration knows its shape.
         weighted: let corners count by their covariances where all views have them.
         reject: leave out what contradicts the rest; otherwise warnings name it. Left out or not, it is listed.
+        refraction: of light towards landmarks, as a share of the Earth's curvature; estimated from here. For
+            simulations and other straight lines it and its sigma are 0.
+        refraction_sigma: its standard deviation beforehand; 0 holds it.
         solver: options of the Levenberg-Marquardt solver; residuals are in sigmas.
     """
 
@@ -59,11 +63,14 @@ class RigOptions:
     board_warp: bool = False
     weighted: bool = True
     reject: bool = True
+    refraction: float = REFRACTION
+    refraction_sigma: float = REFRACTION_SIGMA
     solver: LMOptions = dataclasses.field(default_factory=lambda: LMOptions(residual_floor=1e-8))
 
     def __post_init__(self) -> None:
         if self.intrinsics not in ("fixed", "prior", "free"):
             raise InputError(f"intrinsics must be fixed, prior or free, got {self.intrinsics!r}")
+        check_refraction(self.refraction, self.refraction_sigma)
 
 
 def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
@@ -110,7 +117,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     masks, reasons = _first_masks(initial, reject=options.reject)
     work = _robust(initial, masks, unknowns)
     # With lenses among the unknowns digits are dear, and what is wrong shows without them.
-    looking = ROUGHLY if bool(unknowns.known.any()) else options.solver
+    looking = ROUGHLY if unknowns.refine_lenses else options.solver
     if options.reject:
         masks = without_wrong(work, masks, looking)
     else:
@@ -179,7 +186,7 @@ def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reaso
 
 
 def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns]:
-    """What may change of cameras and board, and the data with the board as it is expected."""
+    """What may change of cameras, board and air, and the data with the board as it is expected."""
     boards = data.boards
     if options.intrinsics == "prior":
         known = []
@@ -197,6 +204,8 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
         unknowns = held(data.cameras) if options.intrinsics == "fixed" else free(data.cameras, data.names)
     if options.board_warp and boards is not None and not len(unknowns.shapes):
         unknowns = unknowns.and_warp(boards.points)
+    if data.absolute:
+        unknowns = unknowns.and_refraction(options.refraction, options.refraction_sigma)
     return data, unknowns
 
 
@@ -207,7 +216,7 @@ def _robust(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> 
     best: tuple[float, Adjustment, PerKind] | None = None
     for start in initial.starts:
         work = Adjustment(initial.data, start, unknowns, sigma)
-        if bool(unknowns.known.any()):
+        if unknowns.refine_lenses:
             # From poses that are far off, lenses would bend towards them, beyond their folds even.
             work.unknowns = held(initial.data.cameras)
         here = possible(work, masks)
