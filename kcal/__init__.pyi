@@ -49,6 +49,7 @@ from kcal.corners.board import Board as Board
 from kcal.corners.detect import Detection as Detection
 from kcal.corners.detect import detect_board as detect_board
 from kcal.corners.detect import detect_images as detect_images
+from kcal.corners.foreign_corners import import_corners as import_corners
 from kcal.corners.images import expand_images as expand_images
 from kcal.corners.images import read_gray as read_gray
 from kcal.corners.match import Matches as Matches
@@ -146,6 +147,7 @@ from kcal.locate.survey import camera_positions as camera_positions
 from kcal.locate.survey import match_landmarks as match_landmarks
 from kcal.locate.survey import read_features as read_features
 from kcal.locate.survey import read_survey as read_survey
+from kcal.locate.survey_files import import_survey as import_survey
 from kcal.locate.triangulate import Triangulate as Triangulate
 from kcal.locate.triangulate import Triangulation as Triangulation
 from kcal.locate.truth import position_errors as position_errors

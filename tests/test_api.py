@@ -138,6 +138,8 @@ PUBLIC = {
     "geodetic_to_enu",
     "image_sigma",
     "import_cameras",
+    "import_corners",
+    "import_survey",
     "load_camera",
     "load_lookup",
     "load_measured_board",

@@ -110,6 +110,18 @@ def import_command(
     fisheye: Annotated[
         bool | None, typer.Option("--fisheye/--no-fisheye", help="Whether four coefficients of OpenCV are a fisheye's.")
     ] = None,
+    board: Annotated[
+        str | None, typer.Option(metavar="CxR", help="Read corners instead, of a board with these inner corners.")
+    ] = None,
+    square: Annotated[
+        str | None, typer.Option(metavar="LENGTH", help="Side of a square of the board with its unit: 25mm.")
+    ] = None,
+    sigma: Annotated[
+        float | None, typer.Option(metavar="M", help="Of surveyed places, along each axis, where the file has none.")
+    ] = None,
+    geoid: Annotated[
+        float | None, typer.Option(metavar="M", help="Height of the geoid there, for the elevations of GPX.")
+    ] = None,
     unit: Annotated[
         str | None,
         typer.Option(metavar="UNIT", help="Unit of the translation, where the file has none: mm, cm, m, in."),
@@ -117,7 +129,9 @@ def import_command(
 ) -> None:
     """Read a camera or a rig from a file of another program.
 
-    The format is recognized. Two cameras with their relative pose become a rig file.
+    The format is recognized. Two cameras with their relative pose become a rig file. With --board, corners become an
+    observations file: mrcal's corners.vnl, CSV (image,u,v,weight), image_points of OpenCV's sample, and MATLAB's
+    imagePoints. GeoJSON and GPX become a survey.csv for `kcal rig --landmarks`.
 
     **Examples**
 
@@ -126,8 +140,18 @@ def import_command(
     `kcal import intrinsics.yml extrinsics.yml --size 640x480 --unit mm -o rig.json`
 
     `kcal import cameras.txt --camera 2 -o second.camera.json`
+
+    `kcal import corners.vnl --board 10x10 --square 58.8mm --size 6000x3376 -o left.obs.json`
+
+    `kcal import places.gpx --sigma 0.02 --geoid -67.3 -o survey.csv`
     """
     check_writable(output, *sources)
+    if board is not None:
+        _import_corners(sources, output, board, square, parse_size(size))
+        return
+    if sources[0].suffix.lower() in (".gpx", ".geojson"):
+        _import_survey(sources, output, sigma, geoid)
+        return
     if unit is not None and unit not in _UNITS:
         raise InputError(f"--unit {unit}: write mm, cm, m or in")
 
@@ -149,4 +173,43 @@ def import_command(
         save_camera(chosen, output)
         out.print(f"camera from {found.format}: {chosen.model}, {chosen.size[0]}x{chosen.size[1]} px", markup=False)
     out.print("not in the file: error bars, calibration record")
+    print_wrote(output)
+
+
+def _import_corners(
+    sources: list[Path], output: Path, board: str, square: str | None, size: tuple[int, int] | None
+) -> None:
+    from kcal.corners.board import Board
+    from kcal.corners.foreign_corners import import_corners
+
+    if square is None or len(sources) != 1:
+        raise InputError("corners are read from one file, with --board and --square")
+    seen = import_corners(sources[0], Board.parse(board, square), size)
+    seen.save(output)
+    weights = "with weights" if seen.covariances() is not None else "without weights"
+    corners = sum(pixel is not None for view in seen.views for pixel in view.pixels)
+    out.print(f"{len(seen.views)} views with {corners} corners, {weights}")
+    print_wrote(output)
+
+
+def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid: float | None) -> None:
+    import csv
+    import io
+
+    from kcal.files import write_atomic
+    from kcal.locate.geodesy import enu_to_geodetic
+    from kcal.locate.survey_files import import_survey
+
+    if len(sources) != 1:
+        raise InputError("places are read from one file")
+    survey = import_survey(sources[0], sigma=sigma, geoid=geoid)
+    assert survey.origin is not None
+    places = enu_to_geodetic(survey.points, survey.origin).tolist()
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["name", "lat", "lon", "height", "sigma", "sigma_up"])
+    for name, (lat, lon, height), (level, _, up) in zip(survey.names, places, survey.sigma.tolist(), strict=True):
+        writer.writerow([name, f"{lat:.11f}", f"{lon:.11f}", f"{height:.5f}", repr(level), repr(up)])
+    write_atomic(output, text.getvalue())
+    out.print(f"{len(places)} places")
     print_wrote(output)

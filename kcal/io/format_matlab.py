@@ -7,12 +7,14 @@ because points were rows.
 from __future__ import annotations
 
 import io
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from kcal.errors import FileError
 from kcal.files import write_atomic
 from kcal.io.foreign import CameraPose, Hints, ImportedCameras, checked_pose, named_camera, numbers, plain, whole_size
 from kcal.lens.camera import Camera
@@ -24,12 +26,7 @@ _METERS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "centimeters": 1e-2, "m"
 
 def read_matlab(path: Path, hints: Hints) -> ImportedCameras:
     """Read a struct of `cameraParameters`, `cameraIntrinsics` or `stereoParameters`; objects must be made structs."""
-    from scipy.io import loadmat
-
-    try:
-        content = loadmat(path, simplify_cells=True)
-    except NotImplementedError:
-        raise ValueError("a file of version 7.3; save it with -v7") from None
+    content = load_mat(path)
     structs = {name: value for name, value in content.items() if not name.startswith("__")}
     # A file may hold one struct, or its fields.
     candidates = [*structs.items(), (path.stem, structs)]
@@ -40,6 +37,26 @@ def read_matlab(path: Path, hints: Hints) -> ImportedCameras:
         if isinstance(value, Mapping) and {"K", "IntrinsicMatrix", "FocalLength"} & set(value):
             return ImportedCameras(format="matlab", cameras=(_camera(value, name, hints),))
     raise ValueError("no struct of camera parameters; save one with s = toStruct(params); save('file.mat', 's')")
+
+
+def load_mat(path: Path) -> dict[str, Any]:
+    """The variables of a `.mat` file, structs as dictionaries.
+
+    Raises:
+        FileError: it cannot be read, or is of version 7.3.
+    """
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        found: dict[str, Any] = loadmat(path, simplify_cells=True)
+    except NotImplementedError:
+        raise FileError(f"{path}: a .mat file of version 7.3; save it with -v7") from None
+    except OSError as error:
+        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
+    except (MatReadError, ValueError, TypeError, KeyError, IndexError, zlib.error, MemoryError) as error:
+        raise FileError(f"{path}: not a .mat file: {error}") from error
+    return found
 
 
 def _camera(value: Mapping[str, Any], name: str, hints: Hints) -> Camera:

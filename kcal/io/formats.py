@@ -163,7 +163,8 @@ def recognized(path: Path) -> str:
         return {".mat": "matlab", ".cameramodel": "mrcal", ".bin": "colmap"}[suffix]
     with reading(path, "camera"):
         text = path.read_text(encoding="utf-8")
-    if suffix == ".json" or text.lstrip()[:1] in ("{", "["):
+    # mrcal's files begin with comments.
+    if suffix == ".json" or re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE).lstrip()[:1] in ("{", "["):
         return _json_format(path, text)
     if suffix == ".xml" or "opencv-matrix" in text or text.startswith("%YAML"):
         return "opencv"

@@ -185,7 +185,9 @@ def fitted_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> l
             found = np.linalg.norm(project(done.paths[0], far) - pixels, axis=1).max()
             model = done.models[0].removeprefix("LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_")
             true = "yes" if found <= misfit.largest + 1e-6 else "NO"
-            rows.append([label, format_name, model, f"{misfit.rms:.2g}", f"{misfit.largest:.4g}", f"{found:.4g} {true}"])
+            rows.append(
+                [label, format_name, model, f"{misfit.rms:.2g}", f"{misfit.largest:.4g}", f"{found:.4g} {true}"]
+            )
     return rows
 
 
