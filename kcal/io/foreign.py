@@ -66,7 +66,11 @@ class ImportedCameras:
 
     def is_rig(self) -> bool:
         """Whether these are two cameras that do not stand in the same place."""
-        return len(self.cameras) == 2 and len(self.poses) == 2 and float(_relative(self.poses).translation.norm()) > 0
+        return (
+            len(self.cameras) == 2
+            and len(self.poses) == 2
+            and float(_second_from_first(self.poses).translation.norm()) > 0
+        )
 
     def rig(self) -> StereoRig:
         """Both cameras as a rig, the first one on the left.
@@ -80,10 +84,10 @@ class ImportedCameras:
                 f"({', '.join(self.names)}) and {len(self.poses)} poses"
             )
         left, right = self.cameras
-        return StereoRig(left, right, *_relative(self.poses))
+        return StereoRig(left, right, *_second_from_first(self.poses))
 
 
-def _relative(poses: Sequence[CameraPose]) -> CameraPose:
+def _second_from_first(poses: Sequence[CameraPose]) -> CameraPose:
     """Of the second camera from the first."""
     first, second = poses
     rotation = second.rotation @ first.rotation.T

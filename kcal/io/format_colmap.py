@@ -43,11 +43,11 @@ def read_colmap(path: Path, hints: Hints) -> ImportedCameras:
     entries = _from_binary(path.read_bytes()) if path.suffix.lower() == ".bin" else _from_text(path)
     if not entries:
         raise ValueError("no cameras")
-    cameras = tuple(_camera(*entry) for entry in entries)
+    cameras = tuple(_colmap_camera(*entry) for entry in entries)
     return ImportedCameras(format="colmap", cameras=cameras)
 
 
-def _camera(number: int, name: str, size: tuple[int, int], values: Sequence[float]) -> Camera:
+def _colmap_camera(number: int, name: str, size: tuple[int, int], values: Sequence[float]) -> Camera:
     known = COLMAP_MODELS[name]
     given = dict(zip(known.parameters, values, strict=True))
     fx = given.pop("fx", None) or given["f"]

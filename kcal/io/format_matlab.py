@@ -35,7 +35,7 @@ def read_matlab(path: Path, hints: Hints) -> ImportedCameras:
             return _pair(value, hints)
     for name, value in candidates:
         if isinstance(value, Mapping) and {"K", "IntrinsicMatrix", "FocalLength"} & set(value):
-            return ImportedCameras(format="matlab", cameras=(_camera(value, name, hints),))
+            return ImportedCameras(format="matlab", cameras=(_matlab_camera(value, name, hints),))
     raise ValueError("no struct of camera parameters; save one with s = toStruct(params); save('file.mat', 's')")
 
 
@@ -59,7 +59,7 @@ def load_mat(path: Path) -> dict[str, Any]:
     return found
 
 
-def _camera(value: Mapping[str, Any], name: str, hints: Hints) -> Camera:
+def _matlab_camera(value: Mapping[str, Any], name: str, hints: Hints) -> Camera:
     if "K" in value or "IntrinsicMatrix" in value:
         matrix = np.array(numbers(value["K"], 9, "K") if "K" in value else numbers(value["IntrinsicMatrix"], 9, "K"))
         matrix = matrix.reshape(3, 3) if "K" in value else matrix.reshape(3, 3).T
@@ -81,9 +81,11 @@ def _camera(value: Mapping[str, Any], name: str, hints: Hints) -> Camera:
 
 
 def _pair(value: Mapping[str, Any], hints: Hints) -> ImportedCameras:
-    cameras = tuple(_camera(value[f"CameraParameters{i}"], side, hints) for i, side in ((1, "left"), (2, "right")))
-    units = str(value.get("WorldUnits") or value["CameraParameters1"].get("WorldUnits") or "mm").strip().lower()
-    notes = []
+    cameras = tuple(
+        _matlab_camera(value[f"CameraParameters{i}"], side, hints) for i, side in ((1, "left"), (2, "right"))
+    )
+    stated = str(value.get("WorldUnits") or value["CameraParameters1"].get("WorldUnits") or "").strip().lower()
+    units = stated or "mm"
     meters = hints.meters or _METERS.get(units)
     if meters is None:
         raise ValueError(f"WorldUnits {units!r}: give the unit (--unit mm)")
@@ -95,10 +97,12 @@ def _pair(value: Mapping[str, Any], hints: Hints) -> ImportedCameras:
         pose = value["PoseCamera2"]
         whole = np.array(numbers(pose["A"] if isinstance(pose, Mapping) else pose, 16, "PoseCamera2")).reshape(4, 4)
         rotation, translation = whole[:3, :3], whole[:3, 3]
-    notes.append(f"translation in {units} by WorldUnits" if hints.meters is None else "translation in the unit given")
+    # MATLAB's own apps work in millimeters.
+    unsaid = hints.meters is None and not stated
+    notes = ("WorldUnits is not in the file: the translation is taken as millimeters (--unit)",) if unsaid else ()
     still = checked_pose(np.eye(3).tolist(), [0.0] * 3)
     pose = checked_pose(rotation.tolist(), (meters * translation).tolist())
-    return ImportedCameras(format="matlab", cameras=cameras, poses=(still, pose), notes=tuple(notes))
+    return ImportedCameras(format="matlab", cameras=cameras, poses=(still, pose), notes=notes)
 
 
 def write_matlab(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:

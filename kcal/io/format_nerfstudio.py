@@ -27,12 +27,12 @@ def read_nerfstudio(path: Path, hints: Hints) -> ImportedCameras:
         values = shared | {key: frame[key] for key in _FIELDS if key in frame}
         found.setdefault(json.dumps(values, sort_keys=True), values | {"name": str(frame.get("file_path", i))})
     single = len(found) == 1
-    cameras = tuple(_camera(values, path.stem if single else values["name"]) for values in found.values())
+    cameras = tuple(_nerfstudio_camera(values, path.stem if single else values["name"]) for values in found.values())
     notes = ("the poses of the frames are not kept",) if any("transform_matrix" in frame for frame in frames) else ()
     return ImportedCameras(format="nerfstudio", cameras=cameras, notes=notes)
 
 
-def _camera(values: dict[str, Any], name: str) -> Camera:
+def _nerfstudio_camera(values: dict[str, Any], name: str) -> Camera:
     kind = str(values.get("camera_model", "OPENCV"))
     if kind not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE"):
         raise ValueError(f"camera_model {kind}: kcal reads OPENCV, PINHOLE and OPENCV_FISHEYE")

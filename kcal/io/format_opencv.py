@@ -28,14 +28,14 @@ def read_opencv(path: Path, hints: Hints) -> ImportedCameras:
     """Read one camera, a pair, or the R and T of a pair whose cameras are in another file."""
     file = _opened(path)
     notes: list[str] = []
-    size = hints.size or _size(file)
+    size = hints.size or _stored_size(file)
     pairs = [("M1", "D1", "left"), ("M2", "D2", "right")]
     if file.getNode("M1").empty() and not file.getNode("cameraMatrix1").empty():
         pairs = [("cameraMatrix1", "distCoeffs1", "left"), ("cameraMatrix2", "distCoeffs2", "right")]
     poses: tuple[CameraPose, ...] = ()
     if not file.getNode("R").empty() and not file.getNode("T").empty():
         meters = hints.meters or 1.0
-        rotation, translation = _matrix(file, "R", 9), [meters * t for t in _matrix(file, "T", 3)]
+        rotation, translation = _stored_numbers(file, "R", 9), [meters * t for t in _stored_numbers(file, "T", 3)]
         poses = (checked_pose(np.eye(3).tolist(), [0.0, 0.0, 0.0]), checked_pose(rotation, translation))
         if hints.meters is None:
             notes.append("the unit of T is not in the file: taken as meters (--unit mm for millimeters)")
@@ -45,7 +45,8 @@ def read_opencv(path: Path, hints: Hints) -> ImportedCameras:
         if not pairs and not poses:
             raise ValueError(f"no camera; {_MATRICES[0]}, M1 or R and T are needed")
     cameras = tuple(
-        _camera(file, matrix, coefficients, name, size, hints.fisheye, notes) for matrix, coefficients, name in pairs
+        _opencv_camera(file, matrix, coefficients, name, size, hints.fisheye, notes)
+        for matrix, coefficients, name in pairs
     )
     return ImportedCameras(format="opencv", cameras=cameras, poses=poses, notes=tuple(dict.fromkeys(notes)))
 
@@ -66,7 +67,7 @@ def _present(file: Any, names: Sequence[str]) -> str:
     return next((name for name in names if not file.getNode(name).empty()), "")
 
 
-def _size(file: Any) -> tuple[int, int] | None:
+def _stored_size(file: Any) -> tuple[int, int] | None:
     width, height = (
         _present(file, [f"image_{side}", f"image_{side.capitalize()}", side]) for side in ("width", "height")
     )
@@ -79,23 +80,23 @@ def _size(file: Any) -> tuple[int, int] | None:
     return None
 
 
-def _matrix(file: Any, name: str, count: int | Sequence[int]) -> list[float]:
+def _stored_numbers(file: Any, name: str, count: int | Sequence[int]) -> list[float]:
     node = file.getNode(name)
     value = node.mat() if node.isMap() else [node.at(i).real() for i in range(node.size())] if node.isSeq() else None
     return numbers([] if value is None else value.ravel() if hasattr(value, "ravel") else value, count, name)
 
 
-def _camera(
+def _opencv_camera(
     file: Any, matrix: str, coefficients: str, name: str, size: Any, fisheye: bool | None, notes: list[str]
 ) -> Camera:
     if size is None:
         raise ValueError("the image size is not in the file; give it (--size WIDTHxHEIGHT)")
-    fx, skew, cx, zero_a, fy, cy, *last = _matrix(file, matrix, 9)
+    fx, skew, cx, zero_a, fy, cy, *last = _stored_numbers(file, matrix, 9)
     if zero_a or last != [0.0, 0.0, 1.0]:
         raise ValueError(f"{matrix} is no camera matrix")
     if skew:
         notes.append(f"{matrix} has a skew of {skew:g}, which OpenCV does not use and kcal does not take over")
-    lens = _matrix(file, coefficients, tuple(_BY_COUNT)) if coefficients else []
+    lens = _stored_numbers(file, coefficients, tuple(_BY_COUNT)) if coefficients else []
     node = file.getNode("fisheye_model")
     known = fisheye if fisheye is not None else bool(node.real()) if not node.empty() else None
     if known and len(lens) != 4:

@@ -29,13 +29,13 @@ def read_opensfm(path: Path, hints: Hints) -> ImportedCameras:
     if isinstance(content, list):
         content = content[0]
     content = content.get("cameras", content)
-    cameras = tuple(_camera(name, value) for name, value in content.items())
+    cameras = tuple(_opensfm_camera(name, value) for name, value in content.items())
     if not cameras:
         raise ValueError("no cameras")
     return ImportedCameras(format="opensfm", cameras=cameras)
 
 
-def _camera(name: str, value: Mapping[str, Any]) -> Camera:
+def _opensfm_camera(name: str, value: Mapping[str, Any]) -> Camera:
     kind = str(value["projection_type"])
     if kind not in _LENSES:
         raise ValueError(f"{name}: projection_type {kind}: kcal reads {', '.join(_LENSES)}")

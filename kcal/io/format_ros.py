@@ -78,11 +78,11 @@ def write_ros(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path
             "image_width": camera.size[0],
             "image_height": camera.size[1],
             "camera_name": camera_name(camera, target.stem),
-            "camera_matrix": _block(np.array(plain(camera.matrix))),
+            "camera_matrix": _matrix_block(np.array(plain(camera.matrix))),
             "distortion_model": kind,
-            "distortion_coefficients": _block(np.array([lens])),
-            "rectification_matrix": _block(rotation),
-            "projection_matrix": _block(projection),
+            "distortion_coefficients": _matrix_block(np.array([lens])),
+            "rectification_matrix": _matrix_block(rotation),
+            "projection_matrix": _matrix_block(projection),
         }
         write_atomic(target, dump_yaml(content))
     return paths
@@ -92,7 +92,7 @@ def _projection(camera: Camera) -> np.ndarray:
     return np.pad(np.array(plain(camera.matrix)), ((0, 0), (0, 1)))
 
 
-def _block(values: np.ndarray) -> dict[str, Any]:
+def _matrix_block(values: np.ndarray) -> dict[str, Any]:
     return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
 
 

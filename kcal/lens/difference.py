@@ -136,7 +136,7 @@ def camera_difference(
     good = good & seen_by_second
     if int(good.sum()) < 8:
         raise DegenerateError(f"camera_difference: only {int(good.sum())} of {len(flat)} pixels have a ray in both")
-    weight = _weights(first, second, flat, good)
+    weight = _inverse_variances(first, second, flat, good)
     points = FAR * rays if math.isinf(at) else first.ray_origins(rays) + at * rays
     freedom = 0 if rotation is not None else 3 if math.isinf(at) else 6
     start = nearest_rotation((rays_second * weight[:, None]).T @ rays) if rotation is None else rotation.double()
@@ -164,7 +164,7 @@ def _has_errors(camera: Camera) -> bool:
     return known is not None and known.lens_size > 0
 
 
-def _weights(first: Camera, second: Camera, pixels: Tensor, good: Tensor) -> Tensor:
+def _inverse_variances(first: Camera, second: Camera, pixels: Tensor, good: Tensor) -> Tensor:
     """(N,) inverse variances with mean one, zero where a camera has no ray."""
     variance = torch.zeros_like(pixels[:, 0])
     for camera in (first, second):

@@ -56,9 +56,10 @@ def hybrid_camera(shape: float, corner_deg: float) -> Camera:
     size, angle = (1920, 1080), math.radians(corner_deg)
     half = 0.5 * math.hypot(*size)
     focal = half / (float(radius_over_angle(torch.tensor(shape * angle * angle).double())) * angle)
-    form = HybridForm(shape=shape, radius=1.08 * half / focal, modes=ZernikeModes())
-    noise = torch.randn(len(form.modes), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    degrees = torch.tensor([float(degree) for *_, degree in form.modes.real_modes], dtype=torch.float64)
+    modes = ZernikeModes()
+    form = HybridForm(shape=shape, radius=1.08 * half / focal, modes=modes)
+    noise = torch.randn(len(modes), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    degrees = torch.tensor([float(degree) for *_, degree in modes.real_modes], dtype=torch.float64)
     head = torch.tensor([focal, 1.0005 * focal, 963.0, 536.0, 0.0, 0.01, 2e-3, 1e-3], dtype=torch.float64)
     weights = 3e-4 * form.radius * torch.exp(-0.5 * degrees) * noise
     return Camera(torch.cat([head, weights]), size=size, model=LensModel(hybrid=form))

@@ -29,7 +29,7 @@ def run(*words: object) -> str:
 
 @pytest.fixture
 def camera(tmp_path: Path) -> Path:
-    known = Camera.build(focal=(800, 810), center=(320, 240), size=(640, 480), coefficients=[-0.1, 0.02, 1e-3, 0, 0])
+    known = Camera.build(focal=(800, 810), center=(320, 240), size=(640, 480), coefficients=[-0.1, 0.02, 1e-3, 0, 1e-3])
     spread = torch.tensor([1.0, 1, 2, 2, 0, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4], dtype=torch.float64)
     known.calibration = CameraCalibration(name="north", covariance=torch.diag(spread**2))
     return save_camera(known, tmp_path / "a.json")

@@ -160,7 +160,9 @@ class TestValues:
         turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
         pose = {"RotationOfCamera2": turn.T, "TranslationOfCamera2": [-120.0, 0, 1]}
         savemat(tmp_path / "s.mat", {"s": {"CameraParameters1": one, "CameraParameters2": one, **pose}})
-        rig = import_cameras(tmp_path / "s.mat").rig()
+        found = import_cameras(tmp_path / "s.mat")
+        assert "taken as millimeters" in found.notes[0]
+        rig = found.rig()
         assert rig.left.params.tolist() == [500, 510, 320, 240, 0.5, -0.2, 0.05, 0.001, 0.002]
         assert rig.right_from_left_rotation.tolist() == turn.tolist()
         assert rig.right_from_left_translation.tolist() == pytest.approx([-0.12, 0, 0.001])
