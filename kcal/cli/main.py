@@ -18,8 +18,11 @@ from kcal.cli.compare import compare_command
 from kcal.cli.console import err
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
+from kcal.cli.diff import diff_command
+from kcal.cli.exchange import export_command, import_command
 from kcal.cli.locate import locate_command
 from kcal.cli.rig import app as rig
+from kcal.cli.show import show_command
 from kcal.cli.undistort import undistort_command
 from kcal.errors import KcalError
 
@@ -59,6 +62,10 @@ app.command("locate")(locate_command)
 app.command("budget")(budget_command)
 app.command("undistort")(undistort_command)
 app.command("bake")(bake_command)
+app.command("export")(export_command)
+app.command("import")(import_command)
+app.command("show")(show_command)
+app.command("diff")(diff_command)
 
 
 def main() -> None:
