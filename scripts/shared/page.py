@@ -49,9 +49,9 @@ CONCLUSIONS = {
         "the error."
     ),
     "refraction.md": (
-        "**Conclusion.** Mark some landmarks as far away as your targets. With the coefficient of refraction off by 0.2, "
-        "heights at 5 km are then wrong by 0.05 m; from landmarks within 400 m they are wrong by 0.35 m, which the "
-        "stated error of ± 0.2 m (one sigma) contains."
+        "**Conclusion.** Mark some landmarks as far away as your targets. With the coefficient of refraction off by "
+        "0.2, heights at 5 km are then wrong by 0.05 m; from landmarks within 400 m they are wrong by 0.35 m, 1.8 of "
+        "the sigmas that are stated."
     ),
     "rig.md": (
         "**Conclusion.** Twelve surveyed landmarks give honest intervals: 94 to 97 % of them contain the true range "
