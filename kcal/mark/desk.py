@@ -68,8 +68,8 @@ class Desk:
             height, width = self.pictures.image(side, 0).shape
             if (width, height) != camera.size:
                 raise InputError(
-                    f"the {side} image has {width}x{height} pixels, its camera {camera.size[0]}x{camera.size[1]}; is it "
-                    "the right file?"
+                    f"the {side} image has {width}x{height} pixels, its camera {camera.size[0]}x{camera.size[1]}; is "
+                    "it the right file?"
                 )
 
     def close(self) -> None:
@@ -246,9 +246,9 @@ def position_text(position: Position, anchored: bool) -> Json:
     """A position with the range and its 95 % interval as text, and the numbers."""
     low, high, best = position.range_low_m, position.range_high_m, position.range_m
     if position.status == PositionStatus.OK and best is not None and low is not None and high is not None:
-        text = f"{_meters(best)} ({_meters(low)} to {_meters(high)})"
+        text = f"{_range_words(best)} ({_range_words(low)} to {_range_words(high)})"
     elif low is not None:
-        text = f"farther than {_meters(low)}"
+        text = f"farther than {_range_words(low)}"
     else:
         text = position.reason or "no position"
     place = ""
@@ -260,7 +260,7 @@ def position_text(position: Position, anchored: bool) -> Json:
     }  # fmt: skip
 
 
-def _meters(value: float) -> str:
+def _range_words(value: float) -> str:
     if math.isinf(value):
         return "infinity"
     return f"{value:.1f} m" if value < 1000 else f"{value:.0f} m" if value < 10_000 else f"{value / 1000:.1f} km"
@@ -277,5 +277,7 @@ def _finite(value: float) -> float | None:
 def _proposal(found: Proposal) -> Json:
     if found.refusal:
         return {"refusal": found.refusal, "score": _finite(found.score)}
-    return {"refusal": "", "u": found.u, "v": found.v, "cov": found.cov, "score": _finite(found.score), "how": found.how,
-            "off_line": _finite(found.off_line), "sigma": math.sqrt(max(found.cov[0], found.cov[2]))}  # fmt: skip
+    return {
+        "refusal": "", "u": found.u, "v": found.v, "cov": found.cov, "how": found.how, "score": _finite(found.score),
+        "off_line": _finite(found.off_line), "sigma": math.sqrt(max(found.cov[0], found.cov[2])),
+    }  # fmt: skip

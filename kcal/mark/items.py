@@ -142,7 +142,7 @@ class Rename(_Strict):
     kind: Kind
 
 
-class Survey(_Strict):
+class SurveyPlace(_Strict):
     """Type in where a landmark is."""
 
     do: Literal["survey"]
@@ -171,7 +171,7 @@ class Step(_Strict):
     do: Literal["undo", "redo"]
 
 
-Change = Add | Put | Take | Drop | Rename | Survey | Places | Load
+Change = Add | Put | Take | Drop | Rename | SurveyPlace | Places | Load
 Action = Annotated[Change | Step, pydantic.Field(discriminator="do")]
 ACTION: pydantic.TypeAdapter[Change | Step] = pydantic.TypeAdapter(Action)
 
@@ -199,7 +199,7 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
             survey[name] = place
             items.setdefault(name, Item(kind="landmark"))
         return MarkingState(items=items, survey=survey)
-    if isinstance(action, Survey):
+    if isinstance(action, SurveyPlace):
         survey[action.name] = action.place
         items.setdefault(action.name, Item(kind="landmark"))
         return MarkingState(items=items, survey=survey)
@@ -215,7 +215,7 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
     if isinstance(action, Put):
         items[action.name] = _with_mark(action, item)
     elif isinstance(action, Take):
-        items[action.name] = _marked(_unmatched(item), action.side, None)
+        items[action.name] = _item_with(_unmatched(item), action.side, None)
     elif isinstance(action, Drop):
         del items[action.name]
     else:
@@ -239,10 +239,10 @@ def _with_mark(action: Put, item: Item) -> Item:
     if action.matched and far is None:
         raise InputError(f"{action.name} has no mark in the other image to be matched with")
     cross = other_side(action.side) if action.matched else None
-    return dataclasses.replace(_marked(_unmatched(item), action.side, action.mark), cross=cross)
+    return dataclasses.replace(_item_with(_unmatched(item), action.side, action.mark), cross=cross)
 
 
-def _marked(item: Item, side: Side, mark: Mark | None) -> Item:
+def _item_with(item: Item, side: Side, mark: Mark | None) -> Item:
     return dataclasses.replace(item, left=mark) if side == "left" else dataclasses.replace(item, right=mark)
 
 
@@ -254,4 +254,4 @@ def _unmatched(item: Item) -> Item:
     side = other_side(item.cross)
     mark = item.mark(side)
     assert mark is not None
-    return dataclasses.replace(_marked(item, side, mark.model_copy(update={"cov": total})), cross=None)
+    return dataclasses.replace(_item_with(item, side, mark.model_copy(update={"cov": total})), cross=None)

@@ -57,7 +57,8 @@ def map_content(rig: StereoRig, located: Located | None, survey: Survey | None, 
         "anchored": anchored,
         "cameras": [{"name": n, "place": p} for n, p in zip(("left", "right"), places(centers, origin), strict=True)],
         "landmarks": [
-            {"name": name, "place": place} for name, place in zip(survey.names, places(survey.points, frame), strict=True)
+            {"name": name, "place": place}
+            for name, place in zip(survey.names, places(survey.points, frame), strict=True)
         ] if survey is not None and drawn else [],
         "targets": targets,
     }  # fmt: skip

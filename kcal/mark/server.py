@@ -155,7 +155,7 @@ def marking_app(desk: Desk, token: str, hosts: tuple[str, ...]) -> Starlette:
         Route(f"/api/{name}", asked(model, answer), methods=[method]) for name, (model, answer, method) in data.items()
     ]
     pages = page_files()
-    routes += [Route(path, _page(content, kind), methods=["GET"]) for path, (content, kind) in pages.items()]
+    routes += [Route(path, _static_page(content, kind), methods=["GET"]) for path, (content, kind) in pages.items()]
     return Starlette(
         routes=routes,
         middleware=[Middleware(_Gate, token=token, hosts=hosts)],
@@ -209,7 +209,7 @@ def _secured(response: Response) -> Response:
     return response
 
 
-def _page(content: bytes, kind: str) -> Callable[[Request], Awaitable[Response]]:
+def _static_page(content: bytes, kind: str) -> Callable[[Request], Awaitable[Response]]:
     async def endpoint(_: Request) -> Response:
         return Response(content, media_type=kind)
 

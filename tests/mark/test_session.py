@@ -9,7 +9,7 @@ import torch
 from kcal.errors import FileError, InputError
 from kcal.locate.marks import Marks, read_marks, write_marks
 from kcal.locate.survey import match_landmarks, read_survey
-from kcal.mark.items import Add, Drop, Mark, Place, Put, Rename, Side, Step, Survey, Take
+from kcal.mark.items import Add, Drop, Mark, Place, Put, Rename, Side, Step, SurveyPlace, Take
 from kcal.mark.session import Session, pair_covariance
 
 SURVEY = "name,lat,lon,height,sigma\npost,40.1,-113.9,1282,0.02\nroof,40.2,-113.8,1290,0.02\n"
@@ -160,7 +160,7 @@ def test_names_places_and_removals(tmp_path: Path, survey: Path) -> None:
     session = Session(tmp_path / "marks.csv", survey)
     work(session)
     session.do(Rename(do="rename", name="post", to="hill, west", kind="landmark"), "key-0007")
-    session.do(Survey(do="survey", name="well", place=Place(at=(40.15, -113.85, 1280.0), sigma=0.05)), "key-0008")
+    session.do(SurveyPlace(do="survey", name="well", place=Place(at=(40.15, -113.85, 1280.0), sigma=0.05)), "key-0008")
     session.do(Take(do="take", name="roof", side="left"), "key-0009")
     assert read_marks(session.files.marks, single=True).names == ("hill, west",)
     assert read_survey(session.files.landmarks).names == ("hill, west", "roof", "well")
