@@ -13,11 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
 from scipy.special import ndtr
 
 Floats = NDArray[np.float64]
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _CONVERGED = 5e-4  # pixels: the last step of a converged point is shorter
+_ALIKE = 4  # pixels within which what is not explained counts as alike
 _STEEPEST = 0.985  # correlation: lines that meet at less than 10° are one edge
 
 
@@ -165,10 +167,12 @@ def fit_shape(
     used = weight > 0.01
     where, levels, weight = where[used], levels[used], weight[used]
     root = np.sqrt(weight)
+    # What stands behind may be brighter on one side.
+    slope = where / np.abs(where).max()
     target = root * levels
 
     def residual(p: Floats) -> Floats:
-        design = root[:, None] * shape.patterns(where, p)
+        design = root[:, None] * np.concatenate([shape.patterns(where, p), slope], 1)
         normal = design.T @ design
         normal[np.diag_indices_from(normal)] *= 1 + 1e-10  # patterns may be equal far from the point
         result: Floats = target - design @ np.linalg.solve(normal + 1e-12 * np.eye(len(normal)), design.T @ target)
@@ -177,7 +181,7 @@ def fit_shape(
     low, high = np.array([-6.0, -6.0, *shape.low]), np.array([6.0, 6.0, *shape.high])
     costs = [0.0] if len(starts) == 1 else [float(np.square(residual(p)).sum()) for p in starts]
     _, best = _minimized(residual, starts[int(np.argmin(costs))], low, high, iterations)
-    return _described(shape, best, residual, weight, target, root)
+    return _described(shape, best, residual, weight, target, where)
 
 
 def starts_at(shape: ShapeModel, points: Floats) -> Floats:
@@ -225,14 +229,14 @@ def slopes(residual: Callable[[Floats], Floats], p: Floats, r: Floats) -> Floats
 
 
 def _described(
-    shape: ShapeModel, p: Floats, residual: Callable[[Floats], Floats], weight: Floats, target: Floats, root: Floats
+    shape: ShapeModel, p: Floats, residual: Callable[[Floats], Floats], weight: Floats, target: Floats, where: Floats
 ) -> ShapeFit | None:
     r = residual(p)
     jacobian = slopes(residual, p, r)
     length = np.linalg.norm(jacobian, axis=0) + 1e-12
     scaled = jacobian / length
     normal = scaled.T @ scaled
-    patterns = shape.patterns(np.zeros((1, 2)), p).shape[1]
+    patterns = shape.patterns(np.zeros((1, 2)), p).shape[1] + 2
     count = float(weight.sum())
     freedom = max(count - len(p) - patterns, 1.0)
     noise2 = float(r @ r) / freedom
@@ -241,11 +245,36 @@ def _described(
     if values[-1] <= 0:
         return None
     inverse = (vectors / np.maximum(values, 1e-9 * values[-1])) @ vectors.T
-    # Weights shape the window and are not inverse variances: the noise is that of single pixels.
-    spread = inverse @ ((scaled * weight[:, None]).T @ scaled) @ inverse
-    covariance = noise2 * spread[:2, :2] / np.outer(length[:2], length[:2])
+    # Weights shape the window and are not inverse variances: the noise is that of single pixels. It is white, or what
+    # the model does not explain, which is alike in neighboring pixels: the larger of the two counts.
+    white = noise2 * (scaled * weight[:, None]).T @ scaled
+    alike = count / freedom * _with_neighbors(scaled * r[:, None], where)
+    covariance = _larger(*(inverse @ part @ inverse for part in (white, alike)))[:2, :2] / np.outer(
+        length[:2], length[:2]
+    )
+    root = np.sqrt(weight)
     mean = float((root * target).sum()) / count
     total = float(np.square(target - root * mean).sum())
     explained = 1 - float(r @ r) / max(total, 1e-12)
     score = count * math.log(max(noise2, 1e-3) * freedom / count) + (len(p) + patterns) * math.log(count)
     return ShapeFit(shape.name, p, p[:2], covariance, math.sqrt(noise2), explained, score)
+
+
+def _with_neighbors(scores: Floats, where: Floats) -> Floats:
+    """Sum of products of scores (N, P) of pixels with those of their neighbors, weighted by a pyramid of distance.
+
+    The covariance of a sum whose terms are alike in space: T. G. Conley, "GMM estimation with cross sectional
+    dependence", 1999.
+    """
+    columns, rows = (np.rint(where - where.min(0))).astype(int).T
+    image = np.zeros((rows.max() + 1, columns.max() + 1, scores.shape[1]))
+    image[rows, columns] = scores
+    tent = 1 - np.abs(np.arange(-_ALIKE, _ALIKE + 1)) / (_ALIKE + 1)
+    spread = convolve1d(convolve1d(image, tent, axis=0, mode="constant"), tent, axis=1, mode="constant")
+    result: Floats = np.einsum("yxp,yxq->pq", image, spread)
+    return 0.5 * (result + result.T)
+
+
+def _larger(first: Floats, second: Floats) -> Floats:
+    """The covariance whose part for the point is larger."""
+    return first if np.trace(first[:2, :2]) > np.trace(second[:2, :2]) else second

@@ -198,8 +198,11 @@ def seen(rig: StereoRig, point: Tensor, side: int) -> tuple[Floats, Floats]:
     return here[0].numpy(), slopes[0] @ np.linalg.inv(slopes[1])
 
 
-def background(rig: StereoRig, side: int, random: np.random.Generator) -> Floats:
-    """Sky, hills and ground as a function of the direction alone, so that both images show the same at infinity."""
+def background(rig: StereoRig, side: int, random: np.random.Generator, amplitude: float = 1.6) -> Floats:
+    """Sky, hills and ground as a function of the direction alone, so that both images show the same at infinity.
+
+    The hills' gray levels vary by 3.5 times the amplitude (standard deviation), over 10 px and more.
+    """
     camera = rig.left if side == 0 else rig.right
     width, height = camera.size
     grid = camera.grid(width // 4 + 2, height // 4 + 2).reshape(-1, 2)
@@ -211,7 +214,7 @@ def background(rig: StereoRig, side: int, random: np.random.Generator) -> Floats
     for _ in range(24):
         frequency, turn, phase = random.uniform(10, 400), random.uniform(0, math.pi), random.uniform(0, 2 * math.pi)
         wave = np.sin(frequency * (azimuth * math.cos(turn) + elevation * math.sin(turn)) + phase)
-        light += 1.6 * wave * (elevation < 0.06)
+        light += amplitude * wave * (elevation < 0.06)
     coarse = torch.from_numpy(light.reshape(1, 1, height // 4 + 2, width // 4 + 2))
     return torch.nn.functional.interpolate(coarse, size=(height, width), mode="bicubic", align_corners=True)[
         0, 0

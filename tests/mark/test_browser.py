@@ -1,15 +1,16 @@
-"""A real browser: everything marked by script as an operator would, the rig solved, and the server killed in between."""
+"""A real browser: a site is marked by script as an operator would, and the server is killed in between."""
 
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from marking_browser import CHROMIUM, Server, chromium_page, choose, click_at, free_port, look_at, settled
+from marking_browser import CHROMIUM, Server, choose, chromium_page, click_at, free_port, look_at, settled
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
@@ -24,7 +25,8 @@ for library in ("starlette", "uvicorn", "playwright"):
 if CHROMIUM is None:
     pytest.skip("Chromium is not installed (Debian: apt-get install chromium)", allow_module_level=True)
 
-KILLS = 10
+# Each start of the server takes seconds; `test_session.py` kills sessions at ten moments, without a browser.
+KILLS = int(os.environ.get("KCAL_KILLS", "3"))
 
 
 @pytest.fixture(scope="module")

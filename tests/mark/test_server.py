@@ -80,8 +80,8 @@ def test_other_hosts_are_refused(client: TestClient) -> None:
         (json.dumps({"key": "k", "action": {"do": "undo"}}).encode(), 422, "key: String should have at least 8"),
         (json.dumps({"key": "12345678", "action": {"do": "undo"}}).encode(), 400, "nothing to undo"),
         (json.dumps({"key": "12345678", "action": {"do": "rm"}}).encode(), 422, "does not match any of the expected"),
-        (json.dumps({"key": "12345678", "action": {"do": "put", "name": "x", "side": "left", "mark": MARK}}).encode(), 400,
-         "nothing is named 'x'"),
+        (json.dumps({"key": "12345678", "action": {"do": "put", "name": "x", "side": "left", "mark": MARK}}).encode(),
+         400, "nothing is named 'x'"),
         (json.dumps({"key": "12345678", "action": {"do": "add", "name": "a\nb", "kind": "target"}}).encode(), 400,
          "one line"),
         (b'{"key": "12345678", "action": {"do": "put", "name": "x", "side": "left", "mark": {"u": NaN, "v": 1, "cov": '

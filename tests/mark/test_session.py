@@ -1,6 +1,11 @@
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import random
+import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -168,3 +173,39 @@ def test_names_places_and_removals(tmp_path: Path, survey: Path) -> None:
     assert session.files.points.read_text().count("\n") == 1
     with pytest.raises(InputError, match="nothing is named 'truck'"):
         session.do(Drop(do="drop", name="truck"), "key-0011")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
+def test_what_was_answered_survives_a_kill_at_any_moment(tmp_path: Path) -> None:
+    """A child marks as fast as it can and tells what was answered; it is killed ten times, also within a write."""
+    moments, answered = random.Random(0), []
+    for turn in range(10):
+        reading, writing = os.pipe()
+        child = os.fork()
+        if child == 0:
+            with contextlib.suppress(BaseException):
+                session = Session(tmp_path / "marks.csv")
+                for number in range(10_000):
+                    name = f"{turn}-{number}"
+                    session.do(Add(do="add", name=name, kind="target"), f"add-{name}")
+                    session.do(put(name, "left", mark(number, 1.0)), f"left-{name}")
+                    session.do(put(name, "right", mark(number, 2.0)), f"right-{name}")
+                    os.write(writing, f"{name}\n".encode())
+            os._exit(0)
+        os.close(writing)
+        told = os.read(reading, 4096)
+        time.sleep(moments.uniform(0.0, 0.1))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        while part := os.read(reading, 4096):
+            told += part
+        os.close(reading)
+        answered += told.decode().split()
+        session = Session(tmp_path / "marks.csv")
+        points = read_marks(session.files.points)
+        session.close()
+        found = dict(zip(points.names, points.pixels.tolist(), strict=True))
+        assert {name: found.get(name) for name in answered} == {
+            name: [[float(name.partition("-")[2]), 1.0], [float(name.partition("-")[2]), 2.0]] for name in answered
+        }
+    assert len(answered) >= 10
