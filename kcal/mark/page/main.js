@@ -71,8 +71,8 @@ class App {
     document.documentElement.dataset.version = state.version;
     document.documentElement.dataset.pending = state.pending;
     this.draw();
-    drawTable(this);
     drawPanel(this);
+    drawTable(this);
     if (state.pending) this.poll();
     else { drawMap(this); if (rigChanged) this.guide(); }
   }
@@ -100,8 +100,8 @@ class App {
         }
       }
     }
-    drawTable(this);
     drawPanel(this);
+    drawTable(this);
     drawMap(this);
     this.draw();
     this.guide();

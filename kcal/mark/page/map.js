@@ -12,10 +12,10 @@ function build() {
   map.setView([0, 0], 2);
 }
 
-function named(shape, name) {
+function named(shape, name, permanent) {
   const words = document.createElement("span");
   words.textContent = name;
-  return shape.bindTooltip(words, {permanent: true, direction: "right", className: "map-name", offset: [5, 0]});
+  return shape.bindTooltip(words, {permanent, direction: "right", className: "map-name", offset: [5, 0]});
 }
 
 export const drawMap = latest(async (app) => {
@@ -29,7 +29,7 @@ export const drawMap = latest(async (app) => {
     spots.push(place);
     const chosen = name === app.selected;
     const shape = L.circleMarker(place, {radius: chosen ? 8 : 5, color: chosen ? "#000" : "#fff", weight: chosen ? 3 : 1, fillColor: wrong.has(name) ? "#d55e00" : color, fillOpacity: 1});
-    named(shape, (wrong.has(name) ? "⚠ " : square) + name).addTo(layer);
+    named(shape, (wrong.has(name) ? "⚠ " : square) + name, chosen || wrong.has(name) || square === "● ").addTo(layer);
     shape.on("click", () => app.select(name));
   };
   for (const camera of data.cameras) {

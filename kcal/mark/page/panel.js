@@ -84,8 +84,8 @@ function drawHistory(history) {
   const svg = byId("history");
   svg.textContent = "";
   const points = history.filter((entry) => entry.promises.length > 1).map((entry) => [entry.count, entry.promises[1].total]);
-  svg.style.display = points.length ? "" : "none";
-  if (!points.length) return;
+  svg.style.display = points.length > 1 ? "" : "none";
+  if (points.length < 2) return;
   const add = (name, attributes, text) => {
     const element = document.createElementNS("http://www.w3.org/2000/svg", name);
     for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
