@@ -43,7 +43,8 @@ def locate_command(
         ),
     ] = None,
     pixel_sigma: Annotated[
-        float, typer.Option(metavar="PX", help="Standard deviation of the marks along each axis.")
+        float,
+        typer.Option(metavar="PX", help="Standard deviation of the marks along each axis, where the CSV has none."),
     ] = 0.3,
     yaw_sigma: Annotated[
         float,
@@ -182,6 +183,7 @@ def locate_command(
         roll_deg=roll,
         pixel_sigma=pixel_sigma,
         names=marks.names,
+        cov=marks.covariance_or(pixel_sigma),
         calibration=calibration,
         mounting=mounting if bool(mounting.any()) else None,
         link=link,
@@ -206,7 +208,8 @@ def locate_command(
     for position in located.positions:
         if position.reason:
             out.print(f"* {position.name}: {position.reason}", markup=False)
-    out.print(f"Interval: {located.interval_note}; marks have {pixel_sigma:g} px of noise.")
+    noise = f"{pixel_sigma:g} px of noise" if marks.covariance is None else "the noise that the CSV states"
+    out.print(f"Interval: {located.interval_note}; marks have {noise}.")
     out.print(f"Heights are ellipsoidal; geoid: {located.geoid or 'none found'}.")
     print_wrote(*written)
     if located.count == 0:

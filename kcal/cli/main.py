@@ -21,6 +21,7 @@ from kcal.cli.detect import detect_command
 from kcal.cli.diff import diff_command
 from kcal.cli.exchange import export_command, import_command
 from kcal.cli.locate import locate_command
+from kcal.cli.mark import mark_command
 from kcal.cli.rig import app as rig
 from kcal.cli.show import show_command
 from kcal.cli.undistort import undistort_command
@@ -57,6 +58,7 @@ app.command("detect")(detect_command)
 app.command("calibrate")(calibrate_command)
 app.command("compare")(compare_command)
 app.command("batch")(batch_command)
+app.command("mark")(mark_command)
 app.add_typer(rig, name="rig")
 app.command("locate")(locate_command)
 app.command("budget")(budget_command)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +16,9 @@ from kcal.files import write_atomic
 from kcal.locate.tables import TableRow, read_rows
 
 PIXELS = ("left_u", "left_v", "right_u", "right_v")
+# The ten entries of a pair's covariance (left_u, left_v, right_u, right_v) on and above its diagonal, row by row.
+_UPPER = tuple((i, j) for i in range(4) for j in range(i, 4))
+COVARIANCE = tuple(f"cov_{i}{j}" for i, j in _UPPER)
 _HEADER = f"name,{','.join(PIXELS)}"
 _PIXEL = "a pixel coordinate"
 
@@ -25,16 +30,32 @@ class Marks(NamedTuple):
         names: one for each pair, unique; the row's number where the file has no names.
         left: (N, 2) float64 pixels in the left image, integer coordinates at pixel centers.
         right: (N, 2) likewise in the right image.
+        covariance: (N, 4, 4) px² of each pair's four coordinates, NaN where the file has none; None if it has none at
+            all.
     """
 
     names: tuple[str, ...]
     left: Tensor
     right: Tensor
+    covariance: Tensor | None = None
 
     @property
     def pixels(self) -> Tensor:
         """(N, 2, 2): both images."""
         return torch.stack([self.left, self.right], 1)
+
+    def covariance_or(self, sigma: float) -> Tensor | None:
+        """(N, 4, 4) the covariance, with `sigma` px along each axis where there is none; None if there is none at all.
+
+        Example:
+            >>> pixel = torch.zeros(1, 2).double()
+            >>> Marks(("mast",), pixel, pixel, torch.full((1, 4, 4), torch.nan)).covariance_or(0.5)[0, 0].tolist()
+            [0.25, 0.0, 0.0, 0.0]
+        """
+        if self.covariance is None:
+            return None
+        known = torch.isfinite(self.covariance).all(-1).all(-1)[:, None, None]
+        return torch.where(known, self.covariance.double(), sigma**2 * torch.eye(4, dtype=torch.float64))
 
 
 def read_marks(path: str | Path, *, single: bool = False) -> Marks:
@@ -42,7 +63,8 @@ def read_marks(path: str | Path, *, single: bool = False) -> Marks:
 
     Columns may come in any order; `name` may be absent (rows are then numbered from 1) and a column `note` is allowed
     and not used. Blank lines are skipped, and a byte order mark at the beginning is accepted. Pixels may lie outside
-    the image: `locate_points` reports such a pair.
+    the image: `locate_points` reports such a pair. The columns `cov_00`, `cov_01` ... `cov_33` may contain a pair's
+    covariance, as `kcal mark` writes it: all ten, or all empty.
 
     Args:
         path: of the file.
@@ -61,9 +83,15 @@ def read_marks(path: str | Path, *, single: bool = False) -> Marks:
         >>> marks.names, marks.right.tolist()
         (('mast',), [[956.8, 540.5]])
     """
-    rows = read_rows(path, _HEADER, ("name", *PIXELS, "note"), PIXELS)
+    rows = read_rows(path, _HEADER, ("name", *PIXELS, *COVARIANCE, "note"), PIXELS)
     table = torch.tensor([_four_pixels(row, single) for row in rows], dtype=torch.float64)
-    return Marks(names=tuple(row.name for row in rows), left=table[:, :2], right=table[:, 2:])
+    stated = torch.stack([_covariance_of(row) for row in rows])
+    return Marks(
+        names=tuple(row.name for row in rows),
+        left=table[:, :2],
+        right=table[:, 2:],
+        covariance=None if bool(torch.isnan(stated).all()) else stated,
+    )
 
 
 def write_marks(path: str | Path, marks: Marks) -> Path:
@@ -72,9 +100,41 @@ def write_marks(path: str | Path, marks: Marks) -> Path:
     Raises:
         FileError: the file cannot be written.
     """
-    rows = zip(marks.names, marks.left.tolist(), marks.right.tolist(), strict=True)
-    lines = [_HEADER, *(",".join([name, *map(repr, (*left, *right))]) for name, left, right in rows)]
-    return write_atomic(path, "\n".join(lines) + "\n")
+    return write_atomic(path, marks_text(marks))
+
+
+def marks_text(marks: Marks) -> str:
+    """The text that `write_marks` writes."""
+    table, header = [*marks.left.T.tolist(), *marks.right.T.tolist()], ["name", *PIXELS]
+    if marks.covariance is not None:
+        table += [marks.covariance[:, i, j].tolist() for i, j in _UPPER]
+        header += COVARIANCE
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for name, *values in zip(marks.names, *table, strict=True):
+        writer.writerow([name, *("" if math.isnan(value) else repr(value) for value in values)])
+    return text.getvalue()
+
+
+def _covariance_of(row: TableRow) -> Tensor:
+    """(4, 4) of one line; NaN where it has none."""
+    cells = [row.cells.get(column, "") for column in COVARIANCE]
+    matrix = torch.full((4, 4), math.nan, dtype=torch.float64)
+    if not any(cells):
+        return matrix
+    for column, (i, j) in zip(COVARIANCE, _UPPER, strict=True):
+        if column not in row.cells:
+            raise FileError(
+                f"{row.where}: the column {column} is missing; a covariance needs all ten, {COVARIANCE[0]} "
+                f"to {COVARIANCE[-1]}"
+            )
+        matrix[i, j] = matrix[j, i] = row.number(column, "a covariance in px²")
+    if not float(torch.linalg.eigvalsh(matrix)[0]) > 0:
+        raise FileError(
+            f"{row.where}: the covariance is not positive definite; write it again or leave its cells empty"
+        )
+    return matrix
 
 
 def _four_pixels(row: TableRow, single: bool) -> list[float]:
