@@ -96,6 +96,7 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
     text, enough = verdict(promises, count)
     wrong = [item.name for item in items if not item.used]
     if wrong:
+        enough = False
         text = f"{', '.join(wrong)} contradict{'s' if len(wrong) == 1 else ''} the other landmarks; {text}"
     return LiveRig(rig, survey.origin, items, promises, count, sigma, text, enough, result.warnings)
 

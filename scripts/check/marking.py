@@ -23,7 +23,7 @@ from kcal.lens.rig import StereoRig
 from kcal.mark.guide import at_shape, propose
 from kcal.mark.snap import snap
 from scripts.shared.marking_scene import KINDS, Floats, background, finished, inside_of, paint, seen, site_rig
-from scripts.shared.page import CONCLUSIONS, table, write_section
+from scripts.shared.page import table, write_section
 
 PAGE = "marking.md"
 CONTRASTS = (20.0, 40.0, 80.0)
@@ -221,7 +221,6 @@ def main() -> None:
         summary += f" Corners and crosses, {name}: RMS {rms(corners):.3f} px, {covered(corners)} in the 95 % ellipse."
     print("\n\n".join([snaps, matches, false, summary]))
     if options.write:
-        write_section(PAGE, "conclusion", CONCLUSIONS[PAGE])
         write_section(PAGE, "snap", snaps)
         write_section(PAGE, "match", matches)
         write_section(PAGE, "false", f"{false}\n\n{summary}")

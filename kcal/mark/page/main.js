@@ -154,8 +154,8 @@ class App {
       done = true;
     }
     this.proposals = {};
-    if (!done) this.say("there is no proposal to accept");
-    else if (item && this.about.reference.includes(item.name)) this.nextOfReference();
+    this.say(done ? `${item.name}: accepted` : "there is no proposal to accept", false);
+    if (done && this.about.reference.includes(item.name)) this.nextOfReference();
     this.draw();
   }
   reject() {
