@@ -8,6 +8,7 @@ import pydantic
 import torch
 from torch import Tensor
 
+from kcal.checks import ImageSize
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.files import NativeFile
@@ -67,7 +68,7 @@ class Observations(NativeFile):
     VERSION: ClassVar[int] = 1
 
     board: Board
-    image_size: tuple[pydantic.PositiveInt, pydantic.PositiveInt]
+    image_size: ImageSize
     refinement: Literal["erf", "saddle", "opencv", "skimage", "none"] = "erf"
     views: tuple[View, ...]
     failures: tuple[Failure, ...] = ()

@@ -8,9 +8,8 @@ import html
 from collections.abc import Sequence
 from pathlib import Path
 
-from kcal.corners.images import read_bytes
 from kcal.errors import InputError
-from kcal.files import write_atomic
+from kcal.files import read_bytes, write_atomic
 
 _PAGE_STYLE = """
 :root { color-scheme: light; }

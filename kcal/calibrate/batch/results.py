@@ -23,10 +23,9 @@ from kcal.calibrate.batch.jobs import (
     pieces,
 )
 from kcal.calibrate.batch.workers import Task, WorkerDiedError, pool, run_tasks
-from kcal.corners.images import read_bytes
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, KcalError
-from kcal.files import NativeFile, write_atomic
+from kcal.files import NativeFile, read_bytes, write_atomic
 
 Piece = TypeVar("Piece", bound=NativeFile)
 
