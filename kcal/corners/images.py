@@ -146,13 +146,14 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _expand_one(path: Path) -> list[Path]:
-    if path.is_dir():
+    # Unlike Path's, these say no where a name is too long.
+    if os.path.isdir(path):
         inside = [file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file()]
         images = _natural(file for file in inside if not file.name.startswith("."))
         if not images:
             raise FileError(f"{path}: no image in this folder (looked for {', '.join(sorted(IMAGE_SUFFIXES))})")
         return images
-    if path.exists():
+    if os.path.exists(path):
         return [path]
     if glob.has_magic(str(path)):
         matches = _natural(Path(match) for match in glob.glob(str(path), recursive=True) if not os.path.isdir(match))

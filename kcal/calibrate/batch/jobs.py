@@ -91,7 +91,7 @@ def read_jobs(source: Path, board: Board | None, model: str) -> list[CameraJob]:
         FileError: no such file or folder, no camera in it, or a table that cannot be read.
         InputError: a camera without a board.
     """
-    if source.is_dir():
+    if os.path.isdir(source):
         rows = [
             {"camera": folder.name, "images": str(folder)}
             for folder in sorted(source.iterdir())
