@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import pydantic
 import torch
@@ -13,7 +13,9 @@ from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.files import NativeFile
 
-Pixel = tuple[float, float]
+# Sides of images have at most 65535 pixels in most formats; far beyond, squares and products overflow.
+Coordinate = Annotated[float, pydantic.Field(ge=-1e6, le=1e6)]
+Pixel = tuple[Coordinate, Coordinate]
 PackedCovariance = tuple[float, float, float]
 
 

@@ -72,9 +72,7 @@ class TestPrecision:
         camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="opencv5")
         point, pixel = torch.tensor([0.1, 0.2, 1.0]), torch.tensor([100.0, 100.0])
         for call, value in ((camera.project, point), (camera.project_rays, point), (camera.unproject, pixel)):
-            with pytest.raises(
-                InputError, match=r"shape \(\.\.\., N, \d\) is needed, got \(\d,\); write points\[None\]"
-            ):
+            with pytest.raises(InputError, match=r"N, \d\) is needed, got \(\d,\); write points\[None\]"):
                 call(value)
         lookup = bake(camera)
         with pytest.raises(InputError, match=r"got \(3,\)"):
