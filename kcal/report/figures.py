@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import math
 import warnings
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import FuncFormatter
 from numpy.typing import ArrayLike, NDArray
 
 from kcal.errors import InputError
@@ -37,16 +40,28 @@ class PlainFigure(Figure):
         """Draw everything; called by the canvas."""
         for axes in self.findobj(Axes):
             for axis in (axes.xaxis, axes.yaxis):
+                # Names at ticks are written anew at each drawing, by a function.
+                names = axis.get_major_formatter()
+                if isinstance(names, FuncFormatter):
+                    axis.set_major_formatter(partial(_shown_tick, names.func))
                 # This makes the labels of ticks, which otherwise appear only while they are drawn.
                 axis.get_ticklabels(which="both")
         for text in self.findobj(Text):
             text.set_parse_math(False)
-            # No picture has room for more, and a text's pixels are all made before they are cut.
-            text.set_text(visible(text.get_text())[:2000])
+            text.set_text(_shown(text.get_text()))
         with warnings.catch_warnings():
             # A character that the font does not have is drawn as a box.
             warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from font")
             super().draw(renderer)
+
+
+def _shown_tick(names: Callable[[float, int | None], str], at: float, place: int | None) -> str:
+    return _shown(names(at, place))
+
+
+def _shown(text: str) -> str:
+    # No picture has room for more, and a text's pixels are all made before they are cut.
+    return visible(text)[:2000]
 
 
 def new_figure(width: float, height: float, dpi: int = 130) -> PlainFigure:

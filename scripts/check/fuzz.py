@@ -94,7 +94,7 @@ def make_files(folder: Path) -> dict[str, bytes]:
     left, right, _ = rig(torch.tensor([[0.0, 0.0, 50.0], [5.0, 1.0, 100.0]]))
     rows = [f"p{i},{a},{b},{c},{d}" for i, (a, b, c, d) in enumerate(torch.cat([left, right], 1).tolist())]
     (folder / "marks.csv").write_text("\n".join(["name,left_u,left_v,right_u,right_v", *rows]) + "\n")
-    image = np.random.default_rng(0).integers(0, 255, (60, 80), np.uint8)
+    image = np.random.default_rng(0).integers(0, 255, (240, 320), np.uint8)
     for suffix in ("png", "jpg", "tif"):
         cv2.imwrite(str(folder / f"image.{suffix}"), image)
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
@@ -176,7 +176,7 @@ def _project(path: Path) -> None:
 COMMANDS: dict[str, list[str | Callable[[Path], object]]] = {
     "camera.json": [
         "bake FILE -o out.npz --tolerance 0.5",
-        "undistort FILE image.png -o u",
+        "undistort image.png FILE -o u",
     ],
     "rig.json": ["locate FILE marks.csv -o out.csv -o out.kml -o out.cot -o out.geojson", "budget FILE"],
     "obs.json": ["calibrate FILE --model pinhole -o out.json", "compare FILE obs.json"],

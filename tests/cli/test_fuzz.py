@@ -17,7 +17,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return fuzz.make_files(tmp_path_factory.mktemp("whole"))
 
 
-@pytest.mark.parametrize("case", [*range(24), 134])
+@pytest.mark.parametrize("case", [*range(24), 134, 1171])
 def test_nothing_is_found(case: int, whole: dict[str, bytes]) -> None:
     assert fuzz.run_case(case, whole, 60.0) == []
 
