@@ -90,12 +90,13 @@ def local_image(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     data = read_bytes(path)
     try:
-        with warnings.catch_warnings(), TiffImageFile(io.BytesIO(data)) as file:
+        with warnings.catch_warnings():
             # Of damaged tags; what is missing is told below.
             warnings.simplefilter("ignore", UserWarning)
-            check_pixel_count(file.size)
-            tags = dict(file.tag_v2)
-            pixels = np.asarray(file.convert("RGBA"))
+            with TiffImageFile(io.BytesIO(data)) as file:
+                check_pixel_count(file.size)
+                tags = dict(file.tag_v2)
+                pixels = np.asarray(file.convert("RGBA"))
     except (OSError, SyntaxError, ValueError, TypeError, KeyError, OverflowError, struct.error) as error:
         raise FileError(f"{path}: cannot read this image as a TIFF: {error}") from error
     matrix, system = _placing(path, tags)

@@ -179,7 +179,7 @@ COMMANDS: dict[str, list[str | Callable[[Path], object]]] = {
         "undistort image.png FILE -o u",
     ],
     "rig.json": ["locate FILE marks.csv -o out.csv -o out.kml -o out.cot -o out.geojson", "budget FILE"],
-    "obs.json": ["calibrate FILE --model pinhole -o out.json", "compare FILE obs.json"],
+    "obs.json": ["calibrate FILE --model pinhole -o out.json", "compare FILE --model pinhole opencv4 --parts 2"],
     "board.json": [load_measured_board],
     "lookup.npz": [_project],
     "marks.csv": ["locate rig.json FILE -o out.csv -o out.kml --picture out.png --map out.html"],
