@@ -8,8 +8,10 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, BinaryIO, ClassVar, Self
 
 import pydantic
 
@@ -36,30 +38,51 @@ def check_writable(path: str | Path, *inputs: str | Path) -> Path:
     return path
 
 
-def write_atomic(path: str | Path, data: str | bytes) -> Path:
-    """Write `data` beside `path` and move it into place, so that a reader never sees half a file.
+@contextmanager
+def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
+    """Open a file beside `path` for writing, and move it into place when the block ends.
+
+    If the block fails or is interrupted, the new file is removed and an old one is untouched.
 
     Raises:
-        FileError: the folder is missing, or nothing can be written there; an old file is then untouched.
+        FileError: the folder is missing, or nothing can be written there.
+
+    Example:
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with open_atomic(Path(folder, "a.txt")) as file:
+        ...         _ = file.write(b"part by part")
+        ...     Path(folder, "a.txt").read_text()
+        'part by part'
     """
     path = check_writable(path)
-    payload = data.encode() if isinstance(data, str) else data
     temporary = None
     try:
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
         with os.fdopen(handle, "wb") as file:
-            file.write(payload)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         umask = os.umask(0)
         os.umask(umask)
         os.chmod(temporary, 0o666 & ~umask)
         os.replace(temporary, path)
+        temporary = None
     except OSError as error:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)
         raise FileError(f"{path}: cannot write: {error.strerror or error}") from error
-    return path
+    finally:
+        if temporary is not None:
+            os.unlink(temporary)
+
+
+def write_atomic(path: str | Path, data: str | bytes) -> Path:
+    """Write `data` beside `path` and move it into place, so that a reader never sees half a file.
+
+    Raises:
+        FileError: the folder is missing, or nothing can be written there; an old file is then untouched.
+    """
+    with open_atomic(path) as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+    return Path(path)
 
 
 def dump_json(value: Any) -> str:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from kcal.errors import FileError
 from kcal.files import write_atomic
-from kcal.locate.tables import TableRow, read_rows
+from kcal.locate.tables import CHUNK_ROWS, TableRow, read_chunks
 
 PIXELS = ("left_u", "left_v", "right_u", "right_v")
 _HEADER = f"name,{','.join(PIXELS)}"
@@ -61,9 +63,46 @@ def read_marks(path: str | Path, *, single: bool = False) -> Marks:
         >>> marks.names, marks.right.tolist()
         (('mast',), [[956.8, 540.5]])
     """
-    rows = read_rows(path, _HEADER, ("name", *PIXELS, "note"), PIXELS)
-    table = torch.tensor([_four_pixels(row, single) for row in rows], dtype=torch.float64)
-    return Marks(names=tuple(row.name for row in rows), left=table[:, :2], right=table[:, 2:])
+    chunks = list(read_mark_chunks(path, single=single, extras=False))
+    names = tuple(name for chunk in chunks for name in chunk.names)
+    pixels = torch.cat([chunk.pixels for chunk in chunks])
+    return Marks(names=names, left=pixels[:, 0], right=pixels[:, 1])
+
+
+class MarkChunk(NamedTuple):
+    """Some consecutive pairs of marks of a long table.
+
+    Attributes:
+        names: as in `Marks`.
+        pixels: (N, 2, 2) float64: both images.
+        extras: the cells of all other columns, as they are written.
+        bytes_read: how far the file has been read.
+    """
+
+    names: Sequence[str]
+    pixels: Tensor
+    extras: dict[str, list[str]]
+    bytes_read: int
+
+
+def read_mark_chunks(
+    path: str | Path, *, single: bool = False, extras: bool = True, at_once: int = CHUNK_ROWS
+) -> Iterator[MarkChunk]:
+    """Read a table of marks some rows at a time; see `read_marks`.
+
+    Args:
+        path: of the file.
+        single: allow a thing to be marked in one image only.
+        extras: accept columns with other names than those of `read_marks`.
+        at_once: most rows of a chunk.
+    """
+    known = ("name", *PIXELS)
+    for chunk in read_chunks(path, _HEADER, (*known, "note"), PIXELS, extras=extras, at_once=at_once):
+        values = chunk.numbers(PIXELS)
+        if values is None:
+            values = np.array([_four_pixels(row, single) for row in chunk.rows()])
+        others = {name: cells for name, cells in chunk.columns.items() if name not in known}
+        yield MarkChunk(chunk.names, torch.from_numpy(values).view(-1, 2, 2), others, chunk.bytes_read)
 
 
 def write_marks(path: str | Path, marks: Marks) -> Path:
