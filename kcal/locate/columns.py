@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -55,6 +55,13 @@ class PositionColumns(NamedTuple):
             {name: [cells[i] for i in places] for name, cells in self.extras.items()},
         )
 
+    def pieces(self, size: int) -> Iterator[PositionColumns]:
+        """The same rows in turn, `size` at a time."""
+        for start in range(0, len(self.names), size):
+            part = slice(start, start + size)
+            extras = {name: cells[part] for name, cells in self.extras.items()}
+            yield PositionColumns(self.names[part], self.status[part], self.reasons[part], self.numbers[part], extras)
+
     @property
     def located(self) -> NDArray[np.bool_]:
         """(N,) which pairs have a position."""
@@ -71,6 +78,9 @@ def number_lines(values: NDArray[np.float64]) -> list[str]:
     if len(values) == 0:
         return []
     # JSON has neither NaN, which becomes null, nor infinity: the largest float stands for it meanwhile.
-    finite = np.ascontiguousarray(np.where(np.isinf(values), _LARGEST, values))
-    text = orjson.dumps(finite, option=orjson.OPT_SERIALIZE_NUMPY).replace(orjson.dumps(_LARGEST), b"inf")
+    infinite = np.isinf(values)
+    some = bool(infinite.any())
+    finite = np.ascontiguousarray(np.where(infinite, _LARGEST, values) if some else values)
+    text = orjson.dumps(finite, option=orjson.OPT_SERIALIZE_NUMPY)
+    text = text.replace(orjson.dumps(_LARGEST), b"inf") if some else text
     return text[2:-2].replace(b"null", b"").decode().split("],[")

@@ -26,13 +26,15 @@ from kcal.locate.geojson import camera_features, point_features, region_features
 from kcal.locate.kml import KML_END, kml_points, kml_regions, kml_start
 from kcal.locate.positions import Located, columns_of
 from kcal.locate.stereo import PositionStatus
+from kcal.locate.tables import guarded, is_number
 from kcal.texts import csv_line
 
+# Rows at once, so that their texts fit the cache.
+_AT_ONCE = 1024
 # Stands for the standard output.
 STREAM = Path("-")
 # What, in a column of texts, one a line, might need more than writing it down.
 _SPECIAL = re.compile(r"[^\w .:/\n-]|^[^\w.\n]", re.MULTILINE)
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 # Names of properties and columns that further columns of a table must not have.
 _TAKEN = {"kind", *TEXTS, *NUMBERS}
 _STATUSES = {int(status): status.name.lower() for status in PositionStatus}
@@ -59,7 +61,7 @@ def _json_start(run: Located, columns: PositionColumns) -> bytes:
 
 
 def _after_others(features: Iterable[bytes]) -> bytes:
-    return b"".join(b",\n" + feature for feature in features)
+    return b",\n".join([b"", *features])
 
 
 def _json_lines(run: Located, columns: PositionColumns, time: datetime) -> bytes:
@@ -88,7 +90,7 @@ def _csv_cells(texts: Iterable[str]) -> list[str]:
     whole = "\n".join(texts)
     if whole.count("\n") == len(texts) - 1 and not _SPECIAL.search(whole):
         return texts
-    return [text if _NUMBER.fullmatch(text) else csv_line([text])[:-1] for text in texts]
+    return [text if is_number(text) else csv_line([guarded(text)])[:-1] for text in texts]
 
 
 _GEOJSON = _Format(
@@ -147,9 +149,10 @@ class PositionWriter:
                 raise InputError(f"the table has a column {taken[0]!r}, as positions have; give it another name")
             self._file.write(self._format.start(self._run, columns))
             self._started = True
-        self._file.write(self._format.rows(self._run, columns, self._time))
-        if self._later is not None and self._format.later is not None:
-            self._later.write(self._format.later(self._run, columns))
+        for piece in columns.pieces(_AT_ONCE):
+            self._file.write(self._format.rows(self._run, piece, self._time))
+            if self._later is not None and self._format.later is not None:
+                self._later.write(self._format.later(self._run, piece))
 
     def close(self) -> None:
         """Write the end of the file, which stays open."""

@@ -11,13 +11,14 @@ import orjson
 
 from kcal.locate.columns import NUMBERS, PositionColumns
 from kcal.locate.positions import Located
-from kcal.locate.region import REGION_SHARE, cut_at_antimeridian, ring_arrays
+from kcal.locate.region import REGION_SHARE, cut_at_antimeridian, ring_blocks
 from kcal.locate.stereo import PositionStatus
 
 # What JSON calls a number; "007" is none, and stays a text.
 _JSON_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(\.[0-9]+)?([eE][+-]?[0-9]+)?")
 # Whole numbers beyond this lose digits in programs that read every number as a float64.
 _LARGEST_WHOLE = 2**53
+_POLYGON = (b'{"type":"Feature","geometry":{"type":"Polygon","coordinates":[[[', b']]]},"properties":')
 _HEIGHT = NUMBERS.index("height_ellipsoidal_m")
 
 
@@ -43,50 +44,57 @@ def camera_features(run: Located) -> list[bytes]:
 def point_features(columns: PositionColumns) -> Iterator[bytes]:
     """A feature for each pair of marks; its geometry is null where there is no position."""
     statuses = {int(status): status.name.lower() for status in PositionStatus}
-    infinite = np.isinf(columns.numbers).any(1).tolist()
-    extras = [list(map(_json_value, cells)) for cells in columns.extras.values()]
-    others: Iterator[tuple[Any, ...]] = zip(*extras, strict=True) if extras else iter([()] * len(columns.names))
-    rows = zip(
-        columns.names, columns.status.tolist(), columns.reasons, columns.numbers.tolist(), infinite, others, strict=True
-    )
-    for name, status, reason, numbers, some_infinite, more in rows:
+    infinite: list[bool] = np.isinf(columns.numbers).any(1).tolist()
+    extras = [(column, list(map(_json_value, cells))) for column, cells in columns.extras.items()]
+    rows = zip(columns.names, columns.status.tolist(), columns.reasons, columns.numbers.tolist(), strict=True)
+    for place, (name, status, reason, numbers) in enumerate(rows):
         lat, lon, height = numbers[0], numbers[1], numbers[_HEIGHT]
-        properties = {"kind": "point", "name": name, "status": statuses[status], "reason": reason}
+        properties: dict[str, Any] = {"kind": "point", "name": name, "status": statuses[status], "reason": reason}
         # JSON has neither NaN nor infinity: both become null.
         properties.update(zip(NUMBERS, numbers, strict=True))
-        if some_infinite:
+        if infinite[place]:
             properties |= {
                 f"{column.removesuffix('_m')}_infinite": True
                 for column, value in zip(NUMBERS, numbers, strict=True)
                 if value == float("inf")
             }
-        properties.update(zip(columns.extras, more, strict=True))
+        properties.update((column, cells[place]) for column, cells in extras)
         yield _feature({"type": "Point", "coordinates": [lon, lat, height]} if lat == lat else None, properties)
 
 
 def region_features(columns: PositionColumns, run: Located) -> Iterator[bytes]:
     """A polygon for each position: its 95 % region, a long and slightly skewed ellipse."""
-    places = np.flatnonzero(columns.located).tolist()
-    for place, ring in zip(places, ring_arrays(columns, run.origin), strict=True):
+    names = iter([columns.names[place] for place in np.flatnonzero(columns.located).tolist()])
+    for block in ring_blocks(columns, run.origin):
+        texts = orjson.dumps(np.ascontiguousarray(block[..., ::-1]), option=orjson.OPT_SERIALIZE_NUMPY)
+        beyond = (np.abs(block[..., 1]).max(-1) > 180.0).tolist()
         # Section 3.1.6: closed, counterclockwise; section 3.1.9: a polygon across the antimeridian is cut in two.
-        shape: dict[str, Any] = {"type": "Polygon", "coordinates": [np.ascontiguousarray(ring[:, ::-1])]}
-        if abs(ring[:, 1]).max() > 180.0:
-            parts = [[[lon, lat] for lat, lon in part] for part in cut_at_antimeridian(ring.tolist())]
-            shape = {"type": "Polygon", "coordinates": parts}
-            if len(parts) > 1:
-                shape = {"type": "MultiPolygon", "coordinates": [[part] for part in parts]}
-        yield _feature(shape, {"kind": "region", "name": columns.names[place], "share": REGION_SHARE})
+        for text, cut, ring in zip(texts[3:-3].split(b"]],[["), beyond, block, strict=True):
+            properties = {"kind": "region", "name": next(names), "share": REGION_SHARE}
+            if cut:
+                yield _feature(_cut(ring.tolist()), properties)
+            else:
+                # Most of the file: copied once.
+                yield b"".join([_POLYGON[0], text, _POLYGON[1], orjson.dumps(properties), b"}"])
+
+
+def _cut(ring: list[tuple[float, float]]) -> dict[str, Any]:
+    parts = [[[lon, lat] for lat, lon in part] for part in cut_at_antimeridian(ring)]
+    if len(parts) == 1:
+        return {"type": "Polygon", "coordinates": parts}
+    return {"type": "MultiPolygon", "coordinates": [[part] for part in parts]}
 
 
 def _feature(geometry: dict[str, Any] | None, properties: dict[str, Any]) -> bytes:
     feature = {"type": "Feature", "geometry": geometry, "properties": properties}
-    return orjson.dumps(feature, option=orjson.OPT_SERIALIZE_NUMPY)
+    return orjson.dumps(feature)
 
 
 def _json_value(cell: str) -> object:
     """The cell of a further column: a number with all its digits where it is one, null where it is empty."""
     if not cell:
         return None
-    if _JSON_NUMBER.fullmatch(cell) and abs(float(cell)) <= _LARGEST_WHOLE:
+    number = _JSON_NUMBER.fullmatch(cell)
+    if number and (number[2] or number[3] or abs(int(cell)) <= _LARGEST_WHOLE):
         return orjson.Fragment(cell)
     return cell

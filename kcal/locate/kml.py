@@ -8,7 +8,7 @@ import numpy as np
 
 from kcal.locate.columns import PositionColumns, number_lines
 from kcal.locate.positions import Located, columns_of
-from kcal.locate.region import ring_arrays
+from kcal.locate.region import ring_blocks
 from kcal.texts import visible
 
 KML_END = " </Document>\n</kml>\n"
@@ -70,7 +70,8 @@ def kml_regions(columns: PositionColumns, run: Located) -> str:
     """A polygon for each row that has a position."""
     names = [columns.names[i] for i in np.flatnonzero(columns.located).tolist()]
     placemarks = []
-    for name, ring in zip(names, ring_arrays(columns, run.origin), strict=True):
+    rings = (ring for block in ring_blocks(columns, run.origin) for ring in block)
+    for name, ring in zip(names, rings, strict=True):
         places = number_lines(np.stack([(ring[:, 1] + 180.0) % 360.0 - 180.0, ring[:, 0]], -1))
         placemarks.append(
             f"  <Placemark>\n   <name>{_xml(name)}, 95 %</name>\n   <styleUrl>#region</styleUrl>\n   <Polygon>\n"

@@ -205,21 +205,20 @@ def positions_of(columns: PositionColumns) -> list[Position]:
     found = []
     rows = zip(columns.names, columns.status.tolist(), columns.reasons, columns.numbers.tolist(), strict=True)
     for name, status, reason, numbers in rows:
-        known = [None if math.isnan(value) else value for value in numbers]
-        lat, lon, height, geoid, east, north, up, distance, low, high, *rest = known
-        ee, en, eu, nn, nu, uu, cep50, cep95, by_pixel, by_degree, azimuth, elevation, left, right = rest
+        lat, lon, height, geoid, distance, low, high, cep50, cep95, by_pixel, by_degree, azimuth, elevation = (
+            None if math.isnan(value) else value for value in (*numbers[:4], *numbers[7:10], *numbers[16:22])
+        )
+        east, north, up = numbers[4:7]
+        ee, en, eu, nn, nu, uu = numbers[10:16]
+        left, right = numbers[22:]
         position = Position(
             name=name, status=PositionStatus(status), reason=reason, lat=lat, lon=lon, height=height,
-            geoid_height=geoid, cep50_m=cep50, cep95_m=cep95, meters_per_pixel=by_pixel, meters_per_degree=by_degree,
+            geoid_height=geoid, enu=None if math.isnan(east) else (east, north, up),
+            covariance=None if math.isnan(ee) else ((ee, en, eu), (en, nn, nu), (eu, nu, uu)),
+            cep50_m=cep50, cep95_m=cep95, meters_per_pixel=by_pixel, meters_per_degree=by_degree,
             range_m=distance, range_low_m=low, range_high_m=high, azimuth_deg=azimuth, elevation_deg=elevation,
+            reprojection_px=None if math.isnan(left) else (left, right),
         )  # fmt: skip
-        if east is not None and north is not None and up is not None:
-            position = dataclasses.replace(position, enu=(east, north, up))
-        if left is not None and right is not None:
-            position = dataclasses.replace(position, reprojection_px=(left, right))
-        if ee is not None:
-            upper = ((ee, en, eu), (en, nn, nu), (eu, nu, uu))
-            position = dataclasses.replace(position, covariance=upper)
         found.append(position)
     return found
 

@@ -6,6 +6,8 @@ import csv
 import difflib
 import itertools
 import math
+import os
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from io import TextIOWrapper
@@ -18,9 +20,15 @@ import orjson
 from numpy.typing import NDArray
 
 from kcal.errors import FileError
+from kcal.lens.tracing import CHUNK
 
-# As many rows as the localizer does in one piece.
-CHUNK_ROWS = 16384
+# The pieces in which the localizer does many points: a table is located as in one call, to the last bit.
+CHUNK_ROWS = CHUNK
+
+
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+# Apostrophes, and what begins a formula: see `kcal.texts.csv_line`.
+_GUARDED = re.compile(r"'+\s*[=+\-@＝＋－＠]")
 
 
 class TableRow(NamedTuple):
@@ -162,7 +170,8 @@ def read_chunks(
     seen = np.empty(0, np.int64)
     count = 0
     with _text_of(path) as file:
-        line, names = 0, []
+        line = 0
+        names: list[str] = []
         while not names and (text := next(file, "")):
             rows, beyond = _split_any(path, [text], file, line)
             line += 1 + beyond
@@ -170,7 +179,7 @@ def read_chunks(
         if not names:
             raise FileError(f"{path}: the file is empty; the first line must be {header}")
         _check_header(f"{path}: line {line}", names, header, columns, required, extras)
-        read = file.buffer.tell()
+        read = _bytes_read(file)
         while texts := list(itertools.islice(file, at_once)):
             by_column = _split_plain(texts, names)
             lines: Sequence[int] = range(line + 1, line + 1 + len(texts))
@@ -183,12 +192,15 @@ def read_chunks(
                 lines = [end for end, _ in rows]
             if not lines:
                 continue
+            for name, cells in by_column.items():
+                if "'" in "".join(cells):
+                    by_column[name] = list(map(_unguarded, cells))
             own = by_column.get("name", [str(count + i) for i in range(1, len(lines) + 1)])
             if "name" in by_column:
                 seen = _check_names(path, own, lines, seen)
             count += len(lines)
             yield TableChunk(path, lines, own, by_column, read)
-            read = file.buffer.tell()
+            read = _bytes_read(file)
     if count == 0:
         raise FileError(f"{path}: no rows under the header; write one line for each")
 
@@ -203,6 +215,11 @@ def _text_of(path: Path) -> Iterator[TextIOWrapper]:
         raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise FileError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from error
+
+
+def _bytes_read(file: TextIOWrapper) -> int:
+    """How much of a file has been taken from the disk; 0 for a pipe."""
+    return os.lseek(file.fileno(), 0, os.SEEK_CUR) if file.seekable() else 0
 
 
 def _csv_reader(texts: Iterable[str]) -> Any:
@@ -247,6 +264,21 @@ def _split_any(path: Path, texts: list[str], file: Iterator[str], line: int) -> 
     return rows, reader.line_num - len(texts)
 
 
+def is_number(cell: str) -> bool:
+    """Whether a spreadsheet reads a cell as a number."""
+    return _NUMBER.fullmatch(cell) is not None
+
+
+def guarded(text: str) -> str:
+    """A text that looks as if `kcal.texts.csv_line` had put an apostrophe before it gets one more."""
+    return f"'{text}" if _GUARDED.match(text) and not is_number(text[1:]) else text
+
+
+def _unguarded(text: str) -> str:
+    """The text before `csv_line` put an apostrophe in front, so that no spreadsheet takes it for a formula."""
+    return text[1:] if text.startswith("'") and _GUARDED.match(text) and not is_number(text[1:]) else text
+
+
 def _check_widths(path: Path, rows: Sequence[tuple[int, list[str]]], width: int) -> None:
     for line, cells in rows:
         if len(cells) != width:
@@ -283,7 +315,7 @@ def _line_of(path: Path, name: str, before: int) -> int | None:
         for cells in reader:
             if reader.line_num >= before:
                 break
-            if any(cells) and cells[column].strip() == name:
+            if any(cells) and _unguarded(cells[column].strip()) == name:
                 return int(reader.line_num)
     return None
 
