@@ -118,8 +118,9 @@ def main() -> None:
         CONCLUSIONS["locate_table.md"],
         "",
         f"Made by `scripts/bench/locate_table.py` with kcal {kcal.__version__}, torch {torch.__version__} on "
-        f"{platform.machine()}, one thread; the fastest of {arguments.repeat} runs. Processor time of the whole command "
-        "without its start. The rig is that of `locate.md`: exact, or with the covariances of cameras, pose and mounting.",
+        f"{platform.machine()}, one thread; the fastest of {arguments.repeat} runs. Processor time of the whole command, "
+        "less that of a table of one row. The rig is that of `locate.md`: exact, or with the covariances of cameras, "
+        "pose and mounting.",
         "",
     ]
     show([*head, *lines])
