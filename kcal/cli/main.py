@@ -68,6 +68,14 @@ def main() -> None:
     except KcalError as error:
         err.print("[bold red]error:[/]", escape(" ".join(str(error).split())))
         sys.exit(1)
+    except OSError as error:
+        # What no command foresaw of files and folders: a disk that was taken away, a folder that may not be listed.
+        name = f"{error.filename}: " if error.filename else ""
+        err.print("[bold red]error:[/]", escape(f"{name}{error.strerror or error}"))
+        sys.exit(1)
+    except MemoryError:
+        err.print("[bold red]error:[/] not enough memory; use fewer or smaller inputs")
+        sys.exit(1)
     except KeyboardInterrupt:
         err.print("interrupted; nothing was written")
         sys.exit(130)

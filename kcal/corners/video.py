@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -72,7 +73,7 @@ def read_frames(source: str | Path, duration: float | None = None) -> Iterator[F
         FileError: the file is missing or no video, the stream does not answer, or no frame can be decoded.
     """
     live, name = is_stream(source), source_name(source) if is_stream(source) else str(source)
-    if not live and not Path(source).is_file():
+    if not live and not os.path.isfile(source):
         raise FileError(f"{source}: no such file")
     video = _open(str(source)) if live else cv2.VideoCapture(str(source))
     until = time.monotonic() + (DURATION if duration is None else duration) if live else float("inf")

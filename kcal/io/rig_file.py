@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
@@ -19,7 +20,7 @@ from torch import Tensor
 from kcal.checks import as_covariance
 from kcal.errors import InputError
 from kcal.files import NativeFile
-from kcal.io.camera_file import CameraFile, camera_to_file
+from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, camera_to_file
 from kcal.io.record import Packed, Record
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
@@ -146,6 +147,7 @@ class RigFile(NativeFile):
     KIND: ClassVar[str] = "rig"
     VERSION: ClassVar[int] = 2
     OLDER: ClassVar[tuple[int, ...]] = (1,)
+    RETIRED: ClassVar[Mapping[str, str]] = RETIRED_FIELDS
 
     left: CameraFile
     right: CameraFile

@@ -109,16 +109,14 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write docs/measured/locate_table.md")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        lines = measure(
-            arguments.source, Path(name), tuple(arguments.formats), arguments.rows, arguments.repeat
-        )
+        lines = measure(arguments.source, Path(name), tuple(arguments.formats), arguments.rows, arguments.repeat)
     head = [
         "# Long tables, measured",
         "",
         CONCLUSIONS["locate_table.md"],
         "",
         f"Made by `scripts/bench/locate_table.py` with kcal {kcal.__version__}, torch {torch.__version__} on "
-        f"{platform.machine()}, one thread; the fastest of {arguments.repeat} runs. Processor time of the whole command, "
+        f"{platform.machine()}, one thread; the fastest of {arguments.repeat} runs. Processor time of the command, "
         "less that of a table of one row. The rig is that of `locate.md`: exact, or with the covariances of cameras, "
         "pose and mounting.",
         "",
