@@ -23,8 +23,8 @@ from kcal.errors import InputError
 _LARGEST_ACROSS = 0.02
 # A quasi-random set of this size knows the radius to some 0.3 %; points at once, so that memory stays below 200 MB.
 _DRAWS, _SAMPLED_AT_ONCE = 8192, 256
-# Points at once in the integral, so that its temporary arrays fit the cache.
-_AT_ONCE = 2048
+# Points at once in the integral: fewer cost more calls, more do not fit the cache.
+_AT_ONCE = 8192
 # Ellipses narrower than this need 6 Gauss-Hermite nodes across, all others 16 nodes: 1e-6 and 5e-4 at worst.
 _NARROW, _FEW_NODES, _NODES = 0.15, 6, 16
 # Standard deviations beyond which a Gaussian need not be integrated, and from which on the circle's edge is far enough

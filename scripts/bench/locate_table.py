@@ -2,9 +2,8 @@
 
     python -m scripts.bench.locate_table [--rows 1000 10000 ...] [--repeat 3] [--source FOLDER] [--write]
 
-Each run is a process of its own with one thread. Processor time (user and system), not time of day, so that other work
-on the machine counts little; the start of the process, measured on a table of one row, is subtracted. Of several runs
-the fastest counts. `--source` measures another copy of kcal, for example an earlier version.
+Each run is a process of its own with one thread, which locates a table of one row first. Processor time (user and
+system), not time of day, so that other work on the machine counts less. Of several runs the fastest counts. `--source` measures another copy of kcal, for example an earlier version.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import resource
 import subprocess
 import sys
 import tempfile
@@ -32,14 +30,19 @@ from scripts.shared.timing import show
 COUNTS = (1_000, 10_000, 100_000, 1_000_000)
 SUFFIXES = ("csv", "geojson", "geojsonl", "kml", "cot")
 _RUN = """
-import pathlib, sys
+import pathlib, sys, time
 from kcal.cli.main import main
-sys.argv = ["kcal", *sys.argv[1:]]
-try:
-    main()
-finally:
-    lines = pathlib.Path("/proc/self/status").read_text().splitlines()
-    print("peak", next(line.split()[1] for line in lines if line.startswith("VmHWM")), file=sys.stderr)
+rig, small, large, out = sys.argv[1:]
+for points in (small, large):
+    sys.argv = ["kcal", "locate", rig, points, "-o", out]
+    start = time.process_time()
+    try:
+        main()
+    except SystemExit as end:
+        assert not end.code, end.code
+lines = pathlib.Path("/proc/self/status").read_text().splitlines()
+peak = next(line.split()[1] for line in lines if line.startswith("VmHWM"))
+print("measured", time.process_time() - start, peak)
 """
 
 
@@ -56,20 +59,16 @@ def write_table(path: Path, count: int) -> Path:
     return path
 
 
-def run(source: Path, arguments: list[str]) -> tuple[float, float]:
-    """Processor seconds and peak megabytes of one command."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+def run(source: Path, *arguments: Path) -> tuple[float, float]:
+    """Processor seconds and peak megabytes of one table, after a table of one row."""
     paths = os.pathsep.join([str(source), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", _RUN, "locate", *arguments], capture_output=True, text=True, env=environment, cwd=source
-    )
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    peak = [line for line in done.stderr.splitlines() if line.startswith("peak ")]
-    if done.returncode != 0 or not peak:
+    command = [sys.executable, "-c", _RUN, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=source)
+    found = [line.split() for line in done.stdout.splitlines() if line.startswith("measured ")]
+    if done.returncode != 0 or not found:
         raise SystemExit(done.stderr)
-    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return seconds, int(peak[0].split()[1]) / 1024.0
+    return float(found[0][1]), int(found[0][2]) / 1024.0
 
 
 def measure(source: Path, folder: Path, suffixes: tuple[str, ...], counts: list[int], repeat: int) -> list[str]:
@@ -88,13 +87,12 @@ def measure(source: Path, folder: Path, suffixes: tuple[str, ...], counts: list[
             if name != "exact" and suffix not in ("csv", "geojson"):
                 continue
             out = folder / f"out.{suffix}"
-            start = min(run(source, [str(path), str(tables[1]), "-o", str(out)])[0] for _ in range(repeat))
             for count in counts:
-                found = [run(source, [str(path), str(tables[count]), "-o", str(out)]) for _ in range(repeat)]
-                seconds, peak = max(min(each[0] for each in found) - start, 1e-9), max(each[1] for each in found)
+                found = [run(source, path, tables[1], tables[count], out) for _ in range(repeat)]
+                seconds, peak = min(each[0] for each in found), max(each[1] for each in found)
                 size = out.stat().st_size / 2**20
                 cells = [f".{suffix}", name, f"{count:,}", f"{count / seconds:,.0f}", f"{peak:.0f}", f"{size:.1f}"]
-                print(*cells, f"{1e6 * seconds / count:.1f} us a row; start {start:.1f} s", sep="  ", flush=True)
+                print(*cells, f"{1e6 * seconds / count:.1f} us a row", sep="  ", flush=True)
                 lines.append(cells)
                 out.unlink()
     return table(["file", "rig", "rows", "rows a second of processor time", "peak MB", "file MB"], lines)
@@ -116,8 +114,8 @@ def main() -> None:
         CONCLUSIONS["locate_table.md"],
         "",
         f"Made by `scripts/bench/locate_table.py` with kcal {kcal.__version__}, torch {torch.__version__} on "
-        f"{platform.machine()}, one thread; the fastest of {arguments.repeat} runs. Processor time of the command, "
-        "less that of a table of one row. The rig is that of `locate.md`: exact, or with the covariances of cameras, "
+        f"{platform.machine()}, one thread; the fastest of {arguments.repeat} runs. Processor time of the command "
+        "from its second call in a process on. The rig is that of `locate.md`: exact, or with the covariances of cameras, "
         "pose and mounting.",
         "",
     ]
