@@ -9,9 +9,10 @@ import json
 import os
 import secrets
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, BinaryIO, ClassVar, Self
 
 import pydantic
 
@@ -78,17 +79,27 @@ def check_writable(path: str | Path, *inputs: str | Path) -> Path:
     return path
 
 
-def write_atomic(path: str | Path, data: str | bytes) -> Path:
-    """Write `data` beside `path` and move it into place, so that a reader never sees half a file.
+@contextmanager
+def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
+    """Open a file beside `path` for writing, and move it into place when the block ends.
+
+    If the block fails or is interrupted, the new file is removed and an old one is untouched.
 
     If `path` is a link, the file it points at is replaced. A file that exists keeps its permissions; a new one gets
     those of the umask.
 
     Raises:
-        FileError: the folder is missing, or nothing can be written there; an old file is then untouched.
+        FileError: the folder is missing, or nothing can be written there.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with open_atomic(Path(folder, "a.txt")) as file:
+        ...         _ = file.write(b"part by part")
+        ...     Path(folder, "a.txt").read_text()
+        'part by part'
     """
     path = check_writable(path)
-    payload = data.encode() if isinstance(data, str) else data
     target = Path(os.path.realpath(path))
     # A short name: that of the file may have all the characters that a name may have.
     temporary = target.with_name(f".kcal-{secrets.token_hex(8)}.part")
@@ -97,7 +108,7 @@ def write_atomic(path: str | Path, data: str | bytes) -> Path:
         handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else 0o600)
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(payload)
+                yield file
                 file.flush()
                 os.fsync(file.fileno())
             if mode is not None:
@@ -108,7 +119,17 @@ def write_atomic(path: str | Path, data: str | bytes) -> Path:
             raise
     except OSError as error:
         raise FileError(f"{path}: cannot write: {error.strerror or error}") from error
-    return path
+
+
+def write_atomic(path: str | Path, data: str | bytes) -> Path:
+    """Write `data` beside `path` and move it into place, so that a reader never sees half a file.
+
+    Raises:
+        FileError: the folder is missing, or nothing can be written there; an old file is then untouched.
+    """
+    with open_atomic(path) as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+    return Path(path)
 
 
 def dump_json(value: Any) -> str:

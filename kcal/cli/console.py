@@ -55,8 +55,8 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
 
 
 @contextmanager
-def steps(description: str, total: int | None) -> Iterator[Callable[[str], None]]:
-    """Show a progress bar on the error stream: call the value with a text after each step."""
+def steps(description: str, total: int | None) -> Iterator[Callable[..., None]]:
+    """Show a progress bar on the error stream: call the value with a text, and how many if not one, after each step."""
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -68,7 +68,7 @@ def steps(description: str, total: int | None) -> Iterator[Callable[[str], None]
     ) as progress:
         task = progress.add_task(description, total=total)
 
-        def advance(text: str) -> None:
-            progress.update(task, advance=1, description=f"{description}: {escape(one_line(text))}")
+        def advance(text: str, by: int = 1) -> None:
+            progress.update(task, advance=by, description=f"{description}: {escape(one_line(text))}")
 
         yield advance

@@ -314,19 +314,33 @@ class StereoLocalizer(nn.Module):
             pixels_left: (..., N, 2).
             pixels_right: (..., N, 2).
         """
-        found = fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right))
-        fit, scale, _, usable = found
-        known = usable & (fit.inverse > 0)
-        inverse = torch.where(known, fit.inverse, 1.0)
-        # d range = -range dρ / ρ
-        slope = scale * found.length / (inverse * inverse)
-        by_mark = fit.gain[..., 2, :, :]
-        by_side = torch.linalg.vector_norm(by_mark.unflatten(-2, (2, 2)), dim=-2)
-        turn = (by_mark[..., None, 2:, :] * by_pose(fit, 1)[..., :3, :, :]).sum(-2)
-        return Sensitivity(
-            torch.where(known, slope * by_side.amax(-2), math.inf),
-            torch.where(known, slope * torch.linalg.vector_norm(turn, dim=-2) * math.radians(1.0), math.inf),
-        )
+        return _sensitivity(fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right)))
+
+    def with_sensitivity(self, pixels_left: Tensor, pixels_right: Tensor) -> tuple[Localization, Sensitivity]:
+        """`forward` and `sensitivity` for the work of one; without covariances, masks and derivatives.
+
+        Args:
+            pixels_left: (..., N, 2); in one piece, so give some ten thousand at once.
+            pixels_right: (..., N, 2).
+        """
+        by_camera = self.calibration_factor is not None
+        found = fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right), by_camera=by_camera)
+        return self._on_earth(found, self.pixel_sigma**2), _sensitivity(found)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         return super()._apply(keep_float64(fn), recurse)
+
+
+def _sensitivity(found: PairFit) -> Sensitivity:
+    fit, scale, _, usable = found
+    known = usable & (fit.inverse > 0)
+    inverse = torch.where(known, fit.inverse, 1.0)
+    # d range = -range dρ / ρ
+    slope = scale * found.length / (inverse * inverse)
+    by_mark = fit.gain[..., 2, :, :]
+    by_side = torch.linalg.vector_norm(by_mark.unflatten(-2, (2, 2)), dim=-2)
+    turn = (by_mark[..., None, 2:, :] * by_pose(fit, 1)[..., :3, :, :]).sum(-2)
+    return Sensitivity(
+        torch.where(known, slope * by_side.amax(-2), math.inf),
+        torch.where(known, slope * torch.linalg.vector_norm(turn, dim=-2) * math.radians(1.0), math.inf),
+    )

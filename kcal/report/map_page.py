@@ -85,7 +85,7 @@ def map_page(
     own = (resources.files("kcal.report") / "map_page.js").read_text(encoding="utf-8")
     scripts = ((library / "leaflet.js").read_text(encoding="utf-8"), own)
     allowed = "data: https://tile.openstreetmap.org" if online else "data:"
-    title = f"{located.count} of {len(located.positions)} points located"
+    title = located.count_note
     note = (
         f"From {located.origin.lat:.6f}°, {located.origin.lon:.6f}°, heading {located.heading_deg:g}° from true north. "
         f"Regions and intervals: {located.interval_note}. Geoid: {located.geoid or 'none found'}."
