@@ -93,7 +93,7 @@ def _view(name: str, corners: Sequence[Corner], weighted: bool) -> View:
     )
 
 
-def _corner(u: str, v: str, weight: float, where: str) -> Corner:
+def _corner_of_weight(u: str, v: str, weight: float, where: str) -> Corner:
     if u in ("", "-") or v in ("", "-") or not weight > 0:
         return None
     values = float(u), float(v), weight
@@ -126,7 +126,7 @@ def _from_vnl(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
         weight = 1.0 if last == "-" else float(last)
         if header[3:] == ["level"] and last != "-":
             weight = 0.0 if weight < 0 else 0.5**weight
-        corners.append(_corner(fields[1], fields[2], weight, where))
+        corners.append(_corner_of_weight(fields[1], fields[2], weight, where))
     return {name: corners for name, corners in views.items() if corners != [None]}, None
 
 
@@ -143,7 +143,7 @@ def _from_csv(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
         where = f"line {table.line_num}"
         if None in row or None in row.values():
             raise ValueError(f"{where}: a wrong number of fields")
-        corner = _corner(row["u"], row["v"], float(row.get("weight") or 1.0), where)
+        corner = _corner_of_weight(row["u"], row["v"], float(row.get("weight") or 1.0), where)
         corners = views.setdefault(row["image"], [None] * board.corners if numbered else [])
         if not numbered:
             corners.append(corner)

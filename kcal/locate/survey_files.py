@@ -103,11 +103,11 @@ def _from_geojson(text: str) -> list[_Place]:
         geometry = feature["geometry"]
         if geometry["type"] != "Point":
             raise ValueError(f"{name}: a {geometry['type']}; points are needed")
-        places.append(_Place(name, _origin(name, *_three(geometry["coordinates"], name)), _stated(properties)))
+        places.append(_Place(name, _origin(name, *_position_in(geometry["coordinates"], name)), _stated(properties)))
     return places
 
 
-def _three(coordinates: Sequence[Any], name: str) -> tuple[float, float, float]:
+def _position_in(coordinates: Sequence[Any], name: str) -> tuple[float, float, float]:
     if len(coordinates) != 3:
         raise ValueError(f"{name}: [longitude, latitude, height] are needed, got {len(coordinates)} numbers")
     lon, lat, height = (float(value) for value in coordinates)
