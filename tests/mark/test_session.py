@@ -80,6 +80,10 @@ def test_a_killed_session_continues(tmp_path: Path, survey: Path) -> None:
     second.do(Step(do="redo"), "key-0008")
     assert second.state == state
     second.close()
+    # What was cut off is gone: the next line did not grow onto it.
+    third = Session(tmp_path / "marks.csv", survey)
+    assert third.state == state
+    third.close()
 
 
 def test_an_action_that_is_sent_twice_is_done_once(tmp_path: Path) -> None:
