@@ -124,7 +124,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
         if abs(work.sigma_corner / before - 1.0) < 1e-3:
             break
     _, found = work.solve(masks, options.solver)
-    return _rig_result(work, found, masks, reasons, initial, warnings)
+    return _rig_result(work, found, masks, reasons, initial, warnings, refuse=options.reject)
 
 
 def _without_rayless(data: RigData) -> tuple[RigData, list[str]]:
@@ -254,7 +254,14 @@ def _refined(camera: Camera, parameters: Tensor, covariance: Tensor) -> Camera:
 
 
 def _rig_result(
-    work: Adjustment, found: Result, masks: PerKind, reasons: Reasons, initial: InitialPoses, warnings: list[str]
+    work: Adjustment,
+    found: Result,
+    masks: PerKind,
+    reasons: Reasons,
+    initial: InitialPoses,
+    warnings: list[str],
+    *,
+    refuse: bool,
 ) -> RigResult:
     data, state, problem = work.data, work.part(masks), work.problem(masks)
     fit = goodness_of_fit(problem, state)
@@ -268,7 +275,7 @@ def _rig_result(
                 "anything; add boards seen by both, surveyed landmarks, far features of known range, a measured "
                 "baseline or measured positions"
             )
-    widen, doubts = check_places(problem, state, covariance, data.names)
+    widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
     if widen > 1.0:
         covariance = SharedCovariance(problem, state, widen**2 * fit.variance)
     squared, counts = torch.zeros(len(data.cameras)).double(), torch.zeros(len(data.cameras)).double()

@@ -1,4 +1,4 @@
-"""Refuse rigs whose baseline the data leave so open that intervals of ranges are wrong; widen intervals where that helps.
+"""Refuse rigs whose baseline is so open that intervals of ranges are wrong; widen intervals where that helps.
 
 Marks fix directions and the baseline turns them into ranges: an inverse range is linear in everything but the place of
 the second camera. So intervals are tried on rigs that are two standard deviations off the solution in that place. Each
@@ -22,11 +22,11 @@ from kcal.calibrate.rig.uncertainty import SharedCovariance, relative_rows
 from kcal.errors import DegenerateError
 from kcal.lens.pose import rotation_from_vector
 
-# Measured on simulated landmarks (docs/measured/weak_geometry.md). Up to the first ratio intervals contain the truth as
-# often as they should; up to the second they do once they are widened by it.
-_WIDEN, _HOPELESS = 1.3, 3.0
-# Of the baseline across the line of sight: sets of landmarks with more than that share open gave any range.
-_OPEN = 0.5
+# Measured on simulated landmarks (docs/measured/weak_geometry.md): up to the first ratio first-order intervals contain
+# the truth as often as they should; above it, once they are widened by the ratio's square, at most three times. Hardly
+# any set above the second ratio gave useful ranges, nor one whose baseline across the line of sight is open by half.
+_LINEAR, _HOPELESS, _OPEN = 1.15, 3.0, 0.5
+_WIDEST = 3.0
 # Extents across over extents along from which landmarks are no longer in a line or plane, and an extent over the
 # distance from which they are no longer in one place: only words depend on these.
 _LINE, _PLANE, _CLUSTER = 0.15, 0.1, 0.1
@@ -41,9 +41,16 @@ _DIRECTIONS = torch.nn.functional.normalize(
 
 
 def check_places(
-    problem: RigProblem, state: RigState, covariance: SharedCovariance, names: Sequence[str]
+    problem: RigProblem, state: RigState, covariance: SharedCovariance, names: Sequence[str], *, refuse: bool = True
 ) -> tuple[float, list[str]]:
     """By how much the standard deviations of a rig must be multiplied for its intervals to be right, and warnings.
+
+    Args:
+        problem: the problem.
+        state: its solution.
+        covariance: of the solution.
+        names: of the cameras.
+        refuse: raise an error where no range is known; otherwise a warning tells.
 
     Raises:
         DegenerateError: a camera whose place is so open that no range is known; what to add is told.
@@ -51,22 +58,22 @@ def check_places(
     widen, warnings = 1.0, list[str]()
     for second in range(1, len(names)):
         found = open_place(problem, state, covariance, 0, second)
-        if found is None or (found.ratio <= _WIDEN and found.share <= _OPEN):
+        if found is None or (found.ratio <= _LINEAR and found.share <= _OPEN):
             continue
+        hopeless = not (found.ratio <= _HOPELESS and found.share <= _OPEN)
         baseline = float((state.center[second] - state.center[0]).norm())
         word = ("sideways", "up and down", "along its view")[int(found.direction.abs().argmax())]
-        known = f"{found.sigma:.2g} m ({word} as {names[0]} sees it) of a baseline of {baseline:.3g} m"
-        if not (found.ratio <= _HOPELESS and found.share <= _OPEN):
-            raise DegenerateError(
-                f"the data do not determine where {names[second]} stands: its standard deviation is {known}, so that "
-                f"ranges could be anything. {_advice(problem, state)}"
-            )
-        widen = max(widen, found.ratio)
-        warnings.append(
-            f"the data hardly determine where {names[second]} stands: its standard deviation is {known}. Errors of "
-            f"ranges are not linear in that; covariances were widened {found.ratio:.1f} times. "
-            f"{_advice(problem, state)}"
+        text = (
+            f"the data {'do not' if hopeless else 'hardly'} determine where {names[second]} stands: "
+            f"± {found.sigma:.2g} m ({word} as {names[0]} sees it) with a baseline of {baseline:.3g} m; "
         )
+        advice = _advice(problem, state)
+        if hopeless and refuse:
+            raise DegenerateError(f"{text}ranges could be anything. {advice}")
+        factor = min(max(found.ratio, 1.0) ** 2, _WIDEST)
+        widen = max(widen, factor)
+        effect = "ranges could be anything" if hopeless else f"intervals were widened {factor:.1f} times for that"
+        warnings.append(f"{text}{effect}. {advice}")
     return widen, warnings
 
 
@@ -196,9 +203,9 @@ def _targets(
     nothing = torch.zeros(count, dtype=torch.float64), torch.full((count,), torch.inf, dtype=torch.float64)
     whitening = (torch.eye(2, dtype=torch.float64) / _MARK).expand(*pixels.shape, 2)
     block = FeatureBlock(pixels, whitening, *nothing, state.center[first])
-    free = ([slot is not None for slot in slots] for slots in (problem.turn, problem.shift))
-    here = state._replace(direction=direction, inverse_range=inverse)
-    follow, own = RigProblem(problem.cameras, [block], (), problem.unknowns, *free).linearize(here).local_response()
+    turning, moving = ([slot is not None for slot in slots] for slots in (problem.turn, problem.shift))
+    alone = RigProblem(problem.cameras, [block], (), problem.unknowns, turning, moving)
+    follow, own = alone.linearize(state._replace(direction=direction, inverse_range=inverse)).local_response()
     rows = follow[:, -1].clone()
     slot = problem.shift[first]
     if slot is not None:
