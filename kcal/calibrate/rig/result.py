@@ -100,7 +100,8 @@ class RigResult:
         rms_px: likewise of each camera; NaN for a camera with none.
         chi2: sum of squares of all residuals over their sigmas.
         freedom: degrees of freedom.
-        variance: by which covariances are multiplied, because residuals are larger than their sigmas say; 1 if not.
+        variance: by which covariances are multiplied, because residuals are larger than their sigmas say or because
+            ranges are not linear in errors of the baseline (`kcal.calibrate.rig.weak_geometry`); 1 if neither.
         sigma_corner: of a board's corner along an axis, px, as used; None without boards.
         undetermined: what the data leave open, in words; none of it concerns the cameras' relative poses.
         status: why the solver stopped.

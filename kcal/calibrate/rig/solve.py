@@ -23,6 +23,7 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, parameter_rows, relative_rows
 from kcal.calibrate.rig.unknowns import SharedUnknowns, free, held
+from kcal.calibrate.rig.weak_geometry import check_places
 from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import provenance
 from kcal.lens.calibration import CameraCalibration
@@ -130,7 +131,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
         if abs(work.sigma_corner / before - 1.0) < 1e-3:
             break
     _, found = work.solve(masks, options.solver)
-    return _rig_result(work, found, masks, reasons, initial, warnings)
+    return _rig_result(work, found, masks, reasons, initial, warnings, refuse=options.reject)
 
 
 def _without_rayless(data: RigData) -> tuple[RigData, list[str]]:
@@ -262,7 +263,14 @@ def _refined(camera: Camera, parameters: Tensor, covariance: Tensor) -> Camera:
 
 
 def _rig_result(
-    work: Adjustment, found: Result, masks: PerKind, reasons: Reasons, initial: InitialPoses, warnings: list[str]
+    work: Adjustment,
+    found: Result,
+    masks: PerKind,
+    reasons: Reasons,
+    initial: InitialPoses,
+    warnings: list[str],
+    *,
+    refuse: bool,
 ) -> RigResult:
     data, state, problem = work.data, work.part(masks), work.problem(masks)
     fit = goodness_of_fit(problem, state)
@@ -276,6 +284,9 @@ def _rig_result(
                 "anything; add boards seen by both, surveyed landmarks, far features of known range, a measured "
                 "baseline or measured positions"
             )
+    widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
+    if widen > 1.0:
+        covariance = SharedCovariance(problem, state, widen**2 * fit.variance)
     squared, counts = torch.zeros(len(data.cameras)).double(), torch.zeros(len(data.cameras)).double()
     for block in problem.blocks:
         squared += block.errors(problem.posed(state), state).square().sum((0, 2, 3))
@@ -293,6 +304,7 @@ def _rig_result(
         warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         warnings.append(f"the solver {status.message}")
+    warnings += doubts
     warnings += [f"not determined by the data: {text}" for text in undetermined]
     whole = [parameter_rows(problem, c) for c in range(len(data.cameras))]
     if not bool(covariance.of(torch.cat(whole))[1].all()):
@@ -321,7 +333,7 @@ def _rig_result(
         rms_px=tuple((squared / counts).sqrt().tolist()),
         chi2=fit.chi2,
         freedom=fit.freedom,
-        variance=fit.variance,
+        variance=widen**2 * fit.variance,
         sigma_corner=None if data.boards is None else work.sigma_corner,
         undetermined=undetermined,
         status=status,
