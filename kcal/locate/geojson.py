@@ -44,7 +44,7 @@ def camera_features(run: Located) -> list[bytes]:
 def point_features(columns: PositionColumns) -> Iterator[bytes]:
     """A feature for each pair of marks; its geometry is null where there is no position."""
     statuses = {int(status): status.name.lower() for status in PositionStatus}
-    infinite: list[bool] = np.isinf(columns.numbers).any(1).tolist()
+    infinite = set(np.isinf(columns.numbers).nonzero()[0].tolist())
     extras = [(column, list(map(_json_value, cells))) for column, cells in columns.extras.items()]
     rows = zip(columns.names, columns.status.tolist(), columns.reasons, columns.numbers.tolist(), strict=True)
     for place, (name, status, reason, numbers) in enumerate(rows):
@@ -52,7 +52,7 @@ def point_features(columns: PositionColumns) -> Iterator[bytes]:
         properties: dict[str, Any] = {"kind": "point", "name": name, "status": statuses[status], "reason": reason}
         # JSON has neither NaN nor infinity: both become null.
         properties.update(zip(NUMBERS, numbers, strict=True))
-        if infinite[place]:
+        if place in infinite:
             properties |= {
                 f"{column.removesuffix('_m')}_infinite": True
                 for column, value in zip(NUMBERS, numbers, strict=True)

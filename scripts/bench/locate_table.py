@@ -3,7 +3,8 @@
     python -m scripts.bench.locate_table [--rows 1000 10000 ...] [--repeat 3] [--source FOLDER] [--write]
 
 Each run is a process of its own with one thread, which locates a table of one row first. Processor time (user and
-system), not time of day, so that other work on the machine counts less. Of several runs the fastest counts. `--source` measures another copy of kcal, for example an earlier version.
+system), not time of day, so that other work on the machine counts less. Of several runs the fastest counts. `--source`
+measures another copy of kcal, for example an earlier version.
 """
 
 from __future__ import annotations
@@ -115,8 +116,8 @@ def main() -> None:
         "",
         f"Made by `scripts/bench/locate_table.py` with kcal {kcal.__version__}, torch {torch.__version__} on "
         f"{platform.machine()}, one thread; the fastest of {arguments.repeat} runs. Processor time of the command "
-        "from its second call in a process on. The rig is that of `locate.md`: exact, or with the covariances of cameras, "
-        "pose and mounting.",
+        "from its second call in a process on. The rig is that of `locate.md`: exact, or with the covariances of "
+        "cameras, pose and mounting.",
         "",
     ]
     show([*head, *lines])
