@@ -48,10 +48,12 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
     """
     rows = [[one_line(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
     for row in rows:
         cells = zip(row, widths, strict=True)
         aligned = [cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(cells)]
-        out.print("  ".join(aligned).rstrip(), markup=False)
+        lines.append("  ".join(aligned).rstrip())
+    out.print("\n".join(lines), markup=False)
 
 
 @contextmanager

@@ -19,8 +19,8 @@ from kcal.checks import as_points
 from kcal.errors import InputError
 
 # The integral in the plane neglects the square of errors across the line of sight, as shares of the horizontal
-# distance: at 2 % the radius is wrong by at most 0.15 %, less than samples know. Points with larger ones are sampled.
-_LARGEST_ACROSS = 0.02
+# distance: at 1 % the radius is wrong by at most 0.3 %, no more than samples are. Points with larger ones are sampled.
+_LARGEST_ACROSS = 0.01
 # A quasi-random set of this size knows the radius to some 0.3 %; points at once, so that memory stays below 200 MB.
 _DRAWS, _SAMPLED_AT_ONCE = 8192, 256
 # Points at once in the integral: fewer cost more calls, more do not fit the cache.
@@ -42,7 +42,7 @@ def circular_error(enu: Tensor, covariance: Tensor, shares: tuple[float, ...] = 
         shares: probabilities: CEP50 and CEP95.
 
     Returns:
-        (..., K) meters, good to 0.2 % (0.5 % where errors across the line of sight are above 2 % of the distance);
+        (..., K) meters, good to 0.3 % (0.5 % where errors across the line of sight are above 1 % of the distance);
         infinite where the covariance is not finite or so large a share may lie at infinity.
 
     Raises:

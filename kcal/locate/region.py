@@ -46,10 +46,10 @@ def region_outline(enu: Tensor, covariance: Tensor, share: float = REGION_SHARE)
         >>> outline[:, 1].min().round().item(), outline[:, 1].max().round().item()
         (4554.0, 5543.0)
     """
-    return torch.stack(_ellipse_outline(enu[..., :2].double(), covariance[..., :2, :2].double(), share), -1)
+    return torch.stack(_level_outline(enu[..., :2].double(), covariance[..., :2, :2].double(), share), -1)
 
 
-def _ellipse_outline(place: Tensor, spread: Tensor, share: float) -> tuple[Tensor, Tensor]:
+def _level_outline(place: Tensor, spread: Tensor, share: float) -> tuple[Tensor, Tensor]:
     """East and north (..., 72) each: one by one they take a third of the time."""
     squared = place.square().sum(-1)
     some = torch.where(squared > 0, squared, 1.0)
@@ -92,7 +92,7 @@ def ring_blocks(columns: PositionColumns, origin: Origin) -> Iterator[NDArray[np
     # Splitting no rows gives one part, of no rows.
     for part in located.split(_AT_ONCE) if len(located) else ():
         east, north, up, lon_of_point = (part[:, NUMBERS.index(name)] for name in ("east_m", "north_m", "up_m", "lon"))
-        outline = _ellipse_outline(torch.stack([east, north], -1), part[:, upper], REGION_SHARE)
+        outline = _level_outline(torch.stack([east, north], -1), part[:, upper], REGION_SHARE)
         x, y, z = (
             row[0] * outline[0] + row[1] * outline[1] + (row[2] * up[:, None] + offset)
             for row, offset in zip(rotation, translation, strict=True)

@@ -35,6 +35,12 @@ CONCLUSIONS = {
         "only, so solve and locate with the rig's covariance. Triangulation is as accurate as OpenCV's and kornia's; "
         "with 10,000 points its closed form is faster than both, with 100 points mostly not."
     ),
+    "locate_table.md": (
+        "**Conclusion.** `kcal locate` takes tables of any length in the memory of a short one: 396 MB for a CSV of a "
+        "million rows, 370 MB for a hundred thousand. On this busy machine a row costs 22 µs of processor time to CSV "
+        "and 68 µs to GeoJSON, which contains a region of 73 corners for each point. The version before took 3,500 µs "
+        "on the same machine, most of it for the radii of circles, which are now integrated and no longer sampled."
+    ),
     "opencv.md": (
         "**Conclusion.** On the same corners kcal and OpenCV reach the same calibration: projections agree to 1e-12 "
         "px, RMS to 1e-7 px up to 12 coefficients, and with 14 coefficients kcal's RMS is lower by 3e-5 and 5e-5 px. "
