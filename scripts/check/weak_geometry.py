@@ -162,7 +162,7 @@ def unchecked(truth: StereoRig, seen: Landmarks) -> RigResult:
     """What `solve_rig` would find without the check."""
     data = RigData(cameras=(truth.left, truth.right), names=("left", "right"), landmarks=seen)
     with mock.patch.object(solve, "check_places", return_value=(1.0, [])):
-        return solve.solve_rig(data, solve.RigOptions(intrinsics="fixed"))
+        return solve.solve_rig(data, solve.RigOptions(intrinsics="fixed", refraction=0.0, refraction_sigma=0.0))
 
 
 def graded(seed: int) -> tuple[StereoRig, Landmarks, dict[str, Any]]:

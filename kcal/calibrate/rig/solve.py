@@ -100,7 +100,8 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
         >>> marks = torch.stack([camera.project((points - center) @ look.T)[0] for center in truth], 1)
         >>> survey = Landmarks(names=tuple("abcde"), points=points, sigma=torch.full((5, 3), 0.02).double(),
         ...                    pixels=marks, pixel_sigma=0.1)
-        >>> found = solve_rig(RigData(cameras=(camera, camera), names=("left", "right"), landmarks=survey))
+        >>> straight = RigOptions(refraction=0.0, refraction_sigma=0.0)  # as these pixels were made
+        >>> found = solve_rig(RigData(cameras=(camera, camera), names=("left", "right"), landmarks=survey), straight)
         >>> round(float(found.stereo().baseline), 6), found.left_out
         (10.0, ())
     """
