@@ -28,7 +28,7 @@ def check_image_header(data: bytes, source: str | Path) -> None:
         kcal.errors.FileError: huge.pgm: 60000x60000 pixels; an image may have at most 500 megapixels
     """
     if not data:
-        raise FileError(f"{source}: the file is empty, not an image; copy it again")
+        raise FileError(f"{source}: the file is empty; copy it again")
     size_of = next((size_of for start, size_of in _FORMATS.items() if data.startswith(start)), None)
     if size_of is None:
         raise FileError(f"{source}: not an image that can be read; use JPEG, PNG, TIFF, BMP, WebP or PGM")

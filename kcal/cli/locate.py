@@ -282,6 +282,6 @@ def _print_positions(located: Located, true: Tensor | None, statuses: dict[str, 
     for position in (located.positions[i] for i in shown):
         if position.reason:
             out.print(f"* {one_line(position.name)}: {position.reason}", markup=False)
-    noise = "the noise that the table states" if stated else f"{located.pixel_sigma:g} px of noise"
+    noise = "the noise that the CSV states" if stated else f"{located.pixel_sigma:g} px of noise"
     out.print(f"Interval: {located.interval_note}; marks have {noise}.")
     out.print(f"Heights are ellipsoidal; geoid: {located.geoid or 'none found'}.")

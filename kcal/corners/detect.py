@@ -162,7 +162,7 @@ def detect_images(
         ...     _ = cv2.imwrite(f"{folder}/a.png", image), Path(folder, "b.png").write_bytes(b"")
         ...     seen = detect_images([f"{folder}/a.png", f"{folder}/b.png"], Board(columns=5, rows=3, square=0.02))
         >>> seen.names, seen.image_size, seen.failures[0].reason
-        (('a.png',), (160, 120), 'the file is empty, not an image; copy it again')
+        (('a.png',), (160, 120), 'the file is empty; copy it again')
     """
     if not paths:
         raise InputError("no images given")

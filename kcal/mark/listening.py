@@ -8,7 +8,7 @@ from kcal.errors import InputError
 
 
 def listening_socket(port: int, *, fallback: bool) -> socket.socket:
-    """A socket bound to 127.0.0.1.
+    """A listening socket bound to 127.0.0.1.
 
     Args:
         port: to bind; 0 for any that is free.
@@ -21,6 +21,8 @@ def listening_socket(port: int, *, fallback: bool) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind(("127.0.0.1", port))
+        # Whoever opens the address as soon as it is printed waits for the server, and is not refused.
+        listener.listen()
     except OSError as error:
         listener.close()
         if fallback:
