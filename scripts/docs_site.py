@@ -12,11 +12,12 @@ import re
 from collections.abc import Iterator
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
-from mkdocs.structure.pages import Page
+if TYPE_CHECKING:  # the tests of the navigation run without MkDocs
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -33,6 +34,7 @@ SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("Reference", "reference", ("commands", "warnings", "conventions")),
     ("Measured", "measured", ("chain", "one-camera", "opencv", "rig", "locate", "paper", "corners", "lens", "solver")),
 )  # fmt: skip
+NETWORK_SHIM = "https://unpkg.com/iframe-worker/shim"
 OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md")  # pages of the repository's root, shown under Reference
 ROOMS = {
     "lens": "Cameras and lenses",
@@ -113,11 +115,12 @@ def commands_page() -> str:
 
 def _option_row(option: Any) -> str:
     names = ", ".join(f"`{name}`" for name in sorted(option.opts, key=len, reverse=True) if name.startswith("-"))
-    value = "" if getattr(option, "is_flag", False) else (option.metavar or option.type.name.upper())
-    shown = f"{names} `{value}`" if names and value else names or f"`{option.metavar or option.human_readable_name}`"
-    default = "required" if option.required else option.default
-    plain = "" if default is None or default is False or callable(default) else str(getattr(default, "value", default))
-    cells = (shown, getattr(option, "help", "") or "", plain)
+    kind = str(getattr(option.type_descriptor.annotation, "__name__", "")).upper()
+    value = "" if getattr(option, "is_flag", False) else f" `{option.metavar or kind}`"
+    shown = f"{names}{value}" if names else f"`{option.metavar or option.name}`"
+    default = "required" if option.required else getattr(option.default, "value", option.default)
+    plain = "" if default is None or default is False or callable(default) else str(default)
+    cells = (shown, option.help or "", plain)
     return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
 
 
@@ -127,7 +130,12 @@ def conclusions_page() -> str:
     _, folder, order = SECTIONS[-1]
     for name in ordered([page.stem for page in (DOCS / folder).glob("*.md")], order):
         title, opening = (DOCS / folder / f"{name}.md").read_text(encoding="utf-8").split("\n\n")[:2]
-        lines += [f"## [{title.removeprefix('# ')}]({name}.md)", "", opening.removeprefix("**Conclusion.**").strip(), ""]
+        lines += [
+            f"## [{title.removeprefix('# ')}]({name}.md)",
+            "",
+            opening.removeprefix("**Conclusion.**").strip(),
+            "",
+        ]
     return "\n".join(lines)
 
 
@@ -137,6 +145,8 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
+    from mkdocs.structure.files import File
+
     pages = {"reference/commands.md": commands_page(), "measured/index.md": conclusions_page()}
     pages |= {f"reference/api/{room}.md": api_page(room, names) for room, names in public_names().items()}
     pages |= {f"reference/{name.lower()}": (ROOT / name).read_text(encoding="utf-8") for name in OUTSIDE}
@@ -150,7 +160,25 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     """Links that leave docs/ in the repository stay inside the site."""
+    if page.is_homepage:
+        page.meta["hide"] = ["navigation", "toc"]  # the picture gets their place
+    if page.file.src_uri.startswith(("reference/api/", "reference/changelog")):
+        page.meta["search"] = {"boost": 0.3}  # what explains is found before what lists
     if page.file.src_uri in {f"reference/{name.lower()}" for name in OUTSIDE}:
         return re.sub(r"\]\(docs/", "](../", markdown)
     up = "../" * page.file.src_uri.count("/")
     return re.sub(rf"\]\({re.escape(up)}\.\./(?=assets/)", f"]({up}", markdown)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """A click on a picture shows it at its full size."""
+    return re.sub(r'<img [^>]*src="([^"]+)"[^>]*>', r'<a href="\1">\g<0></a>', html)
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """The theme takes what searches without a server from the network; the site has its own."""
+    site = Path(config.site_dir)
+    for path in site.rglob("*.html"):
+        up = "../" * (len(path.relative_to(site).parts) - 1)
+        text = path.read_text(encoding="utf-8").replace(NETWORK_SHIM, f"{up}offline-search.js")
+        path.write_text(text, encoding="utf-8")
