@@ -1,6 +1,7 @@
 # make demo   the whole chain on a simulated site; results in demo-output/
 # make test   linters, type check and all tests
 # make check  linters and type check only
+# make docs   the documentation site, in site/; it opens without a server and can be searched offline
 #
 # Each needs Python 3.11 or newer and nothing else; PYTHON=python3.12 make demo chooses another one.
 # Tests that need real data skip unless KCAL_DATA names the folder that holds them.
@@ -15,11 +16,11 @@ export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := demo
-.PHONY: demo test check clean
+.PHONY: demo test check docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/kcal demo --output $(OUT)
-	@echo "results: $(CURDIR)/$(OUT)"
+	@echo "results: $(CURDIR)/$(OUT); to use kcal in this shell: . $(BIN)/activate"
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
@@ -33,8 +34,13 @@ test: export OPENBLAS_NUM_THREADS = 1
 test: check
 	$(BIN)/python -m pytest -n 2 kcal tests
 
+# The release of MkDocs is pinned, so its announcements of other programs are switched off.
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@echo "site: $(CURDIR)/site/index.html"
+
 clean:
-	rm -rf $(VENV) $(OUT)
+	rm -rf $(VENV) $(OUT) site
 
 # The stamps make installation happen once, and again when what is to be installed changes.
 $(VENV)/.python: | Makefile
@@ -49,4 +55,8 @@ $(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: $(VENV)/.python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-docs: $(VENV)/.python pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	touch $@ $(VENV)/.installed

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+import kcal
+from scripts.docs_site import commands_page, navigation, ordered, public_names
 from scripts.shared.page import CONCLUSIONS
 
 ROOT = Path(__file__).parents[1]
@@ -71,10 +76,68 @@ def test_planted_mistakes_are_seen() -> None:
     assert missing_code(text) == ["kcal/none.py", "kcal/lens/camera.py::Camera.none"]
 
 
-def test_every_page_is_in_the_index() -> None:
-    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+def names_in(nav: object) -> list[str]:
+    """Pages of a navigation as MkDocs has it: texts, in lists and in dictionaries."""
+    if isinstance(nav, str):
+        return [nav]
+    return [name for part in (nav.values() if isinstance(nav, dict) else nav) for name in names_in(part)]
+
+
+def test_every_page_is_in_the_navigation() -> None:
     pages = {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
-    assert {page for page in pages if f"({page})" not in index} == {"index.md"}
+    names = names_in(navigation())
+    assert len(names) == len(set(names))
+    made = {name for name in names if name not in pages}
+    assert pages < set(names)
+    # The others are made of the code when the site is built.
+    assert {name for name in made if not name.startswith("reference/")} == {"measured/index.md"}
+
+
+def test_pages_without_a_place_follow_those_that_have_one() -> None:
+    assert ordered(["new", "drift", "board", "marking"], ("board", "mark*", "drift")) == [
+        "board",
+        "marking",
+        "drift",
+        "new",
+    ]
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    names = [name.rsplit(".", 1)[1] for room in public_names().values() for name in room]
+    assert sorted(names) == sorted(kcal.__all__)
+
+
+def test_the_commands_page_has_every_option() -> None:
+    page = commands_page()
+    assert "## kcal rig check" in page
+    assert "`--mark-sigma` `PX` | Noise of marks along each axis. | 0.3 |" in page
+    assert "`--output`, `-o` `PATH` | Rig file to write. | required |" in page
+
+
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    """Broken links and anchors are warnings."""
+    pytest.importorskip("mkdocs")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path / "site")]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    index = (tmp_path / "site" / "search" / "search_index.js").read_text(encoding="utf-8")
+    assert "StereoLocalizer" in index
+    pages = [path.read_text(encoding="utf-8") for path in (tmp_path / "site").rglob("*.html")]
+    assert [page for page in pages if re.search(r'<(script|link|img)[^>]*(src|href)="https?:', page)] == []
+
+
+HOWTOS = sorted((ROOT / "docs" / "howto").glob("*.md"))
+
+
+@pytest.mark.parametrize("page", HOWTOS, ids=[page.stem for page in HOWTOS])
+def test_a_howto_fits_one_screen(page: Path) -> None:
+    assert len(page.read_text(encoding="utf-8").split()) <= 250
+
+
+def test_the_way_to_a_first_position_is_short() -> None:
+    pages = ROOT / "README.md", ROOT / "docs" / "tutorial" / "guide.md"
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in pages) < 1500
 
 
 @pytest.mark.parametrize("page", sorted(path.name for path in (ROOT / "docs" / "measured").glob("*.md")))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from kcal import PositionStatus
 from kcal.cli.main import app
 
 ROOT = Path(__file__).parents[1]
@@ -24,10 +26,19 @@ def test_python_block() -> None:
     scope: dict = {}
     exec(compile(source, "README.md", "exec"), scope)
     # Without noise the target comes back, 2004 m away in the direction that the README gave it.
-    torch.testing.assert_close(scope["found"].points, scope["target"], rtol=1e-8, atol=0)
-    position = scope["located"].positions[0]
-    assert position.range_m == pytest.approx(float(torch.linalg.vector_norm(scope["target"])), rel=1e-8)
-    assert position.range_low_m < position.range_m < position.range_high_m
+    found, distance = scope["found"], float(torch.linalg.vector_norm(scope["target"]))
+    assert found.status.tolist() == [PositionStatus.OK]
+    assert float(1 / found.inverse_range) == pytest.approx(distance, rel=1e-8)
+    east, north, up = found.enu[0].tolist()
+    heading = math.radians(35.0)
+    # Right and forward, turned to a heading of 35 degrees; up is lower by refraction only.
+    assert (east, north) == pytest.approx(
+        (120 * math.cos(heading) + 2000 * math.sin(heading), -120 * math.sin(heading) + 2000 * math.cos(heading)),
+        rel=1e-6,
+    )
+    assert up == pytest.approx(30.0, abs=0.1)
+    assert found.range_low < distance < found.range_high
+    assert len([line for line in source.splitlines() if line]) <= 10
 
 
 COMMANDS = [
@@ -48,8 +59,8 @@ def test_commands_and_options_exist(words: list[str]) -> None:
 
 def test_make_targets_exist() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    targets = re.findall(r"^make (\w+)", "\n".join(blocks("sh")), re.MULTILINE)
-    assert targets == ["demo", "test"]
+    targets = re.findall(r"`make (\w+)`", README)
+    assert sorted(targets) == ["demo", "docs", "test"]
     for target in targets:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE)
 

@@ -213,15 +213,16 @@ def _where(axes: Axes, pixels: list[list[float]]) -> None:
 
 
 def _map(results: Results) -> None:
-    """Plan view of the first draw, with a logarithmic range: as the paper's Fig. 6 and 11."""
+    """Plan view of the first draw of plastic lenses, which differ most: as the paper's Fig. 6 and 11."""
     panels = [("14", "integer"), ("14", "marked"), ("20", "marked"), ("hybrid", "marked")]
-    figure = new_figure(13.5, 2.75 * len(results))
-    for line, (name, runs) in enumerate(results.items()):
-        for column, (label, kind) in enumerate(panels):
-            axes = figure.add_subplot(len(results), len(panels), len(panels) * line + column + 1)
-            title = {"integer": "whole pixels", "marked": "sub-pixel marks"}[kind]
-            _plan(axes, runs[0]["targets"], runs[0]["located"][label][kind])
-            axes.set_title(f"{name}: {label}, {title}", fontsize=10)
+    name = "plastic" if "plastic" in results else next(iter(results))
+    run = results[name][0]
+    figure = new_figure(6.8, 5.1)
+    for place, (label, kind) in enumerate(panels, 1):
+        axes = figure.add_subplot(2, 2, place)
+        title = {"integer": "whole pixels", "marked": "sub-pixel marks"}[kind]
+        _plan(axes, run["targets"], run["located"][label][kind])
+        axes.set_title(f"{name}: {label}, {title}", fontsize=10)
     figure.tight_layout()
     save_png(DOCS / "paper-map.png", figure)
 

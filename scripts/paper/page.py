@@ -149,7 +149,7 @@ def _marks(results: Results) -> list[str]:
         "",
         "![Seven points, true and estimated: whole pixels, sub-pixel marks, models](paper-map.png)",
         "",
-        "The map shows the first draw of each kind, true in magenta, estimated in blue, ranges logarithmic. Below: the "
+        "The map shows the first draw of *plastic*, true in magenta, estimated in blue, ranges logarithmic. Below: the "
         "median range error of the points at 1 km and beyond over all draws, percent.",
         "",
     ]

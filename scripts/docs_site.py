@@ -1,0 +1,184 @@
+"""Pages of the documentation site that follow from the repository: navigation, commands, API, measured conclusions.
+
+MkDocs calls the functions whose names begin with `on_` (`hooks` in mkdocs.yml). New pages appear without an edit: those
+named in `SECTIONS` come first, others of the folder follow by name.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # the tests of the navigation run without MkDocs
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+# Title and folder of each section, and its pages in the order in which they are read.
+SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
+    ("Tutorial", "tutorial", ("guide",)),
+    (
+        "How to",
+        "howto",
+        ("board", "calibrate", "wide-lenses", "survey", "mark*", "detector", "drift", "exchange*", "other-programs",
+         "batches", "gpu"),
+    ),
+    ("Explanation", "explanation", ("which-lens", "rms", "relative-yaw", "intervals", "camera", "paper")),
+    ("Reference", "reference", ("commands", "warnings", "conventions")),
+    ("Measured", "measured", ("chain", "one-camera", "opencv", "rig", "locate", "paper", "corners", "lens", "solver")),
+)  # fmt: skip
+NETWORK_SHIM = "https://unpkg.com/iframe-worker/shim"
+OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md")  # pages of the repository's root, shown under Reference
+ROOMS = {
+    "lens": "Cameras and lenses",
+    "corners": "Boards and corners",
+    "calibrate": "Calibration of cameras and rigs",
+    "locate": "Positions",
+    "report": "Pictures and maps",
+    "io": "Files",
+    "nets": "Networks",
+    "solve": "Least squares",
+    "errors": "Errors",
+}
+
+
+def ordered(names: list[str], order: tuple[str, ...]) -> list[str]:
+    """Names in the order of the first pattern that each matches; the others behind, by name."""
+    return sorted(names, key=lambda name: ([fnmatch(name, pattern) for pattern in (*order, "*")].index(True), name))
+
+
+def navigation() -> list[Any]:
+    """Every page of docs/ and every generated one, by section."""
+    nav: list[Any] = [{"Home": "index.md"}]
+    for title, folder, order in SECTIONS:
+        names = [page.relative_to(DOCS / folder).with_suffix("").as_posix() for page in (DOCS / folder).rglob("*.md")]
+        pages: list[Any] = [f"{folder}/{name}.md" for name in ordered([*names, *_generated(folder)], order)]
+        if folder == "measured":
+            pages.insert(0, "measured/index.md")
+        if folder == "reference":
+            pages += [{"Python": [f"reference/api/{room}.md" for room in public_names()]}]
+            pages += ["architecture.md", *(f"reference/{name.lower()}" for name in OUTSIDE)]
+        nav.append({title: pages})
+    return nav
+
+
+def _generated(folder: str) -> list[str]:
+    return ["commands"] if folder == "reference" else []
+
+
+def public_names() -> dict[str, list[str]]:
+    """Full names of the public classes and functions of each room, as the stub of the package lists them."""
+    rooms: dict[str, list[str]] = {room: [] for room in ROOMS}
+    for line in ast.parse((ROOT / "kcal" / "__init__.pyi").read_text(encoding="utf-8")).body:
+        if isinstance(line, ast.ImportFrom):
+            room = str(line.module).split(".")[1]
+            rooms.setdefault(room, []).extend(f"{line.module}.{alias.name}" for alias in line.names)
+    return {room: names for room, names in rooms.items() if names}
+
+
+def api_page(room: str, names: list[str]) -> str:
+    """A page of mkdocstrings' directives."""
+    lines = [f"# {ROOMS.get(room, room.capitalize())}", "", "All names are imported from `kcal`.", ""]
+    return "\n".join([*lines, *(f"::: {name}\n" for name in names)])
+
+
+def commands_page() -> str:
+    """Every command with its description and options, from the command line itself."""
+    from typer.main import get_command
+
+    from kcal.cli.main import app
+
+    def walk(command: Any, words: tuple[str, ...]) -> Iterator[str]:
+        yield f"## {' '.join(words)}\n" if words[1:] else "# Commands\n"
+        yield f"{inspect.cleandoc(command.help or '')}\n"
+        if hasattr(command, "commands"):
+            for name, found in command.commands.items():
+                # The first command of `kcal rig` and its like runs where none is named.
+                implied = words[1:] and name == next(iter(command.commands))
+                yield from walk(found, words if implied else (*words, name))
+            return
+        yield "| Option | Meaning | Default |\n|---|---|---|"
+        for option in command.params:
+            if option.name != "help":
+                yield _option_row(option)
+        yield ""
+
+    return "\n".join(walk(get_command(app), ("kcal",)))
+
+
+def _option_row(option: Any) -> str:
+    names = ", ".join(f"`{name}`" for name in sorted(option.opts, key=len, reverse=True) if name.startswith("-"))
+    kind = str(getattr(option.type_descriptor.annotation, "__name__", "")).upper()
+    value = "" if getattr(option, "is_flag", False) else f" `{option.metavar or kind}`"
+    shown = f"{names}{value}" if names else f"`{option.metavar or option.name}`"
+    default = "required" if option.required else getattr(option.default, "value", option.default)
+    plain = "" if default is None or default is False or callable(default) else str(default)
+    cells = (shown, option.help or "", plain)
+    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+
+
+def conclusions_page() -> str:
+    """What to conclude from each measured page."""
+    lines = ["# Measured", "", "Each page is written by a script of the repository. This is what each concludes.", ""]
+    _, folder, order = SECTIONS[-1]
+    for name in ordered([page.stem for page in (DOCS / folder).glob("*.md")], order):
+        title, opening = (DOCS / folder / f"{name}.md").read_text(encoding="utf-8").split("\n\n")[:2]
+        lines += [
+            f"## [{title.removeprefix('# ')}]({name}.md)",
+            "",
+            opening.removeprefix("**Conclusion.**").strip(),
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    config.nav = navigation()
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    from mkdocs.structure.files import File
+
+    pages = {"reference/commands.md": commands_page(), "measured/index.md": conclusions_page()}
+    pages |= {f"reference/api/{room}.md": api_page(room, names) for room, names in public_names().items()}
+    pages |= {f"reference/{name.lower()}": (ROOT / name).read_text(encoding="utf-8") for name in OUTSIDE}
+    for name, text in pages.items():
+        files.append(File.generated(config, name, content=text))
+    for path in sorted((ROOT / "assets").rglob("*.*")):
+        name = path.relative_to(ROOT).as_posix()
+        files.append(File.generated(config, name, abs_src_path=str(path)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """Links that leave docs/ in the repository stay inside the site."""
+    if page.is_homepage:
+        page.meta["hide"] = ["navigation", "toc"]  # the picture gets their place
+    if page.file.src_uri.startswith(("reference/api/", "reference/changelog")):
+        page.meta["search"] = {"boost": 0.3}  # what explains is found before what lists
+    if page.file.src_uri in {f"reference/{name.lower()}" for name in OUTSIDE}:
+        return re.sub(r"\]\(docs/", "](../", markdown)
+    up = "../" * page.file.src_uri.count("/")
+    return re.sub(rf"\]\({re.escape(up)}\.\./(?=assets/)", f"]({up}", markdown)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """A click on a picture shows it at its full size."""
+    return re.sub(r'<img [^>]*src="([^"]+)"[^>]*>', r'<a href="\1">\g<0></a>', html)
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """The theme takes what searches without a server from the network; the site has its own."""
+    site = Path(config.site_dir)
+    for path in site.rglob("*.html"):
+        up = "../" * (len(path.relative_to(site).parts) - 1)
+        text = path.read_text(encoding="utf-8").replace(NETWORK_SHIM, f"{up}offline-search.js")
+        path.write_text(text, encoding="utf-8")
