@@ -145,5 +145,5 @@ def test_image_files() -> None:
     floats = cv2.imencode(".tiff", np.ones((4, 4), np.float32))[1].tobytes()
     with pytest.raises(FileError, match=r"x\.tif: pixels are float32"):
         decode_image(floats, "x.tif")
-    with pytest.raises(FileError, match="not an image"):
+    with pytest.raises(FileError, match="the file is empty"):
         decode_image(b"", "x.png")

@@ -19,9 +19,8 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.rig import RigCovariance, StereoRig
 
-ROOT = Path(__file__).parents[2]
 # Written by version 0.1: cameras, covariances, mounting with link, sources, records.
-SAMPLE = ROOT / "assets" / "sample-rig.json"
+SAMPLE = Path(__file__).parent / "rig-version-1.json"
 
 
 def assert_same(before: Any, after: Any, where: str = "") -> None:
