@@ -78,7 +78,10 @@ def test_a_whole_site_while_the_server_is_killed(site: tuple[Path, MarkingSite],
             settled(page)
             for number, name in enumerate(names):
                 if name in {target.name for target in TARGETS}:
+                    # Others may still be on their way to the server: a new target is selected all the same.
+                    page.evaluate("kcal.nudge(0.1, 0), kcal.nudge(-0.1, 0)")
                     page.keyboard.press("n")
+                    page.wait_for_function("() => (kcal.selected || '').startsWith('target ')", timeout=60_000)
                     settled(page)
                     page.fill("#edit-name", name)
                     page.press("#edit-name", "Enter")

@@ -35,12 +35,23 @@ export class Actions {
     this.failed = failed;
     this.waiting = JSON.parse(localStorage.getItem(this.place) || "[]");
     this.sending = false;
+    this.ends = new Map();
     if (this.waiting.length) this.send();
   }
+  // Ends when this action is answered or refused, however many wait before it.
   push(action) {
-    this.waiting.push({key: crypto.randomUUID(), action});
+    const key = crypto.randomUUID();
+    this.waiting.push({key, action});
     this.keep();
-    return this.send();
+    const ended = new Promise((done) => this.ends.set(key, done));
+    this.send();
+    return ended;
+  }
+  // The first of those that wait is dealt with.
+  shift() {
+    const {key} = this.waiting.shift();
+    this.keep();
+    return () => { const done = this.ends.get(key); this.ends.delete(key); if (done) done(); };
   }
   keep() { localStorage.setItem(this.place, JSON.stringify(this.waiting)); }
   async send() {
@@ -49,14 +60,14 @@ export class Actions {
     while (this.waiting.length) {
       try {
         const state = await post("act", this.waiting[0]);
-        this.waiting.shift();
-        this.keep();
+        const ended = this.shift();
         this.answered(state, this.waiting.length);
+        ended();
       } catch (error) {
         if (error instanceof Refused && error.status !== 401) {
-          this.waiting.shift();
-          this.keep();
+          const ended = this.shift();
           this.failed(error.message);
+          ended();
           continue;
         }
         const what = error instanceof Refused ? error.message : "the server does not answer: start kcal mark again with the same -o, and open its address";
