@@ -121,6 +121,14 @@ class TestHoles:
         assert int(result.status) == SolverStatus.CONVERGED
         assert int(result.iterations) == 1
 
+    def test_a_step_that_damping_shortens_is_no_minimum(self, solver: str) -> None:
+        """λ = 3e9 lets a step promise 3e-10 of the cost: below the tolerance, and far from the minimum."""
+        options = LMOptions(initial_damping=3e9, tolerance=1e-8)
+        x, result = SOLVERS[solver](lambda x: torch.cat([beale(x), torch.ones(1).double()]), vector(1.0, 1.0), options)
+        assert int(result.status) == SolverStatus.CONVERGED
+        assert int(result.iterations) > 9
+        torch.testing.assert_close(x, vector(3.0, 0.5), rtol=0, atol=1e-3)
+
     def test_residual_floor_is_per_residual(self, solver: str) -> None:
         """The same misfit in every one of many residuals counts as the same, not as more."""
 
