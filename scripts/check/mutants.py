@@ -39,7 +39,7 @@ from typing import Any
 import pytest
 
 from scripts.check.mutations import Site, sites
-from scripts.shared.page import table, write_section
+from scripts.shared.page import DOCS, table
 
 ROOT = Path(__file__).parents[2]
 STATE = ROOT / ".mutants"
@@ -257,25 +257,37 @@ def interval(hits: int, count: int) -> tuple[float, float]:
     return (middle - half) / (count + z2), (middle + half) / (count + z2)
 
 
-def report(folders: list[str], seed: int) -> str:
-    """A table of the folders, and what was not noticed, line by line."""
-    kept, rows, missed = results(), [], []
-    for folder in folders:
+def report(seed: int) -> str:
+    """The page: a table of the folders, and what was not noticed, line by line."""
+    kept, rows, missed, counts = results(), [], [], {}
+    for folder in FOLDERS:
         every = draws(folder, seed)
         judged = [(path, site, kept[site.key]) for path, _, site in every if site.key in kept]
+        if not judged:
+            continue
         hits = sum(entry["noticed"] for *_, entry in judged)
-        if judged:
-            low, high = interval(hits, len(judged))
-            share = f"{100 * hits / len(judged):.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %"
-            rows.append((folder, len(every), len(judged), hits, *share))
+        counts[folder] = hits, len(judged)
+        low, high = interval(hits, len(judged))
+        share = f"{100 * hits / len(judged):.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %"
+        rows.append((f"`{folder}`", len(every), len(judged), hits, *share))
         for path, site, entry in sorted(judged, key=lambda row: (row[0], row[1].line)):
             if not entry["noticed"]:
-                before, after = (" ".join(text.split())[:70] for text in (site.before, site.after))
+                before, after = (" ".join(text.split())[:70].replace("|", "\\|") for text in (site.before, site.after))
                 missed.append((f"{path}:{site.line}", site.kind, f"`{before}`", f"`{after}`", entry["tests"]))
-    heads = ("folder", "possible mistakes", "planted", "noticed", "share", "95 % interval")
+    hits, total = (sum(values) for values in zip(*counts.values(), strict=True))
+    worst = min(counts, key=lambda folder: counts[folder][0] / counts[folder][1])
+    shares = (
+        f"{100 * hits / total:.0f} % over all folders, {100 * counts[worst][0] / counts[worst][1]:.0f} % in `{worst}`"
+    )
     return "\n".join([
-        *table(heads, rows), "", f"Not noticed ({len(missed)}), with the number of tests that ran:", "",
-        *table(("line", "kind", "before", "after", "tests"), missed),
+        "# What the tests notice", "",
+        f"**Conclusion.** The tests notice {hits} of {total} small mistakes planted at random: {shares}, the lowest. "
+        "Some of the others change no result, but only how fast it is found.", "",
+        "Made by `scripts/check/mutants.py`, which says what a mistake is and which tests run. The intervals tell how "
+        "well so few mistakes know the share.", "",
+        *table(("folder", "possible mistakes", "planted", "noticed", "share", "95 % interval"), rows), "",
+        f"## Not noticed ({len(missed)})", "", "With the number of tests that call the function.", "",
+        *table(("line", "kind", "before", "after", "tests"), missed), "",
     ])  # fmt: skip
 
 
@@ -287,7 +299,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=math.inf, help="after which nothing is begun")
     parser.add_argument("--budget", type=float, default=60.0, help="seconds of tests for one mistake")
     parser.add_argument("--again", action="store_true", help="only what went unnoticed, with the tests as they are now")
-    parser.add_argument("--write", action="store_true", help="put the figures into docs/measured/mutants.md")
+    parser.add_argument("--write", action="store_true", help="write docs/measured/mutants.md")
     arguments = parser.parse_args()
     STATE.mkdir(exist_ok=True)
     for library in LIBRARIES:
@@ -304,10 +316,10 @@ def main() -> None:
                 break
             if site.key not in kept or (arguments.again and not kept[site.key]["noticed"]):
                 judge(groups, path, number, site, arguments.budget)
-    text = report(arguments.folders, arguments.seed)
+    text = report(arguments.seed)
     print(text)
     if arguments.write:
-        write_section("mutants.md", "mutants", text)
+        (DOCS / "mutants.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

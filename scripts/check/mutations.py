@@ -164,7 +164,9 @@ def _variants(node: ast.AST, field: str, inside: bool) -> Iterator[tuple[str, as
         case ast.Call(), ast.Call():
             yield from _calls(new)
         case ast.List() | ast.Tuple(), ast.List(elts=elements) | ast.Tuple(elts=elements) if inside:
-            if isinstance(node.ctx, ast.Load) and len(elements) > 1 and _are_alike(elements[:2]) and field != "slice":
+            # The order of what is searched or indexed with does not matter.
+            matters = isinstance(node.ctx, ast.Load) and field not in ("slice", "comparators", "iter")
+            if matters and len(elements) > 1 and _are_alike(elements[:2]):
                 yield "order", _with(new, elts=[elements[1], elements[0], *elements[2:]])
         case ast.Slice(upper=upper), ast.Slice() if upper is not None and not isinstance(upper, ast.Constant):
             yield "slice", _with(new, upper=ast.BinOp(copy.deepcopy(upper), ast.Sub(), ast.Constant(1)))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 # Corners of a copy differ by less than this share of what independent noise does. Chance alone brings six corners so
-# near each other in one pair of a million.
+# near each other in three pairs of a million.
 _COPY_SHARE = 0.25
 # Pixels that corners of a copy differ by at most. JPEG of quality 60 to 98 moves real corners by 0.0005 to 0.013 px.
 _COPY_PIXELS = 0.03
