@@ -5,6 +5,9 @@ from kcal.calibrate.camera.calibrate import calibrate_camera as calibrate_camera
 from kcal.calibrate.camera.calibrate import calibrate_cameras as calibrate_cameras
 from kcal.calibrate.camera.compare import ComparisonResult as ComparisonResult
 from kcal.calibrate.camera.compare import compare_models as compare_models
+from kcal.calibrate.camera.export import ExportedCameras as ExportedCameras
+from kcal.calibrate.camera.export import Misfit as Misfit
+from kcal.calibrate.camera.export import export_cameras as export_cameras
 from kcal.calibrate.camera.layer import CalibratedViews as CalibratedViews
 from kcal.calibrate.camera.layer import CalibrationLayer as CalibrationLayer
 from kcal.calibrate.camera.options import CalibrationOptions as CalibrationOptions
@@ -46,6 +49,7 @@ from kcal.corners.board import Board as Board
 from kcal.corners.detect import Detection as Detection
 from kcal.corners.detect import detect_board as detect_board
 from kcal.corners.detect import detect_images as detect_images
+from kcal.corners.foreign_corners import import_corners as import_corners
 from kcal.corners.images import expand_images as expand_images
 from kcal.corners.images import read_gray as read_gray
 from kcal.corners.match import Matches as Matches
@@ -65,6 +69,9 @@ from kcal.errors import InputError as InputError
 from kcal.errors import KcalError as KcalError
 from kcal.io.camera_file import load_camera as load_camera
 from kcal.io.camera_file import save_camera as save_camera
+from kcal.io.foreign import CameraPose as CameraPose
+from kcal.io.foreign import ImportedCameras as ImportedCameras
+from kcal.io.formats import import_cameras as import_cameras
 from kcal.io.lookup_file import load_lookup as load_lookup
 from kcal.io.lookup_file import save_lookup as save_lookup
 from kcal.io.onnx_file import save_onnx as save_onnx
@@ -78,6 +85,8 @@ from kcal.lens.calibration import Exclusion as Exclusion
 from kcal.lens.calibration import RigCalibration as RigCalibration
 from kcal.lens.calibration import RigSource as RigSource
 from kcal.lens.camera import Camera as Camera
+from kcal.lens.difference import CameraDifference as CameraDifference
+from kcal.lens.difference import camera_difference as camera_difference
 from kcal.lens.field_modes import FieldModes as FieldModes
 from kcal.lens.gaussian_modes import GaussianModes as GaussianModes
 from kcal.lens.hybrid_terms import HybridForm as HybridForm
@@ -138,6 +147,7 @@ from kcal.locate.survey import camera_positions as camera_positions
 from kcal.locate.survey import match_landmarks as match_landmarks
 from kcal.locate.survey import read_features as read_features
 from kcal.locate.survey import read_survey as read_survey
+from kcal.locate.survey_files import import_survey as import_survey
 from kcal.locate.triangulate import Triangulate as Triangulate
 from kcal.locate.triangulate import Triangulation as Triangulation
 from kcal.locate.truth import position_errors as position_errors
@@ -150,6 +160,7 @@ from kcal.nets.inverse import train_inverse as train_inverse
 from kcal.report.board import save_board_picture as save_board_picture
 from kcal.report.budget import save_budget_picture as save_budget_picture
 from kcal.report.calibration import save_calibration_picture as save_calibration_picture
+from kcal.report.difference import save_difference_picture as save_difference_picture
 from kcal.report.gallery import save_coverage as save_coverage
 from kcal.report.gallery import save_gallery as save_gallery
 from kcal.report.map_page import save_map as save_map

@@ -7,13 +7,46 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
+import secrets
+import stat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, BinaryIO, ClassVar, Self
 
 import pydantic
 
 from kcal.errors import FileError, InputError
+from kcal.strict_json import MOST_BYTES, read_json
+
+
+def read_bytes(path: str | Path, most: int = 4 * 2**30) -> bytes:
+    """The bytes of a regular file; a pipe or a device, which may never end, is refused.
+
+    Raises:
+        FileError: missing, no regular file, larger than `most` bytes, or not readable.
+    """
+    try:
+        with open(path, "rb", opener=_open_at_once) as file:
+            about = os.fstat(file.fileno())
+            if not stat.S_ISREG(about.st_mode):
+                raise FileError(f"{path}: not a regular file; a pipe or a device cannot be read here")
+            if about.st_size > most:
+                size = about.st_size / 2**20
+                raise FileError(f"{path}: {size:.0f} MiB; at most {most / 2**20:.0f} MiB are read")
+            data = file.read(most)
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path}: cannot read: {_reason(error)}") from error
+    return data
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    # Opening a pipe would wait for somebody to write into it.
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def _reason(error: OSError | ValueError) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 def check_writable(path: str | Path, *inputs: str | Path) -> Path:
@@ -24,16 +57,68 @@ def check_writable(path: str | Path, *inputs: str | Path) -> Path:
         inputs: files that are read; writing over one of them is refused.
     """
     path = Path(path)
+    try:
+        target = Path(os.path.realpath(path))
+        mode = target.stat().st_mode
+    except FileNotFoundError:
+        mode = 0
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path}: cannot write: {_reason(error)}") from error
     for other in inputs:
-        if path.exists() and Path(other).exists() and path.samefile(other):
+        if mode and os.path.exists(other) and os.path.samefile(target, other):
             raise FileError(f"{path}: this is an input; give the output another name")
-    if path.is_dir():
+    if stat.S_ISDIR(mode):
         raise FileError(f"{path}: is a folder; give a file name")
-    if not path.parent.is_dir():
-        raise FileError(f"{path}: the folder {path.parent} does not exist; make it first")
-    if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+    if mode and not stat.S_ISREG(mode):
+        raise FileError(f"{path}: not a regular file; give another name")
+    folder = target.parent if path.is_symlink() else path.parent
+    if not folder.is_dir():
+        raise FileError(f"{path}: the folder {folder} does not exist; make it first")
+    if not os.access(folder, os.W_OK) or (mode and not os.access(target, os.W_OK)):
         raise FileError(f"{path}: no permission to write here; choose another place")
     return path
+
+
+@contextmanager
+def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
+    """Open a file beside `path` for writing, and move it into place when the block ends.
+
+    If the block fails or is interrupted, the new file is removed and an old one is untouched.
+
+    If `path` is a link, the file it points at is replaced. A file that exists keeps its permissions; a new one gets
+    those of the umask.
+
+    Raises:
+        FileError: the folder is missing, or nothing can be written there.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with open_atomic(Path(folder, "a.txt")) as file:
+        ...         _ = file.write(b"part by part")
+        ...     Path(folder, "a.txt").read_text()
+        'part by part'
+    """
+    path = check_writable(path)
+    target = Path(os.path.realpath(path))
+    # A short name: that of the file may have all the characters that a name may have.
+    temporary = target.with_name(f".kcal-{secrets.token_hex(8)}.part")
+    try:
+        mode = stat.S_IMODE(target.stat().st_mode) if target.exists() else None
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else 0o600)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            if mode is not None:
+                os.chmod(temporary, mode)
+            os.replace(temporary, target)
+        except BaseException:
+            temporary.unlink()
+            raise
+    except OSError as error:
+        raise FileError(f"{path}: cannot write: {error.strerror or error}") from error
 
 
 def write_atomic(path: str | Path, data: str | bytes) -> Path:
@@ -42,24 +127,9 @@ def write_atomic(path: str | Path, data: str | bytes) -> Path:
     Raises:
         FileError: the folder is missing, or nothing can be written there; an old file is then untouched.
     """
-    path = check_writable(path)
-    payload = data.encode() if isinstance(data, str) else data
-    temporary = None
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        with os.fdopen(handle, "wb") as file:
-            file.write(payload)
-            file.flush()
-            os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
-    except OSError as error:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)
-        raise FileError(f"{path}: cannot write: {error.strerror or error}") from error
-    return path
+    with open_atomic(path) as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+    return Path(path)
 
 
 def dump_json(value: Any) -> str:
@@ -73,14 +143,15 @@ def dump_json(value: Any) -> str:
 class NativeFile(pydantic.BaseModel):
     """Base of kcal's files: a pydantic model that is stored with its `kind` and `version`.
 
-    Subclasses set `KIND`, `VERSION`, and in `OLDER` the versions that they read as well. The JSON text begins
-    `{"kcal": KIND, "version": VERSION, ...}`.
+    Subclasses set `KIND`, `VERSION`, in `OLDER` the versions that they read as well, and in `RETIRED` what to say of
+    fields that are read no more. The JSON text begins `{"kcal": KIND, "version": VERSION, ...}`.
     """
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     KIND: ClassVar[str]
     VERSION: ClassVar[int]
     OLDER: ClassVar[tuple[int, ...]] = ()
+    RETIRED: ClassVar[Mapping[str, str]] = {}
 
     def dump(self) -> dict[str, Any]:
         """The content as it is stored: plain dicts, lists and numbers, kind and version first."""
@@ -98,17 +169,27 @@ class NativeFile(pydantic.BaseModel):
         content = dict(content)
         kind, version = content.pop("kcal"), content.pop("version", None)
         if kind != cls.KIND:
-            raise FileError(f"{source}: this is a kcal {kind} file; a kcal {cls.KIND} file is needed here")
-        if version not in (*cls.OLDER, cls.VERSION):
-            reads = " or ".join(str(known) for known in (*cls.OLDER, cls.VERSION))
-            raise FileError(f"{source}: version {version} of the {kind} format; this kcal reads version {reads}")
+            raise FileError(f"{source}: this is a kcal {kind!s:.40} file; a kcal {cls.KIND} file is needed here")
+        known = (*cls.OLDER, cls.VERSION)
+        if type(version) is not int or version not in known:
+            reads = " or ".join(map(str, known))
+            raise FileError(f"{source}: version {version!s:.40} of the {kind} format; this kcal reads version {reads}")
+        text = json.dumps(content)
         try:
-            return cls.model_validate(content)
+            # As JSON, not as Python values: in strict mode only JSON's numbers are numbers, but arrays are tuples.
+            checked = cls.model_validate_json(text, strict=True)
         except pydantic.ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            what = first["msg"].removeprefix("Value error, ")
+            found = error.errors(include_input=False)
+            retired = [one for one in found if one["type"] == "extra_forbidden" and one["loc"][-1] in cls.RETIRED]
+            first = (retired or found)[0]
+            where = ".".join(str(part) for part in (first["loc"][:-1] if retired else first["loc"]))
+            what = cls.RETIRED[str(first["loc"][-1])] if retired else first["msg"].removeprefix("Value error, ")
             raise FileError(": ".join(filter(None, [source, f"bad {kind} file", where, what]))) from error
+        try:
+            dump_json(content)
+        except InputError as error:
+            raise FileError(f"{source}: bad {kind} file: {error}") from error
+        return checked
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -118,10 +199,4 @@ class NativeFile(pydantic.BaseModel):
             FileError: missing, not JSON, another kind of file, another version, or a field that is wrong.
         """
         path = Path(path)
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
-        except ValueError as error:
-            raise FileError(f"{path}: not a JSON file: {error}") from error
-        return cls.parse(content, str(path))
+        return cls.parse(read_json(read_bytes(path, MOST_BYTES), str(path)), str(path))

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
 import os
 import stat
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import pydantic
 import pytest
 
 from kcal.errors import FileError, InputError
-from kcal.files import NativeFile, check_writable, dump_json, write_atomic
+from kcal.files import NativeFile, check_writable, dump_json, read_bytes, write_atomic
+from kcal.lens.calibration import Exclusion
+from kcal.strict_json import read_json
 
 
 class Note(NativeFile):
@@ -54,6 +58,50 @@ class TestWriteAtomic:
             os.umask(before)
         assert stat.S_IMODE(mode) == 0o640
 
+    def test_links_and_permissions_stay(self, tmp_path: Path) -> None:
+        (tmp_path / "real").mkdir()
+        target, link = tmp_path / "real" / "a.txt", tmp_path / "link.txt"
+        target.write_text("old")
+        target.chmod(0o600)
+        link.symlink_to(Path("real", "a.txt"))
+        assert write_atomic(link, "new") == link
+        assert link.is_symlink()
+        assert target.read_text() == "new"
+        assert stat.S_IMODE(target.stat().st_mode) == 0o600
+        dangling = tmp_path / "dangling.txt"
+        dangling.symlink_to(tmp_path / "real" / "b.txt")
+        write_atomic(dangling, "b")
+        assert (tmp_path / "real" / "b.txt").read_text() == "b"
+        loop = tmp_path / "loop.txt"
+        loop.symlink_to(loop)
+        with pytest.raises(FileError, match=r"loop\.txt: cannot write: .*levels"):
+            write_atomic(loop, "x")
+        assert {file.name for file in (tmp_path / "real").iterdir()} == {"a.txt", "b.txt"}
+
+    def test_the_umask_is_never_changed(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def changed(_: int) -> int:
+            raise AssertionError("other threads would create files with this umask")
+
+        monkeypatch.setattr(os, "umask", changed)
+        assert write_atomic(tmp_path / "a.txt", "x").read_text() == "x"
+
+    def test_long_names(self, tmp_path: Path) -> None:
+        longest = tmp_path / ("a" * 251 + ".txt")
+        assert write_atomic(longest, "x").read_text() == "x"
+        for write in (check_writable, lambda path: write_atomic(path, "x")):
+            with pytest.raises(FileError, match="cannot write: File name too long"):
+                write(tmp_path / ("a" * 300))
+            with pytest.raises(FileError, match=r"cannot write: .*null"):
+                write(tmp_path / "a\0b")
+
+    def test_what_is_no_file_is_not_replaced(self, tmp_path: Path) -> None:
+        pipe = tmp_path / "pipe"
+        os.mkfifo(pipe)
+        for path in (pipe, Path(os.devnull)):
+            with pytest.raises(FileError, match="not a regular file"):
+                write_atomic(path, "x")
+        assert stat.S_ISFIFO(pipe.stat().st_mode)
+
     def test_refused_early(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(FileError, match="is a folder"):
             check_writable(tmp_path)
@@ -62,6 +110,25 @@ class TestWriteAtomic:
         monkeypatch.setattr(os, "access", lambda *_: False)
         with pytest.raises(FileError, match="no permission"):
             check_writable(tmp_path / "a.txt")
+
+
+class TestReadBytes:
+    def test_content(self, tmp_path: Path) -> None:
+        path = tmp_path / "a"
+        path.write_bytes(b"abc")
+        assert read_bytes(path) == b"abc"
+        with pytest.raises(FileError, match="a: 0 MiB; at most 0 MiB are read"):
+            read_bytes(path, 2)
+        with pytest.raises(FileError, match="cannot read: Is a directory"):
+            read_bytes(tmp_path)
+        with pytest.raises(FileError, match="cannot read: File name too long"):
+            read_bytes(tmp_path / ("a" * 300))
+
+    def test_a_pipe_is_refused_and_not_waited_for(self, tmp_path: Path) -> None:
+        os.mkfifo(tmp_path / "pipe")
+        for path in (tmp_path / "pipe", Path(os.devnull)):
+            with pytest.raises(FileError, match="not a regular file"):
+                read_bytes(path)
 
 
 class TestJson:
@@ -74,6 +141,99 @@ class TestJson:
     def test_what_json_has_not(self, value: float) -> None:
         with pytest.raises(InputError, match="not finite"):
             dump_json({"v": [value]})
+
+
+class TestStrictJson:
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("[" * 33 + "]" * 33, "nested deeper than 32 levels"),
+            ("[" * 10**6, "nested deeper than 32 levels"),
+            ('{"a":' * 10**5, "nested deeper than 32 levels"),
+            ('"' + "[" * 100, "not a JSON file"),
+            ("1" + "0" * 400, r"the integer 100000000000\.\.\. has 401 digits"),
+            ("-1" + "0" * 5000, "has 5002 digits"),
+            ('{"a": 1, "b": 2, "a": 3}', "the key 'a' occurs twice"),
+            ('{"x": [{"a": 1, "a": 1}]}', "the key 'a' occurs twice"),
+            ("\ufeff{}", "BOM"),
+        ],
+    )
+    def test_refused(self, text: str, message: str) -> None:
+        with pytest.raises(FileError, match=message) as error:
+            read_json(text.encode(), "x.json")
+        assert len(str(error.value)) < 200
+
+    def test_size(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("kcal.strict_json.MOST_BYTES", 2**20)
+        with pytest.raises(FileError, match="x: 2 MiB of JSON; at most 1 MiB are read"):
+            read_json(b"[" + b" " * 2**21, "x")
+
+    def test_read(self) -> None:
+        deep = "[" * 32 + "]" * 32
+        assert json.dumps(read_json(deep.encode(), "x")) == deep
+        brackets = json.dumps(["[" * 100, '\\"' + "{" * 100, "}"])
+        assert read_json(brackets.encode(), "x") == json.loads(brackets)
+        assert read_json(b"100000000000000000000000", "x") == 10**23
+
+
+class Block(pydantic.BaseModel):
+    on: bool
+    sizes: tuple[int, ...]
+
+
+class Strict(NativeFile):
+    KIND: ClassVar[str] = "strict"
+    VERSION: ClassVar[int] = 1
+
+    number: float = 0.0
+    count: int = 0
+    name: str = ""
+    when: datetime.datetime | None = None
+    block: Block | None = None
+    record: Exclusion | None = None
+    anything: Any = None
+
+
+class TestOnlyJsonsTypes:
+    @pytest.mark.parametrize(
+        ("content", "field"),
+        [
+            ('"number": true', "number"),
+            ('"number": "1.5"', "number"),
+            ('"number": 1e400', "number"),
+            ('"count": "3"', "count"),
+            ('"count": 3.0', "count"),
+            ('"count": false', "count"),
+            ('"name": 3', "name"),
+            ('"when": 3', "when"),
+            ('"block": {"on": 1, "sizes": []}', "block.on"),
+            ('"block": {"on": true, "sizes": ["1"]}', "block.sizes.0"),
+            ('"record": {"name": 1, "reason": ""}', "record.name"),
+            ('"anything": NaN', "not finite"),
+            ('"anything": [1e999]', "not finite"),
+        ],
+    )
+    def test_refused(self, tmp_path: Path, content: str, field: str) -> None:
+        path = tmp_path / "strict.json"
+        path.write_text('{"kcal": "strict", "version": 1, ' + content + "}")
+        with pytest.raises(FileError, match=f"bad strict file: .*{field}"):
+            Strict.load(path)
+
+    def test_read(self, tmp_path: Path) -> None:
+        path = tmp_path / "strict.json"
+        path.write_text(
+            '{"kcal": "strict", "version": 1, "number": 3, "when": "2026-01-01T00:00:00Z", '
+            '"block": {"on": true, "sizes": [1, 2]}, "record": {"name": "a", "reason": "b"}}'
+        )
+        read = Strict.load(path)
+        assert (read.number, read.block, read.record) == (3.0, Block(on=True, sizes=(1, 2)), Exclusion("a", "b"))
+
+    def test_a_version_is_a_number(self, tmp_path: Path) -> None:
+        path = tmp_path / "strict.json"
+        for version in ("true", "1.0", '"1"', "[1]", "{}", "1" * 300):
+            path.write_text('{"kcal": "strict", "version": ' + version + "}")
+            with pytest.raises(FileError, match="of the strict format; this kcal reads version 1"):
+                Strict.load(path)
 
 
 class TestNativeFile:

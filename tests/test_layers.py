@@ -15,6 +15,7 @@ PACKAGE = Path(kcal.__file__).parent
 FLOORS = {
     "cli": 9,
     "report": 8,
+    "mark": 8,
     "nets": 7,
     "locate": 7,
     "calibrate/batch": 6,

@@ -5,13 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
-out = Console(soft_wrap=True, highlight=False)
-err = Console(stderr=True, soft_wrap=True, highlight=False)
+from kcal.texts import one_line, visible
+
+
+class _PlainConsole(Console):
+    """A console on which a text of another origin is shown: escape sequences in it do not reach the terminal."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Called by `print` for every text."""
+        return super().render_str(visible(text), **options)
+
+
+out = _PlainConsole(soft_wrap=True, highlight=False, emoji=False)
+err = _PlainConsole(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 
 def warn(text: str) -> None:
@@ -33,16 +46,19 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
         rows: the first row has the heads.
         left: columns that are aligned to the left; all others are aligned to the right.
     """
+    rows = [[one_line(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
     for row in rows:
         cells = zip(row, widths, strict=True)
         aligned = [cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(cells)]
-        out.print("  ".join(aligned).rstrip(), markup=False)
+        lines.append("  ".join(aligned).rstrip())
+    out.print("\n".join(lines), markup=False)
 
 
 @contextmanager
-def steps(description: str, total: int | None) -> Iterator[Callable[[str], None]]:
-    """Show a progress bar on the error stream: call the value with a text after each step."""
+def steps(description: str, total: int | None) -> Iterator[Callable[..., None]]:
+    """Show a progress bar on the error stream: call the value with a text, and how many if not one, after each step."""
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -54,7 +70,7 @@ def steps(description: str, total: int | None) -> Iterator[Callable[[str], None]
     ) as progress:
         task = progress.add_task(description, total=total)
 
-        def advance(text: str) -> None:
-            progress.update(task, advance=1, description=f"{description}: {escape(text)}")
+        def advance(text: str, by: int = 1) -> None:
+            progress.update(task, advance=by, description=f"{description}: {escape(one_line(text))}")
 
         yield advance

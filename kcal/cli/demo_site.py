@@ -51,22 +51,18 @@ def simulated_site(output: Path, seed: int) -> None:
         "rig", *cameras, "--pairs", *pairs,
         "--landmarks", output / "survey.csv", "--marks", output / "landmarks.csv", "--mark-sigma", scene.mark_sigma,
         f"--origin={scene.lat},{scene.lon},{scene.height}", "-o", output / "rig.json", "--picture", output / "rig.png",
+        # The simulated light goes straight.
+        "--refraction=0", "--refraction-sigma=0",
     )  # fmt: skip
     clock.lap("rig")
 
     marks, targets = scene.target_marks, scene.targets
     write_marks(output / "points.csv", Marks(targets.names, marks.left, marks.right))
     _write_places(output / "truth.csv", targets)
-    # The simulated light goes straight.
-    command = locate_again(
-        output, "--pixel-sigma", scene.mark_sigma, "--refraction=0", "--refraction-sigma=0",
-        "--truth", output / "truth.csv",
-    )  # fmt: skip
+    command = locate_again(output, "--pixel-sigma", scene.mark_sigma, "--truth", output / "truth.csv")
     rig = load_rig(output / "rig.json")
     located, exact = (
-        locate_points(
-            rig, *pixels, pixel_sigma=scene.mark_sigma, names=targets.names, refraction=0.0, refraction_sigma=0.0
-        )
+        locate_points(rig, *pixels, pixel_sigma=scene.mark_sigma, names=targets.names)
         for pixels in ((marks.left, marks.right), (marks.true_left, marks.true_right))
     )
     clock.lap("positions and maps")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -100,7 +101,7 @@ def detect_command(
     streams = [source_name(image) for image in images if is_stream(image)]
     if streams and len(images) > 1:
         raise InputError(f"{streams[0]}: a stream is searched alone, without other images")
-    if keep is not None and not keep.is_dir():
+    if keep is not None and not os.path.isdir(keep):
         raise FileError(f"{keep}: no such folder")
     if streams or (len(images) == 1 and Path(images[0]).suffix.lower() in VIDEO_SUFFIXES):
         searched = 0
@@ -119,7 +120,7 @@ def detect_command(
         check_writable(output, *paths)
         with steps("detecting", len(paths)) as advance:
             observations = detect_images(paths, board, refine.value, progress=advance, time_limit=time_limit)
-        turned = turned_images([path for path in paths if path.is_file()])
+        turned = turned_images([path for path in paths if os.path.isfile(path)])
         source = f"of {len(paths)} images"
     observations.save(output)
     if pictures:

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.console import out, print_table, print_wrote, steps
+from kcal.cli.console import err, out, print_table, print_wrote, steps
 from kcal.errors import DegenerateError, InputError
 from kcal.files import check_writable
+from kcal.texts import one_line
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kcal.locate.positions import Located
 
 
 def locate_command(
     rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
-    points: Annotated[Path, typer.Argument(help="CSV with the columns name,left_u,left_v,right_u,right_v.")],
+    points: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV with the columns name,left_u,left_v,right_u,right_v; others are carried into GeoJSON and CSV."
+        ),
+    ],
     origin: Annotated[
         str | None,
         typer.Option(
@@ -43,7 +55,8 @@ def locate_command(
         ),
     ] = None,
     pixel_sigma: Annotated[
-        float, typer.Option(metavar="PX", help="Standard deviation of the marks along each axis.")
+        float,
+        typer.Option(metavar="PX", help="Standard deviation of the marks along each axis, where the CSV has none."),
     ] = 0.3,
     yaw_sigma: Annotated[
         float,
@@ -59,15 +72,19 @@ def locate_command(
         ),
     ] = 0.0,
     refraction: Annotated[
-        float,
-        typer.Option(metavar="K", help="Refraction: 0.13 lowers a point at 5 km by 0.26 m; 0 for straight lines."),
-    ] = 0.13,
-    refraction_sigma: Annotated[
-        float,
+        float | None,
         typer.Option(
-            metavar="K", help="Its standard deviation; 0.5 for lines of sight near hot or cold ground.", min=0
+            metavar="K",
+            help="Refraction: 0.13, the default, lowers a point at 5 km by 0.26 m; 0 for straight lines. A rig solved "
+            "from landmarks has its own.",
         ),
-    ] = 0.1,
+    ] = None,
+    refraction_sigma: Annotated[
+        float | None,
+        typer.Option(
+            metavar="K", help="Its standard deviation, 0.1; 0.5 for lines of sight near hot or cold ground.", min=0
+        ),
+    ] = None,
     geoid: Annotated[
         Path | None, typer.Option(help="Geoid grid file (.tif, .gtx); one that PROJ finds if not given.")
     ] = None,
@@ -79,8 +96,16 @@ def locate_command(
     ] = None,
     output: Annotated[
         list[Path] | None,
-        typer.Option("--output", "-o", help="File to write, .geojson, .csv, .kml or .cot; may be repeated."),
+        typer.Option(
+            "--output",
+            "-o",
+            help="File to write, .geojson, .geojsonl, .csv, .kml or .cot; may be repeated; - for the standard output.",
+        ),
     ] = None,
+    stream_format: Annotated[
+        str, typer.Option("--format", metavar="NAME", help="Format of `-o -`: csv, geojson, geojsonl, kml or cot.")
+    ] = "csv",
+    as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON in place of the table.")] = False,
     picture: Annotated[Path | None, typer.Option(help="PNG file to write: the map and the intervals.")] = None,
     web_map: Annotated[
         Path | None, typer.Option("--map", help="HTML file to write: an interactive map that needs no network.")
@@ -106,6 +131,9 @@ def locate_command(
     The rig file of a rig that was solved with landmarks contains its position: `--origin` and `--heading` are then not
     needed.
 
+    A table may have any length: rows are read, located and written in turn. Beyond 1,000 rows the screen shows counts
+    only, and pictures and maps show evenly spaced rows and those that have a true position.
+
     The exit code is 1 if nothing could be located.
 
     **Examples**
@@ -116,7 +144,10 @@ def locate_command(
 
     `kcal locate rig.json points.csv --origin -33.9,151.2,10 --heading 250 --pitch -1.5 -o p.geojson -o p.csv
     --picture map.png`
+
+    `kcal locate rig.json detections.csv -o - --format geojsonl | head`
     """
+    import json
     import math
 
     import torch
@@ -125,18 +156,27 @@ def locate_command(
     from kcal.lens.mounting import Origin
     from kcal.lens.rig import RigCovariance
     from kcal.locate.datum import find_geoid, true_from_grid
-    from kcal.locate.export import check_format, write_positions
-    from kcal.locate.marks import read_marks
+    from kcal.locate.export import STREAM, check_format, open_writers
+    from kcal.locate.locator import Locator
+    from kcal.locate.marks import filled, read_mark_chunks
     from kcal.locate.mounting import mounting_covariance
-    from kcal.locate.positions import locate_points
-    from kcal.locate.truth import position_errors, read_truth
+    from kcal.locate.positions import located_by
+    from kcal.locate.sample import PositionSample
+    from kcal.locate.survey import read_survey
+    from kcal.locate.truth import read_truth
     from kcal.report.figures import check_picture
     from kcal.report.map_page import check_map_format, save_map
     from kcal.report.positions import save_positions_picture
-    from kcal.report.tables import position_rows
 
     outputs = output or []
+    streamed = STREAM in outputs
+    suffix = f".{stream_format}"
+    if streamed and (as_json or outputs.count(STREAM) > 1):
+        raise typer.BadParameter("-o - takes the standard output for itself; leave out --json and a second -o -")
     for path in outputs:
+        if path == STREAM:
+            check_format(f"positions{suffix}")
+            continue
         check_format(path)
         check_writable(path, rig, points, *([truth] if truth else []))
     if picture is not None:
@@ -150,7 +190,6 @@ def locate_command(
         raise typer.BadParameter("--pitch, --roll and --grid belong to --heading; the rig file has its own attitude")
     # Parsed before the rig is read, so that a wrong option is reported first.
     place = None if origin is None else Origin.parse(origin)
-    marks = read_marks(points)
     solved = load_rig(rig)
     calibration, link = solved.covariance, None
     if yaw_sigma:
@@ -162,46 +201,87 @@ def locate_command(
         stored = solved.mounting
         if stored is None:
             raise InputError(f"{rig}: the file has no position of the rig; give --origin and --heading")
-        mounting = mounting if stored.covariance is None else mounting + stored.covariance
+        if stored.covariance is not None:
+            more = len(stored.covariance) - len(mounting)
+            mounting = torch.nn.functional.pad(mounting, (0, more, 0, more)) + stored.covariance
         link = stored.link
     elif grid is not None:
         heading = true_from_grid(heading, place, grid)
-    located = locate_points(
-        solved,
-        marks.left,
-        marks.right,
-        origin=place,
-        heading_deg=heading,
-        pitch_deg=pitch,
-        roll_deg=roll,
-        pixel_sigma=pixel_sigma,
-        names=marks.names,
-        calibration=calibration,
-        mounting=mounting if bool(mounting.any()) else None,
-        link=link,
-        refraction=refraction,
-        refraction_sigma=refraction_sigma,
-        geoid=find_geoid(geoid),
-    )
-    true = None if truth is None else read_truth(truth, located)
-    written = [*outputs, *(path for path in (picture, web_map) if path is not None)]
-    with steps("writing", len(written)) as advance:
-        for path in outputs:
-            write_positions(path, located)
-            advance(path.name)
+    locate = Locator(
+        solved, geoid=find_geoid(geoid), origin=place, heading_deg=heading, pitch_deg=pitch, roll_deg=roll,
+        pixel_sigma=pixel_sigma, calibration=calibration, mounting=mounting if bool(mounting.any()) else None,
+        link=link, refraction=refraction, refraction_sigma=refraction_sigma,
+    )  # fmt: skip
+    survey = None if truth is None else read_survey(truth, locate.localize.origin, measured=False)
+    sample = PositionSample(frozenset(survey.names if survey else ()))
+    written: list[Path] = []
+    try:
+        size = points.stat().st_size if points.is_file() else None
+        with open_writers(outputs, located_by(locate), suffix) as writers, steps("locating", size) as advance:
+            read, stated = 0, False
+            for chunk in read_mark_chunks(points):
+                cov = filled(chunk.covariance, pixel_sigma)
+                stated = stated or cov is not None
+                columns = locate(chunk.names, chunk.pixels, cov, chunk.extras)
+                for writer in writers:
+                    writer.add(columns)
+                sample.add(columns)
+                advance(f"{sample.count:,} rows", chunk.bytes_read - read)
+                read = chunk.bytes_read
+            located = sample.located(locate)
+            true = None if truth is None else read_truth(truth, located)
+        written += [path for path in outputs if path != STREAM]
         if picture is not None:
-            save_positions_picture(picture, located, true)
-            advance(picture.name)
+            written.append(save_positions_picture(picture, located, true))
         if web_map is not None:
-            save_map(web_map, located, true, tiles=tiles, image=image, online=online)
-            advance(web_map.name)
-    rows = position_rows(located, None if true is None else position_errors(located, true))
-    print_table(rows, left=(0, len(rows[0]) - 1))
-    for position in located.positions:
+            written.append(save_map(web_map, located, true, tiles=tiles, image=image, online=online))
+    except KeyboardInterrupt:
+        kept = ", ".join(map(str, written)) or "nothing"
+        err.print(
+            f"interrupted after {sample.count:,} rows; written: {kept}; other files are as they were", markup=False
+        )
+        raise typer.Exit(130) from None
+    if as_json:
+        summary = {
+            "table": str(points),
+            "rows": sample.count,
+            "statuses": sample.statuses,
+            "pixel_sigma": pixel_sigma,
+            "interval": located.interval_note,
+            "geoid": located.geoid,
+            "written": list(map(str, written)),
+        }
+        print(json.dumps(summary, indent=1))
+    elif streamed:
+        err.print(_counts(sample.count, sample.statuses), markup=False)
+    else:
+        _print_positions(located, true, sample.statuses, stated=stated)
+        print_wrote(*written)
+    if "ok" not in sample.statuses:
+        raise DegenerateError(f"{points}: none of the {sample.count} pairs could be located; see the table")
+
+
+def _counts(rows: int, statuses: dict[str, int]) -> str:
+    return f"{rows:,} rows: " + ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in statuses.items())
+
+
+def _print_positions(located: Located, true: Tensor | None, statuses: dict[str, int], *, stated: bool) -> None:
+    """Print the table with the reasons below it; of a long one the counts, and the rows that have a true position."""
+    from kcal.locate.truth import position_errors
+    from kcal.report.tables import position_rows
+
+    errors = None if true is None else position_errors(located, true)
+    rows = position_rows(located, errors)
+    shown: Sequence[int] = range(len(located.positions))
+    if located.rows is not None:
+        out.print(_counts(located.rows, statuses), markup=False)
+        shown = [] if true is None else true.isfinite().all(-1).nonzero()[:, 0].tolist()
+        out.print(f"Pictures and maps show {len(located.positions):,} of them.", markup=False)
+    if shown:
+        print_table([rows[0], *(rows[i + 1] for i in shown)], left=(0, len(rows[0]) - 1))
+    for position in (located.positions[i] for i in shown):
         if position.reason:
-            out.print(f"* {position.name}: {position.reason}", markup=False)
-    out.print(f"Interval: {located.interval_note}; marks have {pixel_sigma:g} px of noise.")
+            out.print(f"* {one_line(position.name)}: {position.reason}", markup=False)
+    noise = "the noise that the CSV states" if stated else f"{located.pixel_sigma:g} px of noise"
+    out.print(f"Interval: {located.interval_note}; marks have {noise}.")
     out.print(f"Heights are ellipsoidal; geoid: {located.geoid or 'none found'}.")
-    print_wrote(*written)
-    if located.count == 0:
-        raise DegenerateError(f"{points}: none of the {len(located.positions)} pairs could be located; see the table")

@@ -18,8 +18,12 @@ from kcal.cli.compare import compare_command
 from kcal.cli.console import err
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
+from kcal.cli.diff import diff_command
+from kcal.cli.exchange import export_command, import_command
 from kcal.cli.locate import locate_command
+from kcal.cli.mark import mark_command
 from kcal.cli.rig import app as rig
+from kcal.cli.show import show_command
 from kcal.cli.undistort import undistort_command
 from kcal.errors import KcalError
 
@@ -54,11 +58,16 @@ app.command("detect")(detect_command)
 app.command("calibrate")(calibrate_command)
 app.command("compare")(compare_command)
 app.command("batch")(batch_command)
+app.command("mark")(mark_command)
 app.add_typer(rig, name="rig")
 app.command("locate")(locate_command)
 app.command("budget")(budget_command)
 app.command("undistort")(undistort_command)
 app.command("bake")(bake_command)
+app.command("export")(export_command)
+app.command("import")(import_command)
+app.command("show")(show_command)
+app.command("diff")(diff_command)
 
 
 def main() -> None:
@@ -67,6 +76,14 @@ def main() -> None:
         app()
     except KcalError as error:
         err.print("[bold red]error:[/]", escape(" ".join(str(error).split())))
+        sys.exit(1)
+    except OSError as error:
+        # What no command foresaw of files and folders: a disk that was taken away, a folder that may not be listed.
+        name = f"{error.filename}: " if error.filename else ""
+        err.print("[bold red]error:[/]", escape(f"{name}{error.strerror or error}"))
+        sys.exit(1)
+    except MemoryError:
+        err.print("[bold red]error:[/] not enough memory; use fewer or smaller inputs")
         sys.exit(1)
     except KeyboardInterrupt:
         err.print("interrupted; nothing was written")

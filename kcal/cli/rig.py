@@ -67,6 +67,12 @@ def solve_command(
             "free."
         ),
     ] = "prior",
+    refraction: Annotated[
+        float, typer.Option(metavar="K", help="Refraction of light from landmarks beforehand; 0 for straight lines.")
+    ] = 0.13,
+    refraction_sigma: Annotated[
+        float, typer.Option(metavar="K", help="Its standard deviation; 0 holds it.", min=0)
+    ] = 0.1,
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Leave nothing out; only warn.")] = False,
     board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
     picture: Annotated[Path | None, typer.Option(help="A .png file: residuals by source and a plan.")] = None,
@@ -112,9 +118,13 @@ def solve_command(
         check_picture(picture)
     if not any((pairs, landmarks, marks, features, positions, baseline)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
+    options = RigOptions(
+        intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
+        refraction_sigma=refraction_sigma,
+    )  # fmt: skip
     data, frame, unpaired = read_sources((load_camera(left), load_camera(right)), sources)
     with steps("solving the rig", 1) as advance:
-        result = solve_rig(data, RigOptions(intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all))
+        result = solve_rig(data, options)
         advance("done")
     rig = result.stereo() if frame is None else placed_rig(result, frame)
     # Everything that can fail comes before the file.
@@ -169,6 +179,8 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
             f"(± {max(sigma[:2]):.3f} m level, {sigma[2]:.3f} m up), heading {mounting.heading_deg:.4f}° ± "
             f"{math.degrees(sigma[5]):.4f}, pitch {mounting.pitch_deg:.4f}°, roll {mounting.roll_deg:.4f}°"
         )
+        if mounting.refraction is not None and result.data.landmarks is not None:
+            lines.append(f"refraction of light {mounting.refraction:.2f} ± {sigma[6]:.2f} of the Earth's curvature")
     return lines
 
 

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from kcal.cli.console import err, out, print_wrote, steps
 from kcal.errors import FileError, InputError
-from kcal.files import check_writable
+from kcal.files import check_writable, read_bytes
 
 if TYPE_CHECKING:
     from kcal.lens.images import Undistort
@@ -122,7 +122,7 @@ def _prepare(folder: Path, files: list[Path]) -> None:
 def _convert(path: Path, target: Path, module: Undistort) -> None:
     import torch
 
-    from kcal.corners.images import decode_gray, read_bytes
+    from kcal.corners.images import decode_gray
     from kcal.io.images import decode_image, write_png
 
     data = read_bytes(path)

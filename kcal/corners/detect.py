@@ -18,13 +18,14 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.corners.charuco import MIN_CORNERS, enough, find_charuco, free_side
 from kcal.corners.grid import MIN_SHARPNESS, grid_trouble, local_side, sharpness
-from kcal.corners.images import Gray, decode_gray, read_bytes, to_8bit, unique_names
+from kcal.corners.images import Gray, decode_gray, to_8bit, unique_names
 from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.order import canonical_order
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
 from kcal.errors import FileError, InputError
+from kcal.files import read_bytes
 
 SEARCH_SIDES = (1200, 2400)  # pixels: longer sides of the searched image, small first
 MIN_REFINED_SIDE = 8.0  # pixels: smaller squares in a reduced image are not refined there

@@ -21,6 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kcal.errors import FileError, InputError
+from kcal.files import read_bytes
+from kcal.image_header import check_image_header
 
 Gray = npt.NDArray[np.uint8 | np.uint16]
 
@@ -35,37 +37,22 @@ _BROKEN_JPEG = re.compile(
 )
 
 
-def read_bytes(path: str | Path) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        FileError: missing, a folder, empty or not readable.
-    """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
-    if not data:
-        raise FileError(f"{path}: the file is empty; copy it again")
-    return data
-
-
 def decode_gray(data: bytes, source: str | Path) -> Gray:
     """Decode an image file's bytes to gray levels, (H, W) uint8 or uint16 as stored; `source` names it in errors.
 
     Colors become gray by OpenCV's weights (ITU-R BT.601). The EXIF orientation is ignored.
 
     Raises:
-        FileError: not an image, truncated or corrupt (also where the decoder would fill the rest with gray), pixels
-            other than 8 or 16 bit unsigned, smaller than 16 pixels, or of one gray level.
+        FileError: empty, not an image, more than 500 megapixels, truncated or corrupt (also where the decoder would
+            fill the rest with gray), pixels other than 8 or 16 bit unsigned, smaller than 16 pixels, or of one gray
+            level.
     """
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    check_image_header(data, source)
     image, complaints = _imdecode(data, flags)
     broken = _BROKEN_JPEG.search(complaints)
-    if image is None and data.startswith((b"\xff\xd8", b"\x89PNG", b"II*\0", b"MM\0*", b"BM", b"RIFF")):
-        raise FileError(f"{source}: the image is truncated or corrupt; copy it again or leave it out")
     if image is None:
-        raise FileError(f"{source}: not an image that can be read; use JPEG, PNG, TIFF, BMP, WebP or PGM")
+        raise FileError(f"{source}: the image is truncated or corrupt; copy it again or leave it out")
     if broken:
         raise FileError(f"{source}: {broken.group().decode(errors='replace').strip()}; copy it again or leave it out")
     if image.dtype not in (np.uint8, np.uint16):
@@ -159,13 +146,14 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _expand_one(path: Path) -> list[Path]:
-    if path.is_dir():
+    # Unlike Path's, these say no where a name is too long.
+    if os.path.isdir(path):
         inside = [file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file()]
         images = _natural(file for file in inside if not file.name.startswith("."))
         if not images:
             raise FileError(f"{path}: no image in this folder (looked for {', '.join(sorted(IMAGE_SUFFIXES))})")
         return images
-    if path.exists():
+    if os.path.exists(path):
         return [path]
     if glob.has_magic(str(path)):
         matches = _natural(Path(match) for match in glob.glob(str(path), recursive=True) if not os.path.isdir(match))

@@ -26,7 +26,7 @@ _MAX_PLACES = 4000
 _IMAGE_BLUR = 0.8  # pixels, of both images: bilinear samples of it are good to 0.005 px
 _MAX_ITERATIONS = 15
 _CONVERGED = 1e-4  # pixels
-_RIVAL_DISTANCE = 3.0  # pixels from which two places count as different matches
+RIVAL_DISTANCE = 3.0  # pixels from which two places count as different matches
 _MAX_PROJECTED = 1 << 18  # points projected at a time, which bounds the memory
 
 
@@ -92,7 +92,23 @@ class MatchOptions:
             raise InputError("match options: min_score and max_rival lie between 0 and 1, max_off_line is positive")
 
 
-class _Match(NamedTuple):
+class BlurredWindow(NamedTuple):
+    """A part of a blurred image: large images are blurred only where they are searched.
+
+    Attributes:
+        values: (h, w) gray levels.
+        corner: (2,) pixel of its first value.
+        size: (2,) width and height of the whole image.
+    """
+
+    values: Tensor
+    corner: Tensor
+    size: tuple[int, int]
+
+
+class PatchMatch(NamedTuple):
+    """What became of one patch; the fields are those of `Matches`."""
+
     status: MatchStatus
     score: float = math.nan
     off_line: float = math.nan
@@ -134,16 +150,14 @@ def match_points(
     pixels = as_points("pixels_left", pixels_left, 2)
     if pixels.ndim != 2:
         raise InputError(f"pixels_left: shape (N, 2) is needed, got {tuple(pixels.shape)}")
-    blurred = []
-    kernel = _blur_kernel()
     for word, image, camera in (("left", left, rig.left), ("right", right, rig.right)):
-        gray = as_gray(f"{word} image", image)
-        if tuple(gray.shape) != (camera.size[1], camera.size[0]):
+        if not isinstance(image, Tensor) or image.dtype.is_floating_point:
+            as_gray(f"{word} image", image)
+        if tuple(image.shape) != (camera.size[1], camera.size[0]):
             raise InputError(
-                f"{word} image {tuple(gray.shape)}: the {word} camera needs (H, W) = {camera.size[::-1]}; is it the "
+                f"{word} image {tuple(image.shape)}: the {word} camera needs (H, W) = {camera.size[::-1]}; is it the "
                 "right file?"
             )
-        blurred.append(filtered(gray, kernel, kernel))
     numbers = torch.full((len(pixels), 8), math.nan, dtype=torch.float64)
     found = Matches(
         numbers[:, :2],
@@ -153,13 +167,13 @@ def match_points(
         numbers[:, 7],
     )
     for row, pixel in enumerate(pixels):
-        match = _match_one(rig, blurred[0], blurred[1], pixel, options)
+        match = _match_one(rig, left, right, pixel, options)
         found.status[row], found.score[row], found.off_line[row] = int(match.status), match.score, match.off_line
         found.pixels[row], found.covariance[row] = match.pixel, match.covariance
     return found
 
 
-def _match_one(rig: StereoRig, left: Tensor, right: Tensor, pixel: Tensor, options: MatchOptions) -> _Match:
+def _match_one(rig: StereoRig, left: Tensor, right: Tensor, pixel: Tensor, options: MatchOptions) -> PatchMatch:
     half = options.half
     axis = torch.arange(-half, half + 1, dtype=torch.float64)
     y, x = torch.meshgrid(axis, axis, indexing="ij")
@@ -167,12 +181,13 @@ def _match_one(rig: StereoRig, left: Tensor, right: Tensor, pixel: Tensor, optio
     normalized, valid = rig.left.normalize(patch)
     middle = len(patch) // 2
     if not bool(valid[middle]):
-        return _Match(MatchStatus.NO_RAY)
-    if not bool(valid.all()) or not bool(_has_room(patch, left).all()):
-        return _Match(MatchStatus.OUTSIDE)
-    template = _sample(left, patch)
+        return PatchMatch(MatchStatus.NO_RAY)
+    window = blurred_window(left, patch)
+    if not bool(valid.all()) or not bool(_has_room(patch, window).all()):
+        return PatchMatch(MatchStatus.OUTSIDE)
+    template = sample_window(window, patch)
     if not float(template.std()) > 1e-6 * max(1.0, float(template.abs().max())):
-        return _Match(MatchStatus.FLAT)
+        return PatchMatch(MatchStatus.FLAT)
 
     directions = torch.cat([normalized, torch.ones_like(normalized[:, :1])], -1) @ rig.right_from_left_rotation.T
     nearest = options.nearest if options.nearest is not None else 10.0 * float(rig.baseline)
@@ -186,36 +201,42 @@ def _match_one(rig: StereoRig, left: Tensor, right: Tensor, pixel: Tensor, optio
     count = min(max(3, math.ceil(length / _SPACING) + 1), _MAX_PLACES)
     inverse_depths = torch.linspace(0.0, 1.0 / nearest, count, dtype=torch.float64)
     line, scores = [], []
+    path, seen = projected(inverse_depths, directions[middle : middle + 1])
+    # Lenses and perspective may stretch the patch.
+    window = blurred_window(right, path[seen], 3 * half)
     for part in inverse_depths.split(max(1, _MAX_PROJECTED // len(patch))):
         where, visible = projected(part, directions)
-        usable = (visible & _has_room(where, right)).all(-1)
+        usable = (visible & _has_room(where, window)).all(-1)
         line.append(where[:, middle])
-        scores.append(torch.where(usable, _correlation(_sample(right, where), template), -torch.inf))
+        scores.append(torch.where(usable, patch_correlation(sample_window(window, where), template), -torch.inf))
     places, score = torch.cat(line), torch.cat(scores)
     best = int(score.argmax())
     top = float(score[best])
     if top == -math.inf:
-        return _Match(MatchStatus.OUTSIDE)
+        return PatchMatch(MatchStatus.OUTSIDE)
     if not top >= options.min_score:
-        return _Match(MatchStatus.NO_MATCH, top)
+        return PatchMatch(MatchStatus.NO_MATCH, top)
     if _has_rival(places, score, best, options.max_rival):
-        return _Match(MatchStatus.AMBIGUOUS, top)
+        return PatchMatch(MatchStatus.AMBIGUOUS, top)
     where = projected(inverse_depths[best : best + 1], directions)[0][0]
     along = places[min(best + 1, count - 1)] - places[max(best - 1, 0)]
-    return _fit_shift(right, template, where, torch.nn.functional.normalize(along, dim=0), top, options)
+    return fit_shift(window, template, where, torch.nn.functional.normalize(along, dim=0), top, options)
 
 
-def _fit_shift(
-    right: Tensor, template: Tensor, where: Tensor, tangent: Tensor, score: float, options: MatchOptions
-) -> _Match:
+def fit_shift(
+    right: BlurredWindow, template: Tensor, where: Tensor, tangent: Tensor, score: float, options: MatchOptions
+) -> PatchMatch:
     """Fit the shift of the projected patch by least squares, with a contrast and a brightness of its own."""
     shift = torch.zeros(2, dtype=torch.float64)
     for _ in range(_MAX_ITERATIONS):
         moved = where + shift
         if not bool(_has_room(moved, right).all()):
-            return _Match(MatchStatus.OUTSIDE, score)
-        values = _sample(right, moved)
-        slope = torch.stack([_sample(right, moved + d) - _sample(right, moved - d) for d in torch.eye(2)], -1) / 2.0
+            return PatchMatch(MatchStatus.OUTSIDE, score)
+        values = sample_window(right, moved)
+        slope = (
+            torch.stack([sample_window(right, moved + d) - sample_window(right, moved - d) for d in torch.eye(2)], -1)
+            / 2.0
+        )
         # right(moved + s) = gain * template + offset, linear in s, gain and offset.
         design = torch.cat([slope, -template[:, None], -torch.ones_like(template)[:, None]], -1)
         solution = torch.linalg.lstsq(design, -values[:, None], driver="gelsd").solution[:, 0]
@@ -224,13 +245,13 @@ def _fit_shift(
         if step < _CONVERGED:
             break
     if step >= 10 * _CONVERGED:
-        return _Match(MatchStatus.NOT_CONVERGED, score)
+        return PatchMatch(MatchStatus.NOT_CONVERGED, score)
     # Only the part across the line counts: along it, the search stopped at the nearest of its places.
     off = abs(float(tangent[0] * shift[1] - tangent[1] * shift[0]))
     if off > options.max_off_line:
-        return _Match(MatchStatus.OFF_LINE, score, off)
+        return PatchMatch(MatchStatus.OFF_LINE, score, off)
     covariance = _shift_covariance(design, values + design @ solution)
-    return _Match(MatchStatus.GOOD, score, off, where[len(where) // 2] + shift, covariance)
+    return PatchMatch(MatchStatus.GOOD, score, off, where[len(where) // 2] + shift, covariance)
 
 
 def _shift_covariance(design: Tensor, residual: Tensor) -> Tensor:
@@ -256,11 +277,11 @@ def _has_rival(places: Tensor, score: Tensor, best: int, share: float) -> bool:
     inner = score[1:-1]
     peak = torch.zeros_like(score, dtype=torch.bool)
     peak[1:-1] = (inner >= score[:-2]) & (inner >= score[2:])
-    away = torch.linalg.vector_norm(places - places[best], dim=-1) > _RIVAL_DISTANCE
+    away = torch.linalg.vector_norm(places - places[best], dim=-1) > RIVAL_DISTANCE
     return bool((peak & away & (score > share * score[best])).any())
 
 
-def _correlation(samples: Tensor, template: Tensor) -> Tensor:
+def patch_correlation(samples: Tensor, template: Tensor) -> Tensor:
     """Normalized correlation (C,) of samples (C, K) with a template (K,)."""
     a = samples - samples.mean(-1, keepdim=True)
     b = template - template.mean()
@@ -268,19 +289,40 @@ def _correlation(samples: Tensor, template: Tensor) -> Tensor:
     return (a @ b) / norm.clamp_min(1e-12)  # never divide by zero
 
 
-def _has_room(where: Tensor, image: Tensor) -> Tensor:
+def blurred_window(image: Tensor, where: Tensor, beyond: int = 0) -> BlurredWindow:
+    """The part of a blurred image around positions (..., 2), with room for samples and their slopes."""
+    size = image.shape[1], image.shape[0]
+    kernel = _blur_kernel()
+    room = len(kernel) // 2 + 3 + beyond
+    spots = where.reshape(-1, 2)
+    low = [0, 0] if not len(spots) else [math.floor(float(v)) - room for v in spots.amin(0)]
+    high = [1, 1] if not len(spots) else [math.ceil(float(v)) + room + 1 for v in spots.amax(0)]
+    left, top = (min(max(v, 0), most - 1) for v, most in zip(low, size, strict=True))
+    right, bottom = (max(min(v, most), start + 1) for v, most, start in zip(high, size, (left, top), strict=True))
+    values = filtered(image[top:bottom, left:right].to(torch.float64), kernel, kernel)
+    return BlurredWindow(values, torch.tensor([left, top], dtype=torch.float64), size)
+
+
+def _has_room(where: Tensor, image: BlurredWindow) -> Tensor:
     """Whether positions leave room for a sample and its slope."""
+    width, height = image.size
     x, y = where.unbind(-1)
-    height, width = image.shape
-    return (x >= 1) & (y >= 1) & (x <= width - 2) & (y <= height - 2)
+    inside = (x >= 1) & (y >= 1) & (x <= width - 2) & (y <= height - 2)
+    # The blur repeats the window's edge: only inside it are values those of the whole image.
+    reach = len(_blur_kernel()) // 2
+    local = where - image.corner
+    low = torch.where(image.corner > 0, reach, 0)
+    end = torch.tensor(image.values.shape[::-1]) - 1
+    high = torch.where(image.corner + end < torch.tensor([width - 1, height - 1]), end - reach, end)
+    return inside & ((local >= low) & (local <= high)).all(-1)
 
 
-def _sample(image: Tensor, where: Tensor) -> Tensor:
+def sample_window(image: BlurredWindow, where: Tensor) -> Tensor:
     """Bilinear samples at (..., 2)."""
-    size = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)
-    grid = (2.0 * where / size - 1.0).reshape(1, 1, -1, 2)
+    size = torch.tensor([max(image.values.shape[1] - 1.0, 1.0), max(image.values.shape[0] - 1.0, 1.0)]).double()
+    grid = (2.0 * (where - image.corner) / size - 1.0).reshape(1, 1, -1, 2)
     values = torch.nn.functional.grid_sample(
-        image[None, None], grid, mode="bilinear", padding_mode="border", align_corners=True
+        image.values[None, None], grid, mode="bilinear", padding_mode="border", align_corners=True
     )
     return values.reshape(where.shape[:-1])
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import pydantic
 import torch
 from torch import Tensor
 
+from kcal.checks import ImageSize
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.files import NativeFile
 
-Pixel = tuple[float, float]
+# Sides of images have at most 65535 pixels in most formats; far beyond, squares and products overflow.
+Coordinate = Annotated[float, pydantic.Field(ge=-1e6, le=1e6)]
+Pixel = tuple[Coordinate, Coordinate]
 PackedCovariance = tuple[float, float, float]
 
 # Pixels that noise or a bad refinement may move a corner at the image's edge beyond it.
@@ -70,7 +73,7 @@ class Observations(NativeFile):
     VERSION: ClassVar[int] = 1
 
     board: Board
-    image_size: tuple[pydantic.PositiveInt, pydantic.PositiveInt]
+    image_size: ImageSize
     refinement: Literal["erf", "saddle", "opencv", "skimage", "none"] = "erf"
     views: tuple[View, ...]
     failures: tuple[Failure, ...] = ()

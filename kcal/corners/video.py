@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -72,7 +73,7 @@ def read_frames(source: str | Path, duration: float | None = None) -> Iterator[F
         FileError: the file is missing or no video, the stream does not answer, or no frame can be decoded.
     """
     live, name = is_stream(source), source_name(source) if is_stream(source) else str(source)
-    if not live and not Path(source).is_file():
+    if not live and not os.path.isfile(source):
         raise FileError(f"{source}: no such file")
     video = _open(str(source)) if live else cv2.VideoCapture(str(source))
     until = time.monotonic() + (DURATION if duration is None else duration) if live else float("inf")
@@ -94,6 +95,38 @@ def read_frames(source: str | Path, duration: float | None = None) -> Iterator[F
             raise FileError(f"{name}: no frame that can be decoded")
     finally:
         video.release()
+
+
+class VideoFrames:
+    """Single frames of a video file by their number from 0, gray, as `read_frames` gives them.
+
+    Args:
+        source: a video file.
+
+    Raises:
+        FileError: the file is missing or no video, or its number of frames is not known.
+    """
+
+    def __init__(self, source: str | Path) -> None:
+        if not Path(source).is_file():
+            raise FileError(f"{source}: no such file")
+        self.source = Path(source)
+        self._video = cv2.VideoCapture(str(source))
+        self.count = int(self._video.get(cv2.CAP_PROP_FRAME_COUNT)) if self._video.isOpened() else 0
+        self.rate = float(self._video.get(cv2.CAP_PROP_FPS))
+        if self.count < 1:
+            raise FileError(f"{source}: not a video that can be read; use MP4, AVI, MOV or MKV")
+        self._video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        self._next = 0
+
+    def __getitem__(self, number: int) -> npt.NDArray[np.uint8]:
+        if self._next != number:
+            self._video.set(cv2.CAP_PROP_POS_FRAMES, number)
+        done, frame = self._video.read()
+        self._next = number + 1
+        if not done:
+            raise FileError(f"{self.source}: frame {number} cannot be decoded")
+        return np.asarray(frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 def _open(stream: str) -> cv2.VideoCapture:

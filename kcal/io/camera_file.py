@@ -15,6 +15,7 @@ import pydantic
 import torch
 
 import kcal
+from kcal.checks import ImageSize
 from kcal.errors import InputError
 from kcal.files import NativeFile
 from kcal.io.information_record import InformationRecord
@@ -51,6 +52,12 @@ class ValidRegion(Record):
     polygon: tuple[tuple[float, float], ...]
 
 
+RETIRED_FIELDS = {
+    "residual": "its lens has a residual field, which this version cannot read: a hybrid of kcal 0.1; calibrate again: "
+    "kcal calibrate OBS -o CAMERA"
+}
+
+
 class CameraFile(NativeFile):
     """One camera (file kind `camera`, version 2).
 
@@ -84,9 +91,10 @@ class CameraFile(NativeFile):
     KIND: ClassVar[str] = "camera"
     VERSION: ClassVar[int] = 2
     OLDER: ClassVar[tuple[int, ...]] = (1,)
+    RETIRED: ClassVar[Mapping[str, str]] = RETIRED_FIELDS
 
     name: str
-    image_size: tuple[pydantic.PositiveInt, pydantic.PositiveInt]
+    image_size: ImageSize
     model: LensOrders
     intrinsics: IntrinsicsRecord
     coefficients: dict[str, float]
@@ -95,16 +103,6 @@ class CameraFile(NativeFile):
     information: InformationRecord | None = None
     valid_region: ValidRegion | None = None
     calibration: CalibrationRecord | None = None
-
-    @pydantic.model_validator(mode="before")
-    @classmethod
-    def _without_residual_field(cls, value: Any) -> Any:
-        if isinstance(value, dict) and "residual" in value:
-            raise ValueError(
-                "its lens has a residual field, which this version cannot read: a hybrid of kcal 0.1; calibrate again: "
-                "kcal calibrate OBS -o CAMERA"
-            )
-        return value
 
     @pydantic.field_validator("coefficients", "standard_deviations")
     @classmethod

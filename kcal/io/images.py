@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kcal.errors import FileError, InputError
 from kcal.files import write_atomic
+from kcal.image_header import check_image_header
 
 
 def decode_image(data: bytes, source: str | Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
@@ -22,19 +23,21 @@ def decode_image(data: bytes, source: str | Path) -> NDArray[np.uint8] | NDArray
     The EXIF orientation is ignored: row 0 is the row the sensor read first, because the lens does not turn with it.
 
     Raises:
-        FileError: not an image, or pixels other than 8 or 16 bits unsigned; `source` names it.
+        FileError: not an image, more than 500 megapixels, or pixels other than 8 or 16 bits unsigned; `source` names
+            it.
 
     Example:
         >>> colors = np.zeros((4, 6, 3), np.uint16) + np.array([1, 2, 65535], np.uint16)
         >>> decode_image(encode_png(colors), "memory")[0, 0].tolist()
         [1, 2, 65535]
     """
+    check_image_header(data, source)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None:
-        raise FileError(f"{source}: not an image that can be read; use JPEG, PNG, TIFF, BMP, WebP or PGM")
+        raise FileError(f"{source}: the image is truncated or corrupt; copy it again or leave it out")
     if image.dtype not in (np.uint8, np.uint16):
         raise FileError(f"{source}: pixels are {image.dtype}; store the image with 8 or 16 bits unsigned")
     return _swap_red_and_blue(image)

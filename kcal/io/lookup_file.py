@@ -30,18 +30,22 @@ x right, y down, z forward.
 from __future__ import annotations
 
 import io
+import math
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from kcal.checks import check_pixel_count
 from kcal.errors import FileError, InputError
-from kcal.files import write_atomic
+from kcal.files import read_bytes, write_atomic
 from kcal.lens.lookup import LookupCamera
 from kcal.lens.spline import Spline
 
 KIND, VERSION = "lookup", 1
+# Tables of 700 cells each way take 16 MB.
+_MOST_BYTES = 256 * 2**20
 _TABLES = {"project": "pixels_from_chart", "unproject": "chart_from_pixels"}
 
 
@@ -90,14 +94,9 @@ def load_lookup(path: str | Path) -> LookupCamera:
         Traceback (most recent call last):
         kcal.errors.FileError: no-such-file.npz: cannot read: No such file or directory
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except OSError as error:
-        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
-    except (ValueError, zipfile.BadZipFile, EOFError, AttributeError) as error:
-        raise FileError(f"{path}: not an .npz file with a lookup camera") from error
-    if str(arrays.get("kcal")) != KIND or arrays.get("version") != VERSION:
+    arrays = _read_arrays(read_bytes(path, _MOST_BYTES), path)
+    kind, version = arrays.get("kcal"), arrays.get("version")
+    if kind is None or str(kind) != KIND or version is None or str(version) != str(VERSION):
         raise FileError(f"{path}: not a kcal {KIND} file of version {VERSION}")
     try:
         tables = {}
@@ -107,17 +106,16 @@ def load_lookup(path: str | Path) -> LookupCamera:
             numbers = [parts["coefficients"], parts["origin"], parts["step"]]
             if not all(n.dtype == torch.float64 and bool(n.isfinite().all()) for n in numbers):
                 raise InputError(f"{name}: numbers must be finite and float64")
-            if parts["cells"].dtype != torch.bool or not bool((parts["step"] > 0).all()):
-                raise InputError(f"{name}: cells must be bool and steps positive")
+            if parts["cells"].dtype != torch.bool or parts["cells"].numel() == 0 or not bool((parts["step"] > 0).all()):
+                raise InputError(f"{name}: cells must be bool, at least one, and steps positive")
             if any(parts[part].shape != (2,) for part in ("origin", "step")):
                 raise InputError(f"{name}: origin and step have two numbers each")
-        width, height = (int(value) for value in arrays["image_size"])
-        bound, coverage = (tuple(float(v) for v in arrays[key]) for key in ("bound", "coverage"))
+        width, height = _two(arrays, "image_size", "iu", 1, math.inf)
         return LookupCamera(
-            size=(width, height),
-            center=torch.from_numpy(arrays["center"]),
-            bound=(bound[0], bound[1]),
-            coverage=(coverage[0], coverage[1]),
+            size=check_pixel_count((int(width), int(height))),
+            center=torch.tensor(_two(arrays, "center", "f", -math.inf, math.inf), dtype=torch.float64),
+            bound=_two(arrays, "bound", "f", 0.0, math.inf),
+            coverage=_two(arrays, "coverage", "f", 0.0, 1.0),
             source=str(arrays["source"]),
             **tables,
         )
@@ -125,3 +123,28 @@ def load_lookup(path: str | Path) -> LookupCamera:
         raise FileError(f"{path}: bad lookup file: {error.args[0]} is missing") from error
     except (InputError, ValueError, TypeError, IndexError) as error:
         raise FileError(f"{path}: bad lookup file: {error}") from error
+
+
+def _read_arrays(data: bytes, path: str | Path) -> dict[str, np.ndarray]:
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > _MOST_BYTES:
+            raise FileError(f"{path}: unpacks to {size / 2**20:.0f} MiB; no lookup camera is larger than 256 MiB")
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            return {name: np.asarray(file[name]) for name in file.files}
+    except FileError:
+        raise
+    except Exception as error:
+        # Damaged archives and headers raise errors of a dozen kinds, from zlib.error to MemoryError.
+        raise FileError(f"{path}: not an .npz file with a lookup camera, or a damaged one") from error
+
+
+def _two(arrays: dict[str, np.ndarray], key: str, kinds: str, low: float, high: float) -> tuple[float, float]:
+    values = arrays[key]
+    if values.shape != (2,) or values.dtype.kind not in kinds:
+        raise ValueError(f"{key}: two numbers are needed, got shape {values.shape} of {values.dtype}")
+    first, second = values.tolist()
+    if not (low <= min(first, second) and max(first, second) <= high and math.isfinite(first + second)):
+        raise ValueError(f"{key} is {first:g}, {second:g}; finite numbers from {low:g} to {high:g} are needed")
+    return first, second

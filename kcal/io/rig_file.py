@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
@@ -19,7 +20,7 @@ from torch import Tensor
 from kcal.checks import as_covariance
 from kcal.errors import InputError
 from kcal.files import NativeFile
-from kcal.io.camera_file import CameraFile, camera_to_file
+from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, camera_to_file
 from kcal.io.record import Packed, Record
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
@@ -77,8 +78,10 @@ class RigMounting(Record):
         heading_deg: of its axis, clockwise from true north.
         pitch_deg: of its axis, positive up.
         roll_deg: clockwise as seen from behind.
-        covariance: (6, 6) of east, north, up of the center (meters) and of turns about these axes (radians).
-        link: (P, 6) covariance of the rig's P quantities (`RigFile.covariance`) with these six.
+        covariance: (6, 6) of east, north, up of the center (meters) and of turns about these axes (radians), or (7, 7)
+            with the coefficient of refraction.
+        link: (P, 6) or (P, 7) covariance of the rig's P quantities (`RigFile.covariance`) with these.
+        refraction: the coefficient, if anything was found of it.
     """
 
     lat: float = pydantic.Field(ge=-90, le=90)
@@ -89,11 +92,14 @@ class RigMounting(Record):
     roll_deg: float
     covariance: Matrix | None = None
     link: Matrix | None = None
+    refraction: float | None = pydantic.Field(default=None, ge=-2, le=2)
 
     @pydantic.model_validator(mode="after")
     def _square(self) -> RigMounting:
         if self.covariance is not None:
-            as_covariance("the mounting's covariance", _tensor(self.covariance, 6, 6, "the mounting's covariance"), 6)
+            size = 7 if len(self.covariance) == 7 else 6
+            matrix = _tensor(self.covariance, size, size, "the mounting's covariance")
+            as_covariance("the mounting's covariance", matrix, size)
         self.mounting()
         return self
 
@@ -107,6 +113,7 @@ class RigMounting(Record):
             roll_deg=mounting.roll_deg,
             covariance=_stored(mounting.covariance),
             link=_stored(mounting.link),
+            refraction=mounting.refraction,
         )
 
     def mounting(self) -> Mounting:
@@ -119,6 +126,7 @@ class RigMounting(Record):
             roll_deg=self.roll_deg,
             covariance=covariance,
             link=link,
+            refraction=self.refraction,
         )
 
 
@@ -146,6 +154,7 @@ class RigFile(NativeFile):
     KIND: ClassVar[str] = "rig"
     VERSION: ClassVar[int] = 2
     OLDER: ClassVar[tuple[int, ...]] = (1,)
+    RETIRED: ClassVar[Mapping[str, str]] = RETIRED_FIELDS
 
     left: CameraFile
     right: CameraFile
@@ -169,7 +178,7 @@ class RigFile(NativeFile):
             if self.mounting is None or self.mounting.covariance is None:
                 raise ValueError("the mounting's link needs the mounting's covariance")
             mounted = torch.tensor(self.mounting.covariance, dtype=torch.float64)
-            known.checked_link(mounted, _tensor(link, size, 6, "the mounting's link"))
+            known.checked_link(mounted, _tensor(link, size, len(mounted), "the mounting's link"))
         length = math.hypot(*self.right_from_left.translation)
         # A thousandth of a millimeter in a meter: more is not rounding but another rig.
         if self.calibration and not math.isclose(self.calibration.baseline_m, length, rel_tol=1e-6):

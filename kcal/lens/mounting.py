@@ -66,19 +66,34 @@ class Origin:
         return torch.tensor([self.lat, self.lon, self.height], dtype=torch.float64)
 
 
+# Gauss's coefficient of refraction, the mean over land by day. What is not known of it is the gradient of temperature:
+# k = 503 p / T² (0.0342 + dT/dz) in hPa, K and K/m (Brunner 1984), so that 0.1 stands for ± 0.016 K/m. That suits lines
+# of sight some ten meters above the ground; near it k varies by 1 and more (Hirt et al. 2010).
+REFRACTION, REFRACTION_SIGMA = 0.13, 0.1
+
+
+def check_refraction(refraction: float, sigma: float) -> None:
+    """Raise `InputError` for a coefficient of refraction, or its standard deviation, that cannot be."""
+    if not -2.0 <= refraction <= 2.0:
+        raise InputError(f"refraction {refraction}: a coefficient such as 0.13 is needed, not beyond ±2")
+    if not 0.0 <= sigma <= 2.0:
+        raise InputError(f"refraction_sigma {sigma}: a number from 0 to 2 is needed, such as 0.1")
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Mounting:
-    """How the left camera of a rig stands, and how well that is known.
+    """How the left camera of a rig stands, how light bended when that was found, and how well both are known.
 
     Args:
         origin: place of the camera's projection center.
         heading_deg: azimuth of the optical axis, degrees clockwise from true north.
         pitch_deg: elevation of the optical axis, degrees, positive up.
         roll_deg: degrees, positive clockwise as seen from behind the camera.
-        covariance: (6, 6) of east, north, up (meters) and of turns about these axes (radians), all at the camera; None:
-            exact.
-        link: (P, 6) covariance of the rig's P quantities, in the order of `RigCovariance`, with these six; None:
+        covariance: (7, 7) of east, north, up (meters), of turns about these axes (radians), all at the camera, and of
+            the coefficient of refraction; (6, 6) where nothing was found of the last; None: exact.
+        link: (P, 7) or (P, 6) covariance of the rig's P quantities, in the order of `RigCovariance`, with these; None:
             independent.
+        refraction: coefficient k, see `StereoLocalizer`; None: nothing was found of it.
 
     Example:
         >>> Mounting(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0).pitch_deg
@@ -91,3 +106,4 @@ class Mounting:
     roll_deg: float = 0.0
     covariance: Tensor | None = None
     link: Tensor | None = None
+    refraction: float | None = None

@@ -172,18 +172,18 @@ class RigCovariance:
         return RigCovariance(half=torch.cat([self.half, torch.cat([zero, more], 1)]))
 
     def checked_link(self, mounting: Tensor, link: Tensor) -> Tensor:
-        """`link` (P, 6) as float64, after checking that it fits this covariance and that of the mounting (6, 6).
+        """`link` (P, M) as float64, after checking that it fits this covariance and that of the mounting (M, M).
 
         Raises:
             InputError: a wrong shape, or the three together are no covariance.
         """
-        size = self.half.shape[1]
-        if not isinstance(link, Tensor) or tuple(link.shape) != (size, 6):
-            raise InputError(f"link: a covariance of the calibration with the mounting, ({size}, 6), is needed")
+        size, more = self.half.shape[1], len(mounting)
+        if not isinstance(link, Tensor) or tuple(link.shape) != (size, more):
+            raise InputError(f"link: a covariance of the calibration with the mounting, ({size}, {more}), is needed")
         matrix = self.matrix
         link, mounting = link.to(matrix), mounting.to(matrix)
         whole = torch.cat([torch.cat([matrix, link], 1), torch.cat([link.T, mounting], 1)])
-        return as_covariance("covariance of calibration and mounting", whole, size + 6)[:size, size:]
+        return as_covariance("covariance of calibration and mounting", whole, size + more)[:size, size:]
 
 
 def half_of_covariance(matrix: Tensor) -> Tensor:

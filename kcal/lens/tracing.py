@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from kcal.errors import InputError
+
 # Points per piece: large enough to outweigh the cost of a call, small enough for the caches of one core.
 CHUNK = 16384
 
@@ -91,7 +93,12 @@ def in_chunks(
         points: (..., N, K).
         batch: number of cameras for each point.
         differentiated: work in one piece, because the autograd graph would keep all pieces anyway.
+
+    Raises:
+        InputError: a single point without the dimension N.
     """
+    if points.ndim < 2:
+        raise InputError(f"shape (..., N, {points.shape[-1]}) is needed, got {tuple(points.shape)}; write points[None]")
     count = points.shape[-2]
     size = max(1, CHUNK // max(1, batch * points[..., 0, 0].numel() if count else 1))
     if is_traced() or differentiated or count <= size:

@@ -65,11 +65,12 @@ def pixel_covariance(
     flat = places.reshape(-1, places.shape[-1])
     wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
     half = known.by_parameter(known.half())[:, wanted]
-    by_camera, by_turn, good = _pixel_slopes(camera, camera.grid(*grid).reshape(-1, 2), math.inf, wanted)
+    by_camera, by_motion, good = pixel_slopes(camera, camera.grid(*grid).reshape(-1, 2), math.inf, wanted)
+    by_turn = by_motion[..., :3]
     # The turn that best undoes each parameter's effect.
     undo = torch.linalg.lstsq(by_turn[good].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
-    by_camera, by_turn, good = _pixel_slopes(camera, flat, at, wanted)
-    by_camera = by_camera - by_turn @ undo
+    by_camera, by_motion, good = pixel_slopes(camera, flat, at, wanted)
+    by_camera = by_camera - by_motion[..., :3] @ undo
     spread = by_camera @ half.T
     found = spread @ spread.transpose(-1, -2)
     return torch.where(good[:, None, None], found, torch.nan).reshape(*places.shape[:-1], 2, 2)
@@ -119,8 +120,11 @@ def image_sigma(camera: Camera, columns: int = 33, rows: int = 25) -> Tensor:
     return projection_sigma(camera, camera.grid(columns, rows))
 
 
-def _pixel_slopes(camera: Camera, places: Tensor, at: float, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Derivatives of the pixels of pixels or rays by parameters (N, 2, C) and a turn (N, 2, 3), and which have them."""
+def pixel_slopes(camera: Camera, places: Tensor, at: float, wanted: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Derivatives of the pixels of pixels or rays by parameters (N, 2, C) and a step (N, 2, 6), and which have them.
+
+    A step is that of `kcal.lens.pose`: a turn, then a shift. `wanted` are the numbers of the C parameters.
+    """
     if places.shape[-1] == 3:
         length = torch.linalg.vector_norm(places, dim=-1)
         rays, valid = places / length[:, None], length > 0
@@ -129,5 +133,5 @@ def _pixel_slopes(camera: Camera, places: Tensor, at: float, wanted: list[int]) 
     rays = torch.where(valid[:, None], rays, rays.new_tensor([0.0, 0.0, 1.0]))
     points = FAR * rays if math.isinf(at) else camera.ray_origins(rays) + at * rays
     seen = project_components(points.T, camera.params.detach(), camera.model, wanted)
-    by_turn = step_rows(seen.by_point, points.T)[:3]
-    return seen.by_camera.permute(2, 1, 0), by_turn.permute(2, 1, 0), valid & seen.regular
+    by_motion = step_rows(seen.by_point, points.T)
+    return seen.by_camera.permute(2, 1, 0), by_motion.permute(2, 1, 0), valid & seen.regular

@@ -5,11 +5,16 @@ from __future__ import annotations
 import datetime
 import hashlib
 import math
-import xml.etree.ElementTree as ET
+from xml.sax.saxutils import escape, quoteattr
+
+import numpy as np
 
 from kcal.errors import InputError
-from kcal.locate.positions import Located, Position
+from kcal.locate.columns import PositionColumns
+from kcal.locate.positions import Located, columns_of
+from kcal.texts import one_line
 
+COT_END = "</events>\n"
 # What Cursor-on-Target writes for a number that is not known.
 _UNKNOWN = "9999999.0"
 # Unknown affiliation, on the ground: kcal says where, not what.
@@ -33,43 +38,48 @@ def to_cot(located: Located, *, time: datetime.datetime | None = None, stale_s: 
     Raises:
         InputError: a time without a time zone, or a `stale_s` that is not positive.
     """
+    return cot_start() + cot_events(columns_of(located.positions), located, time=time, stale_s=stale_s) + COT_END
+
+
+def cot_start() -> str:
+    """The beginning of the document."""
+    return '<?xml version="1.0" encoding="UTF-8"?>\n<events>\n'
+
+
+def cot_events(
+    columns: PositionColumns, run: Located, *, time: datetime.datetime | None = None, stale_s: float = 300.0
+) -> str:
+    """An event for each row that has a position; see `to_cot`."""
     moment = datetime.datetime.now(datetime.UTC) if time is None else time
     if moment.tzinfo is None:
         raise InputError("time: a time zone is needed; write for example datetime.now(datetime.UTC)")
     if not 0 < stale_s < math.inf:
         raise InputError(f"stale_s {stale_s}: a positive number of seconds is needed")
     moment = moment.astimezone(datetime.UTC)
-    root = ET.Element("events")
-    for position in located.positions:
-        if position.lat is not None and position.lon is not None:
-            _event(root, located, position, moment, moment + datetime.timedelta(seconds=stale_s))
-    ET.indent(root, " ")
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+    start, stale = _stamp(moment), _stamp(moment + datetime.timedelta(seconds=stale_s))
+    station = f"{run.origin.lat!r} {run.origin.lon!r}"
+    remark = escape(f"kcal: ce and le contain 95 %; {run.interval_note}")
+    found = columns.rows(np.flatnonzero(columns.located))
+    vertical = 1.96 * np.sqrt(np.maximum(found.column("cov_uu_m2"), 0.0))
+    errors = zip(found.column("cep95_m").tolist(), vertical.tolist(), strict=True)
+    events = []
+    for name, reason, (lat, lon, height, *_), (circle, up) in zip(
+        found.names, found.reasons, found.numbers.tolist(), errors, strict=True
+    ):
+        identity = hashlib.sha256(f"{station} {name}".encode()).hexdigest()[:16]
+        more = f". {escape(reason)}" if reason else ""
+        events.append(
+            f' <event version="2.0" uid="kcal-{identity}" type="{_TYPE}" how="{_HOW}" time="{start}" start="{start}" '
+            f'stale="{stale}">\n  <point lat="{lat!r}" lon="{lon!r}" hae="{_meters_text(height)}" '
+            f'ce="{_meters_text(circle)}" le="{_meters_text(up)}" />\n  <detail>\n'
+            f"   <contact callsign={quoteattr(one_line(name))} />\n   <remarks>{remark}{more}</remarks>\n"
+            "  </detail>\n </event>\n"
+        )
+    return "".join(events)
 
 
-def _event(
-    root: ET.Element, located: Located, position: Position, start: datetime.datetime, stale: datetime.datetime
-) -> None:
-    origin = located.origin
-    identity = hashlib.sha256(f"{origin.lat!r} {origin.lon!r} {position.name}".encode()).hexdigest()[:16]
-    event = ET.SubElement(
-        root, "event", version="2.0", uid=f"kcal-{identity}", type=_TYPE, how=_HOW,
-        time=_stamp(start), start=_stamp(start), stale=_stamp(stale),
-    )  # fmt: skip
-    vertical = None if position.covariance is None else 1.96 * math.sqrt(max(position.covariance[2][2], 0.0))
-    ET.SubElement(
-        event, "point", lat=repr(position.lat), lon=repr(position.lon), hae=_meters_text(position.height),
-        ce=_meters_text(position.cep95_m), le=_meters_text(vertical),
-    )  # fmt: skip
-    detail = ET.SubElement(event, "detail")
-    name = "".join(c for c in position.name if c >= " ")
-    ET.SubElement(detail, "contact", callsign=name)
-    remark = f"kcal: ce and le contain 95 %; {located.interval_note}"
-    ET.SubElement(detail, "remarks").text = f"{remark}. {position.reason}" if position.reason else remark
-
-
-def _meters_text(value: float | None) -> str:
-    return _UNKNOWN if value is None or not math.isfinite(value) else f"{value:.3f}"
+def _meters_text(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else _UNKNOWN
 
 
 def _stamp(moment: datetime.datetime) -> str:

@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pyproj
+from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
 
 from kcal.errors import FileError, InputError
@@ -63,6 +65,12 @@ def geoid_heights(geoid: Geoid, places: Sequence[tuple[float, float]]) -> list[f
     Raises:
         FileError: PROJ cannot read the grid.
     """
+    heights = geoid_column(geoid, *np.asarray(places, dtype=np.float64).reshape(-1, 2).T)
+    return [height if math.isfinite(height) else None for height in heights.tolist()]
+
+
+def geoid_column(geoid: Geoid, lat: NDArray[np.float64], lon: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same for arrays (N,) of latitudes and longitudes in one call; NaN outside the grid."""
     try:
         shift = pyproj.Transformer.from_pipeline(
             f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
@@ -70,10 +78,10 @@ def geoid_heights(geoid: Geoid, places: Sequence[tuple[float, float]]) -> list[f
             "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
         )
         # Above the geoid 0 m is above the ellipsoid N m.
-        heights = [shift.transform(lon, lat, 0.0)[2] for lat, lon in places]
+        heights = shift.transform(lon, lat, np.zeros(len(lon)))[2]
     except ProjError as error:
         raise FileError(f"{geoid.path}: PROJ cannot read this geoid grid: {error}") from error
-    return [height if math.isfinite(height) else None for height in heights]
+    return np.where(np.isfinite(heights), heights, np.nan)
 
 
 def true_from_grid(grid_heading_deg: float, origin: Origin, crs: str) -> float:

@@ -58,7 +58,11 @@ def ecef_to_geodetic(ecef: Tensor) -> Tensor:
         >>> bool(torch.allclose(ecef_to_geodetic(geodetic_to_ecef(place)), place, rtol=1e-14))
         True
     """
-    x, y, z = as_points("ecef", ecef, 3).unbind(-1)
+    return torch.stack(geodetic_components(*as_points("ecef", ecef, 3).unbind(-1)), -1)
+
+
+def geodetic_components(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Latitude, longitude, height of ECEF coordinates that are given one by one; see `ecef_to_geodetic`."""
     squared = x * x + y * y
     off_axis = squared > _AT_POLE**2
     distance = torch.sqrt(torch.where(off_axis, squared, _AT_POLE**2))
@@ -75,7 +79,7 @@ def ecef_to_geodetic(ecef: Tensor) -> Tensor:
     sine, cosine = torch.sin(lat), torch.cos(lat)
     # p cos φ + z sin φ - a √(1 - e² sin² φ) needs no division by a cosine that is zero at the poles.
     height = distance * cosine + z * sine - SEMI_MAJOR * torch.sqrt(1.0 - _E2 * sine * sine)
-    return torch.stack([torch.rad2deg(lat), torch.rad2deg(lon), height], -1)
+    return torch.rad2deg(lat), torch.rad2deg(lon), height
 
 
 def ecef_from_enu_rotation(lat_deg: float, lon_deg: float) -> Tensor:

@@ -1,19 +1,195 @@
-"""Positions as files: GeoJSON (RFC 7946), CSV, KML and Cursor-on-Target; numbers keep every float64 digit."""
+"""Positions as files: GeoJSON (RFC 7946), CSV, KML and Cursor-on-Target; numbers keep every float64 digit.
+
+Rows are written in chunks, so that a table may be longer than memory.
+"""
 
 from __future__ import annotations
 
-import csv
 import io
-from collections.abc import Callable
+import re
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, NamedTuple
+
+import orjson
 
 from kcal.errors import InputError
-from kcal.files import dump_json, write_atomic
-from kcal.locate.cot import to_cot
-from kcal.locate.kml import to_kml
-from kcal.locate.positions import Located, Position
-from kcal.locate.region import REGION_SHARE, cut_at_antimeridian, region_rings
+from kcal.files import open_atomic
+from kcal.locate.columns import NUMBERS, TEXTS, PositionColumns, number_lines
+from kcal.locate.cot import COT_END, cot_events, cot_start
+from kcal.locate.geojson import camera_features, point_features, region_features
+from kcal.locate.kml import KML_END, kml_points, kml_regions, kml_start
+from kcal.locate.positions import Located, columns_of
+from kcal.locate.stereo import PositionStatus
+from kcal.locate.tables import guarded, is_number
+from kcal.texts import csv_line
+
+# Rows at once, so that their texts fit the cache.
+_AT_ONCE = 1024
+# Stands for the standard output.
+STREAM = Path("-")
+# What, in a column of texts, one a line, might need more than writing it down.
+_SPECIAL = re.compile(r"[^\w .:/\n-]|^[^\w.\n]", re.MULTILINE)
+# Names of properties and columns that further columns of a table must not have.
+_TAKEN = {"kind", *TEXTS, *NUMBERS}
+_STATUSES = {int(status): status.name.lower() for status in PositionStatus}
+
+
+class _Format(NamedTuple):
+    """How a file is made: its beginning, a text for each chunk, and its end.
+
+    Attributes:
+        start: the beginning; of a table it names the columns.
+        rows: of each chunk; the time is that of the whole file.
+        later: of each chunk too, but written after all rows.
+        end: the end.
+    """
+
+    start: Callable[[Located, PositionColumns], bytes]
+    rows: Callable[[Located, PositionColumns, datetime], bytes]
+    later: Callable[[Located, PositionColumns], bytes] | None = None
+    end: bytes = b""
+
+
+def _json_start(run: Located, columns: PositionColumns) -> bytes:
+    return b'{"type":"FeatureCollection","features":[\n' + b",\n".join(camera_features(run))
+
+
+def _after_others(features: Iterable[bytes]) -> bytes:
+    return b",\n".join([b"", *features])
+
+
+def _json_lines(run: Located, columns: PositionColumns, time: datetime) -> bytes:
+    """Each point with its region behind it."""
+    regions = region_features(columns, run)
+    lines = []
+    for feature, there in zip(point_features(columns), columns.located.tolist(), strict=True):
+        lines += [feature, next(regions)] if there else [feature]
+    return b"".join(line + b"\n" for line in lines)
+
+
+def _csv_start(run: Located, columns: PositionColumns) -> bytes:
+    return csv_line([*TEXTS, *NUMBERS, *columns.extras]).encode()
+
+
+def _csv_rows(run: Located, columns: PositionColumns, time: datetime) -> bytes:
+    statuses = [_STATUSES[code] for code in columns.status.tolist()]
+    texts = [_csv_cells(columns.names), statuses, _csv_cells(columns.reasons)]
+    cells = [*texts, number_lines(columns.numbers), *map(_csv_cells, columns.extras.values())]
+    return "".join([",".join(row) + "\n" for row in zip(*cells, strict=True)]).encode()
+
+
+def _csv_cells(texts: Iterable[str]) -> list[str]:
+    """Texts as cells; numbers stay numbers."""
+    texts = list(texts)
+    whole = "\n".join(texts)
+    if whole.count("\n") == len(texts) - 1 and not _SPECIAL.search(whole):
+        return texts
+    return [text if is_number(text) else csv_line([guarded(text)])[:-1] for text in texts]
+
+
+_GEOJSON = _Format(
+    _json_start,
+    lambda run, columns, time: _after_others(point_features(columns)),
+    lambda run, columns: _after_others(region_features(columns, run)),
+    b"\n]}\n",
+)
+_FORMATS = {
+    ".geojson": _GEOJSON,
+    ".json": _GEOJSON,
+    ".csv": _Format(_csv_start, _csv_rows),
+    ".kml": _Format(
+        lambda run, columns: kml_start(run).encode(),
+        lambda run, columns, time: kml_points(columns).encode(),
+        lambda run, columns: kml_regions(columns, run).encode(),
+        KML_END.encode(),
+    ),
+    ".cot": _Format(
+        lambda run, columns: cot_start().encode(),
+        lambda run, columns, time: cot_events(columns, run, time=time).encode(),
+        end=COT_END.encode(),
+    ),
+    ".geojsonl": _Format(lambda run, columns: b"".join(line + b"\n" for line in camera_features(run)), _json_lines),
+}
+
+
+def check_format(path: str | Path) -> None:
+    """Raise `InputError` unless the suffix of `path` is one that `write_positions` knows."""
+    if Path(path).suffix.lower() not in _FORMATS:
+        raise InputError(f"{path}: unknown format; the file name must end with {', '.join(_FORMATS)}")
+
+
+class PositionWriter:
+    """Write positions into an open file, chunk by chunk; `close` writes what comes after all rows.
+
+    Regions of GeoJSON and KML wait in a temporary file meanwhile.
+
+    Args:
+        file: open for writing bytes.
+        suffix: the format: ".csv" and so on.
+        run: how the positions were located; its own positions are not written.
+    """
+
+    def __init__(self, file: BinaryIO, suffix: str, run: Located) -> None:
+        self._file, self._run, self._format = file, run, _FORMATS[suffix.lower()]
+        self._later = tempfile.TemporaryFile() if self._format.later is not None else None  # noqa: SIM115
+        self._started = False
+        self._time = datetime.now(UTC)
+
+    def add(self, columns: PositionColumns) -> None:
+        """Write some rows; all chunks must have the same further columns."""
+        if not self._started:
+            taken = [name for name in columns.extras if name in _TAKEN or name.endswith("_infinite")]
+            if taken:
+                raise InputError(f"the table has a column {taken[0]!r}, as positions have; give it another name")
+            self._file.write(self._format.start(self._run, columns))
+            self._started = True
+        for piece in columns.pieces(_AT_ONCE):
+            self._file.write(self._format.rows(self._run, piece, self._time))
+            if self._later is not None and self._format.later is not None:
+                self._later.write(self._format.later(self._run, piece))
+
+    def close(self) -> None:
+        """Write the end of the file, which stays open."""
+        if self._later is not None:
+            self._later.seek(0)
+            shutil.copyfileobj(self._later, self._file, 1 << 20)
+            self._later.close()
+        self._file.write(self._format.end)
+        self._file.flush()
+
+
+@contextmanager
+def open_writers(paths: Sequence[Path], run: Located, stream_suffix: str = ".csv") -> Iterator[list[PositionWriter]]:
+    """Open files for positions, all of them whole or untouched in the end.
+
+    Args:
+        paths: of the files; `STREAM` stands for the standard output, which gets rows as soon as they are known.
+        run: how the positions are located.
+        stream_suffix: the format of `STREAM`.
+    """
+    with ExitStack() as stack:
+        writers = []
+        for path in paths:
+            streamed = path == STREAM
+            file = sys.stdout.buffer if streamed else stack.enter_context(open_atomic(path))
+            writers.append(PositionWriter(file, stream_suffix if streamed else path.suffix, run))
+        yield writers
+        for writer in writers:
+            writer.close()
+
+
+def _written(suffix: str, located: Located) -> bytes:
+    file = io.BytesIO()
+    writer = PositionWriter(file, suffix, located)
+    writer.add(columns_of(located.positions))
+    writer.close()
+    return file.getvalue()
 
 
 def to_geojson(located: Located) -> dict[str, Any]:
@@ -33,122 +209,26 @@ def to_geojson(located: Located) -> dict[str, Any]:
         >>> to_geojson(located)["features"][0]["geometry"]
         {'type': 'Point', 'coordinates': [72.87, 19.07, 14.0]}
     """
-    features = []
-    for camera in located.cameras:
-        properties: dict[str, Any] = {"name": f"{camera.name} camera", "kind": "camera"}
-        if camera.name == "left":
-            properties |= {
-                "heading_deg": located.heading_deg,
-                "pitch_deg": located.pitch_deg,
-                "roll_deg": located.roll_deg,
-                "pixel_sigma": located.pixel_sigma,
-                "range_interval": located.interval_note,
-                "geoid": located.geoid,
-            }
-        features.append(_feature(camera.geodetic, properties))
-    for position in located.positions:
-        place = None
-        if position.lat is not None and position.lon is not None and position.height is not None:
-            place = (position.lat, position.lon, position.height)
-        features.append(_feature(place, {"kind": "point", **_fields(position)}))
-    for position, ring in region_rings(located):
-        # Section 3.1.6: closed, counterclockwise; section 3.1.9: a polygon across the antimeridian is cut in two.
-        parts = [[[lon, lat] for lat, lon in part] for part in cut_at_antimeridian(ring)]
-        shape = {"type": "Polygon", "coordinates": parts}
-        if len(parts) > 1:
-            shape = {"type": "MultiPolygon", "coordinates": [[part] for part in parts]}
-        properties = {"kind": "region", "name": position.name, "share": REGION_SHARE}
-        features.append({"type": "Feature", "geometry": shape, "properties": properties})
-    return {"type": "FeatureCollection", "features": features}
-
-
-def _feature(place: tuple[float, float, float] | None, properties: dict[str, Any]) -> dict[str, Any]:
-    geometry = None
-    if place is not None:
-        lat, lon, height = place
-        geometry = {"type": "Point", "coordinates": [lon, lat, height]}
-    if properties.get("range_high_m") == float("inf"):
-        properties |= {"range_high_m": None, "range_high_infinite": True}
-    if properties.get("cep95_m") == float("inf"):
-        properties |= {"cep95_m": None, "cep95_infinite": True}
-    return {"type": "Feature", "geometry": geometry, "properties": properties}
-
-
-# Of east, north, up in square meters; the first letters of the two axes.
-_COVARIANCE = ("cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2")
-
-
-def _upper(position: Position) -> list[float | None]:
-    c = position.covariance
-    return [None] * 6 if c is None else [c[0][0], c[0][1], c[0][2], c[1][1], c[1][2], c[2][2]]
-
-
-def _fields(position: Position) -> dict[str, Any]:
-    """The values of a position by column name; None where unknown."""
-    east, north, up = position.enu or (None, None, None)
-    left, right = position.reprojection_px or (None, None)
-    return {
-        "name": position.name,
-        "status": position.status.name.lower(),
-        "reason": position.reason,
-        "lat": position.lat,
-        "lon": position.lon,
-        "height_ellipsoidal_m": position.height,
-        "geoid_height_m": position.geoid_height,
-        "east_m": east,
-        "north_m": north,
-        "up_m": up,
-        "range_m": position.range_m,
-        "range_low_m": position.range_low_m,
-        "range_high_m": position.range_high_m,
-        **dict(zip(_COVARIANCE, _upper(position), strict=True)),
-        "cep50_m": position.cep50_m,
-        "cep95_m": position.cep95_m,
-        "range_m_per_px": position.meters_per_pixel,
-        "range_m_per_deg_yaw": position.meters_per_degree,
-        "azimuth_deg": position.azimuth_deg,
-        "elevation_deg": position.elevation_deg,
-        "reprojection_left_px": left,
-        "reprojection_right_px": right,
-    }
+    content: dict[str, Any] = orjson.loads(_written(".geojson", located))
+    return content
 
 
 def to_csv(located: Located) -> str:
     """Comma-separated text, one line for each pair; unknown fields are empty and an infinite range is `inf`."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_fields(located.positions[0]))
-    for position in located.positions:
-        # repr reads back to the same float64; csv would write it so too, but only by accident of str().
-        values = _fields(position).values()
-        writer.writerow([repr(value) if isinstance(value, float) else value for value in values])
-    return text.getvalue()
-
-
-_FORMATS: dict[str, Callable[[Located], str]] = {
-    ".geojson": lambda located: dump_json(to_geojson(located)),
-    ".json": lambda located: dump_json(to_geojson(located)),
-    ".csv": to_csv,
-    ".kml": to_kml,
-    ".cot": to_cot,
-}
-
-
-def check_format(path: str | Path) -> None:
-    """Raise `InputError` unless the suffix of `path` is one that `write_positions` knows."""
-    if Path(path).suffix.lower() not in _FORMATS:
-        raise InputError(f"{path}: unknown format; the file name must end with {', '.join(_FORMATS)}")
+    return _written(".csv", located).decode()
 
 
 def write_positions(path: str | Path, located: Located) -> Path:
-    """Write positions, atomically, in the format of the suffix: .geojson or .json, .csv, .kml, .cot (Cursor-on-Target).
+    """Write positions, atomically, in the format of the suffix: .geojson, .json, .geojsonl, .csv, .kml or .cot.
+
+    `.geojsonl` is GeoJSON with one feature a line, each region behind its point; `.cot` is Cursor-on-Target.
 
     Raises:
         InputError: another suffix.
         FileError: the file cannot be written; an old one is then untouched.
 
     Example:
-        >>> import tempfile, torch
+        >>> import torch
         >>> from kcal.lens.mounting import Origin
         >>> from kcal.locate.budget import planned_rig
         >>> from kcal.locate.positions import locate_points
@@ -160,4 +240,6 @@ def write_positions(path: str | Path, located: Located) -> Path:
         '1,ok'
     """
     check_format(path)
-    return write_atomic(path, _FORMATS[Path(path).suffix.lower()](located))
+    with open_atomic(path) as file:
+        file.write(_written(Path(path).suffix, located))
+    return Path(path)

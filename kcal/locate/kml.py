@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
+from xml.sax.saxutils import escape
 
-from kcal.locate.positions import Located, Position
-from kcal.locate.region import region_rings
+import numpy as np
 
-_NAMESPACE = "http://www.opengis.net/kml/2.2"
+from kcal.locate.columns import PositionColumns, number_lines
+from kcal.locate.positions import Located, columns_of
+from kcal.locate.region import ring_blocks
+from kcal.texts import visible
+
+KML_END = " </Document>\n</kml>\n"
+_STYLES = """  <Style id="camera">
+   <IconStyle><color>ffb06c2b</color></IconStyle>
+  </Style>
+  <Style id="point">
+   <IconStyle><color>ff6b2ac0</color></IconStyle>
+  </Style>
+  <Style id="region">
+   <LineStyle><color>ff271811</color></LineStyle>
+   <PolyStyle><color>33271811</color></PolyStyle>
+  </Style>
+"""
 
 
 def to_kml(located: Located) -> str:
@@ -17,66 +32,64 @@ def to_kml(located: Located) -> str:
     absolute and their height above that geoid; without one they are `clampToGround`, because an ellipsoidal height
     taken for a height above the sea would be wrong by up to 100 m. Regions lie on the ground.
     """
-    ET.register_namespace("", _NAMESPACE)
-    root = ET.Element(_tag("kml"))
-    document = ET.SubElement(root, _tag("Document"))
-    _text(document, "name", "kcal positions")
-    _text(document, "description", f"Regions: {located.interval_note}. Geoid: {located.geoid or 'none'}.")
-    _style(document, "camera", "ffb06c2b", None)
-    _style(document, "point", "ff6b2ac0", None)
-    _style(document, "region", "ff271811", "33271811")
-    for camera in located.cameras:
-        lat, lon, _ = camera.geodetic
-        _point(document, f"{camera.name} camera", "camera", (lat, lon, None), "")
-    for position in located.positions:
-        if position.lat is None or position.lon is None or position.height is None:
-            continue
-        above = None if position.geoid_height is None else position.height - position.geoid_height
-        _point(document, position.name, "point", (position.lat, position.lon, above), _description(position))
-    for position, ring in region_rings(located):
-        placemark = ET.SubElement(document, _tag("Placemark"))
-        _text(placemark, "name", f"{position.name}, 95 %")
-        _text(placemark, "styleUrl", "#region")
-        polygon = ET.SubElement(placemark, _tag("Polygon"))
-        boundary = ET.SubElement(ET.SubElement(polygon, _tag("outerBoundaryIs")), _tag("LinearRing"))
-        _text(boundary, "coordinates", " ".join(f"{(lon + 180) % 360 - 180!r},{lat!r}" for lat, lon in ring))
-    ET.indent(root, " ")
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+    columns = columns_of(located.positions)
+    return kml_start(located) + kml_points(columns) + kml_regions(columns, located) + KML_END
 
 
-def _tag(name: str) -> str:
-    return f"{{{_NAMESPACE}}}{name}"
+def kml_start(run: Located) -> str:
+    """The beginning of the document: styles and cameras."""
+    note = f"Regions: {run.interval_note}. Geoid: {run.geoid or 'none'}."
+    cameras = "".join(
+        _point(f"{camera.name} camera", "camera", f"{camera.geodetic[1]!r},{camera.geodetic[0]!r}", False, "")
+        for camera in run.cameras
+    )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">\n <Document>\n'
+        f"  <name>kcal positions</name>\n  <description>{_xml(note)}</description>\n{_STYLES}{cameras}"
+    )
 
 
-def _text(parent: ET.Element, name: str, text: str) -> None:
-    # XML has no control characters.
-    ET.SubElement(parent, _tag(name)).text = "".join(c for c in text if c >= " " or c in "\n\t")
+def kml_points(columns: PositionColumns) -> str:
+    """A placemark for each row that has a position."""
+    found = columns.rows(np.flatnonzero(columns.located))
+    height, geoid = found.column("height_ellipsoidal_m"), found.column("geoid_height_m")
+    places = number_lines(np.stack([found.column("lon"), found.column("lat"), height - geoid], -1))
+    ranges = np.stack([found.column(name) for name in ("range_m", "range_low_m", "range_high_m")], -1)
+    placemarks = []
+    for name, reason, place, (distance, low, high) in zip(
+        found.names, found.reasons, places, ranges.tolist(), strict=True
+    ):
+        text = f"range {distance:.1f} m, 95 %: {low:.1f} to {high:.1f} m"
+        known = not place.endswith(",")
+        text = f"{text}. {reason}" if reason else text
+        placemarks.append(_point(name, "point", place.removesuffix(","), known, text))
+    return "".join(placemarks)
 
 
-def _style(document: ET.Element, name: str, line: str, fill: str | None) -> None:
-    style = ET.SubElement(document, _tag("Style"), id=name)
-    if fill is None:
-        _text(ET.SubElement(style, _tag("IconStyle")), "color", line)
-        return
-    _text(ET.SubElement(style, _tag("LineStyle")), "color", line)
-    _text(ET.SubElement(style, _tag("PolyStyle")), "color", fill)
+def kml_regions(columns: PositionColumns, run: Located) -> str:
+    """A polygon for each row that has a position."""
+    names = [columns.names[i] for i in np.flatnonzero(columns.located).tolist()]
+    placemarks = []
+    rings = (ring for block in ring_blocks(columns, run.origin) for ring in block)
+    for name, ring in zip(names, rings, strict=True):
+        places = number_lines(np.stack([(ring[:, 1] + 180.0) % 360.0 - 180.0, ring[:, 0]], -1))
+        placemarks.append(
+            f"  <Placemark>\n   <name>{_xml(name)}, 95 %</name>\n   <styleUrl>#region</styleUrl>\n   <Polygon>\n"
+            f"    <outerBoundaryIs><LinearRing><coordinates>{' '.join(places)}</coordinates></LinearRing>"
+            "</outerBoundaryIs>\n   </Polygon>\n  </Placemark>\n"
+        )
+    return "".join(placemarks)
 
 
-def _point(
-    document: ET.Element, name: str, style: str, place: tuple[float, float, float | None], description: str
-) -> None:
-    lat, lon, height = place
-    placemark = ET.SubElement(document, _tag("Placemark"))
-    _text(placemark, "name", name)
-    if description:
-        _text(placemark, "description", description)
-    _text(placemark, "styleUrl", f"#{style}")
-    point = ET.SubElement(placemark, _tag("Point"))
-    _text(point, "altitudeMode", "clampToGround" if height is None else "absolute")
-    _text(point, "coordinates", f"{lon!r},{lat!r}" if height is None else f"{lon!r},{lat!r},{height!r}")
+def _point(name: str, style: str, place: str, absolute: bool, description: str) -> str:
+    about = f"   <description>{_xml(description)}</description>\n" if description else ""
+    mode = "absolute" if absolute else "clampToGround"
+    return (
+        f"  <Placemark>\n   <name>{_xml(name)}</name>\n{about}   <styleUrl>#{style}</styleUrl>\n"
+        f"   <Point>\n    <altitudeMode>{mode}</altitudeMode>\n    <coordinates>{place}</coordinates>\n   </Point>\n"
+        "  </Placemark>\n"
+    )
 
 
-def _description(position: Position) -> str:
-    low, high = position.range_low_m or 0.0, position.range_high_m or 0.0
-    text = f"range {position.range_m or 0.0:.1f} m, 95 %: {low:.1f} to {high:.1f} m"
-    return f"{text}. {position.reason}" if position.reason else text
+def _xml(text: str) -> str:
+    return escape(visible(text))

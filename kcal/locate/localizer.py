@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from kcal.checks import as_covariance, as_points, keep_float64
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
-from kcal.lens.mounting import Origin
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin, check_refraction
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.lens.tracing import is_differentiated
 from kcal.locate.ellipsoid import mean_radius
@@ -30,11 +30,6 @@ from kcal.locate.stereo import (
     piece_by_piece,
     reprojection_errors,
 )
-
-# Gauss's coefficient of refraction, the mean over land by day. What is not known of it is the gradient of temperature:
-# k = 503 p / T² (0.0342 + dT/dz) in hPa, K and K/m (Brunner 1984), so that 0.1 stands for ± 0.016 K/m. That suits lines
-# of sight some ten meters above the ground; near it k varies by 1 and more (Hirt et al. 2010).
-REFRACTION, REFRACTION_SIGMA = 0.13, 0.1
 
 
 class Localization(NamedTuple):
@@ -92,8 +87,8 @@ class StereoLocalizer(nn.Module):
 
     The covariance of a position is the sum of four parts: noise in the marks, errors in the calibration
     (`calibration`, a joint covariance of cameras and rig), errors in the mounting (`mounting`) and, upward, what is not
-    known of refraction. All but the noise move neighboring points together, so that averaging over frames does not
-    reduce them.
+    known of refraction, together with the mounting where both come from the same landmarks. All but the noise move
+    neighboring points together, so that averaging over frames does not reduce them.
 
     Light bends downward: a point at the level distance d is k d² / 2R lower than a straight line of sight says, with R
     the Earth's radius and k the coefficient of refraction: 0.26 ± 0.20 m at 5 km, 0.01 m at 1 km.
@@ -106,14 +101,16 @@ class StereoLocalizer(nn.Module):
         roll_deg: of the left camera, positive clockwise as seen from behind.
         pixel_sigma: standard deviation of a mark along each axis, px, where no covariance is given.
         calibration: how well the rig is known; `rig.covariance` if left out, and exact if that is None.
-        mounting: (6, 6) of `mounting_covariance`; if left out, that of `rig.mounting`, and exact for an `origin` that
-            is given.
-        link: (P, 6) covariance of the calibration with the mounting, where both come from the same landmarks; that of
-            `rig.mounting` if all of origin, calibration and mounting come from the rig.
-        refraction: k, bending of light as a share of the Earth's curvature. For simulations and other straight lines
-            it and its sigma are 0.
-        refraction_sigma: standard deviation of k; 0.1 suits lines of sight some ten meters above the ground, near hot
-            or cold ground 0.5 and more are usual.
+        mounting: (6, 6) of `mounting_covariance`, or (7, 7) of `Mounting`; if left out, that of `rig.mounting`, and
+            exact for an `origin` that is given.
+        link: (P, 6) or (P, 7) covariance of the calibration with the mounting, where both come from the same landmarks;
+            that of `rig.mounting` if all of origin, calibration and mounting come from the rig.
+        refraction: k, bending of light as a share of the Earth's curvature; if left out, that of the landmarks of
+            `rig.mounting`, and 0.13 where there were none. For simulations and other straight lines it and its sigma
+            are 0.
+        refraction_sigma: standard deviation of k; if left out, as it comes with the mounting, and 0.1 otherwise, which
+            suits lines of sight some ten meters above the ground; near hot or cold ground 0.5 and more are usual. Where
+            `refraction` or its sigma is given, as for another day, landmarks say nothing of it.
 
     Raises:
         InputError: an angle, sigma or covariance that cannot be, or a rig that does not say where it stands.
@@ -153,16 +150,17 @@ class StereoLocalizer(nn.Module):
         calibration: RigCovariance | None = None,
         mounting: Tensor | None = None,
         link: Tensor | None = None,
-        refraction: float = REFRACTION,
-        refraction_sigma: float = REFRACTION_SIGMA,
+        refraction: float | None = None,
+        refraction_sigma: float | None = None,
     ) -> None:
         super().__init__()
         self.pixel_sigma = checked_rig(rig, pixel_sigma)
-        if not -2.0 <= refraction <= 2.0:
-            raise InputError(f"refraction {refraction}: a coefficient such as 0.13 is needed, not beyond ±2")
-        if not 0.0 <= refraction_sigma <= 2.0:
-            raise InputError(f"refraction_sigma {refraction_sigma}: a number from 0 to 2 is needed, such as 0.1")
-        stored = rig.covariance
+        stored, own = rig.covariance, refraction is not None or refraction_sigma is not None
+        bending = (
+            REFRACTION if refraction is None else refraction,
+            REFRACTION_SIGMA if refraction_sigma is None else refraction_sigma,
+        )
+        check_refraction(*bending)
         if origin is None or heading_deg is None:
             if origin is not None or heading_deg is not None or pitch_deg or roll_deg:
                 raise InputError("origin and heading_deg belong together, and pitch_deg and roll_deg to them")
@@ -172,6 +170,8 @@ class StereoLocalizer(nn.Module):
             origin, heading_deg, pitch_deg, roll_deg = (
                 stands.origin, stands.heading_deg, stands.pitch_deg, stands.roll_deg,
             )  # fmt: skip
+            if not own and stands.refraction is not None:
+                bending = (stands.refraction, bending[1])
             if mounting is None:
                 mounting = stands.covariance
                 link = stands.link if link is None and calibration is None else link
@@ -181,8 +181,8 @@ class StereoLocalizer(nn.Module):
         self.attitude_deg = (heading_deg, pitch_deg, roll_deg)
         errors = (("marks", True), ("calibration", calibration is not None), ("mounting", mounting is not None))
         self.included = tuple(name for name, there in errors if there)
-        curvature = 0.5 / mean_radius(origin.lat)
-        self.drop, self.drop_sigma = refraction * curvature, refraction_sigma * curvature
+        self.half_curvature = 0.5 / mean_radius(origin.lat)
+        self.drop = bending[0] * self.half_curvature
         device = rig.right_from_left_rotation.device
         rotation, translation = anchor(origin, device)
         self.register_buffer("enu_from_rig", enu_from_cam(heading_deg, pitch_deg, roll_deg).to(device))
@@ -194,13 +194,20 @@ class StereoLocalizer(nn.Module):
             calibration.check(rig)
             factor = calibration.half.T.to(device) if bool(calibration.half.any()) else None
         self.register_buffer("calibration_factor", factor)
-        standing = None if mounting is None else as_covariance("mounting", mounting, 6).to(device)
-        self.register_buffer("mounting", standing)
         if link is not None:
             if calibration is None or mounting is None:
                 raise InputError("link: it needs the covariances of both the calibration and the mounting")
-            link = calibration.checked_link(mounting, link).to(device)
-        self.register_buffer("link", link)
+            link = calibration.checked_link(mounting, link)
+        if mounting is None and bending[1]:
+            mounting = torch.zeros(6, 6, dtype=torch.float64)
+        if mounting is not None:
+            mounting = as_covariance("mounting", mounting, 7 if mounting.shape[-1:] == (7,) else 6)
+            if own or len(mounting) == 6:
+                mounting = torch.block_diag(mounting[:6, :6], torch.tensor([[bending[1] ** 2]], dtype=torch.float64))
+                link = None if link is None else torch.nn.functional.pad(link[:, :6], (0, 1))
+            mounting = mounting.to(device)
+        self.register_buffer("mounting", mounting)
+        self.register_buffer("link", None if link is None else link.to(device))
 
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> Self:
@@ -275,12 +282,11 @@ class StereoLocalizer(nn.Module):
         enu = torch.where(ok[..., None], depth[..., None] * (fit.direction.mT @ self.enu_from_rig.mT), 0.0)
         slope = self.enu_from_rig @ position_slope(fit, scale, ok)
         covariance = slope @ symmetric(spread) @ slope.mT
-        if self.drop or self.drop_sigma:
-            up = torch.stack([*torch.zeros_like(enu[..., :2]).unbind(-1), enu[..., :2].square().sum(-1)], -1)
+        up = torch.stack([*torch.zeros_like(enu[..., :2]).unbind(-1), enu[..., :2].square().sum(-1)], -1)
+        if self.drop:
             enu = enu - self.drop * up
-            covariance = covariance + self.drop_sigma**2 * up[..., :, None] * up[..., None, :]
         if self.mounting is not None:
-            turn = by_mounting(enu)
+            turn = torch.cat([by_mounting(enu), -self.half_curvature * up[..., None]], -1)
             covariance = covariance + turn @ self.mounting @ turn.mT
             if self.link is not None and self.calibration_factor is not None:
                 mixed = slope @ (effect @ self.link) @ turn.mT
@@ -308,19 +314,33 @@ class StereoLocalizer(nn.Module):
             pixels_left: (..., N, 2).
             pixels_right: (..., N, 2).
         """
-        found = fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right))
-        fit, scale, _, usable = found
-        known = usable & (fit.inverse > 0)
-        inverse = torch.where(known, fit.inverse, 1.0)
-        # d range = -range dρ / ρ
-        slope = scale * found.length / (inverse * inverse)
-        by_mark = fit.gain[..., 2, :, :]
-        by_side = torch.linalg.vector_norm(by_mark.unflatten(-2, (2, 2)), dim=-2)
-        turn = (by_mark[..., None, 2:, :] * by_pose(fit, 1)[..., :3, :, :]).sum(-2)
-        return Sensitivity(
-            torch.where(known, slope * by_side.amax(-2), math.inf),
-            torch.where(known, slope * torch.linalg.vector_norm(turn, dim=-2) * math.radians(1.0), math.inf),
-        )
+        return _sensitivity(fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right)))
+
+    def with_sensitivity(self, pixels_left: Tensor, pixels_right: Tensor) -> tuple[Localization, Sensitivity]:
+        """`forward` and `sensitivity` for the work of one; without covariances, masks and derivatives.
+
+        Args:
+            pixels_left: (..., N, 2); in one piece, so give some ten thousand at once.
+            pixels_right: (..., N, 2).
+        """
+        by_camera = self.calibration_factor is not None
+        found = fit_pairs(self.rig, *checked_pairs(pixels_left, pixels_right), by_camera=by_camera)
+        return self._on_earth(found, self.pixel_sigma**2), _sensitivity(found)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         return super()._apply(keep_float64(fn), recurse)
+
+
+def _sensitivity(found: PairFit) -> Sensitivity:
+    fit, scale, _, usable = found
+    known = usable & (fit.inverse > 0)
+    inverse = torch.where(known, fit.inverse, 1.0)
+    # d range = -range dρ / ρ
+    slope = scale * found.length / (inverse * inverse)
+    by_mark = fit.gain[..., 2, :, :]
+    by_side = torch.linalg.vector_norm(by_mark.unflatten(-2, (2, 2)), dim=-2)
+    turn = (by_mark[..., None, 2:, :] * by_pose(fit, 1)[..., :3, :, :]).sum(-2)
+    return Sensitivity(
+        torch.where(known, slope * by_side.amax(-2), math.inf),
+        torch.where(known, slope * torch.linalg.vector_norm(turn, dim=-2) * math.radians(1.0), math.inf),
+    )

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from kcal.errors import FileError
 from kcal.files import write_atomic
-from kcal.locate.tables import TableRow, read_rows
+from kcal.locate.tables import CHUNK_ROWS, TableChunk, TableRow, guarded, read_chunks
+from kcal.texts import csv_line
 
 PIXELS = ("left_u", "left_v", "right_u", "right_v")
+# The ten entries of a pair's covariance (left_u, left_v, right_u, right_v) on and above its diagonal, row by row.
+_UPPER = tuple((i, j) for i in range(4) for j in range(i, 4))
+COVARIANCE = tuple(f"cov_{i}{j}" for i, j in _UPPER)
 _HEADER = f"name,{','.join(PIXELS)}"
 _PIXEL = "a pixel coordinate"
 
@@ -25,16 +31,36 @@ class Marks(NamedTuple):
         names: one for each pair, unique; the row's number where the file has no names.
         left: (N, 2) float64 pixels in the left image, integer coordinates at pixel centers.
         right: (N, 2) likewise in the right image.
+        covariance: (N, 4, 4) px² of each pair's four coordinates, NaN where the file has none; None if it has none at
+            all.
     """
 
     names: tuple[str, ...]
     left: Tensor
     right: Tensor
+    covariance: Tensor | None = None
 
     @property
     def pixels(self) -> Tensor:
         """(N, 2, 2): both images."""
         return torch.stack([self.left, self.right], 1)
+
+    def covariance_or(self, sigma: float) -> Tensor | None:
+        """See `filled`."""
+        return filled(self.covariance, sigma)
+
+
+def filled(covariance: Tensor | None, sigma: float) -> Tensor | None:
+    """(N, 4, 4) a covariance as in `Marks`, with `sigma` px along each axis where there is none; None: none at all.
+
+    Example:
+        >>> filled(torch.full((1, 4, 4), torch.nan), 0.5)[0, 0].tolist()
+        [0.25, 0.0, 0.0, 0.0]
+    """
+    if covariance is None:
+        return None
+    known = torch.isfinite(covariance).all(-1).all(-1)[:, None, None]
+    return torch.where(known, covariance.double(), sigma**2 * torch.eye(4, dtype=torch.float64))
 
 
 def read_marks(path: str | Path, *, single: bool = False) -> Marks:
@@ -42,7 +68,8 @@ def read_marks(path: str | Path, *, single: bool = False) -> Marks:
 
     Columns may come in any order; `name` may be absent (rows are then numbered from 1) and a column `note` is allowed
     and not used. Blank lines are skipped, and a byte order mark at the beginning is accepted. Pixels may lie outside
-    the image: `locate_points` reports such a pair.
+    the image: `locate_points` reports such a pair. The columns `cov_00`, `cov_01` ... `cov_33` may contain a pair's
+    covariance, as `kcal mark` writes it: all ten, or all empty.
 
     Args:
         path: of the file.
@@ -61,9 +88,56 @@ def read_marks(path: str | Path, *, single: bool = False) -> Marks:
         >>> marks.names, marks.right.tolist()
         (('mast',), [[956.8, 540.5]])
     """
-    rows = read_rows(path, _HEADER, ("name", *PIXELS, "note"), PIXELS)
-    table = torch.tensor([_four_pixels(row, single) for row in rows], dtype=torch.float64)
-    return Marks(names=tuple(row.name for row in rows), left=table[:, :2], right=table[:, 2:])
+    chunks = list(read_mark_chunks(path, single=single, extras=False))
+    names = tuple(name for chunk in chunks for name in chunk.names)
+    pixels = torch.cat([chunk.pixels for chunk in chunks])
+    covariance = None
+    if any(chunk.covariance is not None for chunk in chunks):
+        unknown = torch.full((4, 4), math.nan, dtype=torch.float64)
+        parts = [
+            unknown.expand(len(chunk.names), 4, 4) if chunk.covariance is None else chunk.covariance for chunk in chunks
+        ]
+        covariance = torch.cat(parts)
+    return Marks(names=names, left=pixels[:, 0], right=pixels[:, 1], covariance=covariance)
+
+
+class MarkChunk(NamedTuple):
+    """Some consecutive pairs of marks of a long table.
+
+    Attributes:
+        names: as in `Marks`.
+        pixels: (N, 2, 2) float64: both images.
+        covariance: as in `Marks`.
+        extras: the cells of all other columns, as they are written.
+        bytes_read: how far the file has been read.
+    """
+
+    names: Sequence[str]
+    pixels: Tensor
+    covariance: Tensor | None
+    extras: dict[str, list[str]]
+    bytes_read: int
+
+
+def read_mark_chunks(
+    path: str | Path, *, single: bool = False, extras: bool = True, at_once: int = CHUNK_ROWS
+) -> Iterator[MarkChunk]:
+    """Read a table of marks some rows at a time; see `read_marks`.
+
+    Args:
+        path: of the file.
+        single: allow a thing to be marked in one image only.
+        extras: accept columns with other names than those of `read_marks`.
+        at_once: most rows of a chunk.
+    """
+    known = ("name", *PIXELS, *COVARIANCE)
+    for chunk in read_chunks(path, _HEADER, (*known, "note"), PIXELS, extras=extras, at_once=at_once):
+        values = chunk.numbers(PIXELS)
+        if values is None:
+            values = np.array([_four_pixels(row, single) for row in chunk.rows()])
+        others = {name: cells for name, cells in chunk.columns.items() if name not in known}
+        pixels = torch.from_numpy(values).view(-1, 2, 2)
+        yield MarkChunk(chunk.names, pixels, _covariances_of(chunk), others, chunk.bytes_read)
 
 
 def write_marks(path: str | Path, marks: Marks) -> Path:
@@ -72,9 +146,54 @@ def write_marks(path: str | Path, marks: Marks) -> Path:
     Raises:
         FileError: the file cannot be written.
     """
-    rows = zip(marks.names, marks.left.tolist(), marks.right.tolist(), strict=True)
-    lines = [_HEADER, *(",".join([name, *map(repr, (*left, *right))]) for name, left, right in rows)]
-    return write_atomic(path, "\n".join(lines) + "\n")
+    return write_atomic(path, marks_text(marks))
+
+
+def marks_text(marks: Marks) -> str:
+    """The text that `write_marks` writes."""
+    table, header = [*marks.left.T.tolist(), *marks.right.T.tolist()], ["name", *PIXELS]
+    if marks.covariance is not None:
+        table += [marks.covariance[:, i, j].tolist() for i, j in _UPPER]
+        header += COVARIANCE
+    lines = [csv_line(header)]
+    for name, *values in zip(marks.names, *table, strict=True):
+        lines.append(csv_line([guarded(name), *(None if math.isnan(value) else value for value in values)]))
+    return "".join(lines)
+
+
+def _covariances_of(chunk: TableChunk) -> Tensor | None:
+    """(N, 4, 4) of a chunk; NaN for rows that have none, None if no row has one."""
+    if not any(column in chunk.columns for column in COVARIANCE):
+        return None
+    values = chunk.numbers(COVARIANCE) if all(column in chunk.columns for column in COVARIANCE) else None
+    if values is not None:
+        found = torch.empty(len(values), 4, 4, dtype=torch.float64)
+        for place, (i, j) in enumerate(_UPPER):
+            found[:, i, j] = found[:, j, i] = torch.from_numpy(values[:, place])
+        if bool((torch.linalg.eigvalsh(found)[:, 0] > 0).all()):
+            return found
+    stated = torch.stack([_covariance_of(row) for row in chunk.rows()])
+    return None if bool(torch.isnan(stated).all()) else stated
+
+
+def _covariance_of(row: TableRow) -> Tensor:
+    """(4, 4) of one line; NaN where it has none."""
+    cells = [row.cells.get(column, "") for column in COVARIANCE]
+    matrix = torch.full((4, 4), math.nan, dtype=torch.float64)
+    if not any(cells):
+        return matrix
+    for column, (i, j) in zip(COVARIANCE, _UPPER, strict=True):
+        if column not in row.cells:
+            raise FileError(
+                f"{row.where}: the column {column} is missing; a covariance needs all ten, {COVARIANCE[0]} "
+                f"to {COVARIANCE[-1]}"
+            )
+        matrix[i, j] = matrix[j, i] = row.number(column, "a covariance in px²")
+    if not float(torch.linalg.eigvalsh(matrix)[0]) > 0:
+        raise FileError(
+            f"{row.where}: the covariance is not positive definite; write it again or leave its cells empty"
+        )
+    return matrix
 
 
 def _four_pixels(row: TableRow, single: bool) -> list[float]:

@@ -35,7 +35,12 @@ def attitude(enu_from_cam: Tensor) -> tuple[float, float, float]:
 
 
 def mounting_of(
-    cam_from_enu: Tensor, center: Tensor, covariance: Tensor, origin: Origin, link: Tensor | None = None
+    cam_from_enu: Tensor,
+    center: Tensor,
+    covariance: Tensor,
+    origin: Origin,
+    link: Tensor | None = None,
+    refraction: float | None = None,
 ) -> Mounting:
     """How a camera with a pose in the frame of `origin` stands where it is.
 
@@ -45,9 +50,11 @@ def mounting_of(
     Args:
         cam_from_enu: (3, 3).
         center: (3,) meters.
-        covariance: (6, 6) of the center and of turns of the camera, both about the frame's axes.
+        covariance: (6, 6) of the center and of turns of the camera, both about the frame's axes; (7, 7) with the
+            coefficient of refraction.
         origin: of the frame.
-        link: (P, 6) covariance of anything else with these six.
+        link: (P, 6) or (P, 7) covariance of anything else with these.
+        refraction: the coefficient, if anything was found of it.
 
     Example:
         >>> from kcal.locate.geodesy import enu_from_cam
@@ -58,7 +65,7 @@ def mounting_of(
     """
     lat, lon, height = enu_to_geodetic(center, origin).tolist()
     turn = ecef_from_enu_rotation(lat, lon).T @ ecef_from_enu_rotation(origin.lat, origin.lon)
-    both = torch.block_diag(turn, turn)
+    both = torch.block_diag(turn, turn, torch.eye(len(covariance) - 6, dtype=torch.float64))
     heading, pitch, roll = attitude(turn @ cam_from_enu.T)
     return Mounting(
         origin=Origin(lat=lat, lon=lon, height=height),
@@ -67,6 +74,7 @@ def mounting_of(
         roll_deg=roll,
         covariance=both @ covariance @ both.T,
         link=None if link is None else link @ both.T,
+        refraction=refraction,
     )
 
 
@@ -94,7 +102,9 @@ def placed_rig(result: RigResult, origin: Origin) -> StereoRig:
     rig = result.stereo()
     covariance = result.mounting_covariance(0)
     if result.absolute and bool(torch.isfinite(covariance).all()):
-        rig.mounting = mounting_of(result.rotation[0], result.center[0], covariance, origin, result.mounting_link())
+        rig.mounting = mounting_of(
+            result.rotation[0], result.center[0], covariance, origin, result.mounting_link(), result.refraction
+        )
     return rig
 
 

@@ -6,30 +6,18 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.checks import as_points
 from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance, StereoRig
-from kcal.locate.cep import circular_error
-from kcal.locate.datum import Geoid, geoid_heights
-from kcal.locate.geodesy import azimuth_elevation, enu_to_geodetic
-from kcal.locate.localizer import REFRACTION, REFRACTION_SIGMA, Localization, StereoLocalizer
-from kcal.locate.stereo import PositionStatus
-
-# A reprojection error of this many sigma is not noise: two different things were marked, or the rig has moved.
-_MISMATCH_SIGMAS = 10.0
-
-_STATUS_TEXTS = {
-    PositionStatus.OUTSIDE_LENS: "the lens model has no ray for a mark",
-    PositionStatus.BEHIND: "the lines of sight cross behind a camera: are the marks the same thing?",
-    PositionStatus.NOT_FINITE: "a pixel coordinate is not finite",
-    PositionStatus.OUTSIDE_IMAGE: "a mark lies outside its image",
-    PositionStatus.BAD_COVARIANCE: "the covariance of the marks is not positive definite",
-}
+from kcal.locate.columns import NUMBERS, PositionColumns
+from kcal.locate.datum import Geoid
+from kcal.locate.locator import Locator, Viewpoint
+from kcal.locate.stereo import PositionStatus, checked_pairs
+from kcal.locate.tables import CHUNK_ROWS
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -70,28 +58,11 @@ class Position:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Viewpoint:
-    """Where a camera of the rig stands and what it sees, for maps.
-
-    Args:
-        name: "left" or "right".
-        enu: meters; zeros for the left camera.
-        geodetic: latitude, longitude in degrees, ellipsoidal WGS84 height in meters.
-        azimuths_deg: of the left and right ends of the image's middle row, or None if the lens model has no ray there.
-    """
-
-    name: str
-    enu: tuple[float, float, float]
-    geodetic: tuple[float, float, float]
-    azimuths_deg: tuple[float, float] | None
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Located:
     """Result of `locate_points`: one position for each pair of marks, in order, and where the rig stood.
 
     `included` names the errors that intervals and covariances cover; `geoid` is the grid of the geoid heights, None
-    without one.
+    without one. `rows` is the length of the table of which the positions are a sample, None if they are all.
     """
 
     positions: tuple[Position, ...]
@@ -103,6 +74,13 @@ class Located:
     pixel_sigma: float
     included: tuple[str, ...] = ("marks",)
     geoid: str | None = None
+    rows: int | None = None
+
+    @property
+    def count_note(self) -> str:
+        """How many points are located, and of how long a table they are a sample."""
+        note = f"{self.count} of {len(self.positions)} points located"
+        return note if self.rows is None else f"{note}, a sample of the {self.rows:,} in the table"
 
     @property
     def interval_note(self) -> str:
@@ -140,8 +118,8 @@ def locate_points(
     calibration: RigCovariance | None = None,
     mounting: Tensor | None = None,
     link: Tensor | None = None,
-    refraction: float = REFRACTION,
-    refraction_sigma: float = REFRACTION_SIGMA,
+    refraction: float | None = None,
+    refraction_sigma: float | None = None,
     geoid: Geoid | None = None,
 ) -> Located:
     """Positions on the Earth of things marked in both images of a stereo rig.
@@ -173,6 +151,7 @@ def locate_points(
         InputError: wrong shapes, dtypes or names, or an angle or sigma out of range.
 
     Example:
+        >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> located = locate_points(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),
@@ -181,9 +160,7 @@ def locate_points(
         >>> round(position.range_m, 3), round(position.lat, 6), round(position.range_high_m, 1)
         (1000.0, 19.079034, 1054.8)
     """
-    device = rig.right_from_left_rotation.device
-    pixels_left = as_points("pixels_left", pixels_left, 2).to(device)
-    pixels_right = as_points("pixels_right", pixels_right, 2).to(device)
+    pixels_left, pixels_right = checked_pairs(pixels_left, pixels_right)
     if pixels_left.ndim != 2:
         raise InputError(f"pixels_left: shape (N, 2) is needed, got {tuple(pixels_left.shape)}")
     if len(pixels_left) == 0:
@@ -191,121 +168,75 @@ def locate_points(
     names = [str(i + 1) for i in range(len(pixels_left))] if names is None else list(names)
     if len(names) != len(pixels_left):
         raise InputError(f"names: {len(names)} for {len(pixels_left)} pairs of marks; one each is needed")
-    with torch.no_grad():
-        localize = StereoLocalizer(
-            rig, origin=origin, heading_deg=heading_deg, pitch_deg=pitch_deg, roll_deg=roll_deg,
-            pixel_sigma=pixel_sigma, calibration=calibration, mounting=mounting, link=link, refraction=refraction,
-            refraction_sigma=refraction_sigma,
-        )  # fmt: skip
-        slopes = [slope.tolist() for slope in localize.sensitivity(pixels_left, pixels_right)]
-        result = Localization(*(tensor.cpu() for tensor in localize(pixels_left, pixels_right, cov)))
-        cameras = _viewpoints(rig, localize.enu_from_rig.cpu(), localize.origin)
-    heading, pitch, roll = localize.attitude_deg
-    angles = azimuth_elevation(result.bearing).tolist()
-    circles = circular_error(result.enu, result.covariance).tolist()
-    sigmas = [pixel_sigma] * len(names) if cov is None else _marks_sigma(cov, len(names))
-    baseline = float(rig.baseline)
+    locate = Locator(
+        rig, geoid=geoid, origin=origin, heading_deg=heading_deg, pitch_deg=pitch_deg, roll_deg=roll_deg,
+        pixel_sigma=pixel_sigma, calibration=calibration, mounting=mounting, link=link, refraction=refraction,
+        refraction_sigma=refraction_sigma,
+    )  # fmt: skip
+    pixels = torch.stack([pixels_left, pixels_right], 1)
+    if cov is not None:
+        cov = cov.expand(len(pixels), 4, 4)
+    positions: list[Position] = []
+    for start in range(0, len(pixels), CHUNK_ROWS):
+        piece = slice(start, start + CHUNK_ROWS)
+        positions += positions_of(locate(names[piece], pixels[piece], None if cov is None else cov[piece]))
+    return located_by(locate, positions)
 
-    positions = []
-    for i, name in enumerate(names):
-        status = PositionStatus(int(result.status[i]))
-        position = Position(name=name, status=status, reason=_explanation(status, result, i, sigmas[i], baseline))
-        if status in (PositionStatus.OK, PositionStatus.BEARING_ONLY, PositionStatus.PARALLEL):
-            position = dataclasses.replace(position, azimuth_deg=angles[i][0], elevation_deg=angles[i][1])
-            low, high = float(result.range_low[i]), float(result.range_high[i])
-            if math.isfinite(low):
-                position = dataclasses.replace(position, range_low_m=low, range_high_m=high)
-        if status in (PositionStatus.OK, PositionStatus.BEARING_ONLY):
-            left, right = result.reprojection[i].tolist()
-            position = dataclasses.replace(position, reprojection_px=(left, right))
-        if status == PositionStatus.OK:
-            position = _placed(position, result, i)
-            position = dataclasses.replace(
-                position, cep50_m=circles[i][0], cep95_m=circles[i][1], meters_per_pixel=slopes[0][i],
-                meters_per_degree=slopes[1][i],
-            )  # fmt: skip
-        positions.append(position)
-    if geoid is not None:
-        positions = _with_geoid(positions, geoid)
+
+def located_by(locate: Locator, positions: Sequence[Position] = ()) -> Located:
+    """Positions with what they were located by: where the rig stood, and which errors are covered."""
+    heading, pitch, roll = locate.localize.attitude_deg
     return Located(
         positions=tuple(positions),
-        cameras=cameras,
-        origin=localize.origin,
+        cameras=locate.cameras,
+        origin=locate.localize.origin,
         heading_deg=heading,
         pitch_deg=pitch,
         roll_deg=roll,
-        pixel_sigma=pixel_sigma,
-        included=localize.included,
-        geoid=None if geoid is None else geoid.name,
+        pixel_sigma=locate.localize.pixel_sigma,
+        included=locate.localize.included,
+        geoid=None if locate.geoid is None else locate.geoid.name,
     )
 
 
-def _placed(position: Position, result: Localization, i: int) -> Position:
-    east, north, up = result.enu[i].tolist()
-    lat, lon, height = result.geodetic[i].tolist()
-    first, second, third = (tuple(row) for row in result.covariance[i].tolist())
-    return dataclasses.replace(
-        position, lat=lat, lon=lon, height=height, enu=(east, north, up), covariance=(first, second, third),
-        range_m=float(1.0 / result.inverse_range[i]),
-    )  # fmt: skip
-
-
-def _with_geoid(positions: list[Position], geoid: Geoid) -> list[Position]:
-    known = [i for i, position in enumerate(positions) if position.lat is not None]
-    places = [(positions[i].lat or 0.0, positions[i].lon or 0.0) for i in known]
-    for i, height in zip(known, geoid_heights(geoid, places), strict=True):
-        positions[i] = dataclasses.replace(positions[i], geoid_height=height)
-    return positions
-
-
-def _marks_sigma(cov: Tensor, count: int) -> list[float]:
-    """The largest standard deviation of each pair's coordinates; infinite where it is not positive."""
-    variance = cov.detach().cpu().double().diagonal(dim1=-2, dim2=-1).amax(-1).expand(count)
-    return [math.sqrt(value) if value > 0 else math.inf for value in variance.tolist()]
-
-
-def _explanation(status: PositionStatus, result: Localization, i: int, pixel_sigma: float, baseline: float) -> str:
-    if status in _STATUS_TEXTS:
-        return _STATUS_TEXTS[status]
-    low = float(result.range_low[i])
-    if status == PositionStatus.PARALLEL and math.isinf(low):
-        angle = math.degrees(math.atan(-baseline * float(result.inverse_range[i])))
-        return f"the lines of sight diverge by {angle:.3g}°, more than noise: not the same thing, or the rig has turned"
-    if status == PositionStatus.PARALLEL and low == 0:
-        return "a mark lies in the direction of the other camera: no range can be measured along that line"
-    if status in (PositionStatus.PARALLEL, PositionStatus.BEARING_ONLY):
-        return f"the parallax is below three sigma: only the bearing is known, and a range of at least {low:.0f} m"
-    worst = float(result.reprojection[i].max())
-    if worst > _MISMATCH_SIGMAS * pixel_sigma:
-        return (
-            f"doubtful: the reprojection error of {worst:.1f} px is too large for noise; are the marks the same thing?"
+def positions_of(columns: PositionColumns) -> list[Position]:
+    """A `Position` for each row of columns."""
+    found = []
+    rows = zip(columns.names, columns.status.tolist(), columns.reasons, columns.numbers.tolist(), strict=True)
+    for name, status, reason, numbers in rows:
+        lat, lon, height, geoid, distance, low, high, cep50, cep95, by_pixel, by_degree, azimuth, elevation = (
+            None if math.isnan(value) else value for value in (*numbers[:4], *numbers[7:10], *numbers[16:22])
         )
-    return ""
+        east, north, up = numbers[4:7]
+        ee, en, eu, nn, nu, uu = numbers[10:16]
+        left, right = numbers[22:]
+        position = Position(
+            name=name, status=PositionStatus(status), reason=reason, lat=lat, lon=lon, height=height,
+            geoid_height=geoid, enu=None if math.isnan(east) else (east, north, up),
+            covariance=None if math.isnan(ee) else ((ee, en, eu), (en, nn, nu), (eu, nu, uu)),
+            cep50_m=cep50, cep95_m=cep95, meters_per_pixel=by_pixel, meters_per_degree=by_degree,
+            range_m=distance, range_low_m=low, range_high_m=high, azimuth_deg=azimuth, elevation_deg=elevation,
+            reprojection_px=None if math.isnan(left) else (left, right),
+        )  # fmt: skip
+        found.append(position)
+    return found
 
 
-def _viewpoints(rig: StereoRig, enu_from_left: Tensor, origin: Origin) -> tuple[Viewpoint, Viewpoint]:
-    rotation, translation = rig.right_from_left_rotation.cpu(), rig.right_from_left_translation.cpu()
-    enu_from_right = enu_from_left @ rotation.T
-    enu = -enu_from_right @ translation
-    lat, lon, height = enu_to_geodetic(enu, origin).tolist()
-    here = (origin.lat, origin.lon, origin.height)
-    return (
-        _viewpoint("left", rig.left, torch.zeros_like(enu), enu_from_left, here),
-        _viewpoint("right", rig.right, enu, enu_from_right, (lat, lon, height)),
-    )
-
-
-def _viewpoint(
-    name: str, camera: Camera, enu: Tensor, enu_from_camera: Tensor, geodetic: tuple[float, float, float]
-) -> Viewpoint:
-    width, height = camera.size
-    ends = camera.focal.new_tensor([[-0.5, (height - 1) / 2], [width - 0.5, (height - 1) / 2]])
-    rays, valid = camera.unproject(ends)
-    first, last = azimuth_elevation(rays.cpu() @ enu_from_camera.T)[:, 0].tolist()
-    east, north, up = enu.tolist()
-    return Viewpoint(
-        name=name,
-        enu=(east, north, up),
-        geodetic=geodetic,
-        azimuths_deg=(first, last) if bool(valid.all()) else None,
+def columns_of(positions: Sequence[Position]) -> PositionColumns:
+    """The columns of positions: the reverse of `positions_of`."""
+    nowhere = (None, None, None)
+    rows = []
+    for p in positions:
+        first, second, third = p.covariance or (nowhere, nowhere, nowhere)
+        rows.append((
+            p.lat, p.lon, p.height, p.geoid_height, *(p.enu or nowhere), p.range_m, p.range_low_m, p.range_high_m,
+            *first, *second[1:], third[2], p.cep50_m, p.cep95_m, p.meters_per_pixel, p.meters_per_degree,
+            p.azimuth_deg, p.elevation_deg, *(p.reprojection_px or nowhere[:2]),
+        ))  # fmt: skip
+    return PositionColumns(
+        [p.name for p in positions],
+        np.array([int(p.status) for p in positions], dtype=np.int8),
+        [p.reason for p in positions],
+        np.array(rows, dtype=np.float64).reshape(-1, len(NUMBERS)),
+        {},
     )

@@ -95,7 +95,7 @@ def range_sigmas(
             level = torch.nn.functional.normalize(enu[:, :2], dim=-1)
             across = torch.stack([level[:, 1], -level[:, 0], torch.zeros_like(far)], -1)
             rows = (across[:, None] @ by_mounting(enu))[:, 0]
-            sideways = (rows @ stands.covariance * rows).sum(-1).sqrt()
+            sideways = (rows @ stands.covariance[:6, :6] * rows).sum(-1).sqrt()
     total = torch.stack([marks, lenses, pose]).norm(dim=0)
     return RangeSigmas(far, marks, lenses, pose, total, total * BEARING_SIGMAS <= far, sideways)
 

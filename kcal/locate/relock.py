@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.drift import Drift, measure_drift
 from kcal.calibrate.rig.sources import Features, Landmarks
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
 from kcal.lens.rig import StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.mounting import attitude
@@ -40,14 +41,21 @@ def check_rig(rig: StereoRig, *, features: Features | None = None, landmarks: La
     """
     pose: tuple[Tensor, Tensor] | None = None
     left = torch.zeros(3, 3, dtype=torch.float64)
+    refraction = REFRACTION, REFRACTION_SIGMA
     if rig.mounting is not None:
         stands = rig.mounting
         rotation = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
         pose = rotation, torch.zeros(3, dtype=torch.float64)
         if stands.covariance is not None:
-            left = rotation @ stands.covariance[3:, 3:] @ rotation.T
+            left = rotation @ stands.covariance[3:6, 3:6] @ rotation.T
+            # Light that was held straight stays so; otherwise another day has another coefficient.
+            straight = len(stands.covariance) == 7 and not bool(stands.covariance[6, 6])
+            refraction = (
+                REFRACTION if stands.refraction is None else stands.refraction,
+                0.0 if straight else REFRACTION_SIGMA,
+            )
     before = None if rig.covariance is None else (rig.covariance.matrix[-6:-3, -6:-3], left)
-    return measure_drift(rig, features=features, landmarks=landmarks, pose=pose, before=before)
+    return measure_drift(rig, features=features, landmarks=landmarks, pose=pose, before=before, refraction=refraction)
 
 
 def relocked(rig: StereoRig, drift: Drift, note: str) -> StereoRig:
@@ -80,7 +88,7 @@ def relocked(rig: StereoRig, drift: Drift, note: str) -> StereoRig:
         heading, pitch, roll = attitude(rotation.T)
         if covariance is not None:
             covariance = covariance.clone()
-            covariance[3:, 3:] += rotation.T @ drift.left_covariance @ rotation
+            covariance[3:6, 3:6] += rotation.T @ drift.left_covariance @ rotation
         new.mounting = dataclasses.replace(
             rig.mounting, heading_deg=heading, pitch_deg=pitch, roll_deg=roll, covariance=covariance
         )

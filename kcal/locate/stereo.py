@@ -46,8 +46,9 @@ def flag_positions(code: Tensor, condition: Tensor, status: PositionStatus) -> T
 
 def checked_rig(rig: StereoRig, pixel_sigma: float) -> float:
     """The sigma of the marks as a float, after checking that it is positive and that the rig has a baseline."""
-    if not 0 < pixel_sigma < math.inf:
-        raise InputError(f"pixel_sigma: a positive number of pixels is needed, got {pixel_sigma}")
+    if not 1e-6 <= pixel_sigma <= 1e6:
+        # Beyond, squares of it leave the range of float64, or the accuracy of the arithmetic.
+        raise InputError(f"pixel_sigma: a positive number of pixels, 1e-6 to 1e6, is needed, got {pixel_sigma}")
     if not float(rig.baseline) > 0:
         raise DegenerateError("the rig's cameras stand in the same place: no range can be measured")
     return float(pixel_sigma)

@@ -21,8 +21,8 @@ from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.marks import PIXELS, Marks, pixel_of
 from kcal.locate.tables import TableRow, read_rows
 
-_EARTH, _LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
-_PLACES = ("name", *_EARTH, *_LOCAL, "sigma", "sigma_up", "note")
+EARTH, LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
+PLACE_COLUMNS = ("name", *EARTH, *LOCAL, "sigma", "sigma_up", "note")
 # 1/m: how well the inverse range of a star is known.
 _INFINITY_SIGMA = 1e-12
 
@@ -66,10 +66,10 @@ def read_survey(path: str | Path, origin: Origin | None = None, *, measured: boo
         >>> [round(value, 2) for value in survey.points[1].tolist()]  # across the antimeridian
         [1001.88, 0.0, 9.92]
     """
-    rows = read_rows(path, "name,lat,lon,height,sigma", _PLACES, ("sigma",) if measured else ())
+    rows = read_rows(path, "name,lat,lon,height,sigma", PLACE_COLUMNS, ("sigma",) if measured else ())
     columns = _coordinates(rows[0], path)
     values = torch.tensor([[row.number(column) for column in columns] for row in rows], dtype=torch.float64)
-    if columns == _EARTH:
+    if columns == EARTH:
         for row, (lat, lon, height) in zip(rows, values.tolist(), strict=True):
             try:
                 place = Origin(lat=lat, lon=lon, height=height)
@@ -83,9 +83,9 @@ def read_survey(path: str | Path, origin: Origin | None = None, *, measured: boo
 
 
 def _coordinates(row: TableRow, path: str | Path) -> tuple[str, str, str]:
-    for columns in (_EARTH, _LOCAL):
+    for columns in (EARTH, LOCAL):
         if all(column in row.cells for column in columns):
-            other = _LOCAL if columns == _EARTH else _EARTH
+            other = LOCAL if columns == EARTH else EARTH
             if any(column in row.cells for column in other):
                 raise FileError(f"{path}: lat, lon, height or east, north, up are needed, not both")
             return columns

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from torch import Tensor
 
 from kcal.locate.budget import RangeError
-from kcal.report.figures import new_figure, save_png
+from kcal.report.figures import new_figure, plain_number, save_png
 
 _SOURCE_COLORS = {"disparity": "#2b6cb0", "yaw": "#c02a6b", "baseline": "#4b5563", "timing": "#dd7a1f"}
 
@@ -37,13 +38,17 @@ def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[
     axes.set(xscale="log", yscale="log", xlim=(far.min(), far.max()), xlabel="range, m", ylabel="error of the range, m")
     low = min(float(error.nearer.abs()[error.nearer.abs() > 0].min()) for error in found.values())
     axes.set_ylim(max(low, 1e-4), float(far.max()) * 2)
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        axis.set_major_formatter(plain_number)
+        axis.set_minor_formatter(NullFormatter() if high > 10 * low else plain_number)
     axes.grid(which="major", color="#e5e7eb", linewidth=0.8)
     axes.grid(which="minor", color="#f3f4f6", linewidth=0.5)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=9, loc="upper left")
     axes.set_title("Range error by source: outward, inward, and to first order", fontsize=11, color="#374151")
-    figure.tight_layout()
+    figure.subplots_adjust(left=0.1, right=0.98, top=0.94, bottom=0.09)
     return figure
 
 

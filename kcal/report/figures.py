@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import io
 import math
+import warnings
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.ticker import FuncFormatter
 from numpy.typing import ArrayLike, NDArray
 
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
+from kcal.texts import visible
 
 INK, GRAY, FAINT, ACCENT, WARN = "#111827", "#4b5563", "#9aa3af", "#2b6cb0", "#c02a6b"
 CAMERA_COLORS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
@@ -23,11 +30,50 @@ CAMERA_COLORS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 
-def new_figure(width: float, height: float, dpi: int = 130) -> Figure:
+class PlainFigure(Figure):
+    """A figure whose texts are drawn as they are: matplotlib would read what stands between two `$` as mathematics.
+
+    Names come from other people's files, and one that is no valid mathematics would stop the drawing.
+    """
+
+    def draw(self, renderer: RendererBase) -> None:
+        """Draw everything; called by the canvas."""
+        for axes in self.findobj(Axes):
+            for axis in (axes.xaxis, axes.yaxis):
+                # Names at ticks are written anew at each drawing, by a function.
+                names = axis.get_major_formatter()
+                if isinstance(names, FuncFormatter):
+                    axis.set_major_formatter(partial(_shown_tick, names.func))
+                # This makes the labels of ticks, which otherwise appear only while they are drawn.
+                axis.get_ticklabels(which="both")
+        for text in self.findobj(Text):
+            text.set_parse_math(False)
+            text.set_text(_shown(text.get_text()))
+        with warnings.catch_warnings():
+            # A character that the font does not have is drawn as a box.
+            warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from font")
+            super().draw(renderer)
+
+
+def _shown_tick(names: Callable[[float, int | None], str], at: float, place: int | None) -> str:
+    return _shown(names(at, place))
+
+
+def _shown(text: str) -> str:
+    # No picture has room for more, and a text's pixels are all made before they are cut.
+    return visible(text)[:2000]
+
+
+def new_figure(width: float, height: float, dpi: int = 130) -> PlainFigure:
     """Make a figure of that many inches that belongs to no window and no global state."""
-    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
+    figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
+
+
+def plain_number(value: float, _: object = None) -> str:
+    """Write a tick of a logarithmic axis without mathematics: 0.01, 10, 1000."""
+    return f"{value:g}"
 
 
 def range_text(meters: float) -> str:

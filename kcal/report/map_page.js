@@ -5,13 +5,26 @@
   map.attributionControl.setPrefix("kcal, Leaflet");
   L.control.scale({imperial: false, maxWidth: 200}).addTo(map);
   const text = (value) => document.createTextNode(value);
+  // Leaflet takes attributions as HTML: this is the HTML that shows a text.
+  const attribution = (value) => { const s = document.createElement("span"); s.append(text(value)); return s.innerHTML; };
+  const head = (azimuth) => {
+    const node = (parent, name, attributes) => {
+      const made = parent.appendChild(document.createElementNS("http://www.w3.org/2000/svg", name));
+      for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+      return made;
+    };
+    const box = document.createElement("div");
+    node(node(box, "svg", {viewBox: "-6 -6 12 12"}), "path",
+      {d: "M0,0 L-4,6 L4,6 Z", fill: "#c02a6b", transform: "rotate(" + Number(azimuth) + ")"});
+    return box;
+  };
   const overlays = {};
   const layer = (name) => overlays[name] || (overlays[name] = L.layerGroup().addTo(map));
   const label = (shape, name, side) => shape.bindTooltip(() => { const s = document.createElement("span"); s.append(text(name)); return s; },
     {permanent: true, direction: side || "right", className: "name", offset: side ? [0, 0] : [6, 0]});
 
   if (data.image) {
-    L.imageOverlay(data.image.uri, data.image.bounds, {attribution: data.image.name}).addTo(map);
+    L.imageOverlay(data.image.uri, data.image.bounds, {attribution: attribution(data.image.name)}).addTo(map);
   }
   if (data.tiles) {
     const Local = L.GridLayer.extend({createTile: function (at) {
@@ -20,10 +33,10 @@
       if (uri) tile.src = uri;
       return tile;
     }});
-    new Local({minNativeZoom: data.tiles.zooms[0], maxNativeZoom: data.tiles.zooms[1], attribution: data.tiles.name}).addTo(map);
+    new Local({minNativeZoom: data.tiles.zooms[0], maxNativeZoom: data.tiles.zooms[1], attribution: attribution(data.tiles.name)}).addTo(map);
   }
   if (data.online) {
-    L.tileLayer(data.online.url, {maxNativeZoom: 19, attribution: data.online.attribution}).addTo(map);
+    L.tileLayer(data.online.url, {maxNativeZoom: 19, attribution: attribution(data.online.attribution)}).addTo(map);
   }
   // What would only clutter at this zoom: [marker, end, end, least distance in pixels].
   const small = [];
@@ -54,9 +67,9 @@
   }
   for (const arrow of data.arrows) {
     L.polyline(arrow.line, {color: "#c02a6b", weight: 1.6, interactive: false}).addTo(layer("true positions"));
-    const head = L.marker(arrow.line[1], {interactive: false, icon: L.divIcon({className: "head", iconSize: [12, 12],
-      html: '<svg viewBox="-6 -6 12 12" style="transform:rotate(' + Number(arrow.azimuth) + 'deg)"><path d="M0,0 L-4,6 L4,6 Z" fill="#c02a6b"/></svg>'})});
-    small.push([head.addTo(layer("true positions")), arrow.line[0], arrow.line[1], 16]);
+    const tip = L.marker(arrow.line[1], {interactive: false,
+      icon: L.divIcon({className: "head", iconSize: [12, 12], html: head(arrow.azimuth)})});
+    small.push([tip.addTo(layer("true positions")), arrow.line[0], arrow.line[1], 16]);
   }
   for (const spot of data.truth) {
     L.circleMarker(spot, {radius: 5, color: "#fff", weight: 1, fillColor: "#c02a6b", fillOpacity: 1, interactive: false}).addTo(layer("true positions"));

@@ -1,13 +1,12 @@
 """Write an interactive map as one HTML file that needs no network, no server and no other file.
 
 Leaflet (BSD-2-Clause, in the folder `leaflet`) draws. All geometry is computed here, on the ellipsoid, and written into
-the page. Without online tiles, the page's content policy forbids it to load anything.
+the page. The page's content policy allows its own two scripts only and, without online tiles, forbids it to load
+anything.
 """
 
 from __future__ import annotations
 
-import html
-import json
 import math
 from importlib import resources
 from pathlib import Path
@@ -24,11 +23,12 @@ from kcal.locate.region import near, region_rings
 from kcal.locate.stereo import PositionStatus
 from kcal.report.backdrop import local_image, local_tiles
 from kcal.report.figures import CAMERA_COLORS, range_text
+from kcal.texts import page_data, page_policy, page_text
 
 ARCS_M = (250.0, 1000.0, 5000.0)
 _ONLINE = {
     "url": "https://tile.openstreetmap.org/{z}/{x}/{y}.png",
-    "attribution": '&copy; <a href="https://www.openstreetmap.org/copyright">OpenStreetMap</a> contributors',
+    "attribution": "© OpenStreetMap contributors, openstreetmap.org/copyright",
 }
 _MAP_STYLE = """
 html, body { margin: 0; height: 100%; font: 14px/1.4 system-ui, sans-serif; color: #111827; }
@@ -41,7 +41,7 @@ header p { margin: 2px 0 0; color: #4b5563; font-size: 12px; }
   color: #111827; text-shadow: 0 0 3px #fff, 0 0 3px #fff, 0 0 3px #fff, 0 0 3px #fff; }
 .leaflet-tooltip.name::before { display: none; }
 .leaflet-popup-content td { padding: 1px 8px 1px 0; white-space: nowrap; }
-.head { overflow: visible; } .head svg { transform-origin: 50% 50%; overflow: visible; }
+.head, .head svg { overflow: visible; }
 """
 LatLon = tuple[float, float]
 
@@ -83,10 +83,9 @@ def map_page(
     for picture in ("images/layers.png", "images/layers-2x.png", "images/marker-icon.png"):
         style = style.replace(f"url({picture})", "none")
     own = (resources.files("kcal.report") / "map_page.js").read_text(encoding="utf-8")
-    # Only "</" could end the text of a script element.
-    payload = json.dumps(content, allow_nan=False).replace("</", "<\\/")
+    scripts = ((library / "leaflet.js").read_text(encoding="utf-8"), own)
     allowed = "data: https://tile.openstreetmap.org" if online else "data:"
-    title = f"{located.count} of {len(located.positions)} points located"
+    title = located.count_note
     note = (
         f"From {located.origin.lat:.6f}°, {located.origin.lon:.6f}°, heading {located.heading_deg:g}° from true north. "
         f"Regions and intervals: {located.interval_note}. Geoid: {located.geoid or 'none found'}."
@@ -99,17 +98,17 @@ def map_page(
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta http-equiv="Content-Security-Policy"
- content="default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src {allowed}">
-<title>{html.escape(title)}</title>
+ content="{page_policy(scripts=scripts, styles=(style, _MAP_STYLE), images=allowed)}">
+<title>{page_text(title)}</title>
 <style>{style}</style>
 <style>{_MAP_STYLE}</style>
 </head>
 <body>
-<header><b>{html.escape(title)}</b><p>{html.escape(note)}<br>{html.escape(key)}</p></header>
+<header><b>{page_text(title)}</b><p>{page_text(note)}<br>{page_text(key)}</p></header>
 <div id="map"></div>
-<script type="application/json" id="data">{payload}</script>
-<script>{(library / "leaflet.js").read_text(encoding="utf-8")}</script>
-<script>{own}</script>
+<script type="application/json" id="data">{page_data(content)}</script>
+<script>{scripts[0]}</script>
+<script>{scripts[1]}</script>
 </body>
 </html>
 """

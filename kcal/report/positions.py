@@ -53,7 +53,7 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
     _draw_map(plan, located, true_enu, shown, scale)
     _draw_ranges(ranges, located, true_enu, shown)
     figure.suptitle(
-        f"{located.count} of {len(located.positions)} points located from "
+        f"{located.count_note}, from "
         f"{located.origin.lat:.6f}°, {located.origin.lon:.6f}°, heading {located.heading_deg:g}°",
         x=0.015,
         ha="left",

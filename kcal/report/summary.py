@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import html
 from collections.abc import Sequence
 from pathlib import Path
 
-from kcal.corners.images import read_bytes
 from kcal.errors import InputError
-from kcal.files import write_atomic
+from kcal.files import read_bytes, write_atomic
+from kcal.texts import page_policy, page_text
 
 _PAGE_STYLE = """
 :root { color-scheme: light; }
@@ -75,8 +74,9 @@ def summary_page(title: str, lead: str, parts: Sequence[Part]) -> str:
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(title)}</title>\n<style>{_PAGE_STYLE}</style>\n</head>\n<body>\n<main>\n"
-        f"<h1>{html.escape(title)}</h1>\n<p>{html.escape(lead)}</p>\n{body}\n</main>\n</body>\n</html>\n"
+        f'<meta HTTP-EQUIV="Content-Security-Policy" content="{page_policy(styles=[_PAGE_STYLE])}">\n'
+        f"<title>{page_text(title)}</title>\n<style>{_PAGE_STYLE}</style>\n</head>\n<body>\n<main>\n"
+        f"<h1>{page_text(title)}</h1>\n<p>{page_text(lead)}</p>\n{body}\n</main>\n</body>\n</html>\n"
     )
 
 
@@ -91,15 +91,15 @@ def save_summary(path: str | Path, title: str, lead: str, parts: Sequence[Part])
 
 
 def _section(part: Part) -> str:
-    lines = ["<section>", f"<h2>{html.escape(part.heading)}</h2>"]
-    lines += [f"<p>{html.escape(text)}</p>" for text in part.text]
+    lines = ["<section>", f"<h2>{page_text(part.heading)}</h2>"]
+    lines += [f"<p>{page_text(text)}</p>" for text in part.text]
     if part.table:
         lines.append(_html_table(part))
     if part.pictures:
         figures = "\n".join(_figure(path, caption) for path, caption in part.pictures)
         lines.append(f'<div class="row">\n{figures}\n</div>')
     if part.code:
-        lines.append(f"<pre>{html.escape(part.code)}</pre>")
+        lines.append(f"<pre>{page_text(part.code)}</pre>")
     return "\n".join([*lines, "</section>"])
 
 
@@ -107,8 +107,8 @@ def _html_table(part: Part) -> str:
     if len({len(row) for row in part.table}) > 1:
         raise InputError(f"the table of {part.heading!r}: rows of different lengths")
     head, *rows = part.table
-    lines = ["<tr>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in head) + "</tr>"]
-    lines += ["<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
+    lines = ["<tr>" + "".join(f"<th>{page_text(cell)}</th>" for cell in head) + "</tr>"]
+    lines += ["<tr>" + "".join(f"<td>{page_text(cell)}</td>" for cell in row) + "</tr>" for row in rows]
     return '<div class="scroll"><table>\n' + "\n".join(lines) + "\n</table></div>"
 
 
@@ -119,5 +119,5 @@ def _figure(path: str | Path, caption: str) -> str:
     if kind is None:
         raise InputError(f"{path}: neither a PNG nor a JPEG picture")
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
-    text = html.escape(caption)
+    text = page_text(caption)
     return f'<figure><img src="{source}" alt="{text}"><figcaption>{text}</figcaption></figure>'

@@ -125,7 +125,9 @@ def localizer(cameras: tuple[Camera, Camera], seen: Landmarks, how: How) -> Ster
         KcalError: the rig cannot be solved, or says nothing about its errors.
     """
     data = RigData(cameras=cameras, names=("left", "right"), landmarks=seen)
-    rig = placed_rig(solve_rig(data, RigOptions(intrinsics="prior" if how == "prior" else "fixed")), ORIGIN)
+    # The simulated light goes straight.
+    options = RigOptions(intrinsics="prior" if how == "prior" else "fixed", refraction=0.0, refraction_sigma=0.0)
+    rig = placed_rig(solve_rig(data, options), ORIGIN)
     if rig.covariance is None or rig.mounting is None:
         raise KcalError("the solved rig has no covariance or no mounting")
     return StereoLocalizer(rig, pixel_sigma=MARK)

@@ -40,6 +40,8 @@ ROTATION = torch.stack([LOOK, TRUTH.right_from_left_rotation @ LOOK])
 CENTER = torch.stack([torch.zeros(3).double(), -TRUTH.right_from_left_translation @ ROTATION[1]])
 BASELINE = float(TRUTH.baseline)
 NAMES = ("left", "right")
+# The simulated light goes straight.
+STRAIGHT = RigOptions(refraction=0.0, refraction_sigma=0.0)
 
 
 def generator(seed: int) -> torch.Generator:
@@ -151,7 +153,7 @@ def coverage(draws: int, marks: int) -> list[str]:
         inside, squares, yaws, sigmas = [], [], [], []
         for seed in range(draws):
             draw = generator(10_000 + seed)
-            found = solve_rig(data(kind.replace("20 summits", "summits"), draw))
+            found = solve_rig(data(kind.replace("20 summits", "summits"), draw), STRAIGHT)
             pair = found.stereo()
             known = RigCovariance.of(pair, joint=found.joint_covariance())
             localize = StereoLocalizer(
@@ -195,13 +197,13 @@ def wrong(draws: int) -> list[str]:
                 bad.landmarks.pixels[which, 1] += size * torch.tensor([math.cos(seed), math.sin(seed)]).double()
             else:
                 bad.landmarks.points[which, 2] += size
-            found = solve_rig(bad)
+            found = solve_rig(bad, STRAIGHT)
             out = {item.name for item in found.left_out}
             named += bad.landmarks.names[which] in out
             false += len(out - {bad.landmarks.names[which]})
-            errors[0].append(yaw_error(solve_rig(bad, RigOptions(reject=False))))
+            errors[0].append(yaw_error(solve_rig(bad, dataclasses.replace(STRAIGHT, reject=False))))
             errors[1].append(yaw_error(found))
-            errors[2].append(yaw_error(solve_rig(good)))
+            errors[2].append(yaw_error(solve_rig(good, STRAIGHT)))
         rms = [math.sqrt(sum(e * e for e in each) / draws) for each in errors]
         label = f"{size:g} px in one image" if kind == "mark" else f"{size:g} m of height"
         cells = [f"{value:.5f}°" for value in rms]
@@ -288,7 +290,7 @@ def example(path: Path) -> None:
     assert sources.features is not None
     sources.landmarks.points[4, 2] += 2.0
     sources.features.pixels[7, 1, 1] += 2.0
-    save_rig_picture(path, solve_rig(sources))
+    save_rig_picture(path, solve_rig(sources, STRAIGHT))
 
 
 def main() -> None:

@@ -138,7 +138,9 @@ def by_kcal(scene: DemoScene, cameras: tuple[Camera, Camera]) -> Orient:
         )
         try:
             # Nothing is left out: a lens model that contradicts the landmarks is to show it.
-            solved = solve_rig(RigData(cameras=cameras, names=SIDES, landmarks=landmarks), RigOptions(reject=False))
+            # The simulated light goes straight.
+            options = RigOptions(reject=False, refraction=0.0, refraction_sigma=0.0)
+            solved = solve_rig(RigData(cameras=cameras, names=SIDES, landmarks=landmarks), options)
         except (KcalError, RuntimeError):
             return lost
         rig = solved.stereo()

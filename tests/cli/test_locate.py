@@ -12,8 +12,8 @@ import torch
 from kcal.cli.main import main
 from kcal.io.rig_file import save_rig
 from kcal.lens.camera import Camera
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
 from kcal.lens.rig import StereoRig
-from kcal.locate.localizer import REFRACTION, REFRACTION_SIGMA
 
 HEADER = "name,left_u,left_v,right_u,right_v\n"
 ORIGIN = "-33.9,151.2,10"

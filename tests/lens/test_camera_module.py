@@ -11,6 +11,7 @@ from lenses import HYBRID, parameters, strong
 from torch import nn
 
 from kcal.errors import InputError
+from kcal.lens.bake import bake
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.rig import StereoRig
@@ -66,6 +67,16 @@ class TestPrecision:
         assert torch.equal(camera.project(low)[0], camera.project(low.double())[0])
         pixels = torch.tensor([[5.0, 3.0]], dtype=dtype)
         assert torch.equal(camera.unproject(pixels)[0], camera.unproject(pixels.double())[0])
+
+    def test_a_point_alone_is_refused(self) -> None:
+        camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="opencv5")
+        point, pixel = torch.tensor([0.1, 0.2, 1.0]), torch.tensor([100.0, 100.0])
+        for call, value in ((camera.project, point), (camera.project_rays, point), (camera.unproject, pixel)):
+            with pytest.raises(InputError, match=r"N, \d\) is needed, got \(\d,\); write points\[None\]"):
+                call(value)
+        lookup = bake(camera)
+        with pytest.raises(InputError, match=r"got \(3,\)"):
+            lookup.project(point)
 
     def test_autocast_changes_nothing(self) -> None:
         camera, rig = make_camera(), make_rig()

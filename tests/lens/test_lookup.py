@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import io
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -245,11 +247,86 @@ class TestFile:
             ("project_cells", arrays["project_cells"].astype(float), "bool"),
             ("unproject_origin", np.array([np.nan, 0.0]), "finite"),
             ("unproject_step", np.array([0.0, 1.0]), "positive"),
+            ("bound", np.array([np.nan, 0.1]), "bound is nan"),
+            ("bound", np.array([0.1, -1.0]), "bound is 0.1, -1; finite numbers from 0"),
+            ("bound", np.array([0.1, np.inf]), "bound is 0.1, inf"),
+            ("bound", np.array([0.1]), "two numbers are needed"),
+            ("bound", np.array(["0.1", "0.1"]), "two numbers are needed"),
+            ("coverage", np.array([1.1, 1.0]), "from 0 to 1"),
+            ("coverage", np.array([np.nan, 1.0]), "coverage is nan"),
+            ("center", np.array([np.nan, 1.0]), "center is nan"),
+            ("center", np.array([1, 2]), "two numbers are needed"),
+            ("image_size", np.array([0, 480]), "image_size is 0, 480"),
+            ("image_size", np.array([640.0, 480.0]), "two numbers are needed"),
+            ("image_size", np.array([60000, 60000]), "500 megapixels"),
+            ("version", np.array([1, 1]), "of version 1"),
+            ("version", np.array(True), "of version 1"),
+            ("kcal", np.array([["lookup"]]), "not a kcal lookup file"),
+            ("project_cells", np.zeros((0, 0), bool), "at least one"),
         ):
             changed = {key: array for key, array in arrays.items() if key != name}
             np.savez(path, **changed, **({} if value is None else {name: value}))
             with pytest.raises(FileError, match=complaint):
                 load_lookup(path)
+
+    @pytest.mark.parametrize("seed", range(60))
+    def test_damage_is_an_error(self, tmp_path: Path, seed: int) -> None:
+        """Bytes flipped, cut and repeated anywhere: the file is refused, or the tables are the same."""
+        _, lookup = baked("opencv14")
+        whole = save_lookup(lookup, tmp_path / "camera.npz").read_bytes()
+        if seed % 2:
+            # Deflated, where damage ends in another library's errors.
+            packed = io.BytesIO()
+            np.savez_compressed(packed, **np.load(io.BytesIO(whole)))
+            whole = packed.getvalue()
+        rng = np.random.default_rng(seed)
+        damaged = bytearray(whole)
+        # The directory of the archive is at its end, and headers are where the arrays are small.
+        places = rng.choice([len(whole), 400], 3) * rng.random(3)
+        for place in places:
+            damaged[-1 - int(place) if seed % 3 else int(place)] ^= 1 << int(rng.integers(8))
+        if seed % 5 == 0:
+            damaged = damaged[: int(rng.integers(len(damaged)))]
+        path = tmp_path / "damaged.npz"
+        path.write_bytes(damaged)
+        try:
+            again = load_lookup(path)
+        except FileError:
+            return
+        for name, value in lookup.state_dict().items():
+            assert torch.equal(again.state_dict()[name], value)
+
+    def test_headers_that_promise_too_much(self, tmp_path: Path) -> None:
+        _, lookup = baked("opencv14")
+        path = save_lookup(lookup, tmp_path / "camera.npz")
+        arrays = dict(np.load(path))
+
+        def member(header: str, data: bytes) -> bytes:
+            text = header.encode().ljust(118 - 1) + b"\n"
+            return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + data
+
+        for header in (
+            "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000,)}",
+            "{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}",
+            "{'descr': '|O', 'fortran_order': False, 'shape': (2,)}",
+            "{'descr': [], 'fortran_order': None, 'shape': 3}",
+            "(" * 90,
+        ):
+            np.savez(path, **{name: array for name, array in arrays.items() if name != "center"})
+            with zipfile.ZipFile(path, "a") as archive:
+                archive.writestr("center.npy", member(header, bytes(16)))
+            with pytest.raises(FileError, match=r"camera\.npz: (not an \.npz|bad lookup file)"):
+                load_lookup(path)
+
+    def test_an_archive_that_unpacks_to_much_more_is_not_unpacked(self, tmp_path: Path) -> None:
+        with (
+            zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+            archive.open("center.npy", "w") as member,
+        ):
+            for _ in range(300):
+                member.write(bytes(2**20))
+        with pytest.raises(FileError, match="unpacks to 300 MiB"):
+            load_lookup(tmp_path / "bomb.npz")
 
 
 def test_bad_input_is_refused() -> None:

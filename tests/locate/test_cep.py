@@ -54,3 +54,32 @@ def test_the_unknown_is_infinite() -> None:
         circular_error(enu, cov, (1.0,))
     with pytest.raises(InputError, match="covariance"):
         circular_error(enu, cov[0])
+
+
+def sampled(enu: torch.Tensor, covariance: torch.Tensor, draws: int) -> list[float]:
+    """The same two radii by drawing errors of X / |X|² in space."""
+    distance = enu.norm()
+    slope = (torch.eye(3).double() - 2.0 * torch.outer(enu, enu) / distance**2) / distance**2
+    factor = torch.linalg.cholesky(slope @ covariance @ slope.T)
+    uniform = torch.quasirandom.SobolEngine(3, scramble=True, seed=5).draw(draws, dtype=torch.float64)
+    drawn = enu / distance**2 + torch.special.ndtri(uniform.clamp(1e-12, 1 - 1e-12)) @ factor.T
+    away = (drawn / drawn.square().sum(-1, keepdim=True) - enu)[:, :2].norm(dim=-1)
+    away = torch.where(drawn @ enu > 0, away, torch.inf).sort().values
+    return [away[round(share * draws)].item() for share in (0.5, 0.95)]
+
+
+@pytest.mark.parametrize("elevation", [0.0, 40.0, 80.0])
+@pytest.mark.parametrize("along", [0.002, 0.05, 0.2, 0.3])
+@pytest.mark.parametrize(("level", "upward"), [(1e-4, 1e-4), (0.005, 0.001), (0.006, 0.006), (0.1, 0.05)])
+def test_radii_are_those_of_many_draws(elevation: float, along: float, level: float, upward: float) -> None:
+    up, flat = math.sin(math.radians(elevation)), math.cos(math.radians(elevation))
+    sight, across = tensor(0.6 * flat, 0.8 * flat, up), tensor(0.8, -0.6, 0.0)
+    above = torch.linalg.cross(across, sight)
+    # Errors along and across go together, as those of yaw and heading do.
+    mixed = along * sight + 0.5 * level * flat * across
+    parts = (mixed, level * flat * across, upward * flat * above, 1e-5 * sight)
+    covariance = 1e6 * sum(torch.outer(part, part) for part in parts)
+    expected = sampled(1e3 * sight, covariance, 2**17)
+    # Where errors across are large, kcal draws 2^13 itself.
+    exact = level < 0.1
+    assert circular_error(1e3 * sight, covariance).tolist() == pytest.approx(expected, rel=3e-3 if exact else 1.5e-2)

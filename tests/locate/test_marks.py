@@ -3,9 +3,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 
 from kcal.errors import FileError
-from kcal.locate.marks import read_marks
+from kcal.locate.marks import Marks, read_marks, write_marks
 
 HEADER = "name,left_u,left_v,right_u,right_v\n"
 
@@ -77,3 +78,39 @@ def test_bad_files_name_the_line_and_the_remedy(tmp_path: Path, text: str | byte
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"nothing\.csv: cannot read"):
         read_marks(tmp_path / "nothing.csv")
+
+
+class TestCovariance:
+    COLUMNS = ",".join(f"cov_{i}{j}" for i in range(4) for j in range(i, 4))
+
+    def test_round_trip(self, tmp_path: Path) -> None:
+        root = torch.rand(2, 4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        covariance = root @ root.mT + 0.1 * torch.eye(4).double()
+        covariance[1] = torch.nan
+        pixels = torch.rand(2, 2).double()
+        marks = Marks(("hill, west", "b"), pixels, pixels + 1.0, covariance)
+        again = read_marks(write_marks(tmp_path / "marks.csv", marks))
+        assert again.names == marks.names
+        assert again.covariance is not None
+        torch.testing.assert_close(again.covariance, covariance, equal_nan=True, atol=0, rtol=0)
+        filled = again.covariance_or(0.5)
+        assert filled is not None
+        assert torch.equal(filled[1], 0.25 * torch.eye(4).double())
+
+    @pytest.mark.parametrize(
+        ("cells", "message"),
+        [
+            ("1,0,0,0,1,0,0,1,0,", "line 2: cov_33 is empty"),
+            ("1,2,0,0,1,0,0,1,0,1", "line 2: the covariance is not positive definite"),
+            ("1,0,0,0,1,0,0,1,0,x", "cov_33 is 'x'; a covariance in px² is needed"),
+        ],
+    )
+    def test_bad_covariances(self, tmp_path: Path, cells: str, message: str) -> None:
+        path = write(tmp_path, f"name,left_u,left_v,right_u,right_v,{self.COLUMNS}\na,1,2,3,4,{cells}\n")
+        with pytest.raises(FileError, match=message):
+            read_marks(path)
+
+    def test_all_ten_columns_are_needed(self, tmp_path: Path) -> None:
+        path = write(tmp_path, "name,left_u,left_v,right_u,right_v,cov_00\na,1,2,3,4,1\n")
+        with pytest.raises(FileError, match="the column cov_01 is missing; a covariance needs all ten"):
+            read_marks(path)

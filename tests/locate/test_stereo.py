@@ -126,8 +126,9 @@ def test_batches_and_dtypes() -> None:
         triangulate(left, right[:1])
     with pytest.raises(InputError, match="same shape"):
         triangulate(left[0], right[0])
-    with pytest.raises(InputError, match="pixel_sigma"):
-        Triangulate(RIG, pixel_sigma=0.0)
+    for sigma in (0.0, -1.0, float("nan"), float("inf"), 1e300, 1e-300):
+        with pytest.raises(InputError, match="pixel_sigma"):
+            Triangulate(RIG, pixel_sigma=sigma)
     camera = RIG.left
     with pytest.raises(DegenerateError, match="same place"):
         Triangulate(StereoRig(camera, camera, torch.eye(3), torch.zeros(3)))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -25,6 +27,10 @@ ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])
 BROWSER = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+
+needs_browser = pytest.mark.skipif(
+    BROWSER is None, reason="no Chromium on this machine: the map was not opened in a browser"
 )
 
 
@@ -65,6 +71,7 @@ def test_it_may_load_nothing_unless_asked() -> None:
     page = map_page(scene()[0])
     assert 'img-src data:"' in page
     assert "default-src 'none'" in page
+    assert "unsafe" not in page.split("<title>")[0]
     # No element that loads, no style that does.
     assert not re.search(r"<(link|img|iframe|script[^>]* src)", page.split("<script")[0])
     assert "url(images" not in page
@@ -72,22 +79,73 @@ def test_it_may_load_nothing_unless_asked() -> None:
     assert "img-src data: https://tile.openstreetmap.org" in map_page(scene()[0], online=True)
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine: the map was not opened in a browser")
+def dom(page: Path) -> str:
+    """What a browser makes of a page; it must not complain."""
+    assert BROWSER is not None
+    done = subprocess.run(
+        [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
+         f"--user-data-dir={page.parent / 'profile'}", "--virtual-time-budget=2000", "--dump-dom", page.as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert "CONSOLE" not in done.stderr, done.stderr
+    return done.stdout
+
+
+@needs_browser
 @pytest.mark.parametrize("lon", [72.87, 179.99])
 def test_a_browser_draws_it_without_errors(tmp_path: Path, lon: float) -> None:
     located, truth = scene(Origin(lat=19.07, lon=lon, height=14.0))
-    path = save_map(tmp_path / "map.html", located, truth)
+    drawn = dom(save_map(tmp_path / "map.html", located, truth))
+    # Points, true ones, cameras with fields, arcs with ends, regions, arrows with heads, a bearing.
+    assert 'data-drawn="3/' in drawn
+    assert int(re.search(r'data-drawn="3/(\d+)"', drawn).group(1)) == 3 + 4 + 4 + 6 + 3 + 6 + 1
+    for text in ("gate", "&lt;/script&gt;&lt;b&gt;mast", "ship", "5 km", "estimated positions"):
+        assert text in drawn
+
+
+# As a file's name or a point's: each of these ran, or blanked the map, where it was taken for HTML.
+HOSTILE = (
+    "<!--<script>",
+    "<img src=x onerror=document.documentElement.dataset.ran=1>",
+    "<svg onload=document.documentElement.dataset.ran=1>",
+    "]]><style>*{display:none}",
+)
+
+
+@needs_browser
+def test_names_are_texts_in_a_browser(tmp_path: Path) -> None:
+    left, right, _ = pinhole_rig()(TRUTH)
+    located = locate_points(pinhole_rig(), left, right, origin=ORIGIN, heading_deg=300.0, names=list(HOSTILE))
+    tiles = tmp_path / HOSTILE[1]
+    (tiles / "13" / "5754").mkdir(parents=True)
+    Image.new("RGB", (256, 256), "green").save(tiles / "13" / "5754" / "3654.png")
+    image = geotiff(tmp_path / f"{HOSTILE[2]}.tif")
+    drawn = dom(save_map(tmp_path / "map.html", located, TRUTH, tiles=tiles, image=image))
+    assert 'data-drawn="3/' in drawn
+    assert "data-ran" not in drawn
+    for name in HOSTILE[:3]:
+        assert drawn.count(html.escape(name)) >= 1
+        assert name not in drawn
+
+
+@needs_browser
+def test_nothing_else_runs_in_the_page(tmp_path: Path) -> None:
+    """Even where markup gets into the page, the policy stops handlers, scripts and requests."""
+    page = map_page(scene()[0])
+    planted = (
+        "<img src=x onerror=document.documentElement.dataset.ran=1><script>document.documentElement.dataset.ran=2"
+        '</script><b onclick="" style="color:red">b</b><iframe src="data:text/html,x"></iframe><div id="map">'
+    )
+    path = tmp_path / "planted.html"
+    path.write_text(page.replace('<div id="map">', planted))
     done = subprocess.run(
         [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
          f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=2000", "--dump-dom", path.as_uri()],
         capture_output=True, text=True, timeout=120, check=True,
     )  # fmt: skip
-    assert "CONSOLE" not in done.stderr, done.stderr
-    # Points, true ones, cameras with fields, arcs with ends, regions, arrows with heads, a bearing.
+    assert "data-ran" not in done.stdout
     assert 'data-drawn="3/' in done.stdout
-    assert int(re.search(r'data-drawn="3/(\d+)"', done.stdout).group(1)) == 3 + 4 + 4 + 6 + 3 + 6 + 1
-    for text in ("gate", "&lt;/script&gt;&lt;b&gt;mast", "ship", "5 km", "estimated positions"):
-        assert text in done.stdout
+    assert done.stderr.count("Content Security Policy") >= 4
 
 
 def geotiff(path: Path) -> Path:
@@ -133,6 +191,43 @@ def test_tiles_in_view_are_embedded(tmp_path: Path) -> None:
     assert content["tiles"]["zooms"] == [13, 13]
     with pytest.raises(FileError, match="shows this place"):
         local_tiles(tmp_path, (50.0, 8.0, 51.0, 9.0))
+
+
+@pytest.mark.parametrize("name", ["4000", "\u00b2", "999999999", "-1", "013", "28", "9" * 200])
+def test_folders_that_are_no_zoom(tmp_path: Path, name: str) -> None:
+    for folder in (tmp_path / name / "5754", tmp_path / "13" / name, tmp_path / "13" / "5754"):
+        folder.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (256, 256), "green").save(folder / f"{name}.png")
+    with pytest.raises(FileError, match="shows this place"):
+        local_tiles(tmp_path, (19.0, 72.0, 20.0, 73.0))
+
+
+@pytest.mark.parametrize(
+    ("tag", "value", "kind"),
+    [
+        (33550, (math.nan, 20.0, 0.0), 12),
+        (33550, (0.0, 0.0, 0.0), 12),
+        (33550, (20.0,), 12),
+        (33922, (0.0, 0.0), 12),
+        (34735, (1, 1, 0), 3),
+        (34735, (1, 1, 0, 1, 3072, 0, 1, 1), 3),
+        (34264, (1.0,) * 15, 12),
+    ],
+)
+def test_damaged_geotiffs(tmp_path: Path, tag: int, value: tuple[float, ...], kind: int) -> None:
+    path = geotiff(tmp_path / "ortho.tif")
+    with Image.open(path) as image:
+        tags, pixels = image.tag_v2, np.asarray(image)
+    tags[tag] = value
+    tags.tagtype[tag] = kind
+    Image.fromarray(pixels).save(path, tiffinfo=tags)
+    with pytest.raises((FileError, InputError), match=r"ortho\.tif"):
+        local_image(path)
+    whole = geotiff(path).read_bytes()
+    for cut in (0, 9, 100, len(whole) // 2):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(FileError, match=r"ortho\.tif"):
+            local_image(path)
 
 
 def test_bad_arguments(tmp_path: Path) -> None:

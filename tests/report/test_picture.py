@@ -8,11 +8,15 @@ import pytest
 import torch
 from locate_rigs import pinhole_rig, tensor
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from kcal.errors import InputError
 from kcal.lens.mounting import Origin
+from kcal.locate.budget import RangeError
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.positions import Located, locate_points
+from kcal.report.budget import budget_figure
+from kcal.report.figures import new_figure
 from kcal.report.positions import positions_figure, save_positions_picture
 
 HEADING = 300.0
@@ -114,3 +118,51 @@ def test_bad_arguments(tmp_path: Path) -> None:
         positions_figure(located, enu[:2])
     with pytest.raises(InputError, match=r"must end with \.png"):
         save_positions_picture(tmp_path / "map.jpg", located)
+
+
+# Taken for mathematics the first two stop the drawing, and the third loses its signs.
+HOSTILE = (
+    r"$\frac{",
+    "$a$ $^$",
+    "5$ and 6$",
+    "a\x1b[31m\u202e",
+    "\U0001f600 山",
+    "_" + "w" * 100_000,
+    "two\nlines",
+    "\\$",
+)
+
+
+def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
+    points = torch.linspace(80, 6000, len(HOSTILE), dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
+    left, right, _ = pinhole_rig()(points)
+    origin = Origin(lat=10.0, lon=20.0, height=0.0)
+    located = locate_points(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=list(HOSTILE))
+    save_positions_picture(tmp_path / "map.png", located)
+    figure = positions_figure(located)
+    figure.canvas.draw()
+    assert not any(text.get_parse_math() for text in figure.findobj(Text))
+    found = texts(figure)
+    assert HOSTILE[2] in found
+    assert max(map(len, found)) <= 2000
+    assert not any("\x1b" in text for text in found)
+    assert r"a\x1b[31m\u202e" in found
+
+
+def test_names_are_the_same_pixels_as_without_mathematics() -> None:
+    def drawn(name: str, parse_math: bool) -> np.ndarray:
+        figure = new_figure(3.0, 1.0)
+        axes = figure.add_subplot()
+        axes.set_yticks([0.5], [name], parse_math=parse_math)
+        axes.set_title(name, parse_math=parse_math)
+        figure.canvas.draw()
+        return np.asarray(figure.canvas.buffer_rgba())  # type: ignore[attr-defined]
+
+    assert np.array_equal(drawn("5$ and 6$", True), drawn("5$ and 6$", False))
+    # Ticks of a logarithmic axis have no mathematics left to show.
+    budget = budget_figure(
+        tensor(100.0, 5000.0), {"yaw": RangeError(*tensor([1.0, 200.0], [1.0, 90.0], [1.0, 120.0]))}, {"yaw": "$^$"}
+    )
+    budget.canvas.draw()
+    assert not any("mathdefault" in text.get_text() for text in budget.findobj(Text))
+    assert {"100", "1000"} <= {text.get_text() for text in budget.axes[0].get_xticklabels()}

@@ -19,13 +19,14 @@ from typing import ClassVar
 
 import kcal
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.checks import ImageSize
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
-from kcal.corners.images import decode_gray, expand_images, read_bytes, unique_names
+from kcal.corners.images import decode_gray, expand_images, unique_names
 from kcal.corners.observations import Failure, Observations, PackedCovariance, Pixel, View
 from kcal.corners.refine import Refinement
 from kcal.errors import FileError, InputError, KcalError
-from kcal.files import NativeFile
+from kcal.files import NativeFile, read_bytes
 from kcal.io.camera_file import CameraFile
 
 _COLUMNS = ("camera", "images", "board", "square", "model")
@@ -63,7 +64,7 @@ class Detected(NativeFile):
     KIND: ClassVar[str] = "detected"
     VERSION: ClassVar[int] = 1
 
-    size: tuple[int, int] | None = None
+    size: ImageSize | None = None
     pixels: tuple[Pixel | None, ...] | None = None
     covariance: tuple[PackedCovariance | None, ...] | None = None
     reason: str = ""
@@ -90,7 +91,7 @@ def read_jobs(source: Path, board: Board | None, model: str) -> list[CameraJob]:
         FileError: no such file or folder, no camera in it, or a table that cannot be read.
         InputError: a camera without a board.
     """
-    if source.is_dir():
+    if os.path.isdir(source):
         rows = [
             {"camera": folder.name, "images": str(folder)}
             for folder in sorted(source.iterdir())

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -23,10 +21,11 @@ from kcal.calibrate.batch.jobs import (
     pieces,
 )
 from kcal.calibrate.batch.workers import Task, WorkerDiedError, pool, run_tasks
-from kcal.corners.images import read_bytes
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, KcalError
-from kcal.files import NativeFile, write_atomic
+from kcal.files import NativeFile, dump_json, read_bytes, write_atomic
+from kcal.strict_json import MOST_BYTES, read_json
+from kcal.texts import csv_line
 
 Piece = TypeVar("Piece", bound=NativeFile)
 
@@ -156,13 +155,13 @@ class Results:
         kind, number, i, key = task.tag
         if kind == "image":
             if isinstance(outcome, Detected):
-                outcome.save(self._path(key))
+                self._keep(key, outcome)
             else:
                 # Not kept: more memory or time may help.
                 outcome = Detected(reason=_failure_text(outcome))
             return self._detected(number, i, outcome)
         if isinstance(outcome, Calibrated):
-            outcome.save(self._path(key))
+            self._keep(key, outcome)
         else:
             outcome = Calibrated(error=_failure_text(outcome))
         self._finish(number, outcome)
@@ -233,25 +232,33 @@ class Results:
     def _path(self, key: str) -> Path:
         return self._work / f"{key}.json"
 
+    def _keep(self, key: str, piece: NativeFile) -> None:
+        content = piece.dump()
+        write_atomic(self._path(key), dump_json({"sha256": _checksum(content), "piece": content}))
+
     def _load(self, kind: type[Piece], key: str) -> Piece | None:
-        """Load a finished piece; one that cannot be read is done again."""
-        if not self._path(key).exists():
+        """Load a finished piece; one that cannot be read, or was changed since, is done again."""
+        path = self._path(key)
+        if not path.exists():
             return None
         try:
-            piece = kind.load(self._path(key))
-        except FileError:
+            kept = read_json(read_bytes(path, MOST_BYTES), str(path))
+            if not isinstance(kept, dict) or kept.get("sha256") != _checksum(kept.get("piece")):
+                return None
+            piece = kind.parse(kept["piece"], str(path))
+        except KcalError:
             return None
         self.reused += 1
         return piece
 
 
+def _checksum(content: Any) -> str:
+    return hashlib.sha256(dump_json(content).encode()).hexdigest()
+
+
 def write_summary(path: Path, rows: list[SummaryRow]) -> Path:
     """Write the table as CSV, atomically."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(SummaryRow._fields)
-    writer.writerows(["" if value is None else value for value in row] for row in rows)
-    return write_atomic(path, text.getvalue())
+    return write_atomic(path, "".join(csv_line(row) for row in [SummaryRow._fields, *rows]))
 
 
 def _failure_text(error: Exception) -> str:

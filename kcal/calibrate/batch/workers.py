@@ -6,10 +6,19 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
 from kcal.errors import FileError, InputError, KcalError
@@ -26,6 +35,10 @@ class Task(NamedTuple):
 class WorkerDiedError(KcalError):
     """The process of a piece of work ended: out of memory, over its time limit, or crashed."""
 
+
+# Seconds after which the workers are looked after, and that a scheduler may be without any.
+_LOOK, WORKERS_BACK = 5.0, 60.0
+_GONE = "the Dask scheduler or its last worker is gone; start them and run the same command: finished work is kept"
 
 # Called with a finished task and its result or exception; returns tasks that can now be done.
 Done = Callable[[Task, Any], Iterable[Task]]
@@ -47,6 +60,7 @@ class Pool:
         self.workers = workers
         self._client: Any = None
         self._executor: Executor | None = None
+        self._alone_since: float | None = None
         if scheduler is not None:
             self._client = _connect(scheduler)
             self.workers = max(1, sum(self._client.nthreads().values()))
@@ -66,7 +80,13 @@ class Pool:
                 # Not forked: a fork copies the locks of OpenCV's and torch's threads, but not the threads.
                 context = multiprocessing.get_context("spawn")
                 self._executor = ProcessPoolExecutor(self.workers, mp_context=context, initializer=_begin)
-        return self._executor.submit(task.function, *task.arguments)
+        try:
+            return self._executor.submit(task.function, *task.arguments)
+        except (RuntimeError, OSError, ValueError) as error:
+            # What a closed Dask client raises; a broken pool of processes is the caller's to mend.
+            if self._client is None:
+                raise
+            raise FileError(_GONE) from error
 
     def restart(self) -> None:
         """Forget the processes; the next task starts new ones."""
@@ -76,11 +96,33 @@ class Pool:
             self._executor.shutdown(wait=False)
         self._executor = None
 
+    def check(self) -> None:
+        """Raise `FileError` if nobody is left to do the tasks: the scheduler, or all its workers, are gone.
+
+        Processes on this machine tell so themselves. Workers have a minute to come back.
+        """
+        if self._client is None:
+            return
+        try:
+            if self._client.status in ("closing", "closed"):
+                raise FileError(_GONE)
+            alive = self._client.status == "running" and bool(self._client.nthreads())
+        except (OSError, TimeoutError, CancelledError):
+            alive = False
+        if alive:
+            self._alone_since = None
+        elif self._alone_since is None:
+            self._alone_since = time.monotonic()
+        elif time.monotonic() - self._alone_since > WORKERS_BACK:
+            raise FileError(_GONE)
+
     def close(self) -> None:
         """Release all workers."""
         self.restart()
         if self._client is not None:
-            self._client.close()
+            # What happens while a connection ends that may be broken already does not matter.
+            with suppress(Exception):
+                self._client.close(timeout=5)
 
 
 @contextmanager
@@ -114,13 +156,16 @@ def run_tasks(tasks: Iterable[Task], done: Done, workers: Pool) -> None:
                 casualties.append(task)
         if not pending and not casualties:
             return
-        finished, _ = wait(pending, return_when=FIRST_COMPLETED) if pending else (set(), None)
+        finished, _ = wait(pending, _LOOK, return_when=FIRST_COMPLETED) if pending else (set(), None)
+        if pending and not finished:
+            workers.check()
         for future in finished:
             task = pending.pop(future)
-            if isinstance(future.exception(), BrokenExecutor):
+            outcome = _result_of(future)
+            if isinstance(outcome, WorkerDiedError) and isinstance(future.exception(), BrokenExecutor):
                 casualties.append(task)
             else:
-                added.extend(done(task, _result_of(future)))
+                added.extend(done(task, outcome))
         if casualties and not pending:
             workers.restart()
             for task in casualties:
@@ -132,8 +177,15 @@ def run_tasks(tasks: Iterable[Task], done: Done, workers: Pool) -> None:
 
 
 def _result_of(future: Future[Any]) -> Any:
-    """The result, or the exception instead of raising it."""
-    error = future.exception()
+    """The result, or the exception instead of raising it.
+
+    Raises:
+        FileError: the task was given up because the scheduler is gone.
+    """
+    try:
+        error = future.exception()
+    except CancelledError:
+        raise FileError(_GONE) from None
     if error is None:
         return future.result()
     if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":

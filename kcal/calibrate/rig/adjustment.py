@@ -66,6 +66,7 @@ class Adjustment:
         self.state = RigState(
             parameters=torch.cat([camera.params.detach() for camera in data.cameras]),
             unknown=unknowns.begin,
+            refraction=torch.tensor(unknowns.refraction, dtype=torch.float64),
             rotation=start.rotation,
             center=start.center,
             board=torch.zeros(len(unknowns.shapes), dtype=torch.float64),
@@ -81,18 +82,19 @@ class Adjustment:
         cameras = self.data.cameras
         unknowns = nothing(cameras) if held else self.unknowns
         turning, moving = ([not held and one for one in each] for each in (self._turning, self._moving))
-        blocks = self._blocks(masks, unknowns.board)
+        blocks = self._blocks(masks, unknowns)
         return RigProblem(cameras, blocks, () if held else self._terms, unknowns, turning, moving, loss)
 
-    def _blocks(self, masks: PerKind, by_unknown: Tensor) -> list[Block]:
+    def _blocks(self, masks: PerKind, unknowns: SharedUnknowns) -> list[Block]:
         """A block of each kind that has items in the masks."""
         data, found = self.data, list[Block]()
         if data.boards and masks.boards.any():
             pixels, white = (value[masks.boards] for value in (data.boards.pixels, self.corner_whitening()))
-            found.append(BoardBlock(pixels, white, data.boards.points, self.unknowns.shapes, by_unknown))
+            found.append(BoardBlock(pixels, white, data.boards.points, self.unknowns.shapes, unknowns.board))
         if data.landmarks and masks.landmarks.any():
             surveyed = data.landmarks.points[masks.landmarks], data.landmarks.sigma[masks.landmarks]
-            found.append(LandmarkBlock(*_weighted(data.landmarks, masks.landmarks), *surveyed))
+            marks = _weighted(data.landmarks, masks.landmarks)
+            found.append(LandmarkBlock(*marks, *surveyed, unknowns.by_refraction))
         if data.features and masks.features.any():
             known = data.features.inverse_range[masks.features], data.features.inverse_range_sigma[masks.features]
             found.append(FeatureBlock(*_weighted(data.features, masks.features), *known, self.anchor))
@@ -181,7 +183,7 @@ class Adjustment:
 def _masks_of_fields(masks: PerKind) -> RigState:
     """For each tensor of a state the mask of its items; None for what all items share."""
     boards, landmarks, features = masks
-    return RigState(None, None, None, None, None, boards, boards, landmarks, features, features)  # type: ignore[arg-type]
+    return RigState(None, None, None, None, None, None, boards, boards, landmarks, features, features)  # type: ignore[arg-type]
 
 
 def _weighted(source: Landmarks | Features, mask: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,9 @@ feature in direction d at inverse range ρ from a place a near the rig has y = d
 q = d + ρ (a - c) is as regular at infinity as anywhere (Civera, Davison, Montiel 2008). In its units a meter is w,
 which entrance pupils that move depend on.
 
+Light bends downward: a landmark at the level distance d is seen k d² / 2R higher than it stands, k being the
+coefficient of refraction and R the Earth's radius.
+
 Residuals are divided by their standard deviations: their squares add up to χ².
 """
 
@@ -26,6 +29,9 @@ Kind = Literal["boards", "landmarks", "features"]
 KINDS: tuple[Kind, ...] = ("boards", "landmarks", "features")
 # Unknowns of the largest block, a board's pose.
 LOCAL_SIZE = 6
+# 1/m: half the curvature of the Earth, of the mean radius (IUGG) everywhere: a third of a percent of the bending.
+_HALF_CURVATURE = 0.5 / 6_371_008.8
+_UP = 2
 
 
 class PerKind(NamedTuple):
@@ -41,7 +47,8 @@ class RigState(NamedTuple):
 
     Attributes:
         parameters: of all cameras, one after the other.
-        unknown: (K,) of cameras and board together; see `kcal.calibrate.rig.unknowns`.
+        unknown: (K,) of cameras, board and air together; see `kcal.calibrate.rig.unknowns`.
+        refraction: () coefficient of refraction.
         rotation: (C, 3, 3) cam_from_world.
         center: (C, 3) meters, in the world.
         board: (B,) amplitudes of the board's displacements.
@@ -54,6 +61,7 @@ class RigState(NamedTuple):
 
     parameters: Tensor
     unknown: Tensor
+    refraction: Tensor
     rotation: Tensor
     center: Tensor
     board: Tensor
@@ -68,7 +76,7 @@ class PosedCamera(NamedTuple):
     """A camera as it stands during a solve, and where its unknowns are in a step (None: held).
 
     Attributes:
-        by_unknown: (5 + P, K) its parameters by the K unknowns of cameras and board, the first of a step.
+        by_unknown: (5 + P, K) its parameters by the K unknowns of cameras, board and air, the first of a step.
     """
 
     camera: Camera
@@ -121,9 +129,23 @@ class Block(ABC):
     def retract(self, state: RigState, step: Tensor) -> RigState:
         """Apply a step (V, L) to this block's part of the state."""
 
-    def _by_board(self, state: RigState, by_q: Tensor) -> Tensor | None:
-        """Derivatives (V, K, 2, N) of pixels by the unknowns through the board's shape; None where they have none."""
+    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor | None:
+        """Derivatives (V, K, 2, N) of pixels by the unknowns through board or air; None where they have none.
+
+        Args:
+            state: where.
+            by_q: (V, 3, 2, N) of pixels by q in the world.
+            offset: (V, 3, N) straight from the camera.
+        """
         return None
+
+    def _bent(self, state: RigState, offset: Tensor) -> Tensor:
+        """Where things are seen (V, 3, N) that stand at `offset` from the camera."""
+        return offset
+
+    def _by_offset(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor:
+        """Derivatives by where things stand, from those by where they are seen."""
+        return by_q
 
     def _prior(self, state: RigState) -> Tensor | None:
         """(V, L + 1, Q): derivatives of Q residuals of what is known beforehand; the last row holds the residuals."""
@@ -131,16 +153,17 @@ class Block(ABC):
 
     def _projected(
         self, cameras: Sequence[PosedCamera], state: RigState, derivatives: bool
-    ) -> Iterator[tuple[int, PosedCamera, Tensor, Tensor, Projection, Tensor]]:
+    ) -> Iterator[tuple[int, PosedCamera, Tensor, Tensor, Tensor, Projection, Tensor]]:
         y, w = self._place(state)
         for c, posed in enumerate(cameras):
-            q = posed.rotation @ (y - w * posed.center[:, None])
+            offset = y - w * posed.center[:, None]
+            q = posed.rotation @ self._bent(state, offset)
             wanted = posed.by_unknown.any(1).nonzero()[:, 0].tolist() if derivatives else None
             found = project_components(q, posed.parameters, posed.camera.model, wanted, w[..., 0])
             # NaN where a seen point has no projection, so that such a pose is never accepted.
             bad = torch.where(found.regular, 0.0, torch.nan)[..., None, :]
             error = torch.where(self.seen[:, c, None, :], found.pixels - self.target[:, c] + bad, 0.0)
-            yield c, posed, q, w, found, error
+            yield c, posed, offset, q, w, found, error
 
     def errors(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
         """(V, C, 2, N) projected minus seen, pixels; 0 where not seen."""
@@ -155,22 +178,23 @@ class Block(ABC):
     def rows(self, cameras: Sequence[PosedCamera], state: RigState, shared_size: int) -> Tensor:
         """(V, L + S + 1, R) derivatives of whitened residuals by local and shared unknowns; last the residuals."""
         out = []
-        for c, posed, q, w, found, error in self._projected(cameras, state, True):
+        for c, posed, offset, q, w, found, error in self._projected(cameras, state, True):
             rows = q.new_zeros((len(self), self.size + shared_size + 1, 2, q.shape[-1]))
             by_q = torch.einsum("vkun,kj->vjun", found.by_point, posed.rotation)
-            rows[:, : self.size] = self._by_local(state, by_q, posed.center, found.by_meter)
+            by_offset = self._by_offset(state, by_q, offset)
+            rows[:, : self.size] = self._by_local(state, by_offset, posed.center, found.by_meter)
             shared = rows[:, self.size : -1]
             count = posed.by_unknown.shape[1]
             if count:
                 wanted = posed.by_unknown.any(1)
                 shared[:, :count] = torch.einsum("vpun,pk->vkun", found.by_camera, posed.by_unknown[wanted])
-                by_board = self._by_board(state, by_q)
-                if by_board is not None:
-                    shared[:, :count] += by_board
+                besides = self._by_board_or_air(state, by_q, offset)
+                if besides is not None:
+                    shared[:, :count] += besides
             if posed.turn is not None:
                 shared[:, posed.turn] = step_rows(found.by_point, q)[:, :3]
             if posed.shift is not None:
-                shared[:, posed.shift] = -w[..., None] * by_q
+                shared[:, posed.shift] = -w[..., None] * by_offset
             rows[:, -1] = error
             rows = torch.where(self.seen[:, c, None, None, :], rows, 0.0)
             out.append(torch.einsum("vuwn,vpwn->vpun", self.whitening[:, c], rows).flatten(-2))
@@ -220,7 +244,7 @@ class BoardBlock(Block):
         # By ω through ω × (R x), then by v.
         return step_rows(by_q, state.board_rotation @ self._shaped(state))
 
-    def _by_board(self, state: RigState, by_q: Tensor) -> Tensor | None:
+    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor | None:
         if self._shapes is None or self._by_unknown is None or not self._by_unknown.any():
             return None
         moved = torch.einsum("bk,bln->kln", self._by_unknown, self._shapes)
@@ -234,20 +258,44 @@ class BoardBlock(Block):
 
 
 class LandmarkBlock(Block):
-    """Surveyed points, whose adjusted positions are the unknowns."""
+    """Surveyed points, whose adjusted positions are the unknowns.
+
+    Args:
+        pixels: (V, C, 2), see `Block`.
+        whitening: (V, C, 2, 2), see `Block`.
+        points: (V, 3) meters, as surveyed; the third axis is up.
+        sigma: (V, 3) meters.
+        by_refraction: (K,) of the coefficient of refraction by the unknowns; None: it is held.
+    """
 
     kind: Kind = "landmarks"
     size = 3
 
-    def __init__(self, pixels: Tensor, whitening: Tensor, points: Tensor, sigma: Tensor) -> None:
+    def __init__(
+        self, pixels: Tensor, whitening: Tensor, points: Tensor, sigma: Tensor, by_refraction: Tensor | None = None
+    ) -> None:
         super().__init__(pixels[:, :, None], whitening[:, :, None])
-        self._surveyed, self._sigma = points, sigma
+        self._surveyed, self._sigma, self._by_refraction = points, sigma, by_refraction
 
     def _prior_count(self) -> Tensor:
         return torch.full((len(self),), 3)
 
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         return state.points[..., None], state.points.new_ones(len(self), 1, 1)
+
+    def _bent(self, state: RigState, offset: Tensor) -> Tensor:
+        level, up = offset[:, :_UP], offset[:, _UP:]
+        return torch.cat([level, up + state.refraction * _HALF_CURVATURE * level.square().sum(1, keepdim=True)], 1)
+
+    def _by_offset(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor:
+        slope = 2.0 * state.refraction * _HALF_CURVATURE * offset[:, :_UP, None]
+        return torch.cat([by_q[:, :_UP] + slope * by_q[:, _UP:], by_q[:, _UP:]], 1)
+
+    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor | None:
+        if self._by_refraction is None:
+            return None
+        lift = _HALF_CURVATURE * offset[:, :_UP, None].square().sum(1, keepdim=True)
+        return self._by_refraction[:, None, None] * (lift * by_q[:, _UP:])
 
     def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         return by_q

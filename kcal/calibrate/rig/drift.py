@@ -24,6 +24,7 @@ from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, re
 from kcal.calibrate.rig.unknowns import held
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import StereoRig
 from kcal.solve.lm import LMOptions
@@ -92,6 +93,7 @@ def measure_drift(
     landmarks: Landmarks | None = None,
     pose: tuple[Tensor, Tensor] | None = None,
     before: tuple[Tensor, Tensor] | None = None,
+    refraction: tuple[float, float] = (REFRACTION, REFRACTION_SIGMA),
 ) -> Drift:
     """Find how the cameras of a rig have turned.
 
@@ -109,6 +111,7 @@ def measure_drift(
             the landmarks; needed with these.
         before: (3, 3) covariances of the relative turn and of the left camera's attitude (about its own axes) when the
             rig was solved: part of what a turn is compared with, unless features have marks then.
+        refraction: coefficient of refraction of the light from landmarks now, and its standard deviation.
 
     Raises:
         InputError: nothing to measure with, landmarks without a pose or together with features that have marks then, or
@@ -134,7 +137,7 @@ def measure_drift(
     if landmarks is not None and pose is None:
         raise InputError("drift: landmarks need the left camera's pose in their frame")
     if features is None or not bool(torch.isfinite(features.pixels[:, :2]).all(-1).any()):
-        return _against(rig, features, landmarks, pose, before)
+        return _against(rig, features, landmarks, pose, before, refraction)
     if landmarks is not None:
         raise InputError("drift: features with marks then tell the turn without errors of a survey; give either")
     return _since(rig, features, None if pose is None else as_points("pose rotation", pose[0], 3))
@@ -174,6 +177,7 @@ def _against(
     landmarks: Landmarks | None,
     pose: tuple[Tensor, Tensor] | None,
     before: tuple[Tensor, Tensor] | None,
+    refraction: tuple[float, float],
 ) -> Drift:
     """How the cameras stand now against how the rig was solved, from landmarks or features of known range."""
     # Without landmarks the left camera holds the frame.
@@ -189,7 +193,8 @@ def _against(
         features = dataclasses.replace(features, pixels=features.pixels[:, 2:])
     cameras = (rig.left, rig.right)
     data = RigData(cameras=cameras, names=_NAMES, features=features, landmarks=landmarks)
-    work = Adjustment(data, start, held(cameras), 1.0, turning=[loose, True], moving=[False] * 2)
+    unknowns = held(cameras).and_refraction(*refraction) if loose else held(cameras)
+    work = Adjustment(data, start, unknowns, 1.0, turning=[loose, True], moving=[False] * 2)
     masks = _telling(data)
     few = "too few of the images have a mark of it"
     reasons = {

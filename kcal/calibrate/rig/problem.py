@@ -1,7 +1,7 @@
 """The least-squares problem of a rig: cameras that move or are held, what they see, and what was measured besides.
 
-Shared unknowns: those of lenses and board (`kcal.calibrate.rig.unknowns`), then for each camera its rotation and its
-center. Those of boards, landmarks and features are eliminated item by item (`kcal.solve.schur`).
+Shared unknowns: those of lenses, board and air (`kcal.calibrate.rig.unknowns`), then for each camera its rotation and
+its center. Those of boards, landmarks and features are eliminated item by item (`kcal.solve.schur`).
 """
 
 from __future__ import annotations
@@ -206,6 +206,8 @@ class RigProblem:
                 unknown=state.unknown + change,
                 board=state.board + self.unknowns.board @ change,
             )
+            if self.unknowns.by_refraction is not None:
+                state = state._replace(refraction=state.refraction + self.unknowns.by_refraction @ change)
         state = state._replace(
             rotation=rotation_from_vector(turns) @ state.rotation,
             center=state.center + shifts,

@@ -82,6 +82,7 @@ def _state(camera: Camera, known: CameraInformation, rotation: Tensor, translati
     return RigState(
         parameters=camera.params.detach(),
         unknown=torch.zeros(len(known.estimate), dtype=torch.float64),
+        refraction=torch.zeros((), dtype=torch.float64),
         rotation=torch.eye(3, dtype=torch.float64)[None],
         center=torch.zeros(1, 3, dtype=torch.float64),
         board=torch.zeros(known.board_size, dtype=torch.float64),

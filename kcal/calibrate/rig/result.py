@@ -100,7 +100,8 @@ class RigResult:
         rms_px: likewise of each camera; NaN for a camera with none.
         chi2: sum of squares of all residuals over their sigmas.
         freedom: degrees of freedom.
-        variance: by which covariances are multiplied, because residuals are larger than their sigmas say; 1 if not.
+        variance: by which covariances are multiplied, because residuals are larger than their sigmas say or because
+            ranges are not linear in errors of the baseline (`kcal.calibrate.rig.weak_geometry`); 1 if neither.
         sigma_corner: of a board's corner along an axis, px, as used; None without boards.
         undetermined: what the data leave open, in words; none of it concerns the cameras' relative poses.
         status: why the solver stopped.
@@ -251,16 +252,21 @@ class RigResult:
         """Of both cameras' parameters (zeros where held) and their relative pose, in the order of `RigCovariance`."""
         return self._covariance.of(self._joint_rows(first, second))[0]
 
+    @property
+    def refraction(self) -> float:
+        """Coefficient of refraction of the light from landmarks; its variance is the last of `mounting_covariance`."""
+        return float(self._state.refraction)
+
     def mounting_link(self, first: int = 0, second: int = 1) -> Tensor:
-        """(P, 6) covariance of `joint_covariance`'s P quantities with the mounting of the first camera."""
+        """(P, 7) covariance of `joint_covariance`'s P quantities with `mounting_covariance`'s of the first camera."""
         rows = [self._joint_rows(first, second), mounting_rows(self._problem, self._state, first)]
-        return self._covariance.of(torch.cat(rows))[0][:-6, -6:]
+        return self._covariance.of(torch.cat(rows))[0][:-7, -7:]
 
     def mounting_covariance(self, camera: int = 0) -> Tensor:
-        """(6, 6) of a camera's center (meters) and of small turns of it (radians), both about the local frame's axes.
+        """(7, 7) of a camera's center (meters), of small turns of it (radians), and of the coefficient of refraction.
 
-        Infinite variances where the data leave something open; zeros for the first camera of a rig that is not
-        `absolute`.
+        Centers and turns are along and about the local frame's axes. Infinite variances where the data leave something
+        open; zeros for the first camera of a rig that is not `absolute`.
         """
         return self._covariance.of(mounting_rows(self._problem, self._state, camera))[0]
 

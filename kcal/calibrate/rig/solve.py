@@ -23,10 +23,12 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, goodness_of_fit, parameter_rows, relative_rows
 from kcal.calibrate.rig.unknowns import SharedUnknowns, free, held
+from kcal.calibrate.rig.weak_geometry import check_places
 from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import provenance
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, check_refraction
 from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, SolverStatus
 
@@ -52,6 +54,9 @@ class RigOptions:
         board_warp: estimate two parabolas by which the board bends, where no calibration knows its shape.
         weighted: let corners count by their covariances where all views have them.
         reject: leave out what contradicts the rest; otherwise warnings name it. Left out or not, it is listed.
+        refraction: of light towards landmarks, as a share of the Earth's curvature; estimated from here. For
+            simulations and other straight lines it and its sigma are 0.
+        refraction_sigma: its standard deviation beforehand; 0 holds it.
         solver: options of the Levenberg-Marquardt solver; residuals are in sigmas.
     """
 
@@ -59,11 +64,14 @@ class RigOptions:
     board_warp: bool = False
     weighted: bool = True
     reject: bool = True
+    refraction: float = REFRACTION
+    refraction_sigma: float = REFRACTION_SIGMA
     solver: LMOptions = dataclasses.field(default_factory=lambda: LMOptions(residual_floor=1e-8))
 
     def __post_init__(self) -> None:
         if self.intrinsics not in ("fixed", "prior", "free"):
             raise InputError(f"intrinsics must be fixed, prior or free, got {self.intrinsics!r}")
+        check_refraction(self.refraction, self.refraction_sigma)
 
 
 def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
@@ -92,7 +100,8 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
         >>> marks = torch.stack([camera.project((points - center) @ look.T)[0] for center in truth], 1)
         >>> survey = Landmarks(names=tuple("abcde"), points=points, sigma=torch.full((5, 3), 0.02).double(),
         ...                    pixels=marks, pixel_sigma=0.1)
-        >>> found = solve_rig(RigData(cameras=(camera, camera), names=("left", "right"), landmarks=survey))
+        >>> straight = RigOptions(refraction=0.0, refraction_sigma=0.0)  # as these pixels were made
+        >>> found = solve_rig(RigData(cameras=(camera, camera), names=("left", "right"), landmarks=survey), straight)
         >>> round(float(found.stereo().baseline), 6), found.left_out
         (10.0, ())
     """
@@ -110,7 +119,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     masks, reasons = _first_masks(initial, reject=options.reject)
     work = _robust(initial, masks, unknowns)
     # With lenses among the unknowns digits are dear, and what is wrong shows without them.
-    looking = ROUGHLY if bool(unknowns.known.any()) else options.solver
+    looking = ROUGHLY if unknowns.refine_lenses else options.solver
     if options.reject:
         masks = without_wrong(work, masks, looking)
     else:
@@ -123,7 +132,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
         if abs(work.sigma_corner / before - 1.0) < 1e-3:
             break
     _, found = work.solve(masks, options.solver)
-    return _rig_result(work, found, masks, reasons, initial, warnings)
+    return _rig_result(work, found, masks, reasons, initial, warnings, refuse=options.reject)
 
 
 def _without_rayless(data: RigData) -> tuple[RigData, list[str]]:
@@ -179,7 +188,7 @@ def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reaso
 
 
 def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns]:
-    """What may change of cameras and board, and the data with the board as it is expected."""
+    """What may change of cameras, board and air, and the data with the board as it is expected."""
     boards = data.boards
     if options.intrinsics == "prior":
         known = []
@@ -197,6 +206,8 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
         unknowns = held(data.cameras) if options.intrinsics == "fixed" else free(data.cameras, data.names)
     if options.board_warp and boards is not None and not len(unknowns.shapes):
         unknowns = unknowns.and_warp(boards.points)
+    if data.absolute:
+        unknowns = unknowns.and_refraction(options.refraction, options.refraction_sigma)
     return data, unknowns
 
 
@@ -207,7 +218,7 @@ def _robust(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> 
     best: tuple[float, Adjustment, PerKind] | None = None
     for start in initial.starts:
         work = Adjustment(initial.data, start, unknowns, sigma)
-        if bool(unknowns.known.any()):
+        if unknowns.refine_lenses:
             # From poses that are far off, lenses would bend towards them, beyond their folds even.
             work.unknowns = held(initial.data.cameras)
         here = possible(work, masks)
@@ -253,7 +264,14 @@ def _refined(camera: Camera, parameters: Tensor, covariance: Tensor) -> Camera:
 
 
 def _rig_result(
-    work: Adjustment, found: Result, masks: PerKind, reasons: Reasons, initial: InitialPoses, warnings: list[str]
+    work: Adjustment,
+    found: Result,
+    masks: PerKind,
+    reasons: Reasons,
+    initial: InitialPoses,
+    warnings: list[str],
+    *,
+    refuse: bool,
 ) -> RigResult:
     data, state, problem = work.data, work.part(masks), work.problem(masks)
     fit = goodness_of_fit(problem, state)
@@ -267,6 +285,9 @@ def _rig_result(
                 "anything; add boards seen by both, surveyed landmarks, far features of known range, a measured "
                 "baseline or measured positions"
             )
+    widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
+    if widen > 1.0:
+        covariance = SharedCovariance(problem, state, widen**2 * fit.variance)
     squared, counts = torch.zeros(len(data.cameras)).double(), torch.zeros(len(data.cameras)).double()
     for block in problem.blocks:
         squared += block.errors(problem.posed(state), state).square().sum((0, 2, 3))
@@ -284,6 +305,7 @@ def _rig_result(
         warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         warnings.append(f"the solver {status.message}")
+    warnings += doubts
     warnings += [f"not determined by the data: {text}" for text in undetermined]
     whole = [parameter_rows(problem, c) for c in range(len(data.cameras))]
     if not bool(covariance.of(torch.cat(whole))[1].all()):
@@ -312,7 +334,7 @@ def _rig_result(
         rms_px=tuple((squared / counts).sqrt().tolist()),
         chi2=fit.chi2,
         freedom=fit.freedom,
-        variance=fit.variance,
+        variance=widen**2 * fit.variance,
         sigma_corner=None if data.boards is None else work.sigma_corner,
         undetermined=undetermined,
         status=status,

@@ -182,8 +182,11 @@ def relative_rows(problem: RigProblem, state: RigState, first: int, second: int)
 
 
 def mounting_rows(problem: RigProblem, state: RigState, camera: int) -> Tensor:
-    """(6, S): shift of a camera's center and turn of the camera about the world's axes."""
-    return torch.cat([_shift_rows(problem, camera), -state.rotation[camera].T @ turn_rows(problem, camera)])
+    """(7, S): shift of a camera's center, its turn about the world's axes, and the coefficient of refraction."""
+    bending = torch.zeros(1, problem.shared_size, dtype=torch.float64)
+    if problem.unknowns.by_refraction is not None:
+        bending[0, : len(problem.unknowns)] = problem.unknowns.by_refraction
+    return torch.cat([_shift_rows(problem, camera), -state.rotation[camera].T @ turn_rows(problem, camera), bending])
 
 
 def turn_rows(problem: RigProblem, camera: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""What a rig's adjustment may change of its cameras and of its board: linear functions of a few unknowns."""
+"""What a rig's adjustment may change of its cameras, its board and the air: linear functions of a few unknowns."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from kcal.calibrate.bundle.board_problem import warp_shape
 from kcal.calibrate.bundle.views import free_parameters
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.mounting import check_refraction
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,6 +26,8 @@ class SharedUnknowns:
         begin: (K,) what they are for cameras and board as given.
         known: (K,) whether an unknown is a standard normal beforehand; nothing is known of the others.
         labels: (K,) names of those that have one.
+        refraction: coefficient of refraction of light for the unknowns as they begin.
+        by_refraction: (K,) of it by each unknown; None: it is held.
     """
 
     cameras: tuple[Tensor, ...]
@@ -33,6 +36,13 @@ class SharedUnknowns:
     begin: Tensor
     known: Tensor
     labels: tuple[str, ...]
+    refraction: float = 0.0
+    by_refraction: Tensor | None = None
+
+    @property
+    def refine_lenses(self) -> bool:
+        """Whether lenses or board may change within what is known of them."""
+        return bool(torch.cat([*self.cameras, self.board])[:, self.known].any())
 
     def __len__(self) -> int:
         """How many unknowns there are."""
@@ -40,23 +50,42 @@ class SharedUnknowns:
 
     def and_warp(self, board_points: Tensor) -> SharedUnknowns:
         """These, and two parabolas by which the board bends."""
-        shape = warp_shape(board_points)
         shapes = torch.zeros(2, 3, len(board_points), dtype=torch.float64)
-        shapes[:, 2] = shape
-        cameras = [torch.cat([part, part.new_zeros(len(part), 2)], 1) for part in self.cameras]
+        shapes[:, 2] = warp_shape(board_points)
         board = torch.cat([torch.zeros(2, len(self), dtype=torch.float64), torch.eye(2, dtype=torch.float64)], 1)
+        more = self._and("the board's warp along its rows", "the board's warp along its columns", known=False)
+        return dataclasses.replace(more, shapes=shapes, board=board)
+
+    def and_refraction(self, refraction: float, sigma: float) -> SharedUnknowns:
+        """These, and the coefficient of refraction with its standard deviation; with none, it is held."""
+        check_refraction(refraction, sigma)
+        if not sigma:
+            return dataclasses.replace(self, refraction=refraction)
+        more = self._and("the coefficient of refraction", known=True)
+        slope = torch.zeros(len(more), dtype=torch.float64)
+        slope[-1] = sigma
+        return dataclasses.replace(more, refraction=refraction, by_refraction=slope)
+
+    def _and(self, *labels: str, known: bool) -> SharedUnknowns:
+        """These, and more that change nothing yet."""
+
+        def wider(part: Tensor) -> Tensor:
+            return torch.nn.functional.pad(part, (0, len(labels)))
+
         return SharedUnknowns(
-            cameras=tuple(cameras),
-            shapes=shapes,
-            board=board,
-            begin=torch.cat([self.begin, self.begin.new_zeros(2)]),
-            known=torch.cat([self.known, torch.zeros(2, dtype=torch.bool)]),
-            labels=(*self.labels, "the board's warp along its rows", "the board's warp along its columns"),
+            cameras=tuple(map(wider, self.cameras)),
+            shapes=self.shapes,
+            board=wider(self.board),
+            begin=wider(self.begin),
+            known=torch.cat([self.known, torch.full((len(labels),), known)]),
+            labels=(*self.labels, *labels),
+            refraction=self.refraction,
+            by_refraction=None if self.by_refraction is None else wider(self.by_refraction),
         )
 
 
 def held(cameras: Sequence[Camera]) -> SharedUnknowns:
-    """Nothing: cameras and board are as they are."""
+    """Nothing: cameras and board are as they are, and light is straight."""
     return SharedUnknowns(
         cameras=tuple(torch.zeros(camera.params.shape[-1], 0, dtype=torch.float64) for camera in cameras),
         shapes=torch.zeros(0, 3, 0, dtype=torch.float64),

@@ -1,8 +1,10 @@
 import csv
+import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import Future
 
@@ -12,7 +14,7 @@ import torch
 from typer.testing import CliRunner
 
 from kcal.calibrate.batch.jobs import BatchOptions, detect_image, read_jobs
-from kcal.calibrate.batch.results import Results
+from kcal.calibrate.batch.results import Results, SummaryRow, write_summary
 from kcal.calibrate.batch.workers import Pool, Task, WorkerDiedError, pool, run_tasks
 from kcal.cli.main import app
 from kcal.corners.board import Board
@@ -139,6 +141,28 @@ class TestResults:
         assert done == 1
         # If it was a camera, its solution may differ in the last digits.
         assert [row.rms for row in again] == pytest.approx([row.rms for row in first], rel=1e-6)
+
+    def test_an_edited_piece_is_done_again(self, folder, tmp_path):
+        first, _ = run(folder, tmp_path / "out")
+        edited = 0
+        for piece in sorted((tmp_path / "out" / ".work").iterdir()):
+            content = json.loads(piece.read_text())
+            inside = content["piece"]
+            if inside["kcal"] == "calibrated" and not edited:
+                inside["camera"]["intrinsics"]["fx"] += 1.0
+                edited += 1
+            elif inside["kcal"] == "detected" and edited < 2:
+                inside["pixels"][0][0] += 5.0
+                edited += 1
+            piece.write_text(json.dumps(content))
+        again, done = run(folder, tmp_path / "out")
+        assert done == edited == 2
+        assert [row.fx for row in again] == pytest.approx([row.fx for row in first], rel=1e-6)
+
+    def test_no_cell_of_the_table_is_a_formula(self, tmp_path):
+        path = write_summary(tmp_path / "s.csv", [SummaryRow("=1+1", "ok", "@SUM(A1)", 1, 1, 0, fx=-1.5)])
+        (row,) = csv.DictReader(path.open())
+        assert (row["camera"], row["model"], row["fx"], row["fy"]) == ("'=1+1", "'@SUM(A1)", "-1.5", "")
 
     def test_failures_stay_with_their_camera(self, folder, tmp_path):
         (folder / "east" / "bad.png").write_bytes(b"no image")
@@ -295,6 +319,42 @@ def test_dask(folder, tmp_path):
     expected, _ = run(folder, tmp_path / "whole")
     rows = list(csv.DictReader((tmp_path / "out" / "summary.csv").open()))
     assert [float(row["rms"]) for row in rows] == pytest.approx([row.rms for row in expected], rel=1e-6)
+
+
+@pytest.fixture
+def dask_processes(tmp_path):
+    """A scheduler and one worker without a nanny, each a process of its own."""
+    pytest.importorskip("distributed")
+    where = tmp_path / "scheduler.json"
+    started = []
+    try:
+        for arguments in (["scheduler", "--port", "0"], ["worker", "--no-nanny", "--nthreads", "1"]):
+            command = [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]]
+            command += ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(where)]
+            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
+            started.append(subprocess.Popen(command, **quiet))
+            deadline = time.monotonic() + 60
+            while not where.exists() and time.monotonic() < deadline:
+                time.sleep(0.1)
+        yield json.loads(where.read_text())["address"], *started
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.parametrize("killed", ["scheduler", "worker"])
+def test_a_scheduler_or_its_last_worker_that_dies_is_an_error(dask_processes, monkeypatch, killed):
+    address, scheduler, worker = dask_processes
+    monkeypatch.setattr("kcal.calibrate.batch.workers._LOOK", 0.5)
+    monkeypatch.setattr("kcal.calibrate.batch.workers.WORKERS_BACK", 3.0)
+    with pool(1, address) as workers:
+        deadline = time.monotonic() + 60
+        while not workers._client.nthreads() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        threading.Timer(1.0, (scheduler if killed == "scheduler" else worker).kill).start()
+        with pytest.raises(FileError, match="the Dask scheduler or its last worker is gone"):
+            run_tasks([Task(0, time.sleep, (600,)), Task(1, time.sleep, (600,))], lambda *_: [], workers)
 
 
 def test_no_scheduler(tmp_path, folder):

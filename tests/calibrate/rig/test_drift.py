@@ -184,7 +184,7 @@ class TestLandmarks:
     def test_attitudes_in_the_local_frame(self) -> None:
         marks = landmarks()
         marks = dataclasses.replace(marks, pixels=seen(marks.points, TURN))
-        found = measure_drift(RIG, landmarks=marks, pose=(ROTATION[0], CENTER[0]))
+        found = measure_drift(RIG, landmarks=marks, pose=(ROTATION[0], CENTER[0]), refraction=(0.0, 0.0))
         assert found.cam_from_local is not None
         torch.testing.assert_close(found.cam_from_local, rotation_from_vector(TURN[0]) @ ROTATION[0])
         torch.testing.assert_close(found.relative, relative_turn(), rtol=0, atol=1e-10)

@@ -1,0 +1,295 @@
+"""Write cameras and rigs in formats of other programs; what a format cannot hold is refitted, with the misfit stated.
+
+A lens is never truncated. If the format has a model that contains it, it is written exactly. If not, the model of the
+format that comes nearest is fitted over the whole image, and its error is measured on a denser grid. mrcal's files hold
+any lens as a spline, and maps for `cv2.remap` (.npz) any image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import itertools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.calibrate.camera.refit import refit_camera
+from kcal.errors import DegenerateError, InputError
+from kcal.files import write_atomic
+from kcal.io.foreign import CameraPose, camera_name, paths_for, plain, rig_poses
+from kcal.io.format_mrcal import fit_spline, project_spline, write_model
+from kcal.io.formats import FORMATS, CameraFormat, format_named, held_exactly
+from kcal.lens.camera import Camera
+from kcal.lens.images import undistort_maps
+from kcal.lens.model import LensModel
+from kcal.lens.pinhole import new_pinhole
+from kcal.lens.rig import StereoRig
+
+# Columns and rows on which a misfit is measured: four times as dense as the fit's, reaching to the image's edge.
+_DENSE = (129, 97)
+_SPLINE_SAMPLES = (193, 145)
+REMAP = "remap"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Misfit:
+    """What is written instead of a lens, and how far it is from it, over the image and at infinity.
+
+    Args:
+        model: of the format.
+        pixels: (rows, columns, 2) that the camera sees rays at.
+        shift: (rows, columns, 2) pixels at which what was written sees them, minus `pixels`; NaN where the camera
+            itself has no ray.
+    """
+
+    model: str
+    pixels: Tensor
+    shift: Tensor
+
+    @property
+    def length(self) -> Tensor:
+        """(rows, columns) length of the shift, pixels."""
+        return torch.linalg.vector_norm(self.shift, dim=-1)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the length, pixels."""
+        return float(self.length[self.length.isfinite()].square().mean().sqrt())
+
+    @property
+    def largest(self) -> float:
+        """Bound of the length: its maximum on the grid, and what it can be more between the grid's points."""
+        bends = [torch.diff(self.shift, n=2, dim=axis).abs() for axis in (0, 1)]
+        most = [float(torch.nan_to_num(bend).max()) for bend in bends]
+        return float(self.length[self.length.isfinite()].max()) + sum(most) / 4.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class ExportedCameras:
+    """What `export_cameras` has written.
+
+    Args:
+        format: name of the format.
+        paths: of the files.
+        models: lens model of each camera in them, by its name there or in kcal.
+        misfits: for each camera None if it was written exactly.
+        lost: what the cameras have and the files do not.
+    """
+
+    format: str
+    paths: tuple[Path, ...]
+    models: tuple[str, ...]
+    misfits: tuple[Misfit | None, ...]
+    lost: tuple[str, ...]
+
+
+def format_for(path: str | Path, format: str | None = None) -> str:
+    """The format of a file to be written: as named, or by its suffix.
+
+    Raises:
+        InputError: an unknown name or suffix.
+    """
+    path = Path(path)
+    if format is not None:
+        if format != REMAP:
+            format_named(format)
+        return format
+    by_suffix = {suffix: name for name, known in FORMATS.items() for suffix in known.suffixes} | {".npz": REMAP}
+    if path.name == "camera_models.json":
+        return "opensfm"
+    if path.suffix.lower() not in by_suffix:
+        raise InputError(f"{path}: no format for this suffix; name one (--format {', '.join([*FORMATS, REMAP])})")
+    return by_suffix[path.suffix.lower()]
+
+
+def export_cameras(
+    cameras: Camera | StereoRig | Sequence[Camera],
+    path: str | Path,
+    *,
+    format: str | None = None,
+    model: str | None = None,
+) -> ExportedCameras:
+    """Write one camera, several, or a rig for another program.
+
+    The format follows from the suffix: `.yml`, `.yaml`, `.xml` OpenCV; `.cameramodel` mrcal; `.txt`, `.bin` COLMAP;
+    `.json` nerfstudio; `.mat` MATLAB; `.npz` maps for `cv2.remap`. Others are named: ros, kalibr, opensfm. Formats
+    with one camera per file get NAME_left and NAME_right for a rig.
+
+    Args:
+        cameras: a single camera, a rig, or single cameras without poses.
+        path: of the file.
+        format: name of the format; None: by the suffix.
+        model: lens model of kcal to fit, one that the format holds; None: the one that contains the lens, else the one
+            that comes nearest.
+
+    Raises:
+        InputError: batches, an unknown format, a model that the format does not hold, or a lens that no model of the
+            format shows in the whole image.
+        FileError: a file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.1, 0.01])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     done = export_cameras(camera, Path(folder, "cameras.txt"))
+        >>> done.format, done.models, done.misfits, done.lost
+        ('colmap', ('opencv4',), (None,), ())
+    """
+    path = Path(path)
+    poses: tuple[CameraPose, ...] = ()
+    rig = cameras if isinstance(cameras, StereoRig) else None
+    if rig is not None:
+        several, poses = [rig.left, rig.right], rig_poses(rig)
+    else:
+        assert not isinstance(cameras, StereoRig)
+        several = [cameras] if isinstance(cameras, Camera) else list(cameras)
+    if not several or any(camera.params.ndim != 1 for camera in several):
+        raise InputError("export_cameras: single cameras are needed, not batches")
+    name = format_for(path, format)
+    if name == REMAP:
+        return _write_maps(several, path)
+    known = FORMATS[name]
+    if not known.pose or len(several) > 2:
+        poses = ()
+    if model is not None and str(LensModel.named(model)) not in known.models:
+        raise InputError(f"{name} files do not hold {model}; choose one of {', '.join(known.models)}")
+    exact = [held_exactly(camera, [model] if model else known.models, known.skew) for camera in several]
+    if name == "mrcal" and model is None and None in exact:
+        return _write_splines(several, exact, poses, path, _lost(several, rig, known))
+    written, misfits = [], []
+    for camera, held in zip(several, exact, strict=True):
+        substitute, misfit = (held, None) if held is not None else _refitted(camera, name, model)
+        assert substitute is not None
+        substitute.calibration = substitute.calibration or (camera.calibration and dataclasses.replace(
+            camera.calibration, sigma=None, covariance=None, information=None
+        ))  # fmt: skip
+        written.append(substitute)
+        misfits.append(misfit)
+    return ExportedCameras(
+        format=name,
+        paths=tuple(known.write(written, poses, path)),
+        models=tuple(str(camera.model) for camera in written),
+        misfits=tuple(misfits),
+        lost=_lost(several, rig, known),
+    )
+
+
+def _lost(cameras: Sequence[Camera], rig: StereoRig | None, known: CameraFormat) -> tuple[str, ...]:
+    """What the cameras have that the format does not, in words."""
+    records = [camera.calibration for camera in cameras if camera.calibration is not None]
+    found = {
+        "error bars": any(record.covariance is not None or record.sigma is not None for record in records),
+        "calibration record": any(record.record is not None for record in records),
+        "entrance pupil": any(bool((camera.coefficients[1:3] != 0).any()) for camera in cameras if camera.model.hybrid),
+        "relative pose": rig is not None and not known.pose,
+        "covariance of the rig": rig is not None and rig.covariance is not None,
+        "mounting": rig is not None and rig.mounting is not None,
+    }
+    return tuple(what for what, there in found.items() if there)
+
+
+def measured_misfit(camera: Camera, model: str, project: Callable[[Tensor], tuple[Tensor, Tensor]]) -> Misfit:
+    """Compare what a camera sees with pixels and a mask that `project` returns for rays (N, 3).
+
+    Raises:
+        DegenerateError: rays of the camera without a pixel, because the other lens folds or ends.
+    """
+    columns, rows = _DENSE
+    width, height = camera.size
+    # From edge to edge: half a pixel beyond the centers of the outer pixels.
+    u = torch.linspace(-0.5, width - 0.5, columns, dtype=torch.float64)
+    v = torch.linspace(-0.5, height - 0.5, rows, dtype=torch.float64)
+    pixels = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+    rays, valid = camera.unproject(pixels.reshape(-1, 2))
+    if not bool(valid.any()):
+        raise DegenerateError("this camera has no ray for any pixel")
+    seen, shown = project(rays)
+    if not bool(shown[valid].all()):
+        share = float(shown[valid].double().mean())
+        raise DegenerateError(f"{model} shows only {share:.1%} of what the camera sees: it folds or ends before")
+    shift = torch.where(valid[:, None], seen - pixels.reshape(-1, 2), torch.nan)
+    return Misfit(model=model, pixels=pixels, shift=shift.reshape(pixels.shape))
+
+
+def _refitted(camera: Camera, name: str, model: str | None) -> tuple[Camera, Misfit]:
+    """The model of a format that comes nearest to a camera."""
+    models = [model] if model else FORMATS[name].models
+    kinds = [LensModel.named(m) for m in models]
+    richest = [kind for kind in kinds if not any(other != kind and other.contains(kind) for other in kinds)]
+    found: list[tuple[Camera, Misfit]] = []
+    refused = []
+    for kind in richest:
+        try:
+            fitted = refit_camera(camera, kind).camera
+            found.append((fitted, measured_misfit(camera, str(kind), fitted.project_rays)))
+        except (InputError, DegenerateError) as error:
+            refused.append(str(error))
+    if not found:
+        raise InputError(
+            f"no lens model of {name} files can stand for this camera ({'; '.join(refused)}). mrcal files hold it as a "
+            "spline (.cameramodel), and maps for cv2.remap its undistorted image (.npz)"
+        )
+    return min(found, key=lambda entry: entry[1].rms)
+
+
+def _write_splines(
+    cameras: Sequence[Camera],
+    exact: Sequence[Camera | None],
+    poses: Sequence[CameraPose],
+    path: Path,
+    lost: tuple[str, ...],
+) -> ExportedCameras:
+    """Write mrcal files, those cameras as splines that its parametric models do not contain."""
+    paths = paths_for(path, len(cameras))
+    models: list[str] = []
+    misfits: list[Misfit | None] = []
+    for camera, held, pose, target in itertools.zip_longest(cameras, exact, poses, paths):
+        if held is not None:
+            FORMATS["mrcal"].write([held], [pose] if pose else [], target)
+            models.append(str(held.model))
+            misfits.append(None)
+            continue
+        columns, rows = _SPLINE_SAMPLES
+        width, height = camera.size
+        u, v = torch.linspace(-0.5, width - 0.5, columns), torch.linspace(-0.5, height - 0.5, rows)
+        pixels = torch.stack(torch.meshgrid(u.double(), v.double(), indexing="xy"), -1).reshape(-1, 2)
+        rays, valid = camera.unproject(pixels)
+        grid, values = fit_spline(rays[valid].numpy(), pixels[valid].numpy(), camera.size)
+
+        def project(rays: Tensor, grid=grid, values=values) -> tuple[Tensor, Tensor]:  # type: ignore[no-untyped-def]
+            seen = torch.from_numpy(project_spline(grid, values, rays.numpy()))
+            return seen, torch.ones(len(seen), dtype=torch.bool)
+
+        misfits.append(measured_misfit(camera, grid.name, project))
+        write_model(target, camera, grid.name, values.tolist(), pose)
+        models.append(grid.name)
+    return ExportedCameras(
+        format="mrcal", paths=tuple(paths), models=tuple(models), misfits=tuple(misfits), lost=lost
+    )  # fmt: skip
+
+
+def _write_maps(cameras: Sequence[Camera], path: Path) -> ExportedCameras:
+    """Write maps that undistort an image by `cv2.remap`, and the pinhole camera that they lead to."""
+    paths = paths_for(path, len(cameras))
+    for camera, target in zip(cameras, paths, strict=True):
+        new = new_pinhole(camera)
+        maps = undistort_maps(camera, new)
+        data = io.BytesIO()
+        np.savez(
+            data,
+            map_x=maps.map_x,
+            map_y=maps.map_y,
+            mask=maps.mask,
+            camera_matrix=np.array(plain(new.matrix)),
+            image_size=np.array(camera.size),
+            name=np.array(camera_name(camera, target.stem)),
+        )
+        write_atomic(target, data.getvalue())
+    lost = ("everything but the undistorted image",)
+    return ExportedCameras(
+        format=REMAP, paths=tuple(paths), models=("maps",) * len(cameras), misfits=(None,) * len(cameras), lost=lost
+    )

@@ -1,0 +1,62 @@
+"""`kcal diff`: how differently two cameras see, against their error bars."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kcal.cli.camera_sources import single_camera
+from kcal.cli.console import out, print_wrote
+
+if TYPE_CHECKING:
+    from kcal.lens.camera import Camera
+
+
+def diff_command(
+    first: Annotated[str, typer.Argument(metavar="CAMERA", help="Camera file of kcal or of another program.")],
+    second: Annotated[str, typer.Argument(metavar="CAMERA", help="Another one; RIG.json:left is a camera of a rig.")],
+    at: Annotated[
+        float, typer.Option("--at", min=1e-3, metavar="METERS", help="Distance of what is seen; infinity if not given.")
+    ] = math.inf,
+    turn: Annotated[
+        bool, typer.Option("--turn/--no-turn", help="Turn the second camera until it agrees best with the first.")
+    ] = True,
+    picture: Annotated[Path | None, typer.Option(metavar="PNG", help="Map of the difference and of its sigma.")] = None,
+) -> None:
+    """Compare two calibrations of a camera: are they the same within their uncertainty?
+
+    Where the second camera sees what the first one sees, after the turn that no calibration determines. The error bars
+    of both tell how much of that is expected. Use it for one camera over time, or for two halves of its images.
+
+    **Examples**
+
+    `kcal diff june.camera.json december.camera.json --picture diff.png`
+
+    `kcal diff left.camera.json left.cameramodel`
+    """
+    import torch
+
+    from kcal.lens.difference import camera_difference
+    from kcal.report.difference import difference_text, save_difference_picture
+    from kcal.report.figures import check_picture
+
+    if picture is not None:
+        check_picture(picture)
+    cameras = [single_camera(source) for source in (first, second)]
+    for source, camera in zip((first, second), cameras, strict=True):
+        out.print(f"{source}: {_history(camera)}", markup=False)
+    found = camera_difference(*cameras, at=at, rotation=None if turn else torch.eye(3))
+    for line in difference_text(found):
+        out.print(line, markup=False)
+    if picture is not None:
+        print_wrote(save_difference_picture(picture, found, title=f"{first} and {second}"))
+
+
+def _history(camera: Camera) -> str:
+    """Model and, if the file tells, when the camera was calibrated."""
+    record = camera.calibration.record if camera.calibration else None
+    when = f", {record.created:%Y-%m-%d %H:%M}, RMS {record.rms:.3f} px from {record.views} views" if record else ""
+    return f"{camera.model}{when}"

@@ -1,0 +1,215 @@
+"""`kcal export` and `kcal import`: cameras for other programs, and from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from kcal.cli.camera_sources import named_source, parse_size, picked
+from kcal.cli.console import out, print_wrote, warn
+from kcal.errors import InputError
+from kcal.files import check_writable
+
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+
+
+def export_command(
+    source: Annotated[
+        str,
+        typer.Argument(metavar="FILE", help="Camera or rig of kcal; RIG.json:left is one of its cameras."),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="File to write.")],
+    format: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm or remap."),
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Lens model of the format to fit, for example opencv5.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Picture of the error of a refitted lens over the image.")
+    ] = None,
+) -> None:
+    """Write a camera or a rig for another program.
+
+    The format follows from the suffix: .yaml and .xml OpenCV, .cameramodel mrcal, .txt and .bin COLMAP, .json
+    nerfstudio, .mat MATLAB, .npz maps for cv2.remap. ROS, Kalibr and OpenSfM are named by --format. A lens that the
+    format cannot hold is never cut short: the nearest model of the format is fitted, and its error over the image is
+    printed. Pixel origins are converted.
+
+    **Examples**
+
+    `kcal export left.camera.json -o left.yaml`
+
+    `kcal export rig.json --format kalibr -o camchain.yaml`
+
+    `kcal export left.camera.json -o left.cameramodel --picture misfit.png`
+    """
+    path, name = named_source(source)
+    check_writable(output, path)
+
+    from kcal.calibrate.camera.export import export_cameras
+    from kcal.io.formats import import_cameras
+    from kcal.report.difference import save_difference_picture
+    from kcal.report.figures import check_picture
+
+    if picture is not None:
+        check_picture(picture)
+    found = import_cameras(path)
+    subject = _subject(path, name)
+    done = export_cameras(
+        subject if subject is not None else picked(found, name, source), output, format=format, model=model
+    )
+    for camera, model_name, misfit in zip(
+        found.names if subject is not None else [name or found.names[0]], done.models, done.misfits, strict=True
+    ):
+        label = f"{camera or 'camera'}: {model_name}"
+        if misfit is None:
+            out.print(f"{label}, {'baked' if done.format == 'remap' else 'exact'}", markup=False)
+        else:
+            text = f"{label}, fitted: RMS {misfit.rms:.2g} px, at most {misfit.largest:.2g} px over the image"
+            out.print(text, markup=False)
+    if done.lost:
+        out.print(f"not in the file: {', '.join(done.lost)}")
+    misfits = [misfit for misfit in done.misfits if misfit is not None]
+    if picture is not None and misfits:
+        print_wrote(save_difference_picture(picture, max(misfits, key=lambda each: each.largest), title=source))
+    elif picture is not None:
+        out.print("no picture: nothing was refitted")
+    print_wrote(*done.paths)
+
+
+def _subject(path: Path, name: str | None):  # type: ignore[no-untyped-def]
+    """What a file contains as a whole: its rig or its cameras; None where one of them was named."""
+    from kcal.io.formats import import_cameras, recognized
+    from kcal.io.rig_file import load_rig
+
+    if name is not None:
+        return None
+    found = import_cameras(path)
+    if len(found.cameras) == 1:
+        return found.cameras[0]
+    if recognized(path) == "kcal":
+        return load_rig(path)
+    return found.rig() if found.is_rig() else found.cameras
+
+
+def import_command(
+    sources: Annotated[list[Path], typer.Argument(metavar="FILE...", help="File of another program; two of a pair.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Camera or rig file to write.")],
+    format: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab or opensfm."),
+    ] = None,
+    camera: Annotated[str | None, typer.Option(metavar="NAME", help="Take this camera of several.")] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Image size, where the file has none.")
+    ] = None,
+    fisheye: Annotated[
+        bool | None, typer.Option("--fisheye/--no-fisheye", help="Whether four coefficients of OpenCV are a fisheye's.")
+    ] = None,
+    board: Annotated[
+        str | None, typer.Option(metavar="CxR", help="Read corners instead, of a board with these inner corners.")
+    ] = None,
+    square: Annotated[
+        str | None, typer.Option(metavar="LENGTH", help="Side of a square of the board with its unit: 25mm.")
+    ] = None,
+    sigma: Annotated[
+        float | None, typer.Option(metavar="M", help="Of surveyed places, along each axis, where the file has none.")
+    ] = None,
+    geoid: Annotated[
+        float | None, typer.Option(metavar="M", help="Height of the geoid there, for the elevations of GPX.")
+    ] = None,
+    unit: Annotated[
+        str | None,
+        typer.Option(metavar="UNIT", help="Unit of the translation, where the file has none: mm, cm, m, in."),
+    ] = None,
+) -> None:
+    """Read a camera or a rig from a file of another program.
+
+    The format is recognized. Two cameras with their relative pose become a rig file. With --board, corners become an
+    observations file: mrcal's corners.vnl, CSV (image,u,v,weight), image_points of OpenCV's sample, and MATLAB's
+    imagePoints. GeoJSON and GPX become a survey.csv for `kcal rig --landmarks`.
+
+    **Examples**
+
+    `kcal import left.yaml -o left.camera.json`
+
+    `kcal import intrinsics.yml extrinsics.yml --size 640x480 --unit mm -o rig.json`
+
+    `kcal import cameras.txt --camera 2 -o second.camera.json`
+
+    `kcal import corners.vnl --board 10x10 --square 58.8mm --size 6000x3376 -o left.obs.json`
+
+    `kcal import places.gpx --sigma 0.02 --geoid -67.3 -o survey.csv`
+    """
+    check_writable(output, *sources)
+    if board is not None:
+        _import_corners(sources, output, board, square, parse_size(size))
+        return
+    if sources[0].suffix.lower() in (".gpx", ".geojson"):
+        _import_survey(sources, output, sigma, geoid)
+        return
+    if unit is not None and unit not in _UNITS:
+        raise InputError(f"--unit {unit}: write mm, cm, m or in")
+
+    from kcal.io.camera_file import save_camera
+    from kcal.io.formats import import_cameras
+    from kcal.io.rig_file import save_rig
+
+    found = import_cameras(
+        *sources, format=format, size=parse_size(size), fisheye=fisheye, meters=_UNITS[unit] if unit else None
+    )
+    for note in found.notes:
+        warn(note)
+    if camera is None and found.is_rig():
+        rig = found.rig()
+        save_rig(rig, output)
+        out.print(f"rig from {found.format}: baseline {float(rig.baseline):.6g} m", markup=False)
+    else:
+        chosen = picked(found, camera, " ".join(map(str, sources)))
+        save_camera(chosen, output)
+        out.print(f"camera from {found.format}: {chosen.model}, {chosen.size[0]}x{chosen.size[1]} px", markup=False)
+    out.print("not in the file: error bars, calibration record")
+    print_wrote(output)
+
+
+def _import_corners(
+    sources: list[Path], output: Path, board: str, square: str | None, size: tuple[int, int] | None
+) -> None:
+    from kcal.corners.board import Board
+    from kcal.corners.foreign_corners import import_corners
+
+    if square is None or len(sources) != 1:
+        raise InputError("corners are read from one file, with --board and --square")
+    seen = import_corners(sources[0], Board.parse(board, square), size)
+    seen.save(output)
+    weights = "with weights" if seen.covariances() is not None else "without weights"
+    corners = sum(pixel is not None for view in seen.views for pixel in view.pixels)
+    out.print(f"{len(seen.views)} views with {corners} corners, {weights}")
+    print_wrote(output)
+
+
+def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid: float | None) -> None:
+    import csv
+    import io
+
+    from kcal.files import write_atomic
+    from kcal.locate.geodesy import enu_to_geodetic
+    from kcal.locate.survey_files import import_survey
+
+    if len(sources) != 1:
+        raise InputError("places are read from one file")
+    survey = import_survey(sources[0], sigma=sigma, geoid=geoid)
+    assert survey.origin is not None
+    places = enu_to_geodetic(survey.points, survey.origin).tolist()
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["name", "lat", "lon", "height", "sigma", "sigma_up"])
+    for name, (lat, lon, height), (level, _, up) in zip(survey.names, places, survey.sigma.tolist(), strict=True):
+        writer.writerow([name, f"{lat:.11f}", f"{lon:.11f}", f"{height:.5f}", repr(level), repr(up)])
+    write_atomic(output, text.getvalue())
+    out.print(f"{len(places)} places")
+    print_wrote(output)

@@ -1,0 +1,216 @@
+"""Read corners that other programs have found: mrcal's `corners.vnl`, CSV, OpenCV's and MATLAB's exports.
+
+A weight w becomes a covariance of (1 / w)² px² along both axes: only ratios of weights count in a calibration whose
+residuals are below a pixel. Corners with a weight of zero or below were not seen.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pydantic
+
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.errors import FileError, InputError
+
+# (u, v, weight) of a corner, or None where it was not seen.
+Corner = tuple[float, float, float] | None
+
+
+def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] | None = None) -> Observations:
+    r"""Read the corners of one camera from a file of another program.
+
+    * `.vnl`: mrcal's corners, `filename x y level` or `filename x y weight`; a level is a weight of 2^-level.
+    * `.csv`: `image,u,v` and, if need be, `weight` and the corner as `corner` or as `column,row`, from 0.
+    * `.yml`, `.yaml`, `.xml`: `image_points` of OpenCV's calibration sample.
+    * `.mat`: MATLAB's `imagePoints` with `worldPoints`, or in the order of its detector, down the columns first.
+
+    Pixels are converted to kcal's convention: (0, 0) is the center of the first pixel.
+
+    Args:
+        path: of the file.
+        board: the board; corners come row by row unless the file numbers them.
+        image_size: (width, height) in pixels, where the file has none.
+
+    Raises:
+        FileError: it cannot be read, has a wrong number of corners, or a bad line, which is named.
+        InputError: an unknown suffix, or no image size.
+
+    Example:
+        >>> import tempfile
+        >>> text = "# filename x y level" + "".join(f"\na.png {i} {i} 0" for i in range(4))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "corners.vnl")
+        ...     _ = path.write_text(text)
+        ...     seen = import_corners(path, Board(columns=2, rows=2, square=0.1), (640, 480))
+        >>> seen.names, seen.views[0].pixels[3]
+        (('a.png',), (3.0, 3.0))
+    """
+    path = Path(path)
+    readers: dict[str, Callable[[Path, Board], tuple[dict[str, list[Corner]], tuple[int, int] | None]]] = {
+        ".vnl": _from_vnl, ".csv": _from_csv, ".yml": _from_opencv, ".yaml": _from_opencv, ".xml": _from_opencv,
+        ".mat": _from_matlab,
+    }  # fmt: skip
+    if path.suffix.lower() not in readers:
+        raise InputError(f"{path}: corners are read from {', '.join(readers)} files")
+    try:
+        views, size = readers[path.suffix.lower()](path, board)
+    except OSError as error:
+        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError, IndexError, csv.Error, cv2.error) as error:
+        raise FileError(f"{path}: bad corners file: {error}") from error
+    size = image_size or size
+    if size is None:
+        raise InputError(f"{path}: the image size is not in the file; give it (--size WIDTHxHEIGHT)")
+    for name, corners in views.items():
+        if len(corners) != board.corners:
+            raise FileError(f"{path}: {name} has {len(corners)} corners, the board {board.corners}")
+    weighted = any(corner is not None and corner[2] != 1.0 for corners in views.values() for corner in corners)
+    found = [_view(name, corners, weighted) for name, corners in views.items() if any(corners)]
+    if not found:
+        raise FileError(f"{path}: no view with corners")
+    try:
+        return Observations(board=board, image_size=size, refinement="none", views=tuple(found))
+    except pydantic.ValidationError as error:
+        raise FileError(f"{path}: bad corners file: {error.errors()[0]['msg']}") from error
+
+
+def _view(name: str, corners: Sequence[Corner], weighted: bool) -> View:
+    spread = tuple(None if corner is None else (corner[2] ** -2, 0.0, corner[2] ** -2) for corner in corners)
+    return View(
+        name=name,
+        pixels=tuple(None if corner is None else corner[:2] for corner in corners),
+        covariance=spread if weighted else None,
+    )
+
+
+def _corner_of_weight(u: str, v: str, weight: float, where: str) -> Corner:
+    if u in ("", "-") or v in ("", "-") or not weight > 0:
+        return None
+    values = float(u), float(v), weight
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"{where}: {u}, {v}, {weight} are no finite numbers")
+    return values
+
+
+def _from_vnl(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
+    views: dict[str, list[Corner]] = {}
+    header: list[str] = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        where = f"line {number}"
+        if line.startswith("##") or not line.strip():
+            continue
+        if line.startswith("#"):
+            header = header or line.lstrip("#!").split()
+            continue
+        fields = line.split()
+        if header[:3] != ["filename", "x", "y"] or header[3:] not in ([], ["level"], ["weight"]):
+            raise ValueError(f"the header is {' '.join(header)!r}; '# filename x y level' or weight is needed")
+        if len(fields) != len(header) and fields[1:] != ["-", "-"]:
+            raise ValueError(f"{where}: {len(fields)} fields, the header has {len(header)}")
+        corners = views.setdefault(fields[0], [])
+        if fields[1] == "-":
+            # An image without a board has a single line.
+            corners.append(None)
+            continue
+        last = fields[3] if len(fields) > 3 else "-"
+        weight = 1.0 if last == "-" else float(last)
+        if header[3:] == ["level"] and last != "-":
+            weight = 0.0 if weight < 0 else 0.5**weight
+        corners.append(_corner_of_weight(fields[1], fields[2], weight, where))
+    return {name: corners for name, corners in views.items() if corners != [None]}, None
+
+
+def _from_csv(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
+    table = csv.DictReader(io.StringIO(path.read_bytes().decode("utf-8-sig"), newline=""), skipinitialspace=True)
+    names = table.fieldnames or []
+    needed, allowed = {"image", "u", "v"}, {"image", "u", "v", "weight", "corner", "column", "row"}
+    if not needed <= set(names) <= allowed or ("column" in names) != ("row" in names):
+        raise ValueError(f"the header is {','.join(names)!r}; image,u,v and weight, corner or column,row are needed")
+    views: dict[str, list[Corner]] = {}
+    filled: dict[str, set[int]] = {}
+    numbered = "corner" in names or "column" in names
+    for row in table:
+        where = f"line {table.line_num}"
+        if None in row or None in row.values():
+            raise ValueError(f"{where}: a wrong number of fields")
+        corner = _corner_of_weight(row["u"], row["v"], float(row.get("weight") or 1.0), where)
+        corners = views.setdefault(row["image"], [None] * board.corners if numbered else [])
+        if not numbered:
+            corners.append(corner)
+            continue
+        place = int(row["corner"]) if "corner" in names else _place(int(row["column"]), int(row["row"]), board, where)
+        if not 0 <= place < board.corners:
+            raise ValueError(f"{where}: corner {place} is not on the board, which has {board.corners}")
+        if place in filled.setdefault(row["image"], set()):
+            raise ValueError(f"{where}: corner {place} of {row['image']} occurs twice")
+        filled[row["image"]].add(place)
+        corners[place] = corner
+    return views, None
+
+
+def _place(column: int, row: int, board: Board, where: str) -> int:
+    if not (0 <= column < board.columns and 0 <= row < board.rows):
+        raise ValueError(f"{where}: column {column}, row {row} are not on the board of {board.columns}x{board.rows}")
+    return row * board.columns + column
+
+
+def _from_opencv(path: Path, board: Board) -> tuple[dict[str, list[Corner]], tuple[int, int] | None]:
+    text = path.read_text(encoding="utf-8")
+    file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    points = file.getNode("image_points").mat()
+    if points is None or points.ndim != 3 or points.shape[2] != 2:
+        raise ValueError("image_points of OpenCV's calibration sample, views by corners, are needed")
+    sides = [int(file.getNode(name).real()) for name in ("image_width", "image_height")]
+    return _unweighted(points), (sides[0], sides[1]) if all(sides) else None
+
+
+def _unweighted(points: np.ndarray) -> dict[str, list[Corner]]:
+    """Views named by their numbers; NaN where a corner was not seen."""
+    return {
+        f"{number:03d}": [None if not np.isfinite(p).all() else (float(p[0]), float(p[1]), 1.0) for p in view]
+        for number, view in enumerate(points, 1)
+    }
+
+
+def _from_matlab(path: Path, board: Board) -> tuple[dict[str, list[Corner]], tuple[int, int] | None]:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        content: Mapping[str, Any] = loadmat(path)
+    except NotImplementedError:
+        raise ValueError("a file of version 7.3; save it with -v7") from None
+    except (MatReadError, zlib.error) as error:
+        raise ValueError(str(error)) from None
+    points = np.asarray(content["imagePoints"], dtype=float)
+    points = points[..., None] if points.ndim == 2 else points
+    if points.ndim != 3 or points.shape[:2] != (board.corners, 2):
+        raise ValueError(f"imagePoints has the shape {points.shape}; ({board.corners}, 2, views) is needed")
+    # MATLAB's first pixel is (1, 1), and its detector goes down the columns first.
+    views = np.moveaxis(points, -1, 0) - 1.0
+    rows, columns = np.meshgrid(np.arange(board.rows), np.arange(board.columns))
+    if "worldPoints" in content:
+        world = np.asarray(content["worldPoints"], dtype=float)[:, :2]
+        steps = np.diff(np.unique(np.round(world.ravel(), 9)))
+        places = np.round((world - world.min(0)) / steps.min()).astype(int)
+        columns, rows = places[:, 0], places[:, 1]
+        if columns.max() >= board.columns or rows.max() >= board.rows:
+            raise ValueError("worldPoints are not those of the board")
+    order = rows.ravel() * board.columns + columns.ravel()
+    if sorted(order) != list(range(board.corners)):
+        raise ValueError("worldPoints are not those of the board")
+    sorted_views = np.empty_like(views)
+    sorted_views[:, order] = views
+    size = content.get("imageSize")
+    sides = None if size is None else [int(side) for side in np.ravel(size)[:2]]
+    return _unweighted(sorted_views), None if sides is None else (sides[1], sides[0])

@@ -1,0 +1,112 @@
+"""Read the size of an image from its first bytes, before a decoder allocates memory for it."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+from kcal.checks import check_pixel_count
+from kcal.errors import FileError
+
+Size = tuple[int, int]
+
+
+def check_image_header(data: bytes, source: str | Path) -> None:
+    """Refuse bytes that are no image of a known format, or one with more than 500 megapixels.
+
+    The formats are JPEG, PNG, TIFF, BMP, WebP, PNM (PBM, PGM, PPM) and JPEG 2000. Whether the rest of the file is whole
+    is found out by the decoder.
+
+    Raises:
+        FileError: empty, another format, or too many pixels; `source` names it.
+
+    Example:
+        >>> check_image_header(b"P5 60000 60000 255 ", "huge.pgm")
+        Traceback (most recent call last):
+        kcal.errors.FileError: huge.pgm: 60000x60000 pixels; an image may have at most 500 megapixels
+    """
+    if not data:
+        raise FileError(f"{source}: the file is empty; copy it again")
+    size_of = next((size_of for start, size_of in _FORMATS.items() if data.startswith(start)), None)
+    if size_of is None:
+        raise FileError(f"{source}: not an image that can be read; use JPEG, PNG, TIFF, BMP, WebP or PGM")
+    try:
+        size = size_of(data)
+    except (struct.error, IndexError, TypeError, ValueError):
+        raise FileError(f"{source}: the image is truncated or corrupt; copy it again or leave it out") from None
+    try:
+        check_pixel_count(size)
+    except ValueError as error:
+        raise FileError(f"{source}: {error}") from error
+
+
+def _png(data: bytes) -> Size:
+    return struct.unpack_from(">II", data, 16)
+
+
+def _jpeg(data: bytes) -> Size:
+    at = 2
+    while True:
+        at = data.index(b"\xff", at)
+        while data[at] == 0xFF:
+            at += 1
+        marker = data[at]
+        # A start of frame; 0xC4, 0xC8 and 0xCC are tables.
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", data, at + 4)
+            return width, height
+        at += 1 + struct.unpack_from(">H", data, at + 1)[0]
+
+
+def _tiff(data: bytes) -> Size:
+    order = "<" if data.startswith(b"II") else ">"
+    big = struct.unpack_from(order + "H", data, 2)[0] == 43
+    (place,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
+    (count,) = struct.unpack_from(order + ("Q" if big else "H"), data, place)
+    first, step = (place + 8, 20) if big else (place + 2, 12)
+    sizes = {3: "H", 4: "I", 16: "Q"}
+    found: dict[int, int] = {}
+    for entry in range(first, first + step * min(count, 65535), step):
+        tag, kind = struct.unpack_from(order + "HH", data, entry)
+        if tag in (256, 257) and kind in sizes:
+            (found[tag],) = struct.unpack_from(order + sizes[kind], data, entry + (12 if big else 8))
+    return found.get(256, 0), found.get(257, 0)
+
+
+def _bmp(data: bytes) -> Size:
+    if struct.unpack_from("<I", data, 14)[0] == 12:
+        return struct.unpack_from("<HH", data, 18)
+    width, height = struct.unpack_from("<ii", data, 18)
+    return abs(width), abs(height)
+
+
+def _webp(data: bytes) -> Size:
+    # The format has at most 16383 x 16383 pixels.
+    return 0, 0
+
+
+_PNM_SIZE = re.compile(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s")
+
+
+def _pnm(data: bytes) -> Size:
+    found = _PNM_SIZE.match(data)
+    return int(found[1]), int(found[2])  # type: ignore[index]
+
+
+def _jpeg2000(data: bytes) -> Size:
+    at = data.index(b"\xff\x4f\xff\x51")
+    right, bottom, left, top = struct.unpack_from(">IIII", data, at + 8)
+    return right - left, bottom - top
+
+
+_FORMATS: dict[bytes, Callable[[bytes], Size]] = {
+    b"\x89PNG\r\n\x1a\n": _png,
+    b"\xff\xd8": _jpeg,
+    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), _tiff),
+    b"BM": _bmp,
+    b"RIFF": _webp,
+    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), _pnm),
+    **dict.fromkeys((b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51"), _jpeg2000),
+}

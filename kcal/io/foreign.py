@@ -1,0 +1,215 @@
+"""What files of other programs contain, in kcal's conventions, and helpers to read and write them.
+
+Principal points are shifted so that (0, 0) is the center of the first pixel; poses become `cam_from_reference`, meters.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+import yaml
+from torch import Tensor
+
+from kcal.errors import FileError, InputError
+from kcal.lens.calibration import CameraCalibration
+from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
+from kcal.lens.pose import nearest_rotation
+from kcal.lens.rig import StereoRig
+
+# Rotations of files with six digits; beyond it they are no rotation but a mistake.
+_ROUNDED = 1e-4
+
+
+class Hints(NamedTuple):
+    """What a file may leave open: image size (width, height), whether four coefficients are a fisheye's, its unit."""
+
+    size: tuple[int, int] | None = None
+    fisheye: bool | None = None
+    meters: float | None = None
+
+
+class CameraPose(NamedTuple):
+    """Where a camera stands: a point of the reference frame is seen at rotation (3, 3) @ point + translation (3,)."""
+
+    rotation: Tensor
+    translation: Tensor
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class ImportedCameras:
+    """Cameras and poses from a file of another program.
+
+    Args:
+        format: name of the format.
+        cameras: the cameras, each with a name (`camera.calibration.name`).
+        poses: rotation (3, 3) and translation (3,) of each camera from the reference frame of the file, meters; empty
+            if the file contains none.
+        notes: what the file left open and how it was read, and what of it kcal does not keep.
+    """
+
+    format: str
+    cameras: tuple[Camera, ...]
+    poses: tuple[CameraPose, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The cameras' names."""
+        return tuple(camera.calibration.name if camera.calibration else "" for camera in self.cameras)
+
+    def is_rig(self) -> bool:
+        """Whether these are two cameras that do not stand in the same place."""
+        return (
+            len(self.cameras) == 2
+            and len(self.poses) == 2
+            and float(_second_from_first(self.poses).translation.norm()) > 0
+        )
+
+    def rig(self) -> StereoRig:
+        """Both cameras as a rig, the first one on the left.
+
+        Raises:
+            InputError: not two cameras, or no poses.
+        """
+        if not self.is_rig():
+            raise InputError(
+                f"a rig needs two cameras with their relative pose; found {len(self.cameras)} cameras "
+                f"({', '.join(self.names)}) and {len(self.poses)} poses"
+            )
+        left, right = self.cameras
+        return StereoRig(left, right, *_second_from_first(self.poses))
+
+
+def _second_from_first(poses: Sequence[CameraPose]) -> CameraPose:
+    """Of the second camera from the first."""
+    first, second = poses
+    rotation = second.rotation @ first.rotation.T
+    return CameraPose(rotation, second.translation - rotation @ first.translation)
+
+
+def rig_poses(rig: StereoRig) -> tuple[CameraPose, CameraPose]:
+    """Both cameras from the left one's frame."""
+    zero = torch.zeros(3, dtype=torch.float64)
+    still = CameraPose(torch.eye(3, dtype=torch.float64), zero)
+    return still, CameraPose(rig.right_from_left_rotation, rig.right_from_left_translation)
+
+
+def checked_pose(rotation: Any, translation: Any) -> CameraPose:
+    """A pose from lists: the rotation is made exact, because files round it.
+
+    Raises:
+        ValueError: no rotation, or wrong shapes.
+    """
+    matrix = torch.tensor(rotation, dtype=torch.float64).reshape(3, 3)
+    exact = nearest_rotation(matrix)
+    if not float((matrix - exact).abs().max()) <= _ROUNDED:
+        raise ValueError("its rotation is no rotation matrix (R Rᵀ must be 1 and det R = +1)")
+    # One that is exact already stays as it is, to the last bit.
+    same = float((matrix - exact).abs().max()) < 1e-14
+    return CameraPose(matrix if same else exact, torch.tensor(translation, dtype=torch.float64).reshape(3))
+
+
+def named_camera(
+    name: str,
+    intrinsics: Sequence[float],
+    size: Sequence[int],
+    model: LensModel | str,
+    coefficients: Sequence[float] = (),
+    skew: float = 0.0,
+) -> Camera:
+    """A camera from fx, fy, cx, cy in kcal's convention."""
+    fx, fy, cx, cy = map(float, intrinsics)
+    width, height = (int(value) for value in size)
+    camera = Camera.build(
+        focal=(fx, fy), center=(cx, cy), size=(width, height), coefficients=coefficients, model=model, skew=skew
+    )
+    camera.calibration = CameraCalibration(name=name)
+    return camera
+
+
+def numbers(value: Any, count: Sequence[int] | int, what: str) -> list[float]:
+    """A list of finite numbers, flattened; `count` says how many, or which counts are allowed.
+
+    Raises:
+        ValueError: something else.
+    """
+    flat: list[float] = []
+
+    def collect(part: Any) -> None:
+        if isinstance(part, (list, tuple)):
+            for inner in part:
+                collect(inner)
+        elif isinstance(part, bool) or not isinstance(part, (int, float, str)):
+            raise ValueError(f"{what} must be numbers")
+        else:
+            flat.append(float(part))
+
+    collect(value.tolist() if hasattr(value, "tolist") else value)
+    allowed = (count,) if isinstance(count, int) else tuple(count)
+    if len(flat) not in allowed:
+        raise ValueError(f"{what} has {len(flat)} numbers; {' or '.join(map(str, allowed))} are needed")
+    if not all(map(math.isfinite, flat)):
+        raise ValueError(f"{what} has a number that is not finite")
+    return flat
+
+
+def whole_size(width: Any, height: Any) -> tuple[int, int]:
+    """Width and height as positive whole numbers."""
+    sizes = [float(value) for value in (width, height)]
+    if not all(value > 0 and value == int(value) for value in sizes):
+        raise ValueError(f"the image size is {width} x {height}; positive whole numbers are needed")
+    return int(sizes[0]), int(sizes[1])
+
+
+@contextmanager
+def reading(path: str | Path, what: str) -> Iterator[None]:
+    """Turn whatever goes wrong while a file is read into one `FileError` that names it."""
+    try:
+        yield
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
+    except KeyError as error:
+        raise FileError(f"{path}: bad {what} file: {error.args[0]} is missing") from error
+    except (InputError, ValueError, TypeError, IndexError, AttributeError, yaml.YAMLError, RecursionError) as error:
+        raise FileError(f"{path}: bad {what} file: {error}") from error
+
+
+def load_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file; nothing in it is executed."""
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if not isinstance(content, dict):
+        raise ValueError("a mapping of names to values is needed")
+    return content
+
+
+def dump_yaml(content: Mapping[str, Any]) -> str:
+    """YAML text with exact numbers, short lists on one line."""
+    return yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None, width=120)
+
+
+def camera_name(camera: Camera, otherwise: str) -> str:
+    """The name that a camera has, or another one."""
+    return (camera.calibration.name if camera.calibration else "") or otherwise
+
+
+def plain(values: Tensor) -> list[Any]:
+    """Nested lists of Python floats."""
+    listed: list[Any] = values.detach().cpu().double().tolist()
+    return listed
+
+
+def paths_for(path: Path, count: int) -> list[Path]:
+    """Where files of one camera each go: the path itself, or NAME_left and NAME_right beside it."""
+    if count == 1:
+        return [path]
+    sides = ("left", "right") if count == 2 else tuple(str(i) for i in range(count))
+    return [path.with_name(f"{path.stem}_{side}{path.suffix}") for side in sides]

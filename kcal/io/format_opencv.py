@@ -1,0 +1,134 @@
+"""OpenCV's YAML, XML and JSON files of one camera or a stereo pair, as its samples write and read them.
+
+One camera: `image_width`, `image_height`, `camera_matrix`, `distortion_coefficients` (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3
+s4 τx τy), `fisheye_model`. A pair: `M1`, `D1`, `M2`, `D2` and `R`, `T`, in one file or in two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from kcal.errors import InputError
+from kcal.files import write_atomic
+from kcal.io.foreign import CameraPose, Hints, ImportedCameras, checked_pose, named_camera, numbers, plain, whole_size
+from kcal.lens.camera import Camera
+
+MODELS = ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "fisheye4")
+_BY_COUNT = {0: "pinhole", 4: "opencv4", 5: "opencv5", 8: "opencv8", 12: "opencv12", 14: "opencv14"}
+_MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "mtx")
+_COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "dist")
+
+
+def read_opencv(path: Path, hints: Hints) -> ImportedCameras:
+    """Read one camera, a pair, or the R and T of a pair whose cameras are in another file."""
+    file = _opened(path)
+    notes: list[str] = []
+    size = hints.size or _stored_size(file)
+    pairs = [("M1", "D1", "left"), ("M2", "D2", "right")]
+    if file.getNode("M1").empty() and not file.getNode("cameraMatrix1").empty():
+        pairs = [("cameraMatrix1", "distCoeffs1", "left"), ("cameraMatrix2", "distCoeffs2", "right")]
+    poses: tuple[CameraPose, ...] = ()
+    if not file.getNode("R").empty() and not file.getNode("T").empty():
+        meters = hints.meters or 1.0
+        rotation, translation = _stored_numbers(file, "R", 9), [meters * t for t in _stored_numbers(file, "T", 3)]
+        poses = (checked_pose(np.eye(3).tolist(), [0.0, 0.0, 0.0]), checked_pose(rotation, translation))
+        if hints.meters is None:
+            notes.append("the unit of T is not in the file: taken as meters (--unit mm for millimeters)")
+    if file.getNode(pairs[0][0]).empty():
+        matrix, coefficients = _present(file, _MATRICES), _present(file, _COEFFICIENTS)
+        pairs = [(matrix, coefficients, path.stem)] if matrix else []
+        if not pairs and not poses:
+            raise ValueError(f"no camera; {_MATRICES[0]}, M1 or R and T are needed")
+    cameras = tuple(
+        _opencv_camera(file, matrix, coefficients, name, size, hints.fisheye, notes)
+        for matrix, coefficients, name in pairs
+    )
+    return ImportedCameras(format="opencv", cameras=cameras, poses=poses, notes=tuple(dict.fromkeys(notes)))
+
+
+def _opened(path: Path) -> Any:
+    text = path.read_text(encoding="utf-8")
+    try:
+        file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        opened = file.isOpened() and file.root().isMap()
+    except cv2.error as error:
+        raise ValueError(f"OpenCV cannot parse it: {error.err or 'unknown syntax'}") from None
+    if not opened:
+        raise ValueError("OpenCV cannot parse it")
+    return file
+
+
+def _present(file: Any, names: Sequence[str]) -> str:
+    return next((name for name in names if not file.getNode(name).empty()), "")
+
+
+def _stored_size(file: Any) -> tuple[int, int] | None:
+    width, height = (
+        _present(file, [f"image_{side}", f"image_{side.capitalize()}", side]) for side in ("width", "height")
+    )
+    if width and height:
+        return whole_size(file.getNode(width).real(), file.getNode(height).real())
+    for name in ("image_size", "imageSize", "size"):
+        node = file.getNode(name)
+        if node.isSeq() and node.size() == 2:
+            return whole_size(node.at(0).real(), node.at(1).real())
+    return None
+
+
+def _stored_numbers(file: Any, name: str, count: int | Sequence[int]) -> list[float]:
+    node = file.getNode(name)
+    value = node.mat() if node.isMap() else [node.at(i).real() for i in range(node.size())] if node.isSeq() else None
+    return numbers([] if value is None else value.ravel() if hasattr(value, "ravel") else value, count, name)
+
+
+def _opencv_camera(
+    file: Any, matrix: str, coefficients: str, name: str, size: Any, fisheye: bool | None, notes: list[str]
+) -> Camera:
+    if size is None:
+        raise ValueError("the image size is not in the file; give it (--size WIDTHxHEIGHT)")
+    fx, skew, cx, zero_a, fy, cy, *last = _stored_numbers(file, matrix, 9)
+    if zero_a or last != [0.0, 0.0, 1.0]:
+        raise ValueError(f"{matrix} is no camera matrix")
+    if skew:
+        notes.append(f"{matrix} has a skew of {skew:g}, which OpenCV does not use and kcal does not take over")
+    lens = _stored_numbers(file, coefficients, tuple(_BY_COUNT)) if coefficients else []
+    node = file.getNode("fisheye_model")
+    known = fisheye if fisheye is not None else bool(node.real()) if not node.empty() else None
+    if known and len(lens) != 4:
+        raise ValueError(f"a fisheye has 4 coefficients, {coefficients} has {len(lens)}")
+    if known is None and len(lens) == 4:
+        notes.append("4 coefficients read as k1 k2 p1 p2; if they are a fisheye's, use --fisheye")
+    model = "fisheye4" if known else _BY_COUNT[len(lens)]
+    return named_camera(name, (fx, fy, cx, cy), size, model, lens)
+
+
+def write_opencv(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+    """Write one camera, or two with their relative pose."""
+    kind = {".xml": ".xml", ".json": ".json"}.get(path.suffix.lower(), ".yml")
+    file = cv2.FileStorage(kind, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    if cameras[0].size != cameras[-1].size:
+        raise InputError(
+            f"OpenCV's stereo file has one image size; these cameras have {cameras[0].size} and {cameras[-1].size}"
+        )
+    if cameras[0].model.fisheye != cameras[-1].model.fisheye:
+        raise InputError("OpenCV's stereo file has two fisheyes or none: write the cameras one by one")
+    file.write("image_width", cameras[0].size[0])
+    file.write("image_height", cameras[0].size[1])
+    keys = [("camera_matrix", "distortion_coefficients")] if len(cameras) == 1 else [("M1", "D1"), ("M2", "D2")]
+    for camera, (matrix, coefficients) in zip(cameras, keys, strict=True):
+        lens = camera.coefficients.tolist()
+        # Four coefficients could be a fisheye's.
+        lens += [0.0] * (5 - len(lens)) if not camera.model.fisheye else []
+        file.write(matrix, np.array(plain(camera.matrix)))
+        file.write(coefficients, np.array([lens]))
+    file.write("fisheye_model", int(cameras[0].model.fisheye))
+    if len(cameras) == 2 and poses:
+        pair = ImportedCameras(format="opencv", cameras=tuple(cameras), poses=tuple(poses)).rig()
+        file.write("R", np.array(plain(pair.right_from_left_rotation)))
+        file.write("T", np.array(plain(pair.right_from_left_translation))[:, None])
+    return [write_atomic(path, file.releaseAndGetString())]

@@ -1,0 +1,259 @@
+"""The formats of other programs that kcal reads and writes: the table, and `import_cameras`."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+
+from kcal.errors import FileError, InputError
+from kcal.io import (
+    format_colmap,
+    format_kalibr,
+    format_matlab,
+    format_mrcal,
+    format_nerfstudio,
+    format_opencv,
+    format_opensfm,
+    format_ros,
+)
+from kcal.io.camera_file import load_camera
+from kcal.io.foreign import CameraPose, Hints, ImportedCameras, reading, rig_poses
+from kcal.io.rig_file import load_rig
+from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CameraFormat:
+    """A format of another program.
+
+    Args:
+        title: what the files are.
+        suffixes: of file names that mean this format where nothing else is said.
+        models: kcal's lens models that it can hold.
+        read: one file.
+        write: cameras and their poses, all of one of the models.
+        skew: whether it can hold a skew.
+        pose: whether it can hold the relative pose of two cameras.
+    """
+
+    title: str
+    suffixes: tuple[str, ...]
+    models: tuple[str, ...]
+    read: Callable[[Path, Hints], ImportedCameras]
+    write: Callable[[Sequence[Camera], Sequence[CameraPose], Path], list[Path]]
+    skew: bool = False
+    pose: bool = True
+
+
+FORMATS = {
+    "opencv": CameraFormat(
+        title="OpenCV YAML, XML or JSON, one camera or a pair",
+        suffixes=(".yml", ".yaml", ".xml"),
+        models=format_opencv.MODELS,
+        read=format_opencv.read_opencv,
+        write=format_opencv.write_opencv,
+    ),
+    "ros": CameraFormat(
+        title="ROS camera_info, a file per camera",
+        suffixes=(),
+        models=format_ros.MODELS,
+        read=format_ros.read_ros,
+        write=format_ros.write_ros,
+    ),
+    "kalibr": CameraFormat(
+        title="Kalibr camchain",
+        suffixes=(),
+        models=format_kalibr.MODELS,
+        read=format_kalibr.read_kalibr,
+        write=format_kalibr.write_kalibr,
+    ),
+    "mrcal": CameraFormat(
+        title="mrcal cameramodel, a file per camera",
+        suffixes=(".cameramodel",),
+        models=format_mrcal.MODELS,
+        read=format_mrcal.read_mrcal,
+        write=format_mrcal.write_mrcal,
+    ),
+    "colmap": CameraFormat(
+        title="COLMAP cameras.txt or cameras.bin",
+        suffixes=(".txt", ".bin"),
+        models=format_colmap.MODELS,
+        read=format_colmap.read_colmap,
+        write=format_colmap.write_colmap,
+        pose=False,
+    ),
+    "nerfstudio": CameraFormat(
+        title="nerfstudio transforms.json",
+        suffixes=(".json",),
+        models=format_nerfstudio.MODELS,
+        read=format_nerfstudio.read_nerfstudio,
+        write=format_nerfstudio.write_nerfstudio,
+        pose=False,
+    ),
+    "matlab": CameraFormat(
+        title="MATLAB struct of camera or stereo parameters",
+        suffixes=(".mat",),
+        models=format_matlab.MODELS,
+        read=format_matlab.read_matlab,
+        write=format_matlab.write_matlab,
+        skew=True,
+    ),
+    "opensfm": CameraFormat(
+        title="OpenSfM camera_models.json",
+        suffixes=(),
+        models=format_opensfm.MODELS,
+        read=format_opensfm.read_opensfm,
+        write=format_opensfm.write_opensfm,
+        pose=False,
+    ),
+}
+
+
+def format_named(name: str) -> CameraFormat:
+    """The format of that name.
+
+    Raises:
+        InputError: an unknown name; the message lists the known ones.
+    """
+    if name not in FORMATS:
+        raise InputError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}")
+    return FORMATS[name]
+
+
+def held_exactly(camera: Camera, models: Sequence[str], skew: bool = False) -> Camera | None:
+    """The same camera in the first of the models that contains its lens; None if none does.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.1, 0.01])
+        >>> str(held_exactly(camera, ("pinhole", "opencv4", "opencv8")).model)
+        'opencv4'
+    """
+    values = dict(zip(camera.names, camera.params.detach().tolist(), strict=True))
+    if camera.model.hybrid or (values["skew"] and not skew):
+        return None
+    needed = {name for name, value in values.items() if value} - {"fx", "fy", "cx", "cy", "skew"}
+    for model in map(LensModel.named, models):
+        if model.fisheye == camera.model.fisheye and needed <= set(model.names):
+            names = ("fx", "fy", "cx", "cy", "skew", *model.names)
+            parameters = torch.tensor([values.get(name, 0.0) for name in names], dtype=torch.float64)
+            found = Camera(parameters, size=camera.size, model=model)
+            if camera.calibration is not None:
+                found.calibration = dataclasses.replace(
+                    camera.calibration, sigma=None, covariance=None, information=None
+                )
+            return found
+    return None
+
+
+def recognized(path: Path) -> str:
+    """The format of a file, by its suffix or by what is in it; `kcal` for a camera or rig of kcal.
+
+    Raises:
+        FileError: it cannot be read, or is of no known format.
+    """
+    suffix = path.suffix.lower()
+    if suffix in (".mat", ".cameramodel", ".bin"):
+        return {".mat": "matlab", ".cameramodel": "mrcal", ".bin": "colmap"}[suffix]
+    with reading(path, "camera"):
+        text = path.read_text(encoding="utf-8")
+    # mrcal's files begin with comments.
+    if suffix == ".json" or re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE).lstrip()[:1] in ("{", "["):
+        return _json_format(path, text)
+    if suffix == ".xml" or "opencv-matrix" in text or text.startswith("%YAML"):
+        return "opencv"
+    if re.search(r"^cam0\s*:", text, re.MULTILINE):
+        return "kalibr"
+    if re.search(r"^camera_matrix\s*:", text, re.MULTILINE):
+        return "ros"
+    if suffix == ".txt" or re.search(r"^\d+ [A-Z_]+ \d+ \d+ ", text, re.MULTILINE):
+        return "colmap"
+    raise FileError(f"{path}: not a camera file that kcal knows; name its format (--format {', '.join(FORMATS)})")
+
+
+def _json_format(path: Path, text: str) -> str:
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError):
+        # mrcal's files are Python, with comments and single quotes.
+        if "lensmodel" in text or "distortion_model" in text:
+            return "mrcal"
+        raise FileError(f"{path}: neither JSON nor another camera file that kcal knows") from None
+    if isinstance(content, dict) and "kcal" in content:
+        return "kcal"
+    if isinstance(content, dict) and ("fl_x" in content or "frames" in content):
+        return "nerfstudio"
+    if "projection_type" in text:
+        return "opensfm"
+    if isinstance(content, dict) and ("camera_matrix" in content or "M1" in content):
+        return "opencv"
+    raise FileError(f"{path}: a JSON file, but no camera that kcal knows")
+
+
+def import_cameras(
+    *paths: str | Path,
+    format: str | None = None,
+    size: tuple[int, int] | None = None,
+    fisheye: bool | None = None,
+    meters: float | None = None,
+) -> ImportedCameras:
+    """Read cameras, and how they stand to each other, from files of other programs or of kcal.
+
+    OpenCV (YAML, XML), ROS camera_info, Kalibr camchains, mrcal, COLMAP, nerfstudio, MATLAB structs and OpenSfM.
+    Principal points are converted to kcal's convention: (0, 0) is the center of the first pixel.
+
+    Args:
+        paths: one file, or several whose cameras belong together: two of ROS or mrcal, or the intrinsics and extrinsics
+            of OpenCV's stereo sample.
+        format: name of the format; None: by the suffix and the content.
+        size: (width, height) where the file has none.
+        fisheye: whether four coefficients of OpenCV are a fisheye's, where the file does not say.
+        meters: length of the file's unit in meters, where the file does not say; 1 for OpenCV if not given.
+
+    Raises:
+        FileError: a file that cannot be read, or a lens that kcal does not have; the message names the file.
+        InputError: no file, or an unknown format.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "cameras.txt")
+        ...     _ = path.write_text("1 PINHOLE 640 480 500 500 320 240")
+        ...     import_cameras(path).cameras[0].center.tolist()
+        [319.5, 239.5]
+    """
+    if not paths:
+        raise InputError("import_cameras: name a file")
+    if format is not None:
+        format_named(format)
+    parts = [_imported(Path(path), format, Hints(size, fisheye, meters)) for path in paths]
+    cameras = tuple(itertools.chain.from_iterable(part.cameras for part in parts))
+    poses = tuple(itertools.chain.from_iterable(part.poses for part in parts))
+    if not cameras:
+        raise InputError(f"{paths[0]}: the pose of a pair without its cameras; name the file of the cameras too")
+    notes = tuple(dict.fromkeys(itertools.chain.from_iterable(part.notes for part in parts)))
+    return ImportedCameras(
+        format=parts[0].format,
+        cameras=cameras,
+        poses=poses if len(poses) == len(cameras) else (),
+        notes=notes,
+    )
+
+
+def _imported(path: Path, name: str | None, hints: Hints) -> ImportedCameras:
+    name = name or recognized(path)
+    if name != "kcal":
+        with reading(path, name):
+            return FORMATS[name].read(path, hints)
+    with reading(path, "kcal"):
+        kind = json.loads(path.read_text(encoding="utf-8"))["kcal"]
+    if kind == "rig":
+        rig = load_rig(path)
+        return ImportedCameras(format="kcal", cameras=(rig.left, rig.right), poses=rig_poses(rig))
+    return ImportedCameras(format="kcal", cameras=(load_camera(path),))

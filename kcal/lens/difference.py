@@ -1,0 +1,245 @@
+"""How differently two cameras see the same things, after the turn that best undoes it, against what is known of both.
+
+No calibration determines how a camera's frame is turned in its housing. So the second camera is turned until it sees
+what the first one sees as well as it can (mrcal: the implied rotation), with weights from the error bars of both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from scipy.stats import chi2
+from torch import Tensor
+
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.pose import nearest_rotation, rotation_from_vector, step_rows
+from kcal.lens.projection import project_components
+from kcal.lens.pupil import FAR
+from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
+
+# Cameras that agree differ by more than this in 5 % of cases, like the intervals of `kcal.locate`.
+_LEVEL = 0.05
+# Share of the median variance that every pixel has at least in the weights, so that none counts alone.
+_LEAST_SHARE = 0.01
+_MOST_STEPS, _SETTLED = 50, 1e-13
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class CameraDifference:
+    """Where a second camera sees things that a first camera sees at `pixels`.
+
+    Args:
+        pixels: (rows, columns, 2) of the first camera.
+        shift: (rows, columns, 2) pixels of the second minus those of the first camera; NaN where one has no ray.
+        sigma: (rows, columns) one sigma of the shift in the direction in which it is largest, from the error bars of
+            the cameras; None if neither has any.
+        known: whether the error bars of the first, and of the second camera count in it.
+        rotation: (3, 3) from the first camera's frame to the second's.
+        translation: (3,) likewise, meters; zero at infinity.
+        at: distance of the things, meters.
+        ratio: RMS of the shift over what the error bars predict, 1 if they explain it; None without error bars.
+        probability: that cameras which agree differ by at least as much; None without error bars.
+
+    Example:
+        >>> left = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
+        >>> right = Camera.build(focal=(800, 800), center=(321, 240), size=(640, 480))
+        >>> found = camera_difference(left, right)
+        >>> round(float(found.shift[..., 0].abs().max()), 1), round(found.rms, 2)  # most of it is a turn
+        (0.1, 0.06)
+    """
+
+    pixels: Tensor
+    shift: Tensor
+    sigma: Tensor | None
+    known: tuple[bool, bool]
+    rotation: Tensor
+    translation: Tensor
+    at: float
+    ratio: float | None
+    probability: float | None
+
+    @property
+    def length(self) -> Tensor:
+        """(rows, columns) length of the shift, pixels."""
+        return torch.linalg.vector_norm(self.shift, dim=-1)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the length over the image, pixels."""
+        return float(self.length[self.length.isfinite()].square().mean().sqrt())
+
+    @property
+    def largest(self) -> float:
+        """Largest length, pixels."""
+        return float(self.length[self.length.isfinite()].max())
+
+    @property
+    def same(self) -> bool | None:
+        """Whether the error bars explain the difference, at a level of 5 %; None without error bars."""
+        return None if self.probability is None else self.probability >= _LEVEL
+
+    @property
+    def turn_deg(self) -> float:
+        """Angle of the rotation, degrees."""
+        half = 0.5 * torch.linalg.matrix_norm(self.rotation - torch.eye(3, dtype=torch.float64)) / math.sqrt(2.0)
+        return math.degrees(2.0 * math.asin(min(1.0, float(half))))
+
+
+@torch.no_grad()
+def camera_difference(
+    first: Camera,
+    second: Camera,
+    *,
+    at: float = math.inf,
+    rotation: Tensor | None = None,
+    grid: tuple[int, int] = (33, 25),
+) -> CameraDifference:
+    """Compare what two cameras see, after the turn of the second that fits best.
+
+    The turn minimizes the squared shifts over a grid of the image, weighted by the inverse variances of both cameras
+    where their calibration has them, else equally. For things at a distance the second camera may also stand elsewhere.
+    Error bars of the cameras are taken as independent.
+
+    Args:
+        first: a single camera, with its `calibration` if it has error bars.
+        second: a single camera of the same image size.
+        at: distance of the things from the first camera, meters.
+        rotation: (3, 3) from the first camera's frame to the second's, if it is known: the identity where the frames
+            are the same by construction. Nothing is fitted then.
+        grid: columns and rows.
+
+    Raises:
+        InputError: batches, other image sizes, a distance that is not positive.
+        DegenerateError: hardly any pixel that both cameras have a ray for.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.1])
+        >>> camera_difference(camera, camera).largest < 1e-9
+        True
+    """
+    if first.params.ndim != 1 or second.params.ndim != 1:
+        raise InputError("camera_difference: two single cameras are needed, not batches")
+    if first.size != second.size:
+        raise InputError(
+            f"camera_difference: the images have {first.size[0]}x{first.size[1]} and {second.size[0]}x"
+            f"{second.size[1]} px; only cameras with the same image can be compared pixel by pixel"
+        )
+    if not at > 0:
+        raise InputError(f"camera_difference: a positive distance is needed, got {at}")
+    pixels = first.grid(*grid)
+    flat = pixels.reshape(-1, 2)
+    rays, good = first.unproject(flat)
+    rays_second, seen_by_second = second.unproject(flat)
+    good = good & seen_by_second
+    if int(good.sum()) < 8:
+        raise DegenerateError(f"camera_difference: only {int(good.sum())} of {len(flat)} pixels have a ray in both")
+    weight = _inverse_variances(first, second, flat, good)
+    points = FAR * rays if math.isinf(at) else first.ray_origins(rays) + at * rays
+    freedom = 0 if rotation is not None else 3 if math.isinf(at) else 6
+    start = nearest_rotation((rays_second * weight[:, None]).T @ rays) if rotation is None else rotation.double()
+    turn, shift = _fit(second, points[good], flat[good], weight[good], start, freedom)
+    moved = points @ turn.T + shift
+    seen, visible = second.project(moved)
+    good = good & visible
+    away = torch.where(good[:, None], seen - flat, torch.nan)
+    sigma, ratio, probability = _judged(first, second, (flat, moved), away, torch.where(good, weight, 0.0), at, freedom)
+    return CameraDifference(
+        pixels=pixels,
+        shift=away.reshape(pixels.shape),
+        sigma=None if sigma is None else sigma.reshape(pixels.shape[:2]),
+        known=(_has_errors(first), _has_errors(second)),
+        rotation=turn,
+        translation=shift,
+        at=at,
+        ratio=ratio,
+        probability=probability,
+    )
+
+
+def _has_errors(camera: Camera) -> bool:
+    known = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
+    return known is not None and known.lens_size > 0
+
+
+def _inverse_variances(first: Camera, second: Camera, pixels: Tensor, good: Tensor) -> Tensor:
+    """(N,) inverse variances with mean one, zero where a camera has no ray."""
+    variance = torch.zeros_like(pixels[:, 0])
+    for camera in (first, second):
+        if _has_errors(camera):
+            variance = variance + 0.5 * pixel_covariance(camera, pixels).diagonal(dim1=-2, dim2=-1).sum(-1)
+    good = good & variance.isfinite()
+    typical = torch.maximum(variance[good].median(), 1e-6 * variance[good].max())
+    if not float(typical) > 0:
+        return good.double()
+    weight = torch.where(good, 1.0 / (variance + _LEAST_SHARE * typical), 0.0)
+    return weight / weight[good].mean()
+
+
+def _fit(
+    camera: Camera, points: Tensor, pixels: Tensor, weight: Tensor, rotation: Tensor, freedom: int
+) -> tuple[Tensor, Tensor]:
+    """Gauss-Newton for the motion after which the camera sees points (N, 3) at pixels (N, 2)."""
+    translation = torch.zeros(3, dtype=torch.float64)
+    root = weight.sqrt()
+    for _ in range(_MOST_STEPS if freedom else 0):
+        turned = points @ rotation.T
+        seen = project_components((turned + translation).T, camera.params.detach(), camera.model, ())
+        rows = step_rows(seen.by_point, turned.T)[:freedom] * (root * seen.regular)
+        wrong = (seen.pixels - pixels.T) * (root * seen.regular)
+        scale = rows.flatten(1).norm(dim=1)
+        step = (
+            -torch.linalg.lstsq((rows.flatten(1) / scale[:, None]).T, wrong.flatten()[:, None]).solution[:, 0] / scale
+        )
+        rotation = rotation_from_vector(step[:3]) @ rotation
+        translation = translation + step[3:] if freedom == 6 else translation
+        if float(step[:3].norm()) < _SETTLED:
+            break
+    return rotation, translation
+
+
+def _judged(
+    first: Camera,
+    second: Camera,
+    places: tuple[Tensor, Tensor],
+    away: Tensor,
+    weight: Tensor,
+    at: float,
+    freedom: int,
+) -> tuple[Tensor | None, float | None, float | None]:
+    """Sigma (N,) of the shift, its RMS over what is expected, and the probability of as large a shift by chance."""
+    roots = []
+    root = weight.sqrt()[:, None, None]
+    for camera, here in zip((first, second), places, strict=True):
+        if not _has_errors(camera):
+            continue
+        assert camera.calibration is not None
+        known = camera.calibration.known(camera.params.detach())
+        assert known is not None
+        wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
+        by_camera, by_motion, good = pixel_slopes(camera, here, at, wanted)
+        by_camera = torch.where(good[:, None, None], by_camera, 0.0)
+        by_motion = torch.where(good[:, None, None], by_motion, 0.0)[..., :freedom]
+        if freedom:
+            by_motion = by_motion / by_motion.flatten(0, 1).norm(dim=0)
+            # The motion that best undoes each parameter's effect, with the weights with which motions are fitted.
+            undo = torch.linalg.lstsq((root * by_motion).flatten(0, 1), (root * by_camera).flatten(0, 1)).solution
+            by_camera = by_camera - by_motion @ undo
+        roots.append(by_camera @ known.by_parameter(known.half())[:, wanted].T)
+    if not roots:
+        return None, None, None
+    spread = torch.cat(roots, -1)
+    sigma = torch.linalg.matrix_norm(spread, ord=2)
+    weighted = (root * spread).flatten(0, 1)
+    gram = weighted.T @ weighted
+    expected, squared = float(gram.trace()), float(gram.square().sum())
+    found = float((weight[:, None] * torch.where(weight[:, None] > 0, away, 0.0).square()).sum())
+    if not expected > 0:
+        return sigma, None, None
+    # The weighted sum of squares of normal errors has nearly a scaled χ² distribution (Satterthwaite 1946).
+    scale, degrees = squared / expected, expected**2 / squared
+    probability = float(chi2.sf(found / scale, degrees))
+    sigma = torch.where(weight > 0, sigma, torch.nan)
+    return sigma, math.sqrt(found / expected), probability

@@ -1,0 +1,146 @@
+"""Read surveyed places from GeoJSON and GPX, which state no accuracy: it must be given.
+
+GeoJSON (RFC 7946): Point features `[longitude, latitude, height]`, heights above the WGS84 ellipsoid, `name` and,
+optionally, `sigma` and `sigma_up` among the properties. GPX: waypoints with `name` and `ele`, which is above sea level
+unless its writer says otherwise, so a geoid's height must be given.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import xml.etree.ElementTree
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from kcal.errors import FileError, InputError
+from kcal.lens.mounting import Origin
+from kcal.locate.geodesy import geodetic_to_enu
+from kcal.locate.survey import Survey, read_survey
+
+
+class _Place(NamedTuple):
+    name: str
+    origin: Origin
+    sigma: tuple[float, float] | None
+
+
+def import_survey(
+    path: str | Path, origin: Origin | None = None, *, sigma: float | None = None, geoid: float | None = None
+) -> Survey:
+    r"""Read surveyed places from `.geojson`, `.json` or `.gpx`; any other file is read as CSV by `read_survey`.
+
+    Args:
+        path: of the file.
+        origin: of the frame; the first place if left out.
+        sigma: standard deviation along each axis in meters, where the file states none.
+        geoid: height of the geoid above the WGS84 ellipsoid in meters, which is added to the elevations of a GPX file.
+
+    Raises:
+        FileError: it cannot be read, or a place without name, height or accuracy; the place is named.
+        InputError: a GPX file without `geoid`.
+
+    Example:
+        >>> import tempfile
+        >>> place = {"type": "Feature", "properties": {"name": "mast", "sigma": 0.02},
+        ...          "geometry": {"type": "Point", "coordinates": [72.87, 19.07, 14.0]}}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "survey.geojson")
+        ...     _ = path.write_text(json.dumps({"type": "FeatureCollection", "features": [place]}))
+        ...     survey = import_survey(path)
+        >>> survey.names, survey.origin
+        (('mast',), Origin(lat=19.07, lon=72.87, height=14.0))
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".geojson", ".json", ".gpx"):
+        return read_survey(path, origin)
+    if suffix == ".gpx" and geoid is None:
+        raise InputError(
+            f"{path}: elevations of GPX are above sea level; give the geoid's height there (0 if they are ellipsoidal)"
+        )
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        places = _from_gpx(text, geoid or 0.0) if suffix == ".gpx" else _from_geojson(text)
+    except OSError as error:
+        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
+    except xml.etree.ElementTree.ParseError as error:
+        raise FileError(f"{path}: not XML: {error}") from error
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, InputError) as error:
+        raise FileError(f"{path}: bad survey: {error}") from error
+    if not places:
+        raise FileError(f"{path}: no places")
+    names = [place.name for place in places]
+    for name in names:
+        if names.count(name) > 1:
+            raise FileError(f"{path}: the name {name!r} occurs twice; names must differ")
+    spreads = [_spread(place, sigma, path) for place in places]
+    origin = origin or places[0].origin
+    geodetic = torch.tensor([[p.origin.lat, p.origin.lon, p.origin.height] for p in places], dtype=torch.float64)
+    return Survey(tuple(names), geodetic_to_enu(geodetic, origin), torch.tensor(spreads, dtype=torch.float64), origin)
+
+
+def _spread(place: _Place, sigma: float | None, path: Path) -> tuple[float, float, float]:
+    level, up = place.sigma or (sigma, sigma)
+    if level is None or up is None:
+        raise FileError(f"{path}: {place.name!r} has no sigma; say how well the places are known, meters")
+    if not (0 < level < math.inf and 0 < up < math.inf):
+        raise FileError(f"{path}: the sigma of {place.name!r} is {level}, {up}; positive meters are needed")
+    return level, level, up
+
+
+def _from_geojson(text: str) -> list[_Place]:
+    content = json.loads(text)
+    if content.get("crs"):
+        raise ValueError("it has a member crs; RFC 7946 allows WGS84 longitude and latitude only")
+    places = []
+    for number, feature in enumerate(content["features"], 1):
+        properties = feature.get("properties") or {}
+        name = str(properties.get("name") or feature.get("id") or number)
+        geometry = feature["geometry"]
+        if geometry["type"] != "Point":
+            raise ValueError(f"{name}: a {geometry['type']}; points are needed")
+        places.append(_Place(name, _origin(name, *_position_in(geometry["coordinates"], name)), _stated(properties)))
+    return places
+
+
+def _position_in(coordinates: Sequence[Any], name: str) -> tuple[float, float, float]:
+    if len(coordinates) != 3:
+        raise ValueError(f"{name}: [longitude, latitude, height] are needed, got {len(coordinates)} numbers")
+    lon, lat, height = (float(value) for value in coordinates)
+    return lat, lon, height
+
+
+def _origin(name: str, lat: float, lon: float, height: float) -> Origin:
+    try:
+        return Origin(lat=lat, lon=lon, height=height)
+    except InputError as error:
+        raise ValueError(f"{name}: {str(error).removeprefix('origin: ')}") from None
+
+
+def _stated(properties: dict[str, Any]) -> tuple[float, float] | None:
+    if properties.get("sigma") is None:
+        return None
+    level = float(properties["sigma"])
+    return level, float(properties.get("sigma_up") or level)
+
+
+def _from_gpx(text: str, geoid: float) -> list[_Place]:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("document types and entities are not read")
+    places = []
+    for number, element in enumerate(xml.etree.ElementTree.fromstring(text).iter(), 1):
+        if element.tag.rpartition("}")[2] != "wpt":
+            continue
+        parts = {child.tag.rpartition("}")[2]: (child.text or "").strip() for child in element}
+        name = parts.get("name") or str(number)
+        if not parts.get("ele"):
+            raise ValueError(f"{name}: no elevation (ele)")
+        height = float(parts["ele"]) + geoid
+        places.append(
+            _Place(name, _origin(name, float(element.attrib["lat"]), float(element.attrib["lon"]), height), None)
+        )
+    return places

@@ -1,0 +1,257 @@
+"""What is marked: things with a name, a kind and a mark in either image; and the actions that change them.
+
+State is a value: `applied(state, action)` returns the next one, so that undoing is going back to an earlier value.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import pydantic
+
+from kcal.errors import InputError
+
+Kind = Literal["landmark", "feature", "target"]
+Side = Literal["left", "right"]
+_Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
+_Name = Annotated[str, pydantic.StringConstraints(strip_whitespace=True, min_length=1, max_length=60)]
+
+
+SIDES: tuple[Side, Side] = ("left", "right")
+
+
+def other_side(side: Side) -> Side:
+    """The other image."""
+    return "right" if side == "left" else "left"
+
+
+class _Strict(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+class Mark(_Strict):
+    """A pixel with its covariance.
+
+    Args:
+        u: column, integer at a pixel's center.
+        v: row.
+        cov: variance of u, covariance, variance of v, px².
+        how: what it was set by: "hand", a shape that was found there, or "match".
+        frame: name of the pair of images in which it was set.
+    """
+
+    u: _Finite
+    v: _Finite
+    cov: tuple[_Finite, _Finite, _Finite]
+    how: Literal["hand", "corner", "cross", "blob", "end", "edges", "match", "again", "file"] = "hand"
+    frame: str = ""
+
+    @pydantic.model_validator(mode="after")
+    def _is_covariance(self) -> Mark:
+        uu, uv, vv = self.cov
+        if not (uu > 0 and uu * vv - uv * uv > 0):
+            raise ValueError("the covariance is not positive definite")
+        return self
+
+    @property
+    def sigma(self) -> float:
+        """The larger standard deviation along an axis, px."""
+        return math.sqrt(max(self.cov[0], self.cov[2]))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Item:
+    """A thing and its marks.
+
+    Args:
+        kind: "landmark" (surveyed), "feature" (it does not move) or "target" (to be located).
+        left: its mark in the left image.
+        right: its mark in the right image.
+        cross: whether the right mark was matched to the left one or the reverse: "left" or "right" is the side it was
+            matched from, so that both marks share that side's error.
+    """
+
+    kind: Kind
+    left: Mark | None = None
+    right: Mark | None = None
+    cross: Side | None = None
+
+    def mark(self, side: Side) -> Mark | None:
+        """The mark of one side."""
+        return self.left if side == "left" else self.right
+
+
+class Place(_Strict):
+    """Surveyed coordinates: latitude, longitude, height or east, north, up, with sigmas in meters."""
+
+    at: tuple[_Finite, _Finite, _Finite]
+    sigma: Annotated[float, pydantic.Field(gt=0, allow_inf_nan=False)]
+    sigma_up: Annotated[float, pydantic.Field(gt=0, allow_inf_nan=False)] | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MarkingState:
+    """All things by name, in the order in which they were added, and the survey."""
+
+    items: Mapping[str, Item] = dataclasses.field(default_factory=dict)
+    survey: Mapping[str, Place] = dataclasses.field(default_factory=dict)
+
+
+class Add(_Strict):
+    """Add a thing without marks."""
+
+    do: Literal["add"]
+    name: _Name
+    kind: Kind
+
+
+class Put(_Strict):
+    """Set a mark; `matched` says that it was matched to the other side's mark and shares its error."""
+
+    do: Literal["put"]
+    name: _Name
+    side: Side
+    mark: Mark
+    matched: bool = False
+
+
+class Take(_Strict):
+    """Remove a mark."""
+
+    do: Literal["take"]
+    name: _Name
+    side: Side
+
+
+class Drop(_Strict):
+    """Remove a thing with its marks; surveyed places stay."""
+
+    do: Literal["drop"]
+    name: _Name
+
+
+class Rename(_Strict):
+    """Give a thing another name or kind."""
+
+    do: Literal["rename"]
+    name: _Name
+    to: _Name
+    kind: Kind
+
+
+class SurveyPlace(_Strict):
+    """Type in where a landmark is."""
+
+    do: Literal["survey"]
+    name: _Name
+    place: Place
+
+
+class Places(_Strict):
+    """Take over a file of surveyed places. It is no work of the operator's, so it cannot be undone."""
+
+    do: Literal["places"]
+    places: dict[str, Place]
+
+
+class Load(_Strict):
+    """Take over the marks of files that were changed outside, in place of all marks of that kind."""
+
+    do: Literal["load"]
+    items: dict[str, tuple[Kind, Mark | None, Mark | None]]
+    kinds: tuple[Kind, ...]
+
+
+class Step(_Strict):
+    """Undo or redo one action."""
+
+    do: Literal["undo", "redo"]
+
+
+Change = Add | Put | Take | Drop | Rename | SurveyPlace | Places | Load
+Action = Annotated[Change | Step, pydantic.Field(discriminator="do")]
+ACTION: pydantic.TypeAdapter[Change | Step] = pydantic.TypeAdapter(Action)
+
+
+def applied(state: MarkingState, action: Change) -> MarkingState:
+    """The state after an action.
+
+    Raises:
+        InputError: a name that does not exist or exists already, or marks of a moving thing at two moments.
+
+    Example:
+        >>> mark = Mark(u=10.5, v=20.0, cov=(0.01, 0.0, 0.01), frame="1")
+        >>> state = applied(MarkingState(), Add(do="add", name="mast", kind="target"))
+        >>> applied(state, Put(do="put", name="mast", side="left", mark=mark)).items["mast"].left.u
+        10.5
+    """
+    items, survey = dict(state.items), dict(state.survey)
+    if isinstance(action, Load):
+        items = {name: item for name, item in items.items() if item.kind not in action.kinds}
+        for name, (kind, left, right) in action.items.items():
+            items[name] = Item(kind=kind, left=left, right=right)
+        return MarkingState(items=items, survey=survey)
+    if isinstance(action, Places):
+        for name, place in action.places.items():
+            survey[name] = place
+            items.setdefault(name, Item(kind="landmark"))
+        return MarkingState(items=items, survey=survey)
+    if isinstance(action, SurveyPlace):
+        survey[action.name] = action.place
+        items.setdefault(action.name, Item(kind="landmark"))
+        return MarkingState(items=items, survey=survey)
+    if isinstance(action, Add):
+        if action.name in items:
+            raise InputError(f"the name {action.name!r} is used already; names must differ")
+        if not action.name.isprintable():
+            raise InputError("a name is one line of printable characters")
+        return MarkingState(items={**items, action.name: Item(kind=action.kind)}, survey=survey)
+    if action.name not in items:
+        raise InputError(f"nothing is named {action.name!r}")
+    item = items[action.name]
+    if isinstance(action, Put):
+        items[action.name] = _with_mark(action, item)
+    elif isinstance(action, Take):
+        items[action.name] = _item_with(_unmatched(item), action.side, None)
+    elif isinstance(action, Drop):
+        del items[action.name]
+    else:
+        if action.to != action.name and action.to in items:
+            raise InputError(f"the name {action.to!r} is used already; names must differ")
+        renamed = dataclasses.replace(item, kind=action.kind)
+        items = {action.to if name == action.name else name: value for name, value in items.items()}
+        items[action.to] = renamed
+        if action.name in survey:
+            survey = {action.to if name == action.name else name: value for name, value in survey.items()}
+    return MarkingState(items=items, survey=survey)
+
+
+def _with_mark(action: Put, item: Item) -> Item:
+    far = item.mark(other_side(action.side))
+    if item.kind == "target" and far is not None and far.frame != action.mark.frame:
+        raise InputError(
+            f"{action.name} is marked in the pair {far.frame}: marks of a target must be of one moment; remove that "
+            "mark, or add another target"
+        )
+    if action.matched and far is None:
+        raise InputError(f"{action.name} has no mark in the other image to be matched with")
+    cross = other_side(action.side) if action.matched else None
+    return dataclasses.replace(_item_with(_unmatched(item), action.side, action.mark), cross=cross)
+
+
+def _item_with(item: Item, side: Side, mark: Mark | None) -> Item:
+    return dataclasses.replace(item, left=mark) if side == "left" else dataclasses.replace(item, right=mark)
+
+
+def _unmatched(item: Item) -> Item:
+    """The item with marks that stand alone: a matched one has the other's error besides its own."""
+    if item.cross is None or item.left is None or item.right is None:
+        return item
+    total = tuple(a + b for a, b in zip(item.left.cov, item.right.cov, strict=True))
+    side = other_side(item.cross)
+    mark = item.mark(side)
+    assert mark is not None
+    return dataclasses.replace(_item_with(item, side, mark.model_copy(update={"cov": total})), cross=None)

@@ -1,0 +1,363 @@
+// The page: what is selected, what a click, a drag and a key do. The server knows everything that lasts.
+import {Actions, get, latest, post} from "/page/api.js";
+import {View} from "/page/view.js";
+import {listen} from "/page/keys.js";
+import {drawPanel, drawTable} from "/page/panel.js";
+import {drawMap} from "/page/map.js";
+
+const SIDES = ["left", "right"];
+const other = (side) => (side === "left" ? "right" : "left");
+const byId = (id) => document.getElementById(id);
+
+class App {
+  constructor(about) {
+    this.about = about;
+    this.frame = 0;
+    this.items = [];
+    this.survey = {};
+    this.rig = {promises: [], history: [], warnings: []};
+    this.selected = null;
+    this.side = "left";
+    this.linked = true;
+    this.interpolated = false;
+    this.byKeyboard = false;
+    this.curves = {};
+    this.proposals = {};
+    this.dragged = null;
+    this.version = -1;
+    this.views = {};
+    for (const side of SIDES) this.views[side] = new View(side, about.images[side], this);
+    this.actions = new Actions(about.files.log, (state) => this.take(state), (text) => this.say(text, true));
+    this.askCurve = latest(async (side, u, v, key) => {
+      const found = await post("curve", {side, frame: this.frame, u, v});
+      if (key !== this.key()) return;
+      this.curves = found.refusal ? {} : {[other(side)]: found};
+      if (found.refusal) this.say(found.refusal);
+      this.draw();
+    });
+    this.askPosition = latest(async (left, right, matched) => {
+      const strip = ({u, v, cov, how, frame}) => ({u, v, cov, how, frame});
+      const found = await post("position", {left: strip(left), right: strip(right), matched});
+      if (this.dragged) { this.dragged.item.position = found; this.draw(); byId("worth").textContent = found.refusal || found.text; }
+    });
+    for (const side of SIDES) this.handle(this.views[side]);
+  }
+
+  key() { return this.selected + "/" + this.frame; }
+  frameName() { return this.about.frames[this.frame]; }
+  item(name = this.selected) { return this.items.find((item) => item.name === name) || null; }
+  markOf(side, item = this.item()) {
+    if (!item) return null;
+    if (this.dragged && this.dragged.side === side && this.dragged.item.name === item.name) return this.dragged.mark;
+    return item[side];
+  }
+
+  say(text, bad = false) {
+    byId("status").textContent = text;
+    byId("status").classList.toggle("bad", bad);
+  }
+
+  // A new state from the server.
+  take(state) {
+    if (state.version < this.version) return;
+    const rigChanged = JSON.stringify(state.rig.promises) !== JSON.stringify(this.rig.promises);
+    this.version = state.version;
+    this.items = state.items;
+    this.survey = state.survey;
+    this.rig = state.rig;
+    if (!this.item()) this.selected = null;
+    byId("undo").disabled = !state.undo;
+    byId("redo").disabled = !state.redo;
+    document.documentElement.dataset.version = state.version;
+    document.documentElement.dataset.pending = state.pending;
+    this.draw();
+    drawPanel(this);
+    drawTable(this);
+    if (state.pending) this.poll();
+    else { drawMap(this); if (rigChanged) this.guide(); }
+  }
+  poll() {
+    clearTimeout(this.timer);
+    this.timer = setTimeout(async () => {
+      try { this.take(await get("state")); } catch (error) { this.poll(); }
+    }, 250);
+  }
+  draw() { for (const side of SIDES) this.views[side].draw(); }
+  act(action) { return this.actions.push(action); }
+
+  select(name, look = true) {
+    this.selected = name;
+    this.curves = {};
+    this.proposals = {};
+    const item = this.item();
+    if (item) {
+      const frame = this.about.frames.indexOf((item.left || item.right || {}).frame);
+      if (item.kind === "target" && frame >= 0 && frame !== this.frame) this.show(frame);
+      if (look) {
+        for (const side of SIDES) {
+          const mark = item[side];
+          if (mark && this.views[side].scale > this.views[side].ratio * 1.5) this.views[side].look(mark.u, mark.v);
+        }
+      }
+    }
+    drawPanel(this);
+    drawTable(this);
+    drawMap(this);
+    this.draw();
+    this.guide();
+  }
+
+  // The epipolar curve and the proposal for the side that has no mark yet; for the reference, both.
+  async guide() {
+    const item = this.item(), key = this.key();
+    if (!item) return;
+    if (this.about.reference.includes(item.name)) {
+      for (const side of SIDES) {
+        if (item[side]) continue;
+        const found = await post("again", {name: item.name, side, frame: this.frame, reach: 40});
+        if (key !== this.key()) return;
+        this.proposed(side, found);
+      }
+      return;
+    }
+    const from = SIDES.find((side) => item[side] && !item[other(side)]);
+    if (!from) {
+      if (item[this.side]) this.askCurve(this.side, item[this.side].u, item[this.side].v, key);
+      return;
+    }
+    const mark = item[from];
+    if (item.kind === "target" && mark.frame !== this.frameName()) return;
+    this.askCurve(from, mark.u, mark.v, key);
+    const found = await post("proposal", {side: from, frame: this.frame, u: mark.u, v: mark.v, how: mark.how});
+    if (key === this.key() && !this.item()[other(from)]) this.proposed(other(from), found);
+  }
+  proposed(side, found) {
+    this.proposals[side] = found;
+    document.documentElement.dataset.proposal = found.refusal ? "refused" : "there";
+    if (found.refusal) this.say(`${side}: ${found.refusal}`);
+    else {
+      this.say(`${side}: proposal (${found.how}) with σ ${found.sigma.toFixed(3)} px, correlation ${found.score.toFixed(2)}. Enter accepts it, R rejects it.`);
+      const view = this.views[side];
+      if (view.scale > 3 * view.ratio) view.look(found.u, found.v);
+    }
+    this.draw();
+  }
+  accept() {
+    const item = this.item();
+    let done = false;
+    for (const side of SIDES) {
+      const found = this.proposals[side];
+      if (!item || !found || found.refusal) continue;
+      const again = this.about.reference.includes(item.name);
+      const mark = {u: found.u, v: found.v, cov: found.cov, how: again ? "again" : found.how, frame: this.frameName()};
+      this.act({do: "put", name: item.name, side, mark, matched: !again && found.how === "match"});
+      done = true;
+    }
+    this.proposals = {};
+    this.say(done ? `${item.name}: accepted` : "there is no proposal to accept", false);
+    if (done && this.about.reference.includes(item.name)) this.nextOfReference();
+    this.draw();
+  }
+  reject() {
+    this.proposals = {};
+    document.documentElement.dataset.proposal = "rejected";
+    this.say("proposal rejected; mark it by a click");
+    this.draw();
+    if (this.item() && this.about.reference.includes(this.selected)) this.nextOfReference();
+  }
+  nextOfReference() {
+    const at = this.about.reference.indexOf(this.selected);
+    const next = this.about.reference.slice(at + 1).find((name) => { const item = this.item(name); return !item || !item.left || !item.right; });
+    if (next) this.again(next);
+    else this.say("all points of the reference were shown; rejected ones stay without marks");
+  }
+  async again(name) {
+    if (!this.item(name)) await this.act({do: "add", name, kind: "feature"});
+    this.select(name);
+  }
+
+  async add(kind) {
+    const names = new Set(this.items.map((item) => item.name));
+    let number = 1;
+    while (names.has(kind + " " + number)) number += 1;
+    const name = kind + " " + number;
+    await this.act({do: "add", name, kind});
+    this.select(name);
+    this.say(`${name}: click it in either image`);
+  }
+  next(step) {
+    if (!this.items.length) return;
+    const at = this.items.findIndex((item) => item.name === this.selected);
+    this.select(this.items[(at + step + this.items.length) % this.items.length].name);
+  }
+
+  // Place the selected thing's mark: at the shape that is there, or exactly where it was said.
+  async place(side, u, v, snapping = true) {
+    if (!this.item()) await this.add("target");
+    const item = this.item();
+    if (!item) return;
+    const hand = this.about.hand_sigma ** 2;
+    let mark = {u, v, cov: [hand, 0, hand], how: "hand", frame: this.frameName()};
+    if (snapping) {
+      const found = await post("snap", {side, frame: this.frame, u, v});
+      if (found.refusal) this.say(`${found.refusal} (kept as clicked, σ ${this.about.hand_sigma} px)`);
+      else {
+        mark = {...mark, u: found.u, v: found.v, cov: found.cov, how: found.how};
+        this.say(`${item.name}, ${side}: ${found.how}, σ ${found.sigma.toFixed(3)} px`);
+      }
+    }
+    this.side = side;
+    this.proposals[side] = undefined;
+    await this.act({do: "put", name: item.name, side, mark});
+    this.guide();
+  }
+  nudge(du, dv) {
+    const item = this.item(), mark = this.markOf(this.side);
+    if (!item || !mark) { this.say("nothing is marked in this image to be moved"); return; }
+    const hand = this.about.hand_sigma ** 2;
+    const moved = {u: mark.u + du, v: mark.v + dv, cov: [hand, 0, hand], how: "hand", frame: mark.frame};
+    item[this.side] = {...moved, sigma: this.about.hand_sigma};
+    this.act({do: "put", name: item.name, side: this.side, mark: moved});
+    this.askCurve(this.side, moved.u, moved.v, this.key());
+    this.draw();
+  }
+  snapAgain() { const mark = this.markOf(this.side); if (mark) this.place(this.side, mark.u, mark.v); }
+
+  show(frame) {
+    this.frame = Math.max(0, Math.min(frame, this.about.frames.length - 1));
+    this.curves = {};
+    this.proposals = {};
+    byId("frame").value = this.frame;
+    byId("frame-name").textContent = this.frameName();
+    this.draw();
+    this.guide();
+  }
+
+  handle(view) {
+    const canvas = view.canvas, side = view.side;
+    let start = null;
+    canvas.addEventListener("focus", () => { this.side = side; this.draw(); });
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom(view, Math.exp(-event.deltaY * 0.002), ...view.at(event));
+    }, {passive: false});
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.focus({preventScroll: true});
+      canvas.setPointerCapture(event.pointerId);
+      const [x, y] = view.at(event), mark = this.markOf(side);
+      const near = (m) => { const [a, b] = view.screen(m.u, m.v); return Math.hypot(a - x, b - y) < 14 * view.ratio; };
+      start = {x, y, center: [...view.center], others: this.centers(), moved: false, mark: mark && near(mark) ? mark : null};
+      if (!start.mark) start.hit = this.items.find((item) => item[side] && near(item[side]));
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      const [x, y] = view.at(event);
+      view.pointer = [x, y];
+      const [u, v] = view.image(x, y);
+      byId(side + "-place").textContent = `${u.toFixed(2)}, ${v.toFixed(2)}   ${(view.scale / view.ratio).toFixed(2)}×`;
+      if (start && event.buttons) {
+        if (Math.hypot(x - start.x, y - start.y) > 4 * view.ratio) start.moved = true;
+        if (start.moved && start.mark) this.drag(side, start.mark, (x - start.x) / view.scale, (y - start.y) / view.scale);
+        else if (start.moved) this.pan(view, start, (start.x - x) / view.scale, (start.y - y) / view.scale);
+      }
+      view.draw();
+    });
+    canvas.addEventListener("pointerup", (event) => {
+      const begun = start;
+      start = null;
+      if (!begun || event.button !== 0) return;
+      if (this.dragged) { this.drop(); return; }
+      if (begun.moved) return;
+      if (begun.hit) { this.select(begun.hit.name, false); return; }
+      const item = this.item();
+      if (begun.mark || (item && item[side])) { this.say(`${item.name} is marked in the ${side} image: drag it, or press N for another target`); return; }
+      this.place(side, ...view.image(...view.at(event)), !event.shiftKey);
+    });
+    canvas.addEventListener("pointerleave", () => { view.pointer = null; view.draw(); });
+  }
+  centers() { return Object.fromEntries(SIDES.map((side) => [side, [...this.views[side].center]])); }
+  pan(view, start, du, dv) {
+    for (const side of this.linked ? SIDES : [view.side]) this.views[side].look(start.others[side][0] + du, start.others[side][1] + dv);
+  }
+  zoom(view, factor, x, y) {
+    const before = [...view.center], scale = view.scale;
+    view.zoom(factor, x, y);
+    if (!this.linked) return;
+    const far = this.views[other(view.side)];
+    far.scale = view.scale * far.ratio / view.ratio;
+    // Both keep what they show in their middle: the offset between them is that of the thing looked at.
+    const target = this.partner(view, x, y);
+    if (target && factor > 1) { const [u, v] = view.image(x ?? view.canvas.width / 2, y ?? view.canvas.height / 2); far.look(target[0] + view.center[0] - u, target[1] + view.center[1] - v); }
+    else far.look(far.center[0] + view.center[0] - before[0], far.center[1] + view.center[1] - before[1]);
+    if (scale === view.scale) far.draw();
+  }
+  // Where the other image shows what is at this place: the selected thing's mark or proposal, if the place is near it.
+  partner(view, x, y) {
+    const side = view.side, far = other(side), mark = this.markOf(side);
+    if (x === undefined || !mark) return null;
+    const [a, b] = view.screen(mark.u, mark.v);
+    if (Math.hypot(a - x, b - y) > 60 * view.ratio) return null;
+    const [u, v] = view.image(x, y), found = this.markOf(far) || this.proposals[far];
+    return found && !found.refusal ? [found.u + u - mark.u, found.v + v - mark.v] : null;
+  }
+  closer() {
+    const item = this.item();
+    for (const side of SIDES) {
+      const view = this.views[side], found = (item && item[side]) || this.proposals[side];
+      if (found && !found.refusal) view.look(found.u, found.v, 20 * view.ratio);
+      else if (this.curves[side]) { const line = this.curves[side].pixels; view.look(...line[Math.min(3, line.length - 1)], 20 * view.ratio); }
+    }
+  }
+  drag(side, from, du, dv) {
+    const item = this.item(), hand = this.about.hand_sigma ** 2;
+    this.dragged = {side, item, mark: {...from, u: from.u + du, v: from.v + dv, cov: [hand, 0, hand], how: "hand", sigma: this.about.hand_sigma}};
+    const far = item[other(side)];
+    if (far) this.askPosition(...(side === "left" ? [this.dragged.mark, far] : [far, this.dragged.mark]), null);
+    this.askCurve(side, this.dragged.mark.u, this.dragged.mark.v, this.key());
+    this.draw();
+  }
+  drop() {
+    const {side, item, mark} = this.dragged;
+    item[side] = mark;
+    this.dragged = null;
+    this.act({do: "put", name: item.name, side, mark: {u: mark.u, v: mark.v, cov: mark.cov, how: "hand", frame: this.frameName()}});
+    this.guide();
+  }
+
+  contrast() {
+    const pressed = byId("contrast").getAttribute("aria-pressed") !== "true";
+    byId("contrast").setAttribute("aria-pressed", pressed);
+    for (const side of SIDES) {
+      const view = this.views[side], level = view.level();
+      const [left, top] = view.image(0, 0), [right, bottom] = view.image(view.canvas.width, view.canvas.height);
+      let span = pressed ? view.tiles.span(this.frame, level, left, top, right, bottom) : null;
+      const image = this.about.images[side];
+      if (span && image.deep) { const step = (image.span[1] - image.span[0]) / 255; span = span.map((v) => image.span[0] + v * step); }
+      view.tiles.stretch(span);
+      view.enlarged = null;
+      view.draw();
+    }
+  }
+  toggle(name) {
+    this[name] = !this[name];
+    byId(name === "linked" ? "link" : "interpolate").setAttribute("aria-pressed", this[name]);
+    this.draw();
+  }
+}
+
+async function start() {
+  const about = await get("about");
+  const app = new App(about);
+  window.kcal = app;
+  listen(app);
+  byId("frame").max = about.frames.length - 1;
+  byId("time").hidden = about.frames.length < 2;
+  byId("again").hidden = !about.reference.length;
+  byId("frame-name").textContent = about.frames[0];
+  app.take(await get("state"));
+  if (!app.selected && app.items.length) app.select((app.items.find((item) => !item.left || !item.right) || app.items[0]).name);
+  if (app.actions.waiting.length === 0) app.say(about.cameras ? "Choose a thing in the list, or press N for a new target; click it in one image. The key ? lists all keys." : "No cameras were given: marks are snapped and saved, but no geometry helps. Start with --rig or --cameras for it.");
+}
+start().catch((error) => {
+  byId("status").textContent = error.message;
+  byId("status").classList.add("bad");
+});

@@ -1,0 +1,83 @@
+// Tiles of one camera's images: gray levels from the server, made visible with the present contrast.
+import {raw} from "/page/api.js";
+
+export const TILE = 512;
+const KEPT = 80;
+
+export class Tiles {
+  constructor(side, image, loaded) {
+    this.side = side;
+    this.image = image;
+    this.loaded = loaded;
+    this.kept = new Map();
+    this.contrast = null;
+    this.version = 0;
+  }
+  // null: as stored (deep images: their own span); [low, high]: stretched.
+  stretch(span) {
+    this.contrast = span;
+    this.version += 1;
+    if (this.image.deep) this.kept.clear();
+  }
+  get(frame, level, x, y) {
+    const key = frame + "/" + level + "/" + x + "/" + y;
+    let tile = this.kept.get(key);
+    if (!tile) {
+      tile = {gray: null, canvas: null, version: -1};
+      this.kept.set(key, tile);
+      this.fetch(tile, key, frame, level, x, y);
+      if (this.kept.size > KEPT) this.kept.delete(this.kept.keys().next().value);
+    } else {
+      this.kept.delete(key);
+      this.kept.set(key, tile);
+    }
+    if (!tile.gray) return null;
+    if (tile.version !== this.version) this.paint(tile);
+    return tile.canvas;
+  }
+  async fetch(tile, key, frame, level, x, y) {
+    const query = {side: this.side, frame, level, x, y};
+    if (this.image.deep && this.contrast) [query.low, query.high] = this.contrast;
+    try {
+      const answer = await raw("tile", query);
+      tile.width = Number(answer.headers.get("X-Width"));
+      tile.height = Number(answer.headers.get("X-Height"));
+      tile.gray = new Uint8Array(await answer.arrayBuffer());
+      this.loaded();
+    } catch (error) {
+      this.kept.delete(key);
+    }
+  }
+  paint(tile) {
+    const table = new Uint32Array(256);
+    const [low, high] = this.contrast && !this.image.deep ? this.contrast : [0, 255];
+    for (let i = 0; i < 256; i++) {
+      const v = Math.max(0, Math.min(255, Math.round((i - low) * 255 / Math.max(high - low, 1))));
+      table[i] = 0xff000000 | (v << 16) | (v << 8) | v;
+    }
+    const colors = new Uint32Array(tile.gray.length);
+    for (let i = 0; i < colors.length; i++) colors[i] = table[tile.gray[i]];
+    tile.canvas = tile.canvas || new OffscreenCanvas(tile.width, tile.height);
+    tile.canvas.getContext("2d").putImageData(new ImageData(new Uint8ClampedArray(colors.buffer), tile.width, tile.height), 0, 0);
+    tile.version = this.version;
+  }
+  // Gray levels between which 98 % of the loaded pixels of a part of the image lie.
+  span(frame, level, left, top, right, bottom) {
+    const counts = new Uint32Array(256);
+    let total = 0;
+    const size = TILE << level;
+    for (let y = Math.max(0, Math.floor(top / size)); y * size < bottom; y++) {
+      for (let x = Math.max(0, Math.floor(left / size)); x * size < right; x++) {
+        const tile = this.kept.get(frame + "/" + level + "/" + x + "/" + y);
+        if (!tile || !tile.gray) continue;
+        const u0 = Math.max(0, Math.floor((left - x * size) >> level)), u1 = Math.min(tile.width, Math.ceil((right - x * size) / (1 << level)));
+        const v0 = Math.max(0, Math.floor((top - y * size) >> level)), v1 = Math.min(tile.height, Math.ceil((bottom - y * size) / (1 << level)));
+        for (let v = v0; v < v1; v++) for (let u = u0; u < u1; u++) { counts[tile.gray[v * tile.width + u]] += 1; total += 1; }
+      }
+    }
+    if (!total) return null;
+    const at = (share) => { let sum = 0; for (let i = 0; i < 256; i++) { sum += counts[i]; if (sum > share * total) return i; } return 255; };
+    const low = at(0.01), high = at(0.99);
+    return high > low ? [low, high] : [low - 1, low + 1];
+  }
+}

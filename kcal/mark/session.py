@@ -1,0 +1,203 @@
+"""The files of a session: marks, points and landmarks as CSV, rewritten after every action, and the undo log."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import threading
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kcal.files import check_writable, write_atomic
+from kcal.locate.marks import Marks, marks_text, read_marks
+from kcal.mark.items import Change, Item, Kind, Load, Mark, MarkingState, Places, Side, Step
+from kcal.mark.journal import Journal
+from kcal.mark.places import NO_PLACES, SurveyedPlaces, places_text, read_places
+
+_MARKED: tuple[Kind, ...] = ("landmark", "feature")
+_LOADED = "loaded from a file"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MarkingFiles:
+    """Where a session writes; all follow from the file of marks.
+
+    Args:
+        marks: of landmarks and features, as `kcal rig` reads them.
+        points: of targets that are marked in both images, as `kcal locate` reads them.
+        landmarks: the survey with what was typed in, as `kcal rig` reads it.
+        log: of all actions.
+    """
+
+    marks: Path
+    points: Path
+    landmarks: Path
+    log: Path
+
+    @classmethod
+    def beside(cls, marks: Path) -> MarkingFiles:
+        """`site.csv` to `site.points.csv`, `site.landmarks.csv` and `site.log`."""
+        stem = marks.with_suffix("") if marks.suffix.lower() == ".csv" else marks
+        names = (Path(f"{stem}.{end}") for end in ("points.csv", "landmarks.csv", "log"))
+        return cls(marks=marks, **dict(zip(("points", "landmarks", "log"), names, strict=True)))
+
+
+class Session:
+    """State, files and undo log of marking; every method may be called from any thread.
+
+    Args:
+        marks: the file of marks.
+        survey: a file of surveyed places; those are the landmarks.
+        hand_sigma: of a mark that was placed by hand or read without covariance, px.
+
+    Raises:
+        FileError: a file that cannot be read or written, or that another session has open.
+    """
+
+    def __init__(self, marks: Path, survey: Path | None = None, hand_sigma: float = 0.3) -> None:
+        self.files = MarkingFiles.beside(marks)
+        self.hand_sigma = hand_sigma
+        self._lock = threading.Lock()
+        for path in (self.files.marks, self.files.points, self.files.landmarks, self.files.log):
+            check_writable(path, *([survey] if survey else []))
+        places = NO_PLACES if survey is None else read_places(survey)
+        self._journal = Journal(self.files.log)
+        try:
+            self.columns = self._take_over_places(places)
+            self._take_over_changes()
+            self._write()
+        except BaseException:
+            self._journal.close()
+            raise
+
+    @property
+    def state(self) -> MarkingState:
+        """The present one."""
+        return self._journal.state
+
+    @property
+    def version(self) -> int:
+        """How many actions there were."""
+        return self._journal.count
+
+    @property
+    def undoable(self) -> tuple[bool, bool]:
+        """Whether there is something to undo and something to redo."""
+        return self._journal.can_undo, self._journal.can_redo
+
+    def do(self, action: Change | Step, key: str) -> MarkingState:
+        """Apply an action, write the log and the files, and return the new state; see `Journal.do`."""
+        with self._lock:
+            self._journal.do(action, key)
+            self._write()
+            return self.state
+
+    def close(self) -> None:
+        """Release the log."""
+        self._journal.close()
+
+    def marks(self, *kinds: Kind, single: bool = True) -> Marks:
+        """The marks of these kinds; of things marked in both images only, if not `single`."""
+        return marks_of(self.state, kinds, single=single)
+
+    def _write(self) -> None:
+        state = self.state
+        _write_if_new(self.files.marks, marks_text(marks_of(state, _MARKED)))
+        _write_if_new(self.files.points, marks_text(marks_of(state, ("target",), single=False)))
+        if state.survey:
+            _write_if_new(self.files.landmarks, places_text(SurveyedPlaces(self.columns, state.survey)))
+
+    def _take_over_places(self, places: SurveyedPlaces) -> tuple[str, str, str]:
+        """Log the places that are new or have changed, and return the columns of coordinates."""
+        columns = places.columns
+        if not places.places and self.files.landmarks.exists():
+            columns = read_places(self.files.landmarks).columns
+        new = {name: place for name, place in places.places.items() if self.state.survey.get(name) != place}
+        if new:
+            self._journal.do(Places(do="places", places=new), f"{_LOADED} {self.version}")
+        return columns
+
+    def _take_over_changes(self) -> None:
+        """Load files of marks that are neither as the log's last action left them nor as the one before did."""
+        groups: tuple[tuple[Path, tuple[Kind, ...], bool], ...] = (
+            (self.files.marks, _MARKED, True), (self.files.points, ("target",), False),
+        )  # fmt: skip
+        for path, kinds, single in groups:
+            if not path.exists():
+                continue
+            states = self._journal.state, self._journal.before
+            known = [marks_text(marks_of(state, kinds, single=single)) for state in states]
+            text = path.read_text(encoding="utf-8-sig")
+            if text in known or len(text.splitlines()) < 2:
+                continue
+            self._journal.do(self._load(read_marks(path, single=single), kinds), f"{_LOADED} {self.version}")
+
+    def _load(self, marks: Marks, kinds: tuple[Kind, ...]) -> Load:
+        items: dict[str, tuple[Kind, Mark | None, Mark | None]] = {}
+        covariance = marks.covariance_or(self.hand_sigma)
+        for row, name in enumerate(marks.names):
+            old = self.state.items.get(name)
+            kind: Kind = old.kind if old is not None and old.kind in kinds else kinds[-1]
+            both = []
+            for side, pixel in enumerate((marks.left[row], marks.right[row])):
+                block = (
+                    self.hand_sigma**2 * torch.eye(2, dtype=torch.float64)
+                    if covariance is None
+                    else covariance[row, 2 * side : 2 * side + 2, 2 * side : 2 * side + 2]
+                )
+                cov = (float(block[0, 0]), float(block[0, 1]), float(block[1, 1]))
+                seen = bool(torch.isfinite(pixel).all())
+                both.append(Mark(u=float(pixel[0]), v=float(pixel[1]), cov=cov, how="file") if seen else None)
+            items[name] = (kind, both[0], both[1])
+        # Landmarks without marks stay where they are.
+        for name, item in self.state.items.items():
+            if item.kind in kinds and name not in items and name in self.state.survey:
+                items[name] = (item.kind, None, None)
+        return Load(do="load", items=items, kinds=kinds)
+
+
+def marks_of(state: MarkingState, kinds: tuple[Kind, ...], *, single: bool = True) -> Marks:
+    """Marks of the things of some kinds, with their covariance where both images have one."""
+    chosen = {
+        name: item
+        for name, item in state.items.items()
+        if item.kind in kinds and (item.left and item.right if not single else item.left or item.right)
+    }
+
+    def pixels(side: Side) -> Tensor:
+        found = [item.mark(side) for item in chosen.values()]
+        rows = [(math.nan, math.nan) if mark is None else (mark.u, mark.v) for mark in found]
+        return torch.tensor(rows, dtype=torch.float64).reshape(-1, 2)
+
+    covariance = torch.stack([pair_covariance(item) for item in chosen.values()]) if chosen else None
+    return Marks(tuple(chosen), pixels("left"), pixels("right"), covariance)
+
+
+def pair_covariance(item: Item) -> Tensor:
+    """(4, 4) px² of left u, v and right u, v; NaN unless both are marked.
+
+    A mark that was matched has the error of the mark that it was matched to, and that of the match besides.
+    """
+    if item.left is None or item.right is None:
+        return torch.full((4, 4), math.nan, dtype=torch.float64)
+    left, right = (
+        torch.tensor([[m.cov[0], m.cov[1]], [m.cov[1], m.cov[2]]], dtype=torch.float64) for m in (item.left, item.right)
+    )
+    zero = torch.zeros_like(left)
+    if item.cross is None:
+        return torch.block_diag(left, right)
+    shared = left if item.cross == "left" else right
+    own_left, own_right = (zero, right) if item.cross == "left" else (left, zero)
+    return torch.cat([torch.cat([shared + own_left, shared], 1), torch.cat([shared, shared + own_right], 1)])
+
+
+def _write_if_new(path: Path, text: str) -> None:
+    """Write a file atomically unless it has this content."""
+    try:
+        if path.read_text(encoding="utf-8") == text:
+            return
+    except (OSError, UnicodeDecodeError):
+        pass
+    write_atomic(path, text)

@@ -1,0 +1,62 @@
+"""Read JSON of unknown origin: limits on size, depth and numbers are checked before they can do harm."""
+
+from __future__ import annotations
+
+import json
+import re
+from itertools import accumulate
+from typing import Any
+
+from kcal.errors import FileError
+
+# Far more than any file of kcal has: a thousand views of a large board take 50 MB, and a rig is 6 levels deep.
+MOST_BYTES, MOST_DEPTH = 128 * 2**20, 32
+# Of the largest double.
+_MOST_DIGITS = 309
+_STRING = re.compile(rb'"(?:[^"\\]|\\.)*+(?:"|$)', re.DOTALL)
+_STEPS = {ord("["): 1, ord("{"): 1, ord("]"): -1, ord("}"): -1}
+_NOT_BRACKETS = bytes(set(range(256)) - set(_STEPS))
+
+
+def read_json(data: bytes, source: str) -> Any:
+    """Decode a JSON text in UTF-8.
+
+    Besides what JSON itself refuses, a text is refused that is larger than 128 MiB or nested deeper than 32 levels,
+    has a key twice in one object, or has an integer beyond the range of float64. NaN and infinity are left to the
+    caller, who can name the field.
+
+    Args:
+        data: the text.
+        source: names it in errors.
+
+    Raises:
+        FileError: not JSON, or refused.
+
+    Example:
+        >>> read_json(b"[1, 2.5]", "memory")
+        [1, 2.5]
+    """
+    if len(data) > MOST_BYTES:
+        raise FileError(f"{source}: {len(data) / 2**20:.0f} MiB of JSON; at most {MOST_BYTES // 2**20} MiB are read")
+    brackets = _STRING.sub(b"", data).translate(None, _NOT_BRACKETS)
+    if max(accumulate((_STEPS[byte] for byte in brackets), initial=0)) > MOST_DEPTH:
+        raise FileError(f"{source}: nested deeper than {MOST_DEPTH} levels; this is no file of kcal")
+    try:
+        return json.loads(data.decode("utf-8"), parse_int=_integer, object_pairs_hook=_object)
+    except ValueError as error:
+        raise FileError(f"{source}: not a JSON file: {error}") from error
+
+
+def _integer(digits: str) -> int:
+    if len(digits.lstrip("-")) >= _MOST_DIGITS:
+        raise ValueError(f"the integer {digits[:12]}... has {len(digits)} digits, more than a number may have")
+    return int(digits)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice[:40]!r} occurs twice in one object")
+    return found

@@ -1,0 +1,113 @@
+"""The one way by which a text reaches a page, a table, an XML file or a terminal, where some characters would act.
+
+Names of points, cameras and files come from other people's files. Each function takes any text and returns one that is
+shown there, and does nothing else. Pictures have their own way: `kcal.report.figures.new_figure` draws no text as
+mathematics.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+from collections.abc import Iterable
+from typing import Any
+
+# Control characters but tab and line feed (an escape sequence begins with U+001B or U+009B), separators of lines,
+# overrides of the direction of text, halves of surrogate pairs, and the noncharacters of Unicode. What XML 1.0 forbids
+# is among them.
+_ACTING = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufdd0-\ufdef"
+    + "".join(f"{chr(plane + 0xFFFE)}{chr(plane + 0xFFFF)}" for plane in range(0, 0x110000, 0x10000))
+    + "]"
+)
+_NUMBER = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?")
+# Spreadsheets read a cell that begins with one of these as a formula; in Japanese settings, the wide ones too.
+_FORMULA = tuple("=+-@＝＋－＠")
+
+
+def visible(text: str) -> str:
+    r"""Write characters that act instead of being shown as escapes; tabs and line feeds stay.
+
+    This is enough for a terminal and for XML: escape sequences, and characters that XML 1.0 forbids, are gone.
+
+    Example:
+        >>> visible("gate\x1b[2J \ufffe 5°")
+        'gate\\x1b[2J \\ufffe 5°'
+    """
+    return _ACTING.sub(lambda found: ascii(found.group())[1:-1], text)
+
+
+def one_line(text: str) -> str:
+    r"""The same, with tabs and line feeds as escapes too.
+
+    Example:
+        >>> one_line("gate\n2")
+        'gate\\n2'
+    """
+    return visible(text).replace("\t", r"\t").replace("\n", r"\n")
+
+
+def csv_line(cells: Iterable[Any]) -> str:
+    r"""One line of a comma-separated table, with its line feed; None is empty, floats keep every digit.
+
+    A text that a spreadsheet would take for a formula gets an apostrophe in front. Texts with commas, semicolons
+    (separators in some countries), quotation marks or line breaks are quoted.
+
+    Example:
+        >>> print(csv_line(["=1+1", -1.5, None, "gate; north"]), end="")
+        '=1+1,-1.5,,"gate; north"
+    """
+    return ",".join(_cell(value) for value in cells) + "\n"
+
+
+def _cell(value: Any) -> str:
+    if not isinstance(value, str):
+        return "" if value is None else repr(value) if isinstance(value, float) else str(value)
+    text = visible(value)
+    if text.lstrip().startswith(_FORMULA) and not _NUMBER.fullmatch(text):
+        text = f"'{text}"
+    return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',;"\t\n') else text
+
+
+def page_text(text: str) -> str:
+    """A text in HTML, between tags or in an attribute with quotation marks.
+
+    Example:
+        >>> page_text("<b> & co")
+        '&lt;b&gt; &amp; co'
+    """
+    return html.escape(visible(text))
+
+
+def page_data(value: Any) -> str:
+    r"""JSON inside a `<script type="application/json">`: no text in it can end the element or open a comment.
+
+    Example:
+        >>> page_data({"name": "<!--<script>"})
+        '{"name": "\\u003c!--\\u003cscript\\u003e"}'
+    """
+    text = json.dumps(value, allow_nan=False)
+    return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
+
+
+def page_policy(*, scripts: Iterable[str] = (), styles: Iterable[str] = (), images: str = "data:") -> str:
+    """A Content-Security-Policy that allows these texts of `script` and `style` elements and these sources of images.
+
+    Nothing else runs or is loaded: no handler in an attribute, no other script, no request.
+
+    Example:
+        >>> page_policy(styles=["b { color: red; }"])[:47]
+        "default-src 'none'; base-uri 'none'; form-actio"
+    """
+
+    def hashes(texts: Iterable[str]) -> str:
+        digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in texts]
+        return " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
+
+    return (
+        "default-src 'none'; base-uri 'none'; form-action 'none'; "
+        f"script-src {hashes(scripts)}; style-src {hashes(styles)}; img-src {images}"
+    )

@@ -1,0 +1,129 @@
+"""`kcal locate` on long tables, measured: rows per second of processor time, and peak memory, for each format.
+
+    python -m scripts.bench.locate_table [--rows 1000 10000 ...] [--repeat 3] [--source FOLDER] [--write]
+
+Each run is a process of its own with one thread, which locates a table of one row first. Processor time (user and
+system), not time of day, so that other work on the machine counts less. Of several runs the fastest counts. `--source`
+measures another copy of kcal, for example an earlier version.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+
+import kcal
+from kcal.io.rig_file import save_rig
+from kcal.lens.mounting import Mounting
+from kcal.locate.mounting import mounting_covariance
+from scripts.bench.locate import known_to, some_points
+from scripts.shared.long_range import ORIGIN, rig
+from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.timing import show
+
+COUNTS = (1_000, 10_000, 100_000, 1_000_000)
+SUFFIXES = ("csv", "geojson", "geojsonl", "kml", "cot")
+_RUN = """
+import pathlib, sys, time
+from kcal.cli.main import main
+rig, small, large, out = sys.argv[1:]
+for points in (small, large):
+    sys.argv = ["kcal", "locate", rig, points, "-o", out]
+    start = time.process_time()
+    try:
+        main()
+    except SystemExit as end:
+        assert not end.code, end.code
+lines = pathlib.Path("/proc/self/status").read_text().splitlines()
+peak = next(line.split()[1] for line in lines if line.startswith("VmHWM"))
+print("measured", time.process_time() - start, peak)
+"""
+
+
+def write_table(path: Path, count: int) -> Path:
+    """Marks with 0.1 px of noise."""
+    with torch.no_grad():
+        left, right, _ = rig()(some_points(count))
+    marks = torch.cat([left, right], -1)
+    marks += 0.1 * torch.randn(marks.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    with path.open("w") as file:
+        file.write("name,left_u,left_v,right_u,right_v\n")
+        for i, row in enumerate(marks.tolist()):
+            file.write(f"p{i},{','.join(map(repr, row))}\n")
+    return path
+
+
+def run(source: Path, *arguments: Path) -> tuple[float, float]:
+    """Processor seconds and peak megabytes of one table, after a table of one row."""
+    paths = os.pathsep.join([str(source), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", _RUN, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=source)
+    found = [line.split() for line in done.stdout.splitlines() if line.startswith("measured ")]
+    if done.returncode != 0 or not found:
+        raise SystemExit(done.stderr)
+    return float(found[0][1]), int(found[0][2]) / 1024.0
+
+
+def measure(source: Path, folder: Path, suffixes: tuple[str, ...], counts: list[int], repeat: int) -> list[str]:
+    """Rows of the page's table: each format with each rig."""
+    exact, known = rig(), rig()
+    exact.mounting = Mounting(origin=ORIGIN, heading_deg=35.0)
+    known.mounting = Mounting(
+        origin=ORIGIN, heading_deg=35.0, covariance=mounting_covariance(origin_m=[0.05] * 3, attitude_deg=[0.005] * 3)
+    )
+    known.covariance = known_to()
+    rigs = {"exact": save_rig(exact, folder / "exact.json"), "with covariances": save_rig(known, folder / "known.json")}
+    tables = {count: write_table(folder / f"{count}.csv", count) for count in [1, *counts]}
+    lines = []
+    for suffix in suffixes:
+        for name, path in rigs.items():
+            if name != "exact" and suffix not in ("csv", "geojson"):
+                continue
+            out = folder / f"out.{suffix}"
+            for count in counts:
+                found = [run(source, path, tables[1], tables[count], out) for _ in range(repeat)]
+                seconds, peak = min(each[0] for each in found), max(each[1] for each in found)
+                size = out.stat().st_size / 2**20
+                cells = [f".{suffix}", name, f"{count:,}", f"{count / seconds:,.0f}", f"{peak:.0f}", f"{size:.1f}"]
+                print(*cells, f"{1e6 * seconds / count:.1f} us a row", sep="  ", flush=True)
+                lines.append(cells)
+                out.unlink()
+    return table(["file", "rig", "rows", "rows a second of processor time", "peak MB", "file MB"], lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rows", type=int, nargs="+", default=list(COUNTS))
+    parser.add_argument("--formats", nargs="+", default=list(SUFFIXES))
+    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--source", type=Path, default=Path(kcal.__file__).parents[1])
+    parser.add_argument("--write", action="store_true", help="write docs/measured/locate_table.md")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        lines = measure(arguments.source, Path(name), tuple(arguments.formats), arguments.rows, arguments.repeat)
+    head = [
+        "# Long tables, measured",
+        "",
+        CONCLUSIONS["locate_table.md"],
+        "",
+        f"Made by `scripts/bench/locate_table.py` with kcal {kcal.__version__}, torch {torch.__version__} on "
+        f"{platform.machine()}, one thread; the fastest of {arguments.repeat} runs. Processor time of the command "
+        "from its second call in a process on. The rig is that of `locate.md`: exact, or with the covariances of "
+        "cameras, pose and mounting.",
+        "",
+    ]
+    show([*head, *lines])
+    if arguments.write:
+        (DOCS / "locate_table.md").write_text("\n".join([*head, *lines]) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,308 @@
+"""Damage every kind of file and run every command on it: no traceback, no hang, no wrong number in silence.
+
+    python -m scripts.check.fuzz --seconds 60
+    python -m scripts.check.fuzz --first 123 --cases 1      one case again, the number is in the report
+
+Each case damages one file in one place by its own seed: JSON by its structure (values of other types, numbers out of
+range, keys twice, deep nesting, hostile names), tables by their cells, images and archives by their bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import math
+import random
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.lensfit.measured_board import MeasuredBoard, load_measured_board, save_measured_board
+from kcal.cli.main import main as command_line
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.errors import KcalError
+from kcal.io.lookup_file import load_lookup, save_lookup
+from kcal.io.rig_file import RigMounting, rig_to_file
+from kcal.lens.bake import bake
+from kcal.lens.camera import Camera
+from kcal.lens.rig import StereoRig
+
+BOARD = Board(columns=6, rows=5, square=0.02)
+# None of these is a number of JSON in the range of float64: a file with one in a number's place must be refused.
+NO_NUMBERS = ("true", "false", '"1"', "null", "NaN", "Infinity", "-Infinity", "1e999", "1" + "0" * 400, "[1]", "{}")
+ODD_NUMBERS = ("0", "-1", "1e308", "-1e308", "1e-308", "5e-324", "-0.0", "9007199254740993", "1e18", "0.1")
+ODD_TEXTS = ("<!--<script>", "=1+1", "\x1b[2J", "\ufffe", "$\\frac{", "\ud800", "a" * 100_000, "", "../../x", "\0")
+SLOT = "\ue000"
+
+
+class Hang(Exception):  # noqa: N818
+    """A case took longer than its limit."""
+
+
+class Finding(NamedTuple):
+    """What one case brought to light."""
+
+    case: int
+    what: str
+    kind: str
+    damage: str
+    detail: str
+
+
+def make_files(folder: Path) -> dict[str, bytes]:
+    """A valid file of every kind."""
+    camera = Camera.build(
+        focal=(300, 301), center=(159.5, 119.5), size=(320, 240), coefficients=[-0.1, 0.02, 0.0, 0.0], model="opencv4"
+    )
+    generator = torch.Generator().manual_seed(1)
+    views = []
+    for number in range(6):
+        turn = 0.4 * torch.randn(3, generator=generator, dtype=torch.float64)
+        skew = torch.zeros(3, 3, dtype=torch.float64)
+        skew[0, 1], skew[0, 2], skew[1, 2] = -turn[2], turn[1], -turn[0]
+        points = BOARD.points - BOARD.points.mean(0)
+        seen = points @ torch.linalg.matrix_exp(skew - skew.T).T + torch.tensor([0.0, 0.0, 0.25])
+        pixels, _ = camera.project(seen)
+        pixels = pixels + 0.05 * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+        views.append(View(name=f"{number}.png", pixels=tuple(map(tuple, pixels.tolist()))))
+    observations = Observations(board=BOARD, image_size=(320, 240), views=tuple(views))
+    observations.save(folder / "obs.json")
+    calibrate_camera(observations, CalibrationOptions(model="opencv4")).file(name="left").save(folder / "camera.json")
+    rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
+    mounting = RigMounting(lat=10.0, lon=20.0, height=3.0, heading_deg=30.0, pitch_deg=0.0, roll_deg=0.0)
+    rig_to_file(rig, mounting=mounting).save(folder / "rig.json")
+    half = 1e-5 * torch.eye(28, dtype=torch.float64)
+    plate = Board(columns=9, rows=6, square=0.025)
+    flat = MeasuredBoard(name="A", board=plate, amplitudes=0 * half[0], half=half, log_evidence=0.0)
+    save_measured_board(flat, folder / "board.json")
+    save_lookup(bake(camera, 0.05), folder / "lookup.npz")
+    left, right, _ = rig(torch.tensor([[0.0, 0.0, 50.0], [5.0, 1.0, 100.0]]))
+    rows = [f"p{i},{a},{b},{c},{d}" for i, (a, b, c, d) in enumerate(torch.cat([left, right], 1).tolist())]
+    (folder / "marks.csv").write_text("\n".join(["name,left_u,left_v,right_u,right_v", *rows]) + "\n")
+    image = np.random.default_rng(0).integers(0, 255, (240, 320), np.uint8)
+    for suffix in ("png", "jpg", "tif"):
+        cv2.imwrite(str(folder / f"image.{suffix}"), image)
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def _places(value: Any, found: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inside in pairs:
+        found.append((value, key))
+        _places(inside, found)
+    return found
+
+
+def damage_json(data: bytes, rng: random.Random) -> tuple[bytes, str, bool]:
+    """Change one place of a JSON text; also what was done, and whether the text must now be refused."""
+    content = json.loads(data)
+    holder, key = rng.choice(_places(content, []))
+    old = holder[key]
+    number = isinstance(old, int | float) and not isinstance(old, bool)
+    raw, refused = rng.choice(NO_NUMBERS if rng.random() < 0.5 else ODD_NUMBERS), False
+    way = rng.choice(["value", "value", "value", "text", "drop", "repeat", "nest", "twice"])
+    if way == "value":
+        refused = number and raw in NO_NUMBERS and raw != "null"
+    elif way == "text":
+        raw = json.dumps(rng.choice(ODD_TEXTS))
+        refused = number
+    elif way == "nest":
+        raw, refused = "[" * 100 + "]" * 100, True
+    elif way == "repeat" and isinstance(old, list):
+        raw = json.dumps(old + old)
+    elif way == "drop":
+        del holder[key]
+        return json.dumps(content).encode(), f"{way} {key}", False
+    elif way == "twice" and isinstance(holder, dict):
+        raw, refused = f"{json.dumps(old)}, {json.dumps(key)}: {json.dumps(old)}", True
+    holder[key] = SLOT
+    text = json.dumps(content, ensure_ascii=False).replace(json.dumps(SLOT, ensure_ascii=False), raw)
+    return text.encode("utf-8", "surrogatepass"), f"{way} {key}: {raw[:40]}", refused
+
+
+def damage_table(data: bytes, rng: random.Random) -> tuple[bytes, str, bool]:
+    """Change one cell of a table below its header."""
+    lines = [line.split(",") for line in data.decode().splitlines()]
+    row, column = rng.randrange(len(lines)), rng.randrange(len(lines[0]))
+    text = rng.choice([*ODD_TEXTS, *ODD_NUMBERS, "nan", "inf", '"', "1_0", "1;2", "\r", "'"])
+    lines[row][column] = text
+    refused = row > 0 and column > 0 and text in ("nan", "inf", "1_0", "1;2", "'", *ODD_TEXTS)
+    return (
+        "\n".join(map(",".join, lines)).encode("utf-8", "surrogatepass"),
+        f"cell {row},{column}: {text[:40]}",
+        refused,
+    )
+
+
+def damage_bytes(data: bytes, rng: random.Random) -> tuple[bytes, str, bool]:
+    """Flip, cut, repeat or overwrite bytes."""
+    damaged, way = bytearray(data), rng.choice(["flip", "flip", "cut", "repeat", "fill", "head"])
+    at = rng.randrange(64 if way == "head" else len(data))
+    if way in ("flip", "head"):
+        for _ in range(rng.randint(1, 8)):
+            damaged[min(len(data) - 1, at + rng.randrange(8))] ^= 1 << rng.randrange(8)
+    elif way == "cut":
+        del damaged[at:]
+    elif way == "repeat":
+        damaged[at:at] = data[at : at + 1000]
+    else:
+        damaged[at : at + 16] = bytes([rng.choice([0, 255])]) * 16
+    return bytes(damaged), f"{way} at {at}", False
+
+
+def _project(path: Path) -> None:
+    lookup = load_lookup(path)
+    pixels, valid = lookup.project(torch.tensor([[0.1, 0.1, 1.0], [0.0, 0.0, 1.0]]))
+    if not bool(pixels[valid].isfinite().all()):
+        raise AssertionError("valid pixels that are not finite")
+
+
+# What is run on each kind of file; FILE is the damaged one, the others are whole.
+COMMANDS: dict[str, list[str | Callable[[Path], object]]] = {
+    "camera.json": [
+        "bake FILE -o out.npz --tolerance 0.5",
+        "undistort image.png FILE -o u",
+    ],
+    "rig.json": ["locate FILE marks.csv -o out.csv -o out.kml -o out.cot -o out.geojson", "budget FILE"],
+    "obs.json": ["calibrate FILE --model pinhole -o out.json", "compare FILE --model pinhole opencv4 --parts 2"],
+    "board.json": [load_measured_board],
+    "lookup.npz": [_project],
+    "marks.csv": ["locate rig.json FILE -o out.csv -o out.kml --picture out.png --map out.html"],
+    "image.png": ["detect FILE --board 6x5 --square 20mm -o out.json"],
+    "image.jpg": ["detect FILE --board 6x5 --square 20mm -o out.json"],
+    "image.tif": ["detect FILE --board 6x5 --square 20mm -o out.json"],
+}
+
+
+@contextlib.contextmanager
+def _limit(seconds: float) -> Iterator[None]:
+    def ring(*_: object) -> None:
+        raise Hang(f"longer than {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _run(command: str | Callable[[Path], object], path: Path) -> bool:
+    """Whether the file was accepted."""
+    if not isinstance(command, str):
+        try:
+            command(path)
+        except KcalError:
+            return False
+        return True
+    argv, sys.argv = sys.argv, ["kcal", *command.replace("FILE", str(path)).split(" ")]
+    try:
+        command_line()
+    except SystemExit as end:
+        return end.code in (0, None)
+    finally:
+        sys.argv = argv
+    return True
+
+
+def odd_numbers(folder: Path) -> str:
+    """What is wrong with the numbers in what the command wrote, or ""."""
+    table = folder / "out.csv"
+    if table.exists():
+        for line in table.read_text().splitlines()[1:]:
+            if "nan" in line.lower().split(","):
+                return f"NaN in {line[:80]}"
+    for path in folder.glob("out*.json"):
+        if not all(math.isfinite(value) for value in _numbers(json.loads(path.read_bytes()))):
+            return f"{path.name} is not finite"
+    return ""
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, dict | list):
+        for inside in value.values() if isinstance(value, dict) else value:
+            yield from _numbers(inside)
+    elif isinstance(value, int | float):
+        yield value
+
+
+def run_case(case: int, whole: dict[str, bytes], seconds: float) -> list[Finding]:
+    """Damage one file by the seed `case`, and run what reads it."""
+    rng = random.Random(case)
+    kind = rng.choice(sorted(whole))
+    damage = {".json": damage_json, ".csv": damage_table}.get(Path(kind).suffix, damage_bytes)
+    data, done, refused = (damage if rng.random() < 0.85 else damage_bytes)(whole[kind], rng)
+    found = []
+    with tempfile.TemporaryDirectory() as name, contextlib.chdir(name):
+        for file, content in whole.items():
+            Path(file).write_bytes(content)
+        Path("u").mkdir()
+        path = Path(f"damaged-{kind}")
+        path.write_bytes(data)
+        for command in COMMANDS[kind]:
+            shown = command if isinstance(command, str) else command.__name__
+            said = io.StringIO()
+            try:
+                with warnings.catch_warnings(), contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+                    warnings.simplefilter("ignore")
+                    with _limit(seconds):
+                        accepted = _run(command, path)
+            except Hang as hang:
+                found.append(Finding(case, "hang", shown, done, str(hang)))
+                continue
+            except BaseException:
+                found.append(Finding(case, "traceback", shown, done, traceback.format_exc(limit=-3)))
+                continue
+            detail = odd_numbers(Path(name)) if accepted else ""
+            if accepted and refused:
+                detail = "accepted, though it must be refused"
+            if "\x1b" in said.getvalue():
+                detail = "an escape sequence reached the terminal"
+            if detail:
+                found.append(Finding(case, "silent number", shown, done, detail))
+    return found
+
+
+def fuzz(first: int, cases: int | None, seconds: float, limit: float) -> tuple[list[Finding], int]:
+    """Run cases from number `first` on, until so many are done or the time is over."""
+    with tempfile.TemporaryDirectory() as folder:
+        whole = make_files(Path(folder))
+    until, found, case = time.monotonic() + seconds, [], first
+    while time.monotonic() < until and (cases is None or case < first + cases):
+        found += run_case(case, whole, limit)
+        case += 1
+    return found, case - first
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=60.0, help="for all cases")
+    parser.add_argument("--first", type=int, default=0, help="number of the first case")
+    parser.add_argument("--cases", type=int, help="how many; until the time is over if not given")
+    parser.add_argument("--limit", type=float, default=30.0, help="seconds for one command, after which it hangs")
+    chosen = parser.parse_args()
+    found, done = fuzz(chosen.first, chosen.cases, chosen.seconds, chosen.limit)
+    for finding in found:
+        print(f"case {finding.case}: {finding.what} in `{finding.kind}`: {finding.damage}\n{finding.detail}\n")
+    print(f"{done} cases: {dict(Counter(finding.what for finding in found)) or 'nothing found'}")
+    sys.exit(bool(found))
+
+
+if __name__ == "__main__":
+    main()

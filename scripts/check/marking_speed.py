@@ -1,0 +1,127 @@
+"""How fast `kcal mark` is with a pair of 24 megapixels, in Chromium: first picture, dragging, memory.
+
+    python -m scripts.check.marking_speed            needs the extra `mark`, playwright and Chromium
+
+Seconds of the processor are given beside those of the clock: on a busy machine only the former say anything.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from playwright.sync_api import sync_playwright
+
+from kcal.io.images import write_png
+from kcal.io.rig_file import save_rig
+from scripts.shared.marking_scene import background, finished, site_rig
+
+SIZE = 6000, 4000
+_DRAWN = "s => [...kcal.views[s].tiles.kept.values()].some(t => t.canvas)"
+_DRAG = """async ([u, v]) => {
+  const view = kcal.views.left, box = view.canvas.getBoundingClientRect();
+  const send = (kind, x, y) => view.canvas.dispatchEvent(new PointerEvent(kind,
+    {clientX: box.left + x, clientY: box.top + y, buttons: 1, button: 0, pointerId: 1, bubbles: true}));
+  view.canvas.setPointerCapture = () => {};
+  const [x0, y0] = view.screen(u, v), start = performance.now();
+  let frames = 0;
+  send('pointerdown', x0, y0);
+  while (performance.now() - start < 3000) {
+    const angle = (performance.now() - start) / 300;
+    send('pointermove', x0 + 40 * Math.cos(angle), y0 + 40 * Math.sin(angle));
+    await new Promise(requestAnimationFrame);
+    frames += 1;
+  }
+  const seconds = (performance.now() - start) / 1000;
+  send('pointerup', x0, y0);
+  return [frames, seconds];
+}"""
+
+
+def memory(process: int) -> str:
+    """Resident memory of a process now and at most, MB."""
+    status = dict(re.findall(r"(\w+):\s+(\d+)", Path(f"/proc/{process}/status").read_text()))
+    return f"{int(status['VmRSS']) // 1024} MB (at most {int(status['VmHWM']) // 1024} MB)"
+
+
+def processor(process: int | None = None) -> float:
+    """Seconds of the processor that a process has used, or the pages' renderers of Chromium."""
+    total = 0.0
+    for stat in Path("/proc").glob("[0-9]*/stat" if process is None else f"{process}/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+            command = (stat.parent / "cmdline").read_text()
+        except OSError:
+            continue
+        if process is not None or "--type=renderer" in command or "--type=gpu-process" in command:
+            total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return total
+
+
+def dragged(page: Any, what: str, at: tuple[float, float]) -> None:
+    """Print frames a second while dragging, and seconds of the processor per frame."""
+    before = processor()
+    frames, seconds = page.evaluate(_DRAG, list(at))
+    each = (processor() - before) / frames
+    print(f"{what}: {frames / seconds:.0f} frames a second; processor {1000 * each:.1f} ms a frame")
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rig = site_rig(*SIZE)
+        for side, word in enumerate(("left", "right")):
+            light = background(rig, side, np.random.default_rng(0))
+            write_png(folder / f"{word}.png", finished(light, 1.5, np.random.default_rng(side)))
+        save_rig(rig, folder / "rig.json")
+        start = time.perf_counter()
+        command = [sys.executable, "-m", "kcal", "mark", "left.png", "right.png", "--rig", "rig.json", "-o", "m.csv"]
+        command += ["--port", "0", "--no-browser"]
+        server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder)
+        try:
+            assert server.stdout is not None
+            address = server.stdout.readline().split()[-1]
+            print(
+                f"command to address: {time.perf_counter() - start:.1f} s, processor {processor(server.pid):.1f} s; "
+                f"server {memory(server.pid)}"
+            )
+            with sync_playwright() as playwright:
+                browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
+                page = browser.new_page(viewport={"width": 1366, "height": 768})
+                before = processor(server.pid) + processor()
+                page.goto(address, wait_until="commit")
+                page.wait_for_function(f"() => window.kcal && ['left', 'right'].every({_DRAWN})")
+                spent = processor(server.pid) + processor() - before
+                clock = page.evaluate("performance.now()") / 1000
+                print(f"address to both pictures: {clock:.2f} s, processor {spent:.2f} s")
+                page.wait_for_timeout(1000)
+                dragged(page, "panning the whole image", (100, 100))
+                page.evaluate("kcal.views.left.look(3000, 2000, 1); kcal.views.right.look(3000, 2000, 1)")
+                page.wait_for_timeout(2000)
+                dragged(page, "panning at 1:1", (2900, 1950))
+                page.keyboard.press("n")
+                page.wait_for_function("() => kcal.item()")
+                page.evaluate(
+                    "kcal.place('left', 3000, 2000, false).then(() => kcal.place('right', 2900, 2000, false))"
+                )
+                page.wait_for_function("() => kcal.item().right")
+                page.evaluate("kcal.views.left.look(3000, 2000, 10)")
+                page.wait_for_timeout(2000)
+                dragged(page, "dragging a mark at 10x, with curve and range", (3000, 2000))
+                heap = page.evaluate("performance.memory.usedJSHeapSize / 1e6")
+                print(f"server {memory(server.pid)}; heap of the page {heap:.0f} MB")
+                browser.close()
+        finally:
+            server.terminate()
+            server.wait()
+
+
+if __name__ == "__main__":
+    main()

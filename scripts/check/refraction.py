@@ -1,0 +1,154 @@
+"""Refraction of light: heights at 5 km when the coefficient is not what was assumed, with and without far landmarks.
+
+    python -m scripts.check.refraction            # prints; --write puts it into docs/measured/refraction.md
+
+Truth: light bends with a coefficient of 0.13 + 0.2, 0.13 - 0.2, or one drawn from 0.13 ± 0.1. A rig of known lenses
+(scripts/shared/long_range.py) is solved from 12 landmarks, surveyed to 2 cm and marked to 0.07 px: near (40 to 400 m),
+or so that half of them stand 4 to 5 km away. Targets stand 5 km away all over the image. Their height is found with the
+rig's own coefficient, or the rig is solved with exactly 0.13 and the localizer takes 0.13 ± 0.1.
+
+Error without noise: neither survey nor marks have any, so that only the coefficient is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.calibrate.rig.sources import Landmarks, RigData
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
+from kcal.locate.ellipsoid import mean_radius
+from kcal.locate.geodesy import enu_from_cam
+from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.mounting import placed_rig
+from scripts.shared.long_range import ORIGIN, rig
+from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.timing import show
+
+COUNT, SURVEY, MARK = 12, 0.02, 0.07  # landmarks; meters, px
+TARGET_RANGE = 5000.0
+NEAR, FAR = (40.0, 400.0), (4000.0, 5000.0)  # meters
+ENU_FROM_CAM = enu_from_cam(35.0)
+PAGE = "refraction.md"
+
+
+class Site(NamedTuple):
+    """Landmarks (L, 3) and targets (T, 3) in east, north, up, and their pixels (L or T, 2, 2)."""
+
+    landmarks: Tensor
+    landmark_marks: Tensor
+    targets: Tensor
+    target_marks: Tensor
+
+
+def site(refraction: float, far: bool, generator: torch.Generator) -> Site:
+    """Things as they stand, and where both cameras see them in light that bends."""
+    world = rig()
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(shape, dtype=torch.float64, generator=generator)
+
+    def seen(enu: Tensor) -> tuple[Tensor, Tensor]:
+        lift = 0.5 * refraction / mean_radius(ORIGIN.lat) * enu[:, :2].square().sum(-1)
+        above = enu + lift[:, None] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        left, right, valid = world(above @ ENU_FROM_CAM)
+        return torch.stack([left, right], 1), valid
+
+    def places(count: int, low: float, high: float) -> Tensor:
+        pixels = 60.0 + uniform(8 * count, 2) * torch.tensor([1800.0, 960.0], dtype=torch.float64)
+        points = low * (high / low) ** uniform(8 * count, 1) * world.left.unproject(pixels)[0] @ ENU_FROM_CAM.T
+        marks, valid = seen(points)
+        good = valid & ((marks > 20) & (marks < torch.tensor([1900.0, 1060.0]).double())).all(-1).all(-1)
+        return points[good][:count]
+
+    here = torch.cat([places(COUNT // 2, *NEAR), places(COUNT // 2, *(FAR if far else NEAR))])
+    there = places(40, TARGET_RANGE, TARGET_RANGE)
+    return Site(here, seen(here)[0], there, seen(there)[0])
+
+
+def heights(place: Site, generator: torch.Generator, noise: float, learned: bool) -> tuple[Tensor, Tensor, float]:
+    """Errors (T,) of the targets' heights, their sigmas (T,), and the coefficient that was found."""
+
+    def normal(like: Tensor) -> Tensor:
+        return noise * torch.randn(like.shape, dtype=torch.float64, generator=generator)
+
+    landmarks = Landmarks(
+        names=tuple(map(str, range(COUNT))),
+        points=place.landmarks + SURVEY * normal(place.landmarks),
+        sigma=torch.full_like(place.landmarks, SURVEY),
+        pixels=place.landmark_marks + MARK * normal(place.landmark_marks),
+        pixel_sigma=MARK,
+    )
+    world = rig()
+    data = RigData(cameras=(world.left, world.right), names=("left", "right"), landmarks=landmarks)
+    options = RigOptions(intrinsics="fixed", refraction_sigma=REFRACTION_SIGMA if learned else 0.0)
+    solved = solve_rig(data, options)
+    k, sigma = (None, None) if learned else (REFRACTION, REFRACTION_SIGMA)
+    localize = StereoLocalizer(placed_rig(solved, ORIGIN), pixel_sigma=MARK, refraction=k, refraction_sigma=sigma)
+    marks = place.target_marks + MARK * normal(place.target_marks)
+    found = localize(marks[:, 0], marks[:, 1])
+    # Across the line of sight, upward: errors of the range are not those of light.
+    sight = torch.nn.functional.normalize(place.targets, dim=-1)
+    level = torch.nn.functional.normalize(sight[:, :2], dim=-1)
+    upward = torch.cat([-sight[:, 2:] * level, (sight[:, :2] * level).sum(-1, keepdim=True)], -1)
+    ratio = place.targets.norm(dim=-1) / found.enu.norm(dim=-1)
+    error = ((found.enu * ratio[:, None] - place.targets) * upward).sum(-1)
+    spread = torch.einsum("ni,nij,nj->n", upward, found.covariance, upward).sqrt() * ratio
+    return error, spread, solved.refraction
+
+
+def rows(draws: int) -> list[list[str]]:
+    """One row for each truth, place of the landmarks and way of solving."""
+    out = [[
+        "true coefficient", "landmarks", "coefficient", "found", "height error at 5 km without noise, m",
+        "with noise, m", "inside the 95 % interval, %",
+    ]]  # fmt: skip
+    for name, truth in (("0.33", 0.33), ("-0.07", -0.07), ("0.13 ± 0.1", None)):
+        for far in (False, True):
+            for learned in (False, True):
+                bias, errors, inside, found = [], [], [], []
+                for draw in range(draws):
+                    generator = torch.Generator().manual_seed(7000 + draw)
+                    own = torch.randn((), dtype=torch.float64, generator=generator)
+                    k = REFRACTION + REFRACTION_SIGMA * float(own) if truth is None else truth
+                    place = site(k, far, generator)
+                    error, _, _ = heights(place, generator, 0.0, learned)
+                    bias.append(error.square().mean())
+                    error, sigma, estimate = heights(place, generator, 1.0, learned)
+                    errors.append(error.square().mean())
+                    inside.append((error.abs() <= 1.96 * sigma).double().mean())
+                    found.append(estimate - k)
+                rms, noisy, share = (torch.stack(values).mean() for values in (bias, errors, inside))
+                off = torch.tensor(found).square().mean().sqrt()
+                kind = "half at 4 to 5 km" if far else "at 40 to 400 m"
+                way = "the rig's" if learned else "0.13 ± 0.1"
+                out.append([
+                    name, kind, way, f"± {float(off):.3f}", f"{float(rms.sqrt()):.3f}", f"{float(noisy.sqrt()):.3f}",
+                    f"{100 * float(share):.1f}",
+                ])  # fmt: skip
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--draws", type=int, default=40, help="of landmarks, targets and noise")
+    parser.add_argument("--write", action="store_true", help="write the page")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    head, *body = rows(arguments.draws)
+    lines = table(head, body)
+    show(lines)
+    if arguments.write:
+        text = (__doc__ or "").split("\n\n", 2)[2].strip()
+        page = ["# Refraction, measured", "", CONCLUSIONS[PAGE], "", f"Made by `scripts/check/refraction.py`. {text}"]
+        page += ["", f"{arguments.draws} draws of landmarks, targets and noise.", "", *lines, ""]
+        Path(DOCS / PAGE).write_text("\n".join(page), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

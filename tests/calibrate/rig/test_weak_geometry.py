@@ -1,0 +1,136 @@
+"""Landmarks in a row, a plane or one place: rigs are refused or intervals widened; ordinary rigs are left alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, generator, landmarks, normal, see, tensor
+from torch import Tensor
+
+from kcal.calibrate.rig.result import RigResult
+from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.calibrate.rig.sources import Landmarks, MeasuredPosition, RigData
+from kcal.calibrate.rig.weak_geometry import OpenPlace, _targets, open_place
+from kcal.errors import DegenerateError
+from kcal.lens.mounting import Origin
+from kcal.lens.rig import RigCovariance
+from kcal.locate.localizer import StereoLocalizer
+
+HELD = RigOptions(intrinsics="fixed")
+ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
+FAR = 1000.0
+
+
+def box(size: tuple[float, float, float], middle: tuple[float, float, float], seed: int, count: int = 12) -> Tensor:
+    """(count, 3) meters in the left camera's frame: right, down, forward."""
+    draw = torch.rand(count, 3, dtype=torch.float64, generator=generator(seed)) - 0.5
+    return draw * tensor(*size) + tensor(*middle)
+
+
+def surveyed(points: Tensor, seed: int, *, mark: float = 0.3, survey: float = 0.05) -> Landmarks:
+    """Points of the left camera's frame, marked and surveyed with noise."""
+    points = points @ ROTATION[0] + CENTER[0]
+    pixels = torch.stack([see(points, camera) for camera in (0, 1)], 1)
+    return Landmarks(
+        names=tuple(f"post {i}" for i in range(len(points))),
+        points=points + survey * normal(points.shape, 1000 + seed),
+        sigma=torch.full_like(points, survey),
+        pixels=pixels + mark * normal(pixels.shape, 2000 + seed),
+        pixel_sigma=mark,
+    )
+
+
+def solved(seen: Landmarks, options: RigOptions = HELD, sigma: float | None = None) -> RigResult:
+    """The rig; `sigma` in meters of measured positions of the cameras, if there are any."""
+    places = () if sigma is None else tuple(
+        MeasuredPosition(camera=c, point=CENTER[c], sigma=torch.full((3,), sigma).double()) for c in (0, 1)
+    )  # fmt: skip
+    return solve_rig(RigData(cameras=CAMERAS[:2], names=NAMES[:2], landmarks=seen, positions=places), options)
+
+
+def place(found: RigResult) -> OpenPlace:
+    checked = open_place(found._problem, found._state, found._covariance, 0, 1)
+    assert checked is not None
+    return checked
+
+
+def row(seed: int, high: float) -> Landmarks:
+    return surveyed(box((800.0, high, 0.0), (0.0, 0.0, FAR), seed), seed)
+
+
+class TestRefused:
+    @pytest.mark.parametrize("high", [0.0, 40.0])
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_a_row(self, seed: int, high: float) -> None:
+        with pytest.raises(DegenerateError, match=r"where right stands: ± .* m \(up and down .* nearly in one line"):
+            solved(row(seed, high))
+
+    def test_one_place(self) -> None:
+        points = box((30.0, 20.0, 20.0), (150.0, 40.0, FAR), 3)
+        with pytest.raises(DegenerateError, match="close together"):
+            solved(surveyed(points, 3))
+
+    def test_the_remedy_helps(self) -> None:
+        found = solved(row(0, 0.0), sigma=0.05)
+        assert found.warnings == ()
+        assert place(found).share < 0.02
+
+    def test_whoever_wants_to_keep_all_is_warned(self) -> None:
+        found = solved(row(0, 40.0), dataclasses.replace(HELD, reject=False))
+        (text,) = found.warnings
+        assert "ranges could be anything" in text
+
+
+class TestWidened:
+    def test_intervals_contain_the_truth(self) -> None:
+        """Walls that face the cameras: widened intervals contain the truth, first-order ones too seldom."""
+        targets = box((0.9, 0.5, 0.0), (0.0, 0.0, 1.0), 5, 40) * torch.linspace(250.0, 5000.0, 40).double()[:, None]
+        pixels = [see(targets @ ROTATION[0] + CENTER[0], camera) for camera in (0, 1)]
+        far, both = targets.norm(dim=-1), torch.isfinite(torch.cat(pixels, -1)).all(-1)
+        shares = []
+        for seed in (0, 23, 24, 26):
+            found = solved(surveyed(box((900.0, 450.0, 0.0), (0.0, 0.0, FAR), seed), seed))
+            rig = found.stereo()
+            assert rig.covariance is not None
+            (text,) = found.warnings
+            assert "intervals were widened" in text
+            assert "nearly in one plane" in text
+            inside = []
+            for widen in (1.0, 1.0 / math.sqrt(found.variance)):
+                known = RigCovariance(half=widen * rig.covariance.half)
+                localize = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1, calibration=known)
+                answer = localize(*(value[both] for value in pixels))
+                good = (answer.range_low <= far[both]) & (far[both] <= answer.range_high)
+                inside.append(float(good.double().mean()))
+            shares.append(inside)
+        widened, plain = torch.tensor(shares).mean(0).tolist()
+        assert len(shares) == 4
+        assert widened > 0.93
+        assert plain < widened - 0.02
+
+
+class TestOrdinary:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_nothing_is_said(self, seed: int) -> None:
+        found = solved(landmarks(noise=0.2, error=0.02, seed=seed))
+        assert found.warnings == ()
+        assert found.variance == 1.0
+        assert place(found).share < 0.05
+        assert place(found).ratio < 1.0
+
+    def test_sigmas_are_those_of_the_localizer(self) -> None:
+        found = solved(landmarks(noise=0.2, error=0.02))
+        rig = found.stereo()
+        targets = _targets(found._problem, found._state, found._covariance, (0, 1), 1.0 / 200.0)
+        assert targets is not None
+        localize = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1)
+        for far in (200.0, 370.0, 900.0, 5000.0):
+            left, right, good = rig(far * targets.rays)
+            wanted = localize(left, right).inverse_range_sigma[good]
+            by_rig = targets.at(targets.half, torch.full((len(targets.rays),), 1.0 / far).double()).square().sum(-1)
+            # The variance by the marks is that at infinity.
+            torch.testing.assert_close((targets.own + by_rig).sqrt()[good], wanted, rtol=0.03, atol=0.0)
+            assert math.isfinite(float(wanted.max()))

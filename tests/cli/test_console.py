@@ -1,0 +1,94 @@
+"""What reaches the terminal is shown and does nothing else; errors are one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
+from kcal.cli.main import main
+
+ESCAPE = "a\x1b]0;title\x07\x1b[2J\x9b31m\x85:bomb:"
+
+
+def test_no_escape_sequence_reaches_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table([["name"], [ESCAPE], ["two\nlines"]])
+    out.print(ESCAPE, markup=False)
+    out.print(f"[bold]{ESCAPE}[/]")
+    print_wrote(Path(ESCAPE))
+    warn(ESCAPE)
+    with steps("searching", 1) as advance:
+        advance(ESCAPE)
+    shown = "".join(capsys.readouterr())
+    assert not any(c in shown for c in "\x1b\x07\x9b\x85")
+    assert shown.count(r"a\x1b]0;title\x07\x1b[2J\x9b31m\x85:bomb:") == 5
+    assert r"two\nlines" in shown
+
+
+def test_an_error_shows_the_name_of_a_file_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / ESCAPE
+    path.write_text("{}")
+    monkeypatch.setattr(sys, "argv", ["kcal", "bake", str(path), "-o", str(tmp_path / "x.npz")])
+    with pytest.raises(SystemExit) as exit_:
+        main()
+    assert exit_.value.code == 1
+    shown = capsys.readouterr().err
+    assert shown.startswith("error: ")
+    assert "not a kcal file" in shown
+    assert "\x1b" not in shown
+
+
+def test_the_library_s_own_colors_stay() -> None:
+    assert err.render_str("[red]x[/]").spans[0].style == "red"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["bake", "a" * 300],
+        ["bake", "camera.json", "-o", "a" * 300 + ".npz"],
+        ["detect", "a" * 300, "--board", "9x6", "--square", "25mm", "-o", "x.json"],
+        ["detect", "x.png", "--board", "9x6", "--square", "25mm", "-o", "a" * 300],
+        ["detect", "x.png", "--board", "9x6", "--square", "25mm", "-o", "x.json", "--keep", "a" * 300],
+        ["batch", "a" * 300, "--board", "9x6", "--square", "25mm", "-o", "out"],
+        ["batch", ".", "--board", "9x6", "--square", "25mm", "-o", "a" * 300],
+        ["locate", "a" * 300, "b" * 300],
+        ["locate", "rig.json", "marks.csv", "-o", "a" * 300 + ".csv"],
+        ["calibrate", "a" * 300, "-o", "x.json"],
+        ["undistort", "a" * 300, "x.png", "-o", "b" * 300],
+        ["compare", "a" * 300, "b" * 300],
+        ["board", "a" * 300 + ".pdf", "--board", "9x6", "--square", "25mm"],
+        ["budget", "a" * 300],
+        ["rig", "a" * 300, "b" * 300, "-o", "c" * 300],
+        ["demo", "a" * 300],
+    ],
+    ids=lambda arguments: " ".join(arguments)[:40],
+)
+def test_long_names_are_errors_of_one_line(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["kcal", *arguments])
+    with pytest.raises(SystemExit) as exit_:
+        main()
+    assert exit_.value.code in (1, 2)
+    assert len([line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]) <= 1
+
+
+def test_a_pipe_is_an_error_at_once(tmp_path: Path) -> None:
+    import os
+
+    os.mkfifo(tmp_path / "pipe.png")
+    done = subprocess.run(
+        [sys.executable, "-m", "kcal", "detect", str(tmp_path / "pipe.png"), "--board", "9x6", "--square", "25mm",
+         "-o", str(tmp_path / "x.json")],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "not a regular file" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,115 @@
+"""Start `kcal mark` as a user does, and drive its page in Chromium."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+class Server:
+    """A running `kcal mark`."""
+
+    def __init__(self, arguments: list[str], port: int, folder: Path) -> None:
+        command = [sys.executable, "-m", "kcal", "mark", *arguments, "--port", str(port), "--no-browser"]
+        self.errors = (folder / "server.err").open("w+")
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=self.errors, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"}
+        )
+        self.address = self._address()
+
+    def _address(self) -> str:
+        assert self.process.stdout is not None
+        until = time.monotonic() + 120
+        while time.monotonic() < until:
+            ready, _, _ = select.select([self.process.stdout], [], [], 1)
+            if ready:
+                line = self.process.stdout.readline()
+                found = re.search(r"http://127\.0\.0\.1:\d+/#\S+", line)
+                if found:
+                    return found.group()
+            if self.process.poll() is not None:
+                break
+        self.errors.seek(0)
+        raise AssertionError(f"the server did not start: {self.errors.read()[-2000:]}")
+
+    def kill(self) -> None:
+        """As when the power fails."""
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait()
+
+    def stop(self) -> None:
+        """As with Ctrl+C."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+            self.process.wait(timeout=20)
+
+
+def free_port() -> int:
+    """A port that nobody uses now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@contextmanager
+def chromium_page(width: int = 1366, height: int = 768) -> Iterator[Any]:
+    """A page of headless Chromium; requests beyond this machine and errors of scripts are collected on it."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.complaints = []
+        page.on("pageerror", lambda error: page.complaints.append(str(error)))
+        page.on("console", lambda m: page.complaints.append(m.text) if "Content Security" in m.text else None)
+        page.on(
+            "request",
+            lambda r: (
+                page.complaints.append(r.url) if not r.url.startswith(("http://127.0.0.1", "data:", "blob:")) else None
+            ),
+        )
+        yield page
+        browser.close()
+
+
+def settled(page: Any, timeout: float = 60_000) -> None:
+    """Wait until all actions are answered and the rig is solved."""
+    page.wait_for_function(
+        "() => window.kcal && kcal.actions.waiting.length === 0 && "
+        "document.documentElement.dataset.pending === 'false'",
+        timeout=timeout,
+    )
+
+
+def click_at(page: Any, side: str, u: float, v: float) -> None:
+    """Click where the view of one side shows an image position."""
+    x, y = page.evaluate(
+        "([side, u, v]) => { const view = kcal.views[side], box = view.canvas.getBoundingClientRect();"
+        " const [x, y] = view.screen(u, v); return [box.left + x / view.ratio, box.top + y / view.ratio]; }",
+        [side, u, v],
+    )
+    page.mouse.click(x, y)
+
+
+def look_at(page: Any, side: str, u: float, v: float, scale: float = 6.0) -> None:
+    """Show an image position in the middle of one side."""
+    page.evaluate("([side, u, v, scale]) => kcal.views[side].look(u, v, scale)", [side, u, v, scale])
+
+
+def choose(page: Any, name: str) -> None:
+    """Select a thing in the list."""
+    page.evaluate("name => kcal.select(name, false)", name)

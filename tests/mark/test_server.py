@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("starlette", reason="the extra `mark` is not installed")
+pytest.importorskip("httpx", reason="starlette's test client needs httpx")
+from starlette.testclient import TestClient
+
+from kcal.io.images import write_png
+from kcal.mark.desk import Desk
+from kcal.mark.pictures import open_pictures
+from kcal.mark.server import marking_app, page_files
+from kcal.mark.session import Session
+
+TOKEN = "secret-of-this-start"
+HOST = "127.0.0.1:8347"
+MARK = {"u": 30.5, "v": 20.25, "cov": [0.01, 0.0, 0.01], "how": "corner", "frame": "left"}
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> Iterator[TestClient]:
+    axis = np.arange(60)
+    corner = np.where((axis[:, None] >= 30) & (axis >= 27), 160, 60).astype(np.uint8)
+    for side in ("left", "right"):
+        write_png(tmp_path / f"{side}.png", np.pad(corner, 20, mode="edge"))
+    desk = Desk(open_pictures(tmp_path / "left.png", tmp_path / "right.png"), Session(tmp_path / "marks.csv"))
+    app = marking_app(desk, TOKEN, (HOST,))
+    with TestClient(app, base_url=f"http://{HOST}", headers={"X-Kcal-Token": TOKEN}) as found:
+        yield found
+    desk.close()
+
+
+def do(client: TestClient, action: dict[str, Any], key: str = "some-key-1") -> Any:
+    return client.post("/api/act", json={"key": key, "action": action})
+
+
+def test_the_page_loads_nothing_from_elsewhere(client: TestClient) -> None:
+    answer = client.get("/")
+    policy = answer.headers["content-security-policy"]
+    assert answer.status_code == 200
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    for path, (content, kind) in page_files().items():
+        assert client.get(path).content == content
+        if path.startswith("/page/") or path == "/":
+            found = content.decode().replace("http://www.w3.org/2000/svg", "")
+            assert "http" not in found, path
+            assert " style=" not in found or kind != "text/html"
+    assert client.get("/page/../server.py").status_code == 404
+    assert client.get("/page/%2e%2e/server.py").status_code == 404
+
+
+@pytest.mark.parametrize(
+    "path", ["/api/state", "/api/about", "/api/tile?side=left&frame=0&level=0&x=0&y=0", "/api/none"]
+)
+def test_data_need_the_token(client: TestClient, path: str) -> None:
+    for token in ("", "wrong", TOKEN + "x", "é"):
+        assert client.get(path, headers={"X-Kcal-Token": token.encode()}).status_code == 401
+
+
+def test_other_hosts_are_refused(client: TestClient) -> None:
+    for host in ("evil.example", "127.0.0.1", "127.0.0.1:80", "localhost.evil.example:8347", ""):
+        assert client.get("/api/state", headers={"Host": host}).status_code == 403
+        assert client.get("/", headers={"Host": host}).status_code == 403
+    assert client.get("/api/state", headers={"Origin": "http://evil.example"}).status_code == 403
+    assert client.get("/api/state", headers={"Origin": f"http://{HOST}"}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "message"),
+    [
+        (b"{", 400, "Expecting"),
+        (b"\xff", 400, "utf-8"),
+        (json.dumps({"key": "k", "action": {"do": "undo"}}).encode(), 422, "key: String should have at least 8"),
+        (json.dumps({"key": "12345678", "action": {"do": "undo"}}).encode(), 400, "nothing to undo"),
+        (json.dumps({"key": "12345678", "action": {"do": "rm"}}).encode(), 422, "does not match any of the expected"),
+        (json.dumps({"key": "12345678", "action": {"do": "put", "name": "x", "side": "left", "mark": MARK}}).encode(),
+         400, "nothing is named 'x'"),
+        (json.dumps({"key": "12345678", "action": {"do": "add", "name": "a\nb", "kind": "target"}}).encode(), 400,
+         "one line"),
+        (b'{"key": "12345678", "action": {"do": "put", "name": "x", "side": "left", "mark": {"u": NaN, "v": 1, "cov": '
+         b"[1, 0, 1]}}}", 422, "finite number"),
+        (json.dumps({"key": "12345678", "action": {"do": "put", "name": "x", "side": "left",
+                                                   "mark": {**MARK, "cov": [1, 2, 1]}}}).encode(), 422,
+         "the covariance is not positive definite"),
+        (b" " * (1 << 21), 413, "too large"),
+    ],
+)  # fmt: skip
+def test_bad_requests(client: TestClient, body: bytes, status: int, message: str) -> None:
+    answer = client.post("/api/act", content=body)
+    assert answer.status_code == status
+    assert message in answer.json()["error"]
+    assert client.get("/api/state").json()["version"] == 0
+
+
+def test_tiles_are_the_gray_levels(client: TestClient, tmp_path: Path) -> None:
+    answer = client.get("/api/tile", params={"side": "right", "frame": 0, "level": 0, "x": 0, "y": 0})
+    size = int(answer.headers["x-height"]), int(answer.headers["x-width"])
+    tile = np.frombuffer(answer.content, np.uint8).reshape(size)
+    assert size == (100, 100)
+    assert [tile[60, 60], tile[10, 10]] == [160, 60]
+    assert client.get("/api/tile", params={"side": "right", "frame": 0, "level": 0, "x": 5, "y": 0}).status_code == 400
+    assert client.get("/api/tile", params={"side": "up", "frame": 0, "level": 0, "x": 0, "y": 0}).status_code == 422
+    answer = client.get("/api/enlarged", params={"side": "left", "frame": 0, "u": 47, "v": 50})
+    assert answer.headers["x-factor"] == "10"
+    assert int(answer.headers["x-width"]) * int(answer.headers["x-height"]) == len(answer.content) == 490 * 490
+    assert (answer.headers["x-left"], answer.headers["x-top"]) == ("23", "26")
+
+
+def test_marking_without_cameras(client: TestClient, tmp_path: Path) -> None:
+    found = client.post("/api/snap", json={"side": "left", "frame": 0, "u": 48, "v": 48}).json()
+    assert found["how"] == "corner"
+    assert (found["u"], found["v"]) == (pytest.approx(46.5, abs=0.1), pytest.approx(49.5, abs=0.1))
+    assert "flat" in client.post("/api/snap", json={"side": "left", "frame": 0, "u": 20, "v": 20}).json()["refusal"]
+    assert (
+        "four landmarks"
+        in client.post("/api/curve", json={"side": "left", "frame": 0, "u": 1, "v": 1}).json()["refusal"]
+    )
+    do(client, {"do": "add", "name": "tree", "kind": "target"})
+    state = do(client, {"do": "put", "name": "tree", "side": "left", "mark": MARK}, "some-key-2").json()
+    assert state["items"][0]["left"]["sigma"] == pytest.approx(0.1)
+    assert state["undo"]

@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import signal
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from kcal.errors import FileError, InputError
+from kcal.locate.marks import Marks, read_marks, write_marks
+from kcal.locate.survey import match_landmarks, read_survey
+from kcal.mark.items import Add, Drop, Mark, Place, Put, Rename, Side, Step, SurveyPlace, Take
+from kcal.mark.session import Session, pair_covariance
+
+SURVEY = "name,lat,lon,height,sigma\npost,40.1,-113.9,1282,0.02\nroof,40.2,-113.8,1290,0.02\n"
+
+
+def mark(u: float, v: float, sigma: float = 0.1, frame: str = "1") -> Mark:
+    return Mark(u=u, v=v, cov=(sigma**2, 0.0, sigma**2), frame=frame)
+
+
+def put(name: str, side: Side, at: Mark, matched: bool = False) -> Put:
+    return Put(do="put", name=name, side=side, mark=at, matched=matched)
+
+
+def work(session: Session) -> None:
+    """Two landmarks, one target with a matched mark."""
+    session.do(put("post", "left", mark(10.1, 20.2)), "key-0001")
+    session.do(put("post", "right", mark(9.1, 20.3)), "key-0002")
+    session.do(put("roof", "left", mark(110.1, 20.2)), "key-0003")
+    session.do(Add(do="add", name="truck", kind="target"), "key-0004")
+    session.do(put("truck", "left", mark(50.25, 60.5, 0.3)), "key-0005")
+    session.do(put("truck", "right", mark(45.125, 60.75, 0.05), matched=True), "key-0006")
+
+
+@pytest.fixture
+def survey(tmp_path: Path) -> Path:
+    path = tmp_path / "survey.csv"
+    path.write_text(SURVEY)
+    return path
+
+
+def test_the_files_are_those_that_rig_and_locate_read(tmp_path: Path, survey: Path) -> None:
+    session = Session(tmp_path / "marks.csv", survey)
+    work(session)
+    marks = read_marks(session.files.marks, single=True)
+    found = match_landmarks(read_survey(session.files.landmarks), marks, 0.1)
+    assert found.landmarks.names == ("post", "roof")
+    assert found.landmarks.pixels[0].tolist() == [[10.1, 20.2], [9.1, 20.3]]
+    assert found.landmarks.pixels[1, 1].isnan().all()
+    points = read_marks(session.files.points)
+    assert points.names == ("truck",)
+    assert points.covariance is not None
+    # The right mark was matched to the left one: it has its error too, and their difference has only the match's.
+    expected = torch.block_diag(*[torch.eye(2) * 0.09] * 2).double()
+    expected[:2, 2:] = expected[2:, :2] = torch.eye(2).double() * 0.09
+    expected[2:, 2:] += torch.eye(2).double() * 0.0025
+    torch.testing.assert_close(points.covariance[0], expected)
+
+
+def test_a_killed_session_continues(tmp_path: Path, survey: Path) -> None:
+    first = Session(tmp_path / "marks.csv", survey)
+    work(first)
+    state, texts = first.state, [path.read_text() for path in (first.files.marks, first.files.points)]
+    first.close()
+    # Killed between the log and the files, and while the next line was written.
+    first.files.points.write_text("name,left_u,left_v,right_u,right_v\n")
+    with first.files.log.open("ab") as log:
+        log.write(b'{"key": "half')
+    second = Session(tmp_path / "marks.csv", survey)
+    assert second.state == state
+    assert [path.read_text() for path in (first.files.marks, first.files.points)] == texts
+    second.do(Step(do="undo"), "key-0007")
+    assert second.state.items["truck"].right is None
+    second.do(Step(do="redo"), "key-0008")
+    assert second.state == state
+    second.close()
+    # What was cut off is gone: the next line did not grow onto it.
+    third = Session(tmp_path / "marks.csv", survey)
+    assert third.state == state
+    third.close()
+
+
+def test_an_action_that_is_sent_twice_is_done_once(tmp_path: Path) -> None:
+    session = Session(tmp_path / "marks.csv")
+    session.do(Add(do="add", name="a", kind="target"), "key-0001")
+    session.do(Add(do="add", name="a", kind="target"), "key-0001")
+    session.close()
+    again = Session(tmp_path / "marks.csv")
+    again.do(Add(do="add", name="a", kind="target"), "key-0001")
+    assert list(again.state.items) == ["a"]
+    with pytest.raises(InputError, match="'a' is used already"):
+        again.do(Add(do="add", name="a", kind="target"), "key-0002")
+
+
+def test_undo_to_the_beginning(tmp_path: Path, survey: Path) -> None:
+    session = Session(tmp_path / "marks.csv", survey)
+    work(session)
+    for step in range(6):
+        session.do(Step(do="undo"), f"undo-{step:04d}")
+    assert all(item.left is None and item.right is None for item in session.state.items.values())
+    assert set(session.state.survey) == {"post", "roof"}
+    with pytest.raises(InputError, match="nothing to undo"):
+        session.do(Step(do="undo"), "undo-0006")
+
+
+def test_two_sessions_cannot_write_the_same_marks(tmp_path: Path) -> None:
+    first = Session(tmp_path / "marks.csv")
+    with pytest.raises(FileError, match="another `kcal mark`"):
+        Session(tmp_path / "marks.csv")
+    first.close()
+    Session(tmp_path / "marks.csv").close()
+
+
+def test_marks_that_were_changed_outside_are_taken_over(tmp_path: Path, survey: Path) -> None:
+    session = Session(tmp_path / "marks.csv", survey)
+    work(session)
+    session.close()
+    marks = read_marks(session.files.marks, single=True)
+    write_marks(session.files.marks, Marks(marks.names, marks.left + 1.0, marks.right, marks.covariance))
+    again = Session(tmp_path / "marks.csv", survey)
+    left = again.state.items["post"].left
+    assert left is not None
+    assert left.u == pytest.approx(11.1)
+    assert again.state.items["truck"].right is not None
+    again.do(Step(do="undo"), "key-0009")
+    left = again.state.items["post"].left
+    assert left is not None
+    assert left.u == 10.1
+
+
+def test_a_damaged_log_is_named(tmp_path: Path) -> None:
+    session = Session(tmp_path / "marks.csv")
+    work_on = Add(do="add", name="a", kind="target")
+    session.do(work_on, "key-0001")
+    session.close()
+    log = session.files.log
+    log.write_text(log.read_text() + "nonsense\n" + json.dumps({"key": "k", "action": {"do": "undo"}}) + "\n")
+    with pytest.raises(FileError, match="line 3 is damaged"):
+        Session(tmp_path / "marks.csv")
+
+
+def test_marks_of_a_target_are_of_one_moment(tmp_path: Path, survey: Path) -> None:
+    session = Session(tmp_path / "marks.csv", survey)
+    session.do(Add(do="add", name="truck", kind="target"), "key-0001")
+    session.do(put("truck", "left", mark(1, 2, frame="1")), "key-0002")
+    with pytest.raises(InputError, match="of one moment"):
+        session.do(put("truck", "right", mark(1, 2, frame="2")), "key-0003")
+    session.do(put("post", "left", mark(1, 2, frame="1")), "key-0004")
+    session.do(put("post", "right", mark(1, 2, frame="2")), "key-0005")
+
+
+def test_a_match_that_ends_keeps_its_whole_error(tmp_path: Path, survey: Path) -> None:
+    session = Session(tmp_path / "marks.csv", survey)
+    work(session)
+    session.do(put("truck", "left", mark(50.0, 60.0, 0.02)), "key-0007")
+    right = session.state.items["truck"].right
+    assert right is not None
+    assert right.cov[0] == pytest.approx(0.3**2 + 0.05**2)
+    assert float(pair_covariance(session.state.items["truck"])[0, 2]) == 0.0
+
+
+def test_names_places_and_removals(tmp_path: Path, survey: Path) -> None:
+    session = Session(tmp_path / "marks.csv", survey)
+    work(session)
+    session.do(Rename(do="rename", name="post", to="hill, west", kind="landmark"), "key-0007")
+    session.do(SurveyPlace(do="survey", name="well", place=Place(at=(40.15, -113.85, 1280.0), sigma=0.05)), "key-0008")
+    session.do(Take(do="take", name="roof", side="left"), "key-0009")
+    assert read_marks(session.files.marks, single=True).names == ("hill, west",)
+    assert read_survey(session.files.landmarks).names == ("hill, west", "roof", "well")
+    session.do(Drop(do="drop", name="truck"), "key-0010")
+    assert session.files.points.read_text().count("\n") == 1
+    with pytest.raises(InputError, match="nothing is named 'truck'"):
+        session.do(Drop(do="drop", name="truck"), "key-0011")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
+def test_what_was_answered_survives_a_kill_at_any_moment(tmp_path: Path) -> None:
+    """A child marks as fast as it can and tells what was answered; it is killed ten times, also within a write."""
+    moments, answered = random.Random(0), []
+    for turn in range(10):
+        reading, writing = os.pipe()
+        child = os.fork()
+        if child == 0:
+            with contextlib.suppress(BaseException):
+                session = Session(tmp_path / "marks.csv")
+                for number in range(10_000):
+                    name = f"{turn}-{number}"
+                    session.do(Add(do="add", name=name, kind="target"), f"add-{name}")
+                    session.do(put(name, "left", mark(number, 1.0)), f"left-{name}")
+                    session.do(put(name, "right", mark(number, 2.0)), f"right-{name}")
+                    os.write(writing, f"{name}\n".encode())
+            os._exit(0)
+        os.close(writing)
+        told = os.read(reading, 4096)
+        time.sleep(moments.uniform(0.0, 0.1))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        while part := os.read(reading, 4096):
+            told += part
+        os.close(reading)
+        answered += told.decode().split()
+        session = Session(tmp_path / "marks.csv")
+        points = read_marks(session.files.points)
+        session.close()
+        found = dict(zip(points.names, points.pixels.tolist(), strict=True))
+        assert {name: found.get(name) for name in answered} == {
+            name: [[float(name.partition("-")[2]), 1.0], [float(name.partition("-")[2]), 2.0]] for name in answered
+        }
+    assert len(answered) >= 10
