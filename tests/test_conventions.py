@@ -43,7 +43,7 @@ def test_rms_is_over_points() -> None:
     checker = torch.tensor([(-1.0) ** (i // 9 + i % 9) for i in range(72)], dtype=torch.float64)[:, None] * 0.1
     views = []
     for i, rotation in enumerate(rotation_from_vector(tilts)):
-        points = board.points @ rotation.T + torch.tensor([-0.2, -0.17, 0.8], dtype=torch.float64)
+        points = board.points @ rotation.T + torch.tensor([-0.2, -0.17, 1.0], dtype=torch.float64)
         views.append(View(name=str(i), pixels=(camera.project(points)[0] + checker).tolist()))
     result = calibrate_camera(Observations(board=board, image_size=(640, 480), views=tuple(views)))
     finite = result.residuals[torch.isfinite(result.residuals).all(-1)]

@@ -18,6 +18,9 @@ Coordinate = Annotated[float, pydantic.Field(ge=-1e6, le=1e6)]
 Pixel = tuple[Coordinate, Coordinate]
 PackedCovariance = tuple[float, float, float]
 
+# Pixels that noise or a bad refinement may move a corner at the image's edge beyond it.
+_BEYOND = 2.0
+
 
 class View(pydantic.BaseModel):
     """One image in which the board was found.
@@ -54,7 +57,7 @@ class Observations(NativeFile):
 
     Args:
         board: the board that was shown.
-        image_size: (width, height) in pixels, the same for all views.
+        image_size: (width, height) in pixels, the same for all views; all corners lie within.
         refinement: method of `kcal.corners.refine.refine_corners`.
         views: the views in which the board was found.
         failures: the images that gave none.
@@ -84,6 +87,7 @@ class Observations(NativeFile):
         for view in self.views:
             if len(view.pixels) != self.board.corners:
                 raise ValueError(f"view {view.name!r} has {len(view.pixels)} corners, the board {self.board.corners}")
+            self._refuse_outside(view)
             if view.covariance is None:
                 continue
             if len(view.covariance) != len(view.pixels):
@@ -94,6 +98,16 @@ class Observations(NativeFile):
                 if spread is not None and not (spread[0] > 0 and spread[0] * spread[2] > spread[1] ** 2):
                     raise ValueError(f"view {view.name!r}: the covariance {spread} is not positive definite")
         return self
+
+    def _refuse_outside(self, view: View) -> None:
+        width, height = self.image_size
+        low, right, bottom = -0.5 - _BEYOND, width - 0.5 + _BEYOND, height - 0.5 + _BEYOND
+        out = [pixel for pixel in view.pixels if pixel and not (low <= pixel[0] <= right and low <= pixel[1] <= bottom)]
+        if out:
+            raise ValueError(
+                f"view {view.name!r}: {len(out)} corner(s) lie outside the image of {width}x{height} px, one at "
+                f"({out[0][0]:.1f}, {out[0][1]:.1f}): the image size or the corners are wrong, or of another scale"
+            )
 
     @property
     def names(self) -> tuple[str, ...]:

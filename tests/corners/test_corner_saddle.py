@@ -168,6 +168,18 @@ def test_statuses():
     assert torch.isfinite(found.pixels).all(-1).tolist() == [status == CornerStatus.GOOD for status in expected]
 
 
+def test_corners_keep_a_margin_from_all_four_sides():
+    """The disc and two sigma of its blur, 6 px, lie on the image; half a pixel less does not."""
+    width, height = 70, 60
+    y, x = torch.meshgrid(torch.arange(60.0).double(), torch.arange(70.0).double(), indexing="ij")
+    for margin, status in ((6.25, CornerStatus.GOOD), (5.75, CornerStatus.OUTSIDE)):
+        places = [(margin, 30.0), (width - 1 - margin, 30.0), (35.0, margin), (35.0, height - 1 - margin)]
+        for u, v in places:
+            image = torch.tanh((x - u) / 2) * torch.tanh((y - v) / 2)
+            found = saddle(image, torch.tensor([[u, v]]).double(), 20.0)
+            assert int(found.status[0]) == status, (u, v)
+
+
 def test_flat_image_gives_no_number():
     found = saddle(torch.full((50, 50), 128.0), torch.tensor([[25.0, 25.0]]), 20.0)
     assert int(found.status[0]) == CornerStatus.NO_SADDLE

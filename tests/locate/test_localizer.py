@@ -133,6 +133,21 @@ def test_mounting_adds_the_origin_and_what_a_turn_does_at_a_distance() -> None:
     assert torch.allclose(added[0], expected, atol=1e-9)
 
 
+def test_places_follow_the_origin_and_turns_of_the_mounting() -> None:
+    """By autograd through a rigid motion; with origin and attitude correlated, the signs of turns show."""
+    left, right, _ = RIG(spread_points(tensor(300.0, 1000.0)))
+    plain = localizer()(left, right)
+
+    def moved(standing: torch.Tensor, enu: torch.Tensor) -> torch.Tensor:
+        return rotation_from_vector(standing[3:]) @ enu + standing[:3]
+
+    root = torch.diag(tensor(0.5, 0.3, 0.2, 1e-3, 2e-3, 3e-3)) @ (torch.eye(6).double() + 0.3 * noise(1.0, 6, 6))
+    added = localizer(mounting=root @ root.T)(left, right).covariance - plain.covariance
+    for enu, more in zip(plain.enu, added, strict=True):
+        rows = torch.autograd.functional.jacobian(lambda standing, enu=enu: moved(standing, enu), 0 * root[0])
+        torch.testing.assert_close(more, rows @ root @ root.T @ rows.T, rtol=1e-6, atol=1e-6)
+
+
 def test_refraction_lowers_the_point() -> None:
     left, right, _ = RIG(spread_points(tensor(5000.0)))
     straight, bent = localizer()(left, right), localizer(refraction=0.13)(left, right)

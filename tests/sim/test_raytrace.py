@@ -142,6 +142,21 @@ def test_rays_are_those_of_optiland(name: str) -> None:
     torch.testing.assert_close(torch.cat([at[:, :2], rays.directions[:, :2]], -1), known, atol=1e-12, rtol=0)
 
 
+def test_a_tilted_piece_of_glass_turns_as_one_about_its_first_vertex() -> None:
+    """A turn of α about x lowers what lies behind the pivot: (0, -sin α, cos α) times its distance."""
+    lens, alpha = PRESCRIPTIONS["surveillance"], 0.1
+    first, last = lens.elements[1]
+    tilt = tuple((alpha, 0.0) if i == 1 else (0.0, 0.0) for i in range(len(lens.elements)))
+    straight, tilted = (place(lens, 1.0, 1.0, Misalignment(tilt=turns)) for turns in ((), tilt))
+    for k, (before, after) in enumerate(zip(straight, tilted, strict=True)):
+        turned = first <= k <= last
+        depth = before.vertex[2] - straight[first].vertex[2] if turned else torch.zeros(()).double()
+        axis = torch.tensor([0.0, -math.sin(alpha), math.cos(alpha)] if turned else [0.0, 0.0, 1.0]).double()
+        moved = depth * (axis - torch.tensor([0.0, 0.0, 1.0]).double())
+        torch.testing.assert_close(after.vertex - before.vertex, moved, atol=1e-7, rtol=0)
+        torch.testing.assert_close(after.rotation[:, 2], axis, atol=1e-7, rtol=0)
+
+
 def test_pieces_of_glass_are_counted_and_checked() -> None:
     lens = PRESCRIPTIONS["surveillance"]
     assert lens.elements[1] == (2, 4)  # cemented

@@ -63,6 +63,14 @@ def test_what_is_not_seen_says_so(lens: TruthLens) -> None:
     assert lens.project(torch.zeros(0, 3).double())[0].shape == (0, 2)
 
 
+def test_the_image_ends_half_a_pixel_beyond_its_outer_centers(lens: TruthLens) -> None:
+    width, height = lens.size
+    near = torch.tensor([[-0.49, -0.49], [width - 0.51, height - 0.51]]).double()
+    assert bool(lens.inside(near).all())
+    out = torch.tensor([[-0.51, 9.0], [9.0, -0.51], [width - 0.49, 9.0], [9.0, height - 0.49]]).double()
+    assert not bool(lens.inside(out).any())
+
+
 def test_a_perfect_lens_is_round() -> None:
     lens = TruthLens("surveillance", size=(800, 800), focal=700.0)
     around = torch.linspace(0, 6.2, 30, dtype=torch.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from solve_problems import KNOWN, MISRA_X, MISRA_Y, SOLVERS, Known, beale, freud
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.solve.lm import LevenbergMarquardt, LMOptions
+from kcal.solve.lm import LevenbergMarquardt, LMOptions, minimize
 from kcal.solve.result import SolverStatus
 
 
@@ -121,6 +122,14 @@ class TestHoles:
         assert int(result.status) == SolverStatus.CONVERGED
         assert int(result.iterations) == 1
 
+    def test_a_step_that_damping_shortens_is_no_minimum(self, solver: str) -> None:
+        """λ = 3e9 lets a step promise 3e-10 of the cost: below the tolerance, and far from the minimum."""
+        options = LMOptions(initial_damping=3e9, tolerance=1e-8)
+        x, result = SOLVERS[solver](lambda x: torch.cat([beale(x), torch.ones(1).double()]), vector(1.0, 1.0), options)
+        assert int(result.status) == SolverStatus.CONVERGED
+        assert int(result.iterations) > 9
+        torch.testing.assert_close(x, vector(3.0, 0.5), rtol=0, atol=1e-3)
+
     def test_residual_floor_is_per_residual(self, solver: str) -> None:
         """The same misfit in every one of many residuals counts as the same, not as more."""
 
@@ -228,6 +237,46 @@ def test_a_flat_valley_is_left_and_called_so() -> None:
     # The first step after twenty that gained less than half of what is left.
     assert float(left.history[-21]) <= 1.5 * float(left.cost) < float(left.history[-22])
     assert int(LevenbergMarquardt(valley, LMOptions(tolerance=0.0))(vector(3.0)).status) != SolverStatus.FLAT
+
+
+class Scripted:
+    """A problem whose costs and promised decreases are given; it notes the damping of each step."""
+
+    joint, residual_count = False, 1
+
+    def __init__(self, start: float, trials: list[tuple[float, float]]) -> None:
+        """`trials`: the cost of each candidate, and the decrease that was predicted for it."""
+        self.start, self.trials = start, trials
+        self.dampings: list[float] = []
+
+    def linearize(self, state: tuple[Tensor]) -> SimpleNamespace:
+        return SimpleNamespace(cost=vector(self.start)[0], step=self.step)
+
+    def step(self, damping: Tensor) -> tuple[Tensor, Tensor]:
+        self.dampings.append(float(damping))
+        return torch.zeros(()).double(), vector(self.trials[len(self.dampings) - 1][1])[0]
+
+    def retract(self, state: tuple[Tensor], step: Tensor) -> tuple[Tensor]:
+        return state
+
+    def cost(self, state: tuple[Tensor]) -> Tensor:
+        return vector(self.trials[len(self.dampings) - 1][0])[0]
+
+
+def test_damping_follows_the_gain_ratio() -> None:
+    """Nielsen 1999: max(1/10, 1 - (2 ρ - 1)³) after a step that helps; 2, 4, 8, ... times after steps that do not."""
+    gains = (1.0, 0.5, 0.8, 0.1)
+    costs = [100.0]
+    for gain in gains:
+        costs.append(costs[-1] - gain)
+    # What is worse, or NaN, is rejected; a step that helps begins anew with 2.
+    trials = [(cost, 1.0) for cost in costs[1:]]
+    trials = [*trials[:2], (200.0, 1.0), (math.nan, 1.0), (99.0, 1.0), *trials[2:], (150.0, 1.0), (150.0, 1.0)]
+    problem = Scripted(100.0, trials)
+    minimize(problem, (torch.zeros(1).double(),), LMOptions(max_iterations=len(trials), initial_damping=1.0))
+    factors = [b / a for a, b in zip(problem.dampings[:-1], problem.dampings[1:], strict=True)]
+    helped = [max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3) for gain in gains]
+    assert factors == pytest.approx([*helped[:2], 2.0, 4.0, 8.0, *helped[2:], 2.0], rel=1e-9)
 
 
 class TestRefusals:

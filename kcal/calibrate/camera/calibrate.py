@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 
@@ -12,7 +13,8 @@ from kcal.calibrate.camera.assess import assess
 from kcal.calibrate.camera.hybrid import calibrate_hybrid
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.outliers import solve_without_outliers
-from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.repeats import copied_views, copy_warnings, pose_warnings
+from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedView
 from kcal.calibrate.camera.solve import solve
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
@@ -40,7 +42,8 @@ def calibrate_camera(
     found and solved again.
 
     Args:
-        observations: the views of one camera.
+        observations: the views of one camera. Copies of other views, compressed again or not, are left out with a
+            warning.
         options: see `CalibrationOptions`.
         progress: called with what has just been finished.
 
@@ -48,8 +51,8 @@ def calibrate_camera(
         the camera with its residuals and error bars. Skew stays 0 unless `free` or `fixed` name it.
 
     Raises:
-        DegenerateError: fewer than three views, too few corners for the model, or views that do not determine the
-            focal length (all parallel to the image, for example).
+        DegenerateError: fewer than three views or poses of the board, too few corners for the model, or views that do
+            not determine the focal length (all parallel to the image, for example).
         InputError: the data and the model do not fit at all.
 
     Example:
@@ -73,6 +76,46 @@ def calibrate_camera(
         (800.0, True)
     """
     options = options or CalibrationOptions()
+    if options.camera is not None and not options.free:
+        # Each view is for itself.
+        return _calibrate(observations, options, progress)
+    pixels, copied = observations.pixels(), copied_views(observations.pixels(), 0.0)
+    result = _calibrate(_without_copies(observations, copied), options, progress)
+    if (nearly := copied_views(pixels, result.noise)) != copied:
+        progress(f"{len(nearly)} views are copies of others; again without them")
+        copied = nearly
+        result = _calibrate(_without_copies(observations, copied), options, progress)
+    return _complete(result, observations, copied)
+
+
+def _without_copies(observations: Observations, copied: Mapping[int, int]) -> Observations:
+    return observations.model_copy(
+        update={"views": tuple(view for i, view in enumerate(observations.views) if i not in copied)}
+    )
+
+
+def _complete(
+    result: CameraCalibrationResult, observations: Observations, copied: Mapping[int, int]
+) -> CameraCalibrationResult:
+    """A result without copies as one for all observations, with warnings about views that add nothing."""
+    pixels, names = observations.pixels(), observations.names
+    warnings = (*result.warnings, *copy_warnings(names, copied), *pose_warnings(result.observations.pixels()))
+    kept = [i for i in range(len(names)) if i not in copied]
+    left_out = tuple(
+        RejectedView(
+            view=names[i],
+            corners=int(torch.isfinite(pixels[i]).all(-1).sum()),
+            residual=float(result.per_view_rms[kept.index(first)]),
+            reason=f"it is a copy of {names[first]}",
+        )
+        for i, first in copied.items()
+    )
+    if left_out:
+        result = result.among(kept, observations)
+    return dataclasses.replace(result, warnings=warnings, rejected_views=(*result.rejected_views, *left_out))
+
+
+def _calibrate(observations: Observations, options: CalibrationOptions, progress: Progress) -> CameraCalibrationResult:
     if options.hybrid:
         return calibrate_hybrid(observations, options, progress)
     if options.reject is None:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.closed_form import spread_out
+from kcal.calibrate.camera.repeats import repeated_poses
 from kcal.errors import DegenerateError, InputError
 
 MINIMUM_VIEWS = 3
@@ -28,13 +29,19 @@ def check_views(board_points: Tensor, pixels: Tensor, names: Sequence[str], para
         fewest: number of views that are needed.
 
     Raises:
-        DegenerateError: too few views or corners.
+        DegenerateError: too few views, poses or corners.
         InputError: a view with too few corners, or with corners on a line or in one place.
     """
     seen = torch.isfinite(pixels).all(-1).sum(-1)
     if len(pixels) < fewest:
         raise DegenerateError(
             f"{len(pixels)} view(s) of the board: at least {fewest} at different tilts are needed, 10 to 40 are good"
+        )
+    poses = len(pixels) - len(repeated_poses(pixels))
+    if poses < fewest:
+        raise DegenerateError(
+            f"{len(pixels)} views show the board in {poses} pose(s) only, the others are too similar: at least "
+            f"{fewest} at different tilts are needed, 10 to 40 are good; move and tilt the board between views"
         )
     poor = (seen < _MINIMUM_CORNERS).nonzero()[:, 0].tolist()
     if poor:

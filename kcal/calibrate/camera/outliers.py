@@ -57,19 +57,8 @@ class Inliers:
 
     def complete(self, result: CameraCalibrationResult, observations: Observations) -> CameraCalibrationResult:
         """A result for these views as one for all observations: NaN for views left out, all rejections listed."""
-
-        def of_all(values: Tensor) -> Tensor:
-            out = values.new_full((len(observations.views), *values.shape[1:]), torch.nan)
-            out[self.views] = values
-            return out
-
         return dataclasses.replace(
-            result,
-            observations=observations,
-            per_view_rms=of_all(result.per_view_rms),
-            residuals=of_all(result.residuals),
-            cam_from_board_rotation=of_all(result.cam_from_board_rotation),
-            cam_from_board_translation=of_all(result.cam_from_board_translation),
+            result.among(self.views, observations),
             rejected_corners=self.rejected_corners,
             rejected_views=self.rejected_views,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -86,7 +87,7 @@ class CameraCalibrationResult:
         led_by_prior: names of the parameters that a prior determines more than the views do: without it their σ would
             be more than 1.4 times as large.
         rejected_corners: corners of the views that were used, left out by `CalibrationOptions.reject`.
-        rejected_views: views left out likewise.
+        rejected_views: views left out likewise, and copies of other views.
     """
 
     camera: Camera
@@ -115,6 +116,24 @@ class CameraCalibrationResult:
         """Give the camera its error bars and history, which it keeps until its parameters change."""
         self.camera.calibration = CameraCalibration(
             sigma=self.sigma, information=self.information, record=self._record()
+        )
+
+    def among(self, views: Sequence[int], observations: Observations) -> CameraCalibrationResult:
+        """This result of some views as one of all `observations`: NaN for the others."""
+
+        def of_all(values: Tensor) -> Tensor:
+            out = values.new_full((len(observations.views), *values.shape[1:]), torch.nan)
+            out[list(views)] = values
+            return out
+
+        return dataclasses.replace(
+            self,
+            observations=observations,
+            per_view_rms=of_all(self.per_view_rms),
+            residuals=of_all(self.residuals),
+            cam_from_board_rotation=of_all(self.cam_from_board_rotation),
+            cam_from_board_translation=of_all(self.cam_from_board_translation),
+            hybrid=None if self.hybrid is None else self.hybrid.among(views, len(observations.views)),
         )
 
     def _record(self) -> CalibrationRecord:

@@ -177,6 +177,7 @@ class TestAdvice:
         rolled = torch.stack([r @ turn for r, turn in zip(rotation, turned, strict=True)])
         moved = translation + (rotation @ middle) - (rolled @ middle)
         pixels = truth().project(BOARD.points @ rolled.transpose(-1, -2) + moved[:, None])[0]
+        pixels = torch.where(truth().inside(pixels)[..., None], pixels, torch.nan)
         result = calibrate_camera(observe(pixels + 0.1 * torch.sin(1e3 * pixels)))
         assert not any("roll the board" in text for text in result.advice)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
+from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
@@ -21,13 +21,15 @@ def scene(count: int = 14, seed: int = 2) -> Tensor:
 
 
 def spoil(pixels: Tensor, seed: int, share: float = 0.02) -> tuple[Tensor, set[tuple[int, int]]]:
-    """A share of the corners moved by 5 to 60 pixels in any direction."""
+    """A share of the corners moved by 5 to 60 pixels in any direction that does not lead out of the image."""
     generator = torch.Generator().manual_seed(seed)
     wrong = torch.rand(pixels.shape[:2], generator=generator) < share
     turn = 6.2831853 * torch.rand(pixels.shape[:2], generator=generator, dtype=torch.float64)
     length = 5.0 + 55.0 * torch.rand(pixels.shape[:2], generator=generator, dtype=torch.float64)
     shift = torch.stack([length * torch.cos(turn), length * torch.sin(turn)], -1)
-    moved = torch.where(wrong[..., None], pixels + shift, pixels)
+    size = torch.tensor(SIZE, dtype=torch.float64)
+    stays = ((pixels + shift >= 0) & (pixels + shift <= size - 1)).all(-1, keepdim=True)
+    moved = torch.where(wrong[..., None], pixels + torch.where(stays, shift, -shift), pixels)
     return moved, {(i, n) for i, n in wrong.nonzero().tolist()}
 
 

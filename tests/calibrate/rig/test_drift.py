@@ -43,6 +43,17 @@ def static(count: int, noise: float = 0.0, seed: int = 0, turns: Tensor = TURN) 
     )
 
 
+# The same cameras, the right one rolled by 70°: what is transposed, or in the other camera's axes, shows.
+ROLLED = torch.stack([ROTATION[0], rotation_from_vector(tensor(0.0, 0.0, math.radians(70.0))) @ ROTATION[1]])
+ROLLED_RIG = StereoRig(*CAMERAS[:2], ROLLED[1] @ ROLLED[0].T, ROLLED[1] @ (CENTER[0] - CENTER[1]))
+
+
+def seen_rolled(points: Tensor, turns: Tensor) -> Tensor:
+    """(N, 2, 2) pixels in the cameras of `ROLLED_RIG` after they have turned; also outside the image."""
+    local = [(points - CENTER[c]) @ (rotation_from_vector(turns[c]) @ ROLLED[c]).T for c in (0, 1)]
+    return torch.stack([CAMERAS[c].project(local[c])[0] for c in (0, 1)], 1)
+
+
 def relative_turn(turns: Tensor = TURN) -> Tensor:
     left, right = rotation_from_vector(turns)
     return vector_from_rotation(right @ RELATIVE @ left.T @ RELATIVE.T)
@@ -116,6 +127,34 @@ class TestFeatures:
             total += float(error @ torch.linalg.pinv(found.pose_covariance, rtol=1e-9, hermitian=True) @ error)
         assert abs(total - 60) < 4 * (2 * 60) ** 0.5
 
+    def test_covariances_are_those_of_the_cameras_turns(self) -> None:
+        """By autograd through the relative pose that two small turns leave, of cameras that look unlike."""
+        points = spread_points(15, 300.0, 8000.0, 11)
+        pixels = torch.cat([seen_rolled(points, turns) for turns in (0 * TURN, TURN)], 1)
+        found = measure_drift(ROLLED_RIG, features=dataclasses.replace(static(15), pixels=pixels))
+        assert found.left is not None
+        assert found.right is not None
+        torch.testing.assert_close(torch.stack([found.left, found.right]), TURN, rtol=0, atol=1e-10)
+        now = found.rig.right_from_left_rotation
+
+        def pose(both: Tensor) -> tuple[Tensor, Tensor]:
+            left, right = rotation_from_vector(both.unflatten(0, (2, 3)))
+            turned = right @ ROLLED_RIG.right_from_left_rotation @ left.T
+            return vector_from_rotation(turned @ now.T), right @ ROLLED_RIG.right_from_left_translation
+
+        rows = torch.cat(torch.autograd.functional.jacobian(pose, torch.cat([found.left, found.right])))
+        own = torch.block_diag(found.left_covariance, found.right_covariance)
+        scale = own.diagonal().mean() * torch.tensor([1.0] * 3 + [10.0] * 3).double()
+        off = (rows @ own @ rows.T - found.pose_covariance) / (scale[:, None] * scale).sqrt()
+        assert float(off.abs().max()) < 5e-3  # turns of 1e-4 rad, to first order; the largest entry is 30
+        torch.testing.assert_close(found.relative_covariance, found.pose_covariance[:3, :3], rtol=0, atol=0)
+
+    def test_attitude_in_the_local_frame(self) -> None:
+        found = measure_drift(RIG, features=static(12), pose=(ROTATION[0], CENTER[0]))
+        torch.testing.assert_close(
+            found.cam_from_local, rotation_from_vector(TURN[0]) @ ROTATION[0], rtol=0, atol=1e-10
+        )
+
     def test_what_moved_is_named(self) -> None:
         features = static(20, 0.1)
         features.pixels[3, 2:] += tensor([6.0, 1.0], [5.0, 1.0])
@@ -149,6 +188,43 @@ class TestLandmarks:
         assert found.cam_from_local is not None
         torch.testing.assert_close(found.cam_from_local, rotation_from_vector(TURN[0]) @ ROTATION[0])
         torch.testing.assert_close(found.relative, relative_turn(), rtol=0, atol=1e-10)
+
+    def test_turns_and_their_covariances_about_the_cameras_own_axes(self) -> None:
+        marks = landmarks()
+        marks = dataclasses.replace(marks, pixels=seen_rolled(marks.points, TURN))
+        pose = (ROLLED[0], CENTER[0])
+        found = measure_drift(ROLLED_RIG, landmarks=marks, pose=pose)
+        assert found.left is not None
+        assert found.right is not None
+        torch.testing.assert_close(torch.stack([found.left, found.right]), TURN, rtol=0, atol=1e-9)
+        shift = rotation_from_vector(TURN[1]) @ ROLLED_RIG.right_from_left_translation
+        torch.testing.assert_close(found.rig.right_from_left_translation, shift, rtol=0, atol=1e-7)
+        # What was not known of the relative turn and of the left camera's attitude comes on top.
+        relative, left = (torch.diag(tensor(*values)) for values in ((1e-9, 4e-9, 9e-9), (2e-9, 5e-9, 1e-8)))
+        wider = measure_drift(ROLLED_RIG, landmarks=marks, pose=pose, before=(relative, left))
+        onto = found.rig.right_from_left_rotation
+        for name, more in (
+            ("relative_covariance", relative),
+            ("left_covariance", left),
+            ("right_covariance", relative + onto @ left @ onto.T),
+            ("pose_covariance", torch.zeros(6, 6).double()),
+        ):
+            torch.testing.assert_close(getattr(wider, name) - getattr(found, name), more, rtol=1e-6, atol=1e-18)
+
+    def test_sigmas_are_the_spread(self) -> None:
+        """16 checks by exact landmarks: χ² of both cameras' turns and of the relative one, ± 4 of its deviations."""
+        marks, total = landmarks(survey=1e-4), torch.zeros(3).double()
+        exact = seen_rolled(marks.points, TURN)
+        onto = rotation_from_vector(TURN[1]) @ ROLLED_RIG.right_from_left_rotation @ rotation_from_vector(-TURN[0])
+        for seed in range(16):
+            noisy = dataclasses.replace(marks, pixels=exact + 0.1 * normal(exact.shape, 900 + seed))
+            found = measure_drift(ROLLED_RIG, landmarks=noisy, pose=(ROLLED[0], CENTER[0]))
+            relative = vector_from_rotation(found.rig.right_from_left_rotation @ onto.T)
+            errors = found.left - TURN[0], found.right - TURN[1], relative
+            spreads = found.left_covariance, found.right_covariance, found.relative_covariance
+            for k, (error, spread) in enumerate(zip(errors, spreads, strict=True)):
+                total[k] += float(error @ torch.linalg.solve(spread, error))
+        assert bool(((total - 48).abs() < 4 * (2 * 48) ** 0.5).all())
 
     def test_how_well_the_rig_was_known_counts(self) -> None:
         marks = landmarks()

@@ -1,0 +1,74 @@
+"""Planting of mistakes: each kind where it belongs, one at a time, and code that still compiles."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from scripts.check.mutants import interval
+from scripts.check.mutations import sites
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("if a < b:\n        pass", {"a >= b"}),
+        ("return len(a) > 2", {"len(a) <= 2", "len(a) >= 2", "3"}),
+        ("return a and (not b)", {"a or not b", "b"}),
+        ("if a.any():\n        pass", {"a.all()", "not a.any()"}),
+        ("return a @ b.T", {"b.T @ a", "-(a @ b.T)", "b"}),
+        ("return f(a, b) ** 2", {"f(b, a)", "f(a, b) * 2", "-f(a, b) ** 2", "3"}),
+        ("return g([a, b, 1.5], dim=-1)", {"[b, a, 1.5]", "2.5", "2"}),
+        ("return torch.where(a, b, c)", {"torch.where(a, c, b)"}),
+        ("a += b[:n]", {"a -= b[:n]", ":n - 1"}),
+        ("return max(a, b), -a", {"min(a, b)", "a", "(-a, max(a, b))"}),
+        ("return a in (b, c)", {"a not in (b, c)"}),
+        ("raise ValueError(f'{a + 1}: {2 * b}')", set()),
+        ("return f(a, dtype=b[0])", set()),
+    ],
+)
+def test_kinds(before: str, after: set[str]) -> None:
+    found = sites(ast.parse(f"def f(a: int | str, b, c, n):\n    '''1 + 1'''\n    {before}"), "f.py")
+    planted = {site.after.removeprefix("return ") for site in found}
+    assert planted == after
+    assert {site.function for site in found} <= {"f"}
+
+
+def test_one_at_a_time_wherever_it_is() -> None:
+    path = ROOT / "kcal" / "solve" / "lm.py"
+    text = path.read_text(encoding="utf-8")
+    plain, seen = ast.unparse(ast.parse(text)), set()
+    count = len(sites(ast.parse(text), "lm.py"))
+    for number in range(0, count, 40):
+        tree = ast.parse(text)
+        site = sites(tree, "lm.py")[number]
+        site.plant()
+        changed = ast.unparse(ast.fix_missing_locations(tree))
+        compile(tree, "lm.py", "exec")
+        lines = [pair for pair in zip(plain.splitlines(), changed.splitlines(), strict=True) if pair[0] != pair[1]]
+        assert len(lines) == 1, site
+        seen.add(changed)
+    assert len(seen) == len(range(0, count, 40))
+
+
+def test_names_and_keys() -> None:
+    code = (
+        "class A:\n    x = 1\n    def f(self, y=2):\n        def g():\n            return 3\n        return g() + 4\n"
+    )
+    found = sites(ast.parse(code), "a.py")
+    assert {site.after: site.function for site in found if site.kind == "constant"} == {
+        "2": "", "3": "", "4": "A.f.<locals>.g", "5": "A.f",
+    }  # fmt: skip
+    # Keys belong to a statement of the module: another one before it changes nothing but lines.
+    moved = sites(ast.parse(f"import os\nz = 7\n{code}"), "a.py")
+    assert {site.key for site in found} < {site.key for site in moved}
+    assert not {site.key for site in found} & {site.key for site in sites(ast.parse(code), "b.py")}
+
+
+def test_interval_of_a_share() -> None:
+    assert interval(45, 50) == pytest.approx((0.786, 0.957), abs=1e-3)
+    assert interval(10, 10) == pytest.approx((0.722, 1.0), abs=1e-3)
