@@ -193,7 +193,7 @@ class TestLandmarks:
         marks = landmarks()
         marks = dataclasses.replace(marks, pixels=seen_rolled(marks.points, TURN))
         pose = (ROLLED[0], CENTER[0])
-        found = measure_drift(ROLLED_RIG, landmarks=marks, pose=pose)
+        found = measure_drift(ROLLED_RIG, landmarks=marks, pose=pose, refraction=(0.0, 0.0))
         assert found.left is not None
         assert found.right is not None
         torch.testing.assert_close(torch.stack([found.left, found.right]), TURN, rtol=0, atol=1e-9)
@@ -201,7 +201,7 @@ class TestLandmarks:
         torch.testing.assert_close(found.rig.right_from_left_translation, shift, rtol=0, atol=1e-7)
         # What was not known of the relative turn and of the left camera's attitude comes on top.
         relative, left = (torch.diag(tensor(*values)) for values in ((1e-9, 4e-9, 9e-9), (2e-9, 5e-9, 1e-8)))
-        wider = measure_drift(ROLLED_RIG, landmarks=marks, pose=pose, before=(relative, left))
+        wider = measure_drift(ROLLED_RIG, landmarks=marks, pose=pose, before=(relative, left), refraction=(0.0, 0.0))
         onto = found.rig.right_from_left_rotation
         for name, more in (
             ("relative_covariance", relative),
@@ -218,7 +218,7 @@ class TestLandmarks:
         onto = rotation_from_vector(TURN[1]) @ ROLLED_RIG.right_from_left_rotation @ rotation_from_vector(-TURN[0])
         for seed in range(16):
             noisy = dataclasses.replace(marks, pixels=exact + 0.1 * normal(exact.shape, 900 + seed))
-            found = measure_drift(ROLLED_RIG, landmarks=noisy, pose=(ROLLED[0], CENTER[0]))
+            found = measure_drift(ROLLED_RIG, landmarks=noisy, pose=(ROLLED[0], CENTER[0]), refraction=(0.0, 0.0))
             relative = vector_from_rotation(found.rig.right_from_left_rotation @ onto.T)
             errors = found.left - TURN[0], found.right - TURN[1], relative
             spreads = found.left_covariance, found.right_covariance, found.relative_covariance
