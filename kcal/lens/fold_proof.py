@@ -36,30 +36,30 @@ _SHORTEST = 1e-8
 
 
 class _Cells(NamedTuple):
-    """Parts of the plane: radii from `low` to `high` in `count` sectors from the number `sector` on; each (N,)."""
+    """Parts of the plane: radii from `low` to `high` in `width` sectors from the number `sector` on; each (N,)."""
 
     lens: Tensor
     low: Tensor
     high: Tensor
     sector: Tensor
-    count: Tensor
+    width: Tensor
 
     def take(self, where: Tensor) -> _Cells:
         return _Cells(*(value[where] for value in self))
 
     def in_four(self, across: Tensor) -> _Cells:
         """Cut each cell in four: its sectors where `across`, else its radii."""
-        lens, low, high, sector, count = (value[:, None].expand(-1, 4) for value in self)
+        lens, low, high, sector, width = (value[:, None].expand(-1, 4) for value in self)
         part, across = torch.arange(4, device=low.device), across[:, None]
         start = torch.where(part == 0, low, low + (high - low) * (part / 4))
         end = torch.cat([start[:, 1:], high[:, :1]], 1)
-        fewer = count // 4
+        fewer = width // 4
         cut = (
             lens,
             torch.where(across, low, start),
             torch.where(across, high, end),
             torch.where(across, sector + part * fewer, sector),
-            torch.where(across, fewer, count),
+            torch.where(across, fewer, width),
         )
         return _Cells(*(value.flatten() for value in cut))
 
@@ -127,14 +127,15 @@ def _waves(
     if pole is not None:
         square = pole * pole
         cube = square * pole
-        first, second = (along * pole, numerator * square), tuple(each * cube for each in second)
+        first = along * pole, numerator * square
+        second = second[0] * cube, second[1] * cube, second[2] * cube
     once = (first[0] * q + first[1] * (q + more) for q, more in ((qx, more_x), (qy, more_y)))
     return (along * numerator + second[0], *once, *second[1:])
 
 
 def _around(waves: tuple[Jet, ...], cells: _Cells) -> Jet:
     """Bound constant + a cos φ + b sin φ + c cos 2φ + d sin 2φ in all directions of each cell."""
-    middle, half = (cells.sector + 0.5 * cells.count) * (2 * math.pi / SECTORS), cells.count * (math.pi / SECTORS)
+    middle, half = (cells.sector + 0.5 * cells.width) * (2 * math.pi / SECTORS), cells.width * (math.pi / SECTORS)
     cosine, sine = torch.cos(middle), torch.sin(middle)
     factors = [torch.ones_like(half), cosine, sine, cosine * cosine - sine * sine, 2.0 * cosine * sine]
     rates = [torch.zeros_like(half), -sine, cosine, -2.0 * factors[4], 2.0 * factors[3]]
@@ -148,13 +149,13 @@ def _around(waves: tuple[Jet, ...], cells: _Cells) -> Jet:
         own = total(errors, (1.0,) * 5) + total(bounds, (1e-15,) * 5)
         return own + half * total(centers, rates).abs() + 0.5 * half * half * total(bounds, (0.0, 1.0, 1.0, 4.0, 4.0))
 
-    value, slope, bend, value_error, slope_error, _ = zip(*waves, strict=True)
+    values, slopes = [wave.value for wave in waves], [wave.slope for wave in waves]
     return Jet(
-        total(value, factors),
-        total(slope, factors),
-        total(bend, (1.0,) * 5),
-        error(value_error, value, sizes),
-        error(slope_error, slope, steepest),
+        total(values, factors),
+        total(slopes, factors),
+        total([wave.bend for wave in waves], (1.0,) * 5),
+        error([wave.value_error for wave in waves], values, sizes),
+        error([wave.slope_error for wave in waves], slopes, steepest),
         waves[0].half,
     )
 
@@ -182,7 +183,7 @@ def _prove(bound: Callable[[_Cells, Span], Jet], reach: Tensor, disc: Tensor) ->
         sign, falls = jet.sign(), jet.falls()
         # Shorter cells do not help where the error comes from the width of the sector, or from rounding.
         wide = jet.value_error > (jet.slope.abs() + jet.bend * jet.half) * jet.half
-        across = wide & (cells.count > 1)
+        across = wide & (cells.width > 1)
         helps = (~wide | (jet.slope_error < jet.bend * jet.half)) & (span.half > _SHORTEST * cells.high)
         undecided = (sign == 0) & ~(falls & (cells.low >= disc[cells.lens])) & (across | helps)
         if int(undecided.sum()) > _MOST_CELLS * lenses:
@@ -190,14 +191,15 @@ def _prove(bound: Callable[[_Cells, Span], Jet], reach: Tensor, disc: Tensor) ->
         done.append((cells.take(~undecided), sign[~undecided], falls[~undecided]))
         cells = cells.take(undecided).in_four(across[undecided])
 
-    cells = _Cells(*(torch.cat(each) for each in zip(*(part[0] for part in done), strict=True)))
-    sign, falls = (torch.cat([part[i] for part in done]) for i in (1, 2))
+    every, signs, falling = zip(*done, strict=True)
+    cells = _Cells(*(torch.cat(each) for each in zip(*every, strict=True)))
+    sign, falls = torch.cat(signs), torch.cat(falling)
     lowest = torch.where(sign <= 0, cells.low, torch.inf)
     positive = reach.amax(-1).scatter_reduce(0, cells.lens, lowest, "amin")
     # A sign can change from negative to positive only in cells that remained undecided.
     cells = cells.take((sign == 0) & ~falls)
-    row = torch.repeat_interleave(cells.lens * sectors + cells.sector, cells.count)
-    before = torch.repeat_interleave(cells.count.cumsum(0) - cells.count, cells.count)
+    row = torch.repeat_interleave(cells.lens * sectors + cells.sector, cells.width)
+    before = torch.repeat_interleave(cells.width.cumsum(0) - cells.width, cells.width)
     row = row + torch.arange(len(row), device=row.device) - before
-    low = torch.repeat_interleave(cells.low, cells.count)
+    low = torch.repeat_interleave(cells.low, cells.width)
     return positive, reach.flatten().scatter_reduce(0, row, low, "amin").reshape(reach.shape)

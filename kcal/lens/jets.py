@@ -10,9 +10,9 @@ Source: Moore, Kearfott and Cloud, Introduction to Interval Analysis (2009), Tay
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,7 +23,8 @@ _ROUNDING = 32 * torch.finfo(torch.float64).eps
 _ENLARGED = 1.0 + 1e-9
 
 
-class Jet(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Jet:
     """Functions on intervals; every tensor is (N,).
 
     Attributes:
@@ -59,7 +60,7 @@ class Jet(NamedTuple):
         )
 
     def __neg__(self) -> Jet:
-        return self._replace(value=-self.value, slope=-self.slope)
+        return dataclasses.replace(self, value=-self.value, slope=-self.slope)
 
     def __sub__(self, other: Jet) -> Jet:
         return self + -other

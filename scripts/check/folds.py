@@ -225,7 +225,7 @@ def lost_pixels(camera: Camera, step: int) -> tuple[int, int]:
     width, height = camera.size
     pixels = camera.grid(width // step, height // step).reshape(-1, 2)
     values = camera.params.detach()
-    points = torch.stack(from_pixels(*pixels.unbind(-1), values), -1)
+    points = torch.stack(from_pixels(pixels[:, 0], pixels[:, 1], values), -1)
     ready = prepare_inverse(values[5:], camera.model, torch.hypot(*points.unbind(-1)).max())
     _, valid = undistort(points, values[5:], camera.model, ready)
     unproven = ready._replace(region=sampled(Lens("", camera.model, values[5:])))
@@ -283,24 +283,22 @@ def ordinary(count: int, seed: int) -> list[str]:
 def build_times(rounds: int) -> list[str]:
     """Time of `Camera.build`, and of the proof in it."""
 
-    def median(call: Callable[[], object]) -> float:
+    def median(call: Callable[..., object], *arguments: object) -> float:
         durations = []
         for _ in range(rounds):
             start = time.process_time()
-            call()
+            call(*arguments)
             durations.append(1e3 * (time.process_time() - start))
         return sorted(durations)[rounds // 2]
 
     rows = []
     for name in ("opencv5", "opencv8", "opencv14", "ext20", "ext24", "fisheye4"):
         model = LensModel.named(name)
-        values = [0.02, -0.01, 0.002, 0.001] if model.fisheye else LENS[: min(model.size, len(LENS))]
+        values = (0.02, -0.01, 0.002, 0.001) if model.fisheye else LENS[: min(model.size, len(LENS))]
         camera = Camera.build(focal=(FOCAL, FOCAL), center=(959.5, 539.5), size=SIZE, coefficients=values, model=model)
-        lens = Lens("", model, camera.params.detach()[5:])
-        build = median(lambda camera=camera: camera.update_valid_region())
-        proof = median(lambda lens=lens: valid_region(lens.coefficients, lens.model)) - median(
-            lambda lens=lens: sampled(lens)
-        )
+        own = camera.params.detach()[5:]
+        build = median(camera.update_valid_region)
+        proof = median(valid_region, own, model) - median(sampled, Lens("", model, own))
         rows.append([name, f"{build - proof:.0f}", f"{build:.0f}", f"{build / (build - proof):.2f}"])
     return table(["model", "before the proof, ms", "now, ms", "now / before"], rows)
 

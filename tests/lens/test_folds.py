@@ -64,11 +64,11 @@ class TestRadialFolds:
         lens[list(model.denominator_index)] = torch.from_numpy(denominator[1:])
         camera = Camera(torch.cat([torch.tensor([1000.0, 1000, 0, 0, 0]).double(), lens]), size=(100, 100), model=model)
         width = 10.0 ** (0.5 * tiny)
-        offsets = torch.cat([torch.linspace(-40, 40, 4001, dtype=torch.float64) * width * root])
+        offsets = torch.linspace(-40, 40, 4001, dtype=torch.float64) * width * root
         x = torch.cat([torch.linspace(0.0, 2.0, 2001, dtype=torch.float64), root + offsets]).clamp(min=0).unique()
         columns, valid = along_x(camera, x)
-        # Rounding of the formula itself, where the denominator is close to zero.
-        assert bool((columns[valid].diff() > -1e-6).all())
+        # Where the denominator nearly vanishes, the formula itself rounds so much, in pixels.
+        assert bool((columns[valid].diff() > -1e-11 / 10.0**tiny).all())
         assert bool(valid[: int((x < 0.5 * root).sum())].all())
 
 
@@ -91,16 +91,13 @@ class TestOtherTerms:
         assert region.cuts.shape == (2, 4)
         for cut in region.cuts:
             angle, half = torch.atan2(cut[1], cut[0]), torch.acos(cut[2])
-            angle, reach = (
-                angle + half * torch.tensor([0.0, 0.0, 0.99, 1.01]).double(),
-                cut[3] * torch.tensor([0.999, 1.001, 1.001, 1.001]).double(),
-            )
-            assert region.encloses(reach * torch.cos(angle), reach * torch.sin(angle)).tolist() == [
-                True,
-                False,
-                False,
-                True,
-            ]
+            angle = angle + half * torch.tensor([0.0, 0.0, 0.99, -0.99, 1.01, -1.01], dtype=torch.float64)
+            reach = cut[3] * torch.tensor([0.999, *[1.001] * 5], dtype=torch.float64)
+            before, *cut_out, left, right = region.encloses(reach * torch.cos(angle), reach * torch.sin(angle)).tolist()
+            assert before
+            assert not any(cut_out)
+            # On one side, the edge of the region is nearer.
+            assert left or right
 
     def test_a_plane_that_is_wound_twice_around_the_axis(self) -> None:
         """In complex numbers the lens is z + z² / 2: regular but at z = -1, and the same at z and -2 - z."""
