@@ -31,8 +31,8 @@ from kcal.lens.model import LensModel
 SECTORS = 1024
 # A ring has four cells to begin with. A lens may have so many undecided cells; those farthest out are given up first.
 _RINGS, _MOST_CELLS = 128, 512
-# Cells are cut along the radius down to this fraction of it.
-_SHORTEST = 1e-8
+# Cells are cut along the radius down to this fraction of it, and not below this radius.
+_SHORTEST, _INNERMOST = 1e-8, 1e-12
 
 
 class _Cells(NamedTuple):
@@ -184,7 +184,8 @@ def _prove(bound: Callable[[_Cells, Span], Jet], reach: Tensor, disc: Tensor) ->
         # Shorter cells do not help where the error comes from the width of the sector, or from rounding.
         wide = jet.value_error > (jet.slope.abs() + jet.bend * jet.half) * jet.half
         across = wide & (cells.width > 1)
-        helps = (~wide | (jet.slope_error < jet.bend * jet.half)) & (span.half > _SHORTEST * cells.high)
+        helps = (~wide | (jet.slope_error < jet.bend * jet.half)) & (cells.high > _INNERMOST)
+        helps &= span.half > _SHORTEST * cells.high
         undecided = (sign == 0) & ~(falls & (cells.low >= disc[cells.lens])) & (across | helps)
         if int(undecided.sum()) > _MOST_CELLS * lenses:
             undecided &= cells.low <= cells.low[undecided].kthvalue(_MOST_CELLS * lenses).values
