@@ -23,6 +23,7 @@ CONCLUSIONS = {
         "one of the two small cameras, at six times the time; there are no simulations here that would show local "
         "structure. Random features are nearly as good as trained ones."
     ),
+    "folds.md": ("**Conclusion.** TODO"),
     "lens.md": (
         "**Conclusion.** For many points, compile the camera. From 10,000 points on, compiled kcal projects 5 to 18 "
         "times as fast as OpenCV and finds rays 5 to 8 times as fast; for 100 points OpenCV is faster. `cv2.remap` is "

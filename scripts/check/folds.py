@@ -1,0 +1,328 @@
+"""Whether a pixel has two valid rays, on lenses that are built to fold where it is hard to see.
+
+    python -m scripts.check.folds                  all of docs/measured/folds.md
+    python -m scripts.check.folds --lenses 500 --dry
+
+The numerator and the denominator of a radial factor that nearly cancel, denominators and derivatives with nearly double
+roots, the same with tangential, prism and tilt terms, and coefficients at random. Two rays are looked for without what
+`kcal.lens.region` knows of a lens: valid points are sampled, ever more densely around the complex roots of the
+numerator, of the denominator and of the derivative. Newton's method then starts from those with nearly equal images,
+and from the neighborhood of points that the lens turns over.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.polynomial import Polynomial
+from torch import Tensor
+
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.corners.board import Board
+from kcal.corners.detect import detect_images
+from kcal.corners.images import expand_images
+from kcal.lens.camera import Camera
+from kcal.lens.distortion import distort_components
+from kcal.lens.inverse import prepare_inverse, undistort
+from kcal.lens.model import LensModel
+from kcal.lens.newton import inverse_jacobian, newton_step
+from kcal.lens.projection import from_pixels
+from kcal.lens.region import DIRECTIONS, Region, direction_limits, in_region, sampled_region, valid_region
+from scripts.check.uncertainty import LENS
+from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.timing import show
+from scripts.shared.wide_lens import load
+
+FOCAL, SIZE = 1000.0, (1920, 1080)
+# Directions and radii at which valid points are sampled; the radii of a narrow fold at these distances from its root.
+SPOKES, RADII = 3, 40
+NEAR = np.concatenate([-np.logspace(-7, -0.7, 20)[::-1], [0.0], np.logspace(-7, -0.7, 20)])
+# Rays closer together than this, on the plane z = 1, count as one.
+SEPARATE = 1e-6
+CONSTRUCTED = """Lenses that are built so that a fold is hard to see: numerator and denominator of the radial factor
+nearly cancel at a nearly double root (*cancelling*), the denominator alone has one (*pole*), or the derivative of the
+distorted radius has one (*derivative*); the depth is drawn from 1e-12 to 0.01. To seven in ten of them, tangential,
+prism and tilt terms of all sizes are added, and one in ten has a model without such terms. *Random* lenses have all
+coefficients drawn at random, up to 0.5. Two rays of a pixel are looked for among valid points that are sampled ever
+more densely around the complex roots of numerator, denominator and derivative, by Newton's method from those with
+nearly equal images, and around points that the lens turns over."""
+ORDINARY = """Pixels that have a ray by the samples alone, and those of them that have none with the proof. The
+calibrated cameras have 5 to 24 coefficients, with and without the weak prior."""
+TIMES = """Median time of the processor to make the valid region and the start of the inverse, which is most of
+`Camera.build` and of loading a camera."""
+RATIONAL = ("opencv8", "opencv12", "opencv14", "ext20", "ext24")
+
+
+class Lens(NamedTuple):
+    """A constructed lens: how it was built, its model and its coefficients (P,)."""
+
+    kind: str
+    model: LensModel
+    coefficients: Tensor
+
+
+def compose(name: str, numerator: Polynomial, denominator: Polynomial | None, others: dict[str, float]) -> Lens:
+    """A lens with these polynomials in r², cut off where the model has no more coefficients."""
+    model = LensModel.named(name)
+    values = torch.zeros(model.size, dtype=torch.float64)
+    for places, factor in ((model.numerator_index, numerator), (model.denominator_index, denominator)):
+        for place, value in zip(places, factor.coef[1:] if factor else (), strict=False):
+            values[place] = float(value)
+    for term, value in others.items():
+        if term in model.names:
+            values[model.names.index(term)] = value
+    return Lens("", model, values)
+
+
+def construct(generator: np.random.Generator) -> Lens:
+    """Draw a lens that is hard to judge."""
+    draw, normal = generator.uniform, generator.standard_normal
+    kind = generator.choice(["cancelling", "pole", "derivative", "random"], p=[0.4, 0.2, 0.2, 0.2])
+    root, tiny, s = draw(0.1, 1.3) ** 2, 10.0 ** draw(-12, -2), Polynomial([0.0, 1.0])
+    double = (1 - s / root) ** 2 * (1 + draw(-0.2, 0.4) * s)
+    name = str(generator.choice(RATIONAL))
+    if name.startswith("ext") and draw() < 0.5:
+        double = double * (1 - s / draw(0.1, 1.3) ** 2) ** 2
+    others = dict.fromkeys(("p1", "p2", "s1", "s2", "s3", "s4", "s5", "s6", "tau_x", "tau_y"), 0.0)
+    share = draw()
+    if share < 0.7:
+        size = 10.0 ** draw(-9, -1.3)
+        others = {term: size * normal() if term[0] != "t" else min(1.0, 10 * size) * draw(-0.3, 0.3) for term in others}
+    if kind == "cancelling":
+        numerator, denominator = (double + tiny * (abs(normal()) * s + normal() * s**2) for _ in range(2))
+        lens = compose(name, numerator, denominator, others)
+    elif kind == "pole":
+        lens = compose(name, 1 + 0.1 * normal() * s, double + tiny * abs(normal()) * s, others)
+    elif kind == "derivative":
+        slope = double + tiny * normal() * s
+        name = str(generator.choice(["opencv5", "opencv8", "fisheye4", "ext24"]))
+        lens = compose(name, Polynomial(slope.coef / (2 * np.arange(len(slope.coef)) + 1)), None, others)
+    else:
+        model = LensModel.named(str(generator.choice(["opencv4", "opencv5", *RATIONAL])))
+        lens = Lens("", model, torch.from_numpy(10.0 ** draw(-2, -0.3) * normal(model.size)))
+    if share > 0.9:
+        # The same lens as a model without other terms, which has a valid region of its own kind.
+        full = lens.model
+        model = LensModel(numerator=full.numerator, denominator=full.denominator, fisheye=full.fisheye)
+        lens = Lens("", model, lens.coefficients[[full.names.index(own) for own in model.names]])
+    return lens._replace(kind=str(kind))
+
+
+def radial_polynomials(lens: Lens) -> tuple[Polynomial, Polynomial, Polynomial]:
+    """Numerator, denominator and derivative of the radial part, as polynomials in r²."""
+    model, values = lens.model, lens.coefficients.numpy()
+    numerator = Polynomial([1.0, *values[list(model.numerator_index)]])
+    denominator = Polynomial([1.0, *values[list(model.denominator_index)]])
+    s = Polynomial([0.0, 1.0])
+    slope = numerator * denominator + 2 * s * (numerator.deriv() * denominator - numerator * denominator.deriv())
+    return numerator, denominator, slope
+
+
+def sample(lens: Lens, region: Region, generator: np.random.Generator) -> Tensor:
+    """Valid points (2, N) of a lens, dense where its radial part is nearly singular."""
+    roots = np.concatenate([np.atleast_1d(each.roots()) for each in radial_polynomials(lens)])
+    radii = np.sqrt(roots.real[(roots.real > 1e-4) & (roots.real < 10.0)])
+    radii = np.unique(np.concatenate([np.linspace(0.02, 2.0, RADII), *(r * (1.0 + NEAR) for r in radii)]))
+    angle = generator.uniform(0.0, 2 * math.pi) + np.arange(SPOKES) * (2 * math.pi / SPOKES)
+    angle = angle + generator.choice([0.0, 1e-3], SPOKES)
+    x, y = (torch.from_numpy(np.outer(radii, f(angle)).ravel()) for f in (np.cos, np.sin))
+    valid = in_region(x, y, lens.coefficients, lens.model, region)
+    return torch.stack([x[valid], y[valid]])
+
+
+def two_rays(lens: Lens, region: Region, generator: np.random.Generator) -> Tensor | None:
+    """Two valid points (2, 2) of the plane with the same image, if any are found."""
+    for starts in (near_pairs, around_folds):
+        x, y, goal_x, goal_y = starts(lens, region, generator)
+        for _ in range(12):
+            here = distort_components(x, y, lens.coefficients, lens.model)
+            x, y = newton_step(x, y, here.x - goal_x, here.y - goal_y, inverse_jacobian(here.point))
+        here = distort_components(x, y, lens.coefficients, lens.model)
+        solved = torch.hypot(here.x - goal_x, here.y - goal_y) < 1e-12 * (1.0 + torch.hypot(goal_x, goal_y))
+        good = solved & in_region(x, y, lens.coefficients, lens.model, region)
+        # The outermost two solutions of each target.
+        along = torch.where(good, x + 0.1 * y, torch.nan)
+        low, high = (f(along.nan_to_num(nan), -1).indices[:, None] for f, nan in ((torch.min, 1e9), (torch.max, -1e9)))
+        pair = [torch.cat([value.gather(-1, low), value.gather(-1, high)], -1) for value in (x, y, here.determinant)]
+        distance = torch.hypot(pair[0][:, 1] - pair[0][:, 0], pair[1][:, 1] - pair[1][:, 0])
+        # Near a fold, rounding alone moves a point: both must be determined by their image.
+        found = good.any(-1) & (distance > SEPARATE) & (pair[2].amin(-1) * distance > 1e-9)
+        if bool(found.any()):
+            best = int(torch.where(found, distance, 0.0).argmax())
+            return torch.stack([pair[0][best], pair[1][best]], -1)
+    return None
+
+
+def near_pairs(lens: Lens, region: Region, generator: np.random.Generator) -> tuple[Tensor, ...]:
+    """Valid points, and others whose images lie closer by than a regular part of a lens brings them; each (N, K)."""
+    x, y = sample(lens, region, generator)
+    image = distort_components(x, y, lens.coefficients, lens.model)
+    apart = torch.hypot(x[:, None] - x, y[:, None] - y)
+    together = torch.hypot(image.x[:, None] - image.x, image.y[:, None] - image.y)
+    ratio = torch.where(apart > 0.5 * SEPARATE, together / apart, torch.inf).fill_diagonal_(-1.0)
+    nearest = ratio.topk(min(5, len(x)), -1, largest=False).indices
+    return x[nearest], y[nearest], image.x[:, None], image.y[:, None]
+
+
+def around_folds(lens: Lens, region: Region, generator: np.random.Generator) -> tuple[Tensor, ...]:
+    """Starts (N, K) around points that the lens turns over, whose images have more than one preimage if any have."""
+    angle = torch.from_numpy(generator.uniform(0.0, 2 * math.pi, 8000))
+    unit_x, unit_y = torch.cos(angle), torch.sin(angle)
+    edge = torch.maximum(region.radius, region.fraction(unit_x, unit_y).clamp(min=1e-3).reciprocal()).clamp(max=3.0)
+    radius = 1.1 * edge * torch.from_numpy(generator.uniform(0.0, 1.0, 8000)).sqrt()
+    x, y = radius * unit_x, radius * unit_y
+    image = distort_components(x, y, lens.coefficients, lens.model)
+    turned = (image.positive & (image.determinant < 0)).nonzero()[:, 0][:120]
+    step = torch.tensor([0.01, 0.03, 0.1, 0.3], dtype=torch.float64)[:, None]
+    around = torch.arange(8, dtype=torch.float64) * (math.pi / 4)
+    offset_x, offset_y = ((step * f(around)).flatten() for f in (torch.cos, torch.sin))
+    return x[turned, None] + offset_x, y[turned, None] + offset_y, image.x[turned, None], image.y[turned, None]
+
+
+def sampled(lens: Lens) -> Region:
+    """The region by samples alone, without proof."""
+    directions = 1 if lens.model.radial else DIRECTIONS
+    return sampled_region(lens.coefficients, lens.model, direction_limits(lens.coefficients, lens.model, directions))
+
+
+def constructed(count: int, seed: int, compared: int) -> list[str]:
+    """How many constructed lenses have two rays; of the first ones also without the proof."""
+    generator, tally = np.random.default_rng(seed), Counter[tuple[str, str]]()
+    for number in range(count):
+        lens, place = construct(generator), int(generator.integers(1 << 30))
+        tally[lens.kind, "all"] += 1
+        if number < compared:
+            tally[lens.kind, "compared"] += 1
+            tally[lens.kind, "before"] += two_rays(lens, sampled(lens), np.random.default_rng(place)) is not None
+        region = valid_region(lens.coefficients, lens.model)
+        found = two_rays(lens, region, np.random.default_rng(place))
+        if found is not None:
+            tally[lens.kind, "after"] += 1
+            print(number, lens.kind, lens.model, lens.coefficients.tolist(), found.tolist(), flush=True)
+        if (number + 1) % 500 == 0:
+            print(number + 1, dict(tally), flush=True)
+    kinds = sorted({kind for kind, _ in tally})
+    rows = [
+        [kind, tally[kind, "all"], tally[kind, "after"], f"{tally[kind, 'before']} of {tally[kind, 'compared']}"]
+        for kind in kinds
+    ]
+    total = {name: sum(tally[kind, name] for kind in kinds) for name in ("all", "after", "before", "compared")}
+    rows.append(["together", total["all"], total["after"], f"{total['before']} of {total['compared']}"])
+    return table(["radial part", "lenses", "with two rays", "with two rays before the proof"], rows)
+
+
+def lost_pixels(camera: Camera, step: int) -> tuple[int, int]:
+    """Pixels of the image, every `step`-th, that are valid without the proof, and those of them that it takes away."""
+    width, height = camera.size
+    pixels = camera.grid(width // step, height // step).reshape(-1, 2)
+    values = camera.params.detach()
+    points = torch.stack(from_pixels(pixels[:, 0], pixels[:, 1], values), -1)
+    ready = prepare_inverse(values[5:], camera.model, torch.hypot(*points.unbind(-1)).max())
+    _, valid = undistort(points, values[5:], camera.model, ready)
+    unproven = ready._replace(region=sampled(Lens("", camera.model, values[5:])))
+    _, before = undistort(points, values[5:], camera.model, unproven)
+    return int(before.sum()), int((before & ~valid).sum())
+
+
+def mild(generator: np.random.Generator) -> Camera:
+    """A camera with coefficients as calibrations find them; many fold beyond the image, some inside it."""
+    model = LensModel.named(str(generator.choice(["opencv4", "opencv5", *RATIONAL, "fisheye4"])))
+    sigma = {"k1": 0.15, "k2": 0.05, "k3": 0.01, "k4": 0.05, "k5": 0.02, "k6": 0.005, "tau_x": 0.01, "tau_y": 0.01}
+    values = [sigma.get(name, 1e-3) * generator.standard_normal() for name in model.names]
+    values[0] -= 0.0 if model.fisheye else 0.1
+    return Camera.build(focal=(FOCAL, FOCAL), center=(959.5, 539.5), size=SIZE, coefficients=values, model=model)
+
+
+def calibrated() -> list[Camera]:
+    """Cameras of the real views, with parametric models."""
+    folder = os.environ["KCAL_DATA"]
+    sources = [load()[0]]
+    for side in ("left", "right"):
+        paths = expand_images([str(Path(folder, "opencv_stereo", f"{side}*.jpg"))])
+        sources.append(detect_images(paths, Board(columns=9, rows=6, square=0.025)))
+    models = ("opencv5", "opencv8", "opencv14", "ext20", "ext24")
+    return [
+        calibrate_camera(seen, CalibrationOptions(model=model, weak_prior=weak)).camera
+        for seen in sources
+        for model in models
+        for weak in ((0.3, None) if model in ("opencv5", "opencv8") else (0.3,))
+    ]
+
+
+def ordinary(count: int, seed: int) -> list[str]:
+    """Valid pixels that ordinary cameras lose by the proof."""
+    generator = np.random.default_rng(seed)
+    groups: dict[str, tuple[list[Camera], int]] = {
+        "calibrated on real views": (calibrated(), 2),
+        "of the simulations in scripts/check": (
+            [
+                Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=SIZE, coefficients=LENS[:size], model=name)
+                for name, size in (("opencv5", 5), ("opencv8", 8), ("opencv14", 14))
+            ],
+            2,
+        ),
+        "drawn at random": ([mild(generator) for _ in range(count)], 8),
+    }
+    rows = []
+    for name, (cameras, step) in groups.items():
+        counts = [lost_pixels(camera, step) for camera in cameras]
+        folding = sum(not bool(camera.covers_image()) for camera in cameras)
+        rows.append([name, len(cameras), folding, sum(all_ for all_, _ in counts), sum(lost for _, lost in counts)])
+    return table(["cameras", "number", "that fold inside the image", "valid pixels", "lost"], rows)
+
+
+def build_times(rounds: int) -> list[str]:
+    """Time of `Camera.build`, and of the proof in it."""
+
+    def median(call: Callable[..., object], *arguments: object) -> float:
+        durations = []
+        for _ in range(rounds):
+            start = time.process_time()
+            call(*arguments)
+            durations.append(1e3 * (time.process_time() - start))
+        return sorted(durations)[rounds // 2]
+
+    rows = []
+    for name in ("opencv5", "opencv8", "opencv14", "ext20", "ext24", "fisheye4"):
+        model = LensModel.named(name)
+        values = (0.02, -0.01, 0.002, 0.001) if model.fisheye else LENS[: min(model.size, len(LENS))]
+        camera = Camera.build(focal=(FOCAL, FOCAL), center=(959.5, 539.5), size=SIZE, coefficients=values, model=model)
+        own = camera.params.detach()[5:]
+        build = median(camera.update_valid_region)
+        proof = median(valid_region, own, model) - median(sampled, Lens("", model, own))
+        rows.append([name, f"{build - proof:.0f}", f"{build:.0f}", f"{build / (build - proof):.2f}"])
+    return table(["model", "before the proof, ms", "now, ms", "now / before"], rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--lenses", type=int, default=10_000)
+    parser.add_argument("--compared", type=int, default=1000, help="lenses that are also tried without the proof")
+    parser.add_argument("--ordinary", type=int, default=400)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--dry", action="store_true", help="print only")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    parts = [
+        ["# Folds", "", CONCLUSIONS["folds.md"], "", "`python -m scripts.check.folds` writes this page.", ""],
+        ["## Constructed lenses", "", CONSTRUCTED, ""],
+        constructed(arguments.lenses, arguments.seed, arguments.compared),
+        ["", "## Ordinary lenses", "", ORDINARY, "", *ordinary(arguments.ordinary, arguments.seed)],
+        ["", "## Time of a camera", "", TIMES, "", *build_times(15)],
+    ]
+    text = show([line for part in parts for line in part])
+    if not arguments.dry:
+        (DOCS / "folds.md").write_text("\n".join(text) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
