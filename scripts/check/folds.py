@@ -194,10 +194,13 @@ def sampled(lens: Lens) -> Region:
     return sampled_region(lens.coefficients, lens.model, direction_limits(lens.coefficients, lens.model, directions))
 
 
-def constructed(count: int, seed: int, compared: int) -> list[str]:
+def constructed(count: int, seed: int, compared: int, minutes: float) -> list[str]:
     """How many constructed lenses have two rays; of the first ones also without the proof."""
+    end = time.monotonic() + 60.0 * minutes
     generator, tally = np.random.default_rng(seed), Counter[tuple[str, str]]()
     for number in range(count):
+        if time.monotonic() > end:
+            break
         lens, place = construct(generator), int(generator.integers(1 << 30))
         tally[lens.kind, "all"] += 1
         if number < compared:
@@ -307,6 +310,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lenses", type=int, default=10_000)
     parser.add_argument("--compared", type=int, default=1000, help="lenses that are also tried without the proof")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="most time for constructed lenses")
     parser.add_argument("--ordinary", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--dry", action="store_true", help="print only")
@@ -315,7 +319,7 @@ def main() -> None:
     parts = [
         ["# Folds", "", CONCLUSIONS["folds.md"], "", "`python -m scripts.check.folds` writes this page.", ""],
         ["## Constructed lenses", "", CONSTRUCTED, ""],
-        constructed(arguments.lenses, arguments.seed, arguments.compared),
+        constructed(arguments.lenses, arguments.seed, arguments.compared, arguments.minutes),
         ["", "## Ordinary lenses", "", ORDINARY, "", *ordinary(arguments.ordinary, arguments.seed)],
         ["", "## Time of a camera", "", TIMES, "", *build_times(15)],
     ]
