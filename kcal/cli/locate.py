@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.console import err, out, print_table, print_wrote, steps
+from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
 from kcal.errors import DegenerateError, InputError
 from kcal.files import check_writable
 from kcal.texts import one_line
@@ -191,6 +191,9 @@ def locate_command(
     # Parsed before the rig is read, so that a wrong option is reported first.
     place = None if origin is None else Origin.parse(origin)
     solved = load_rig(rig)
+    doubts = solved.calibration.warnings if solved.calibration else ()
+    for text in doubts:
+        warn(f"{rig}: {text}")
     calibration, link = solved.covariance, None
     if yaw_sigma:
         yaw = torch.zeros(6, 6, dtype=torch.float64)
@@ -246,6 +249,7 @@ def locate_command(
             "table": str(points),
             "rows": sample.count,
             "statuses": sample.statuses,
+            "warnings": list(doubts),
             "pixel_sigma": pixel_sigma,
             "interval": located.interval_note,
             "geoid": located.geoid,

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
+from typer.core import TyperGroup
 
 import kcal
 from kcal.cli.bake import bake_command
@@ -26,9 +29,34 @@ from kcal.cli.rig import app as rig
 from kcal.cli.show import show_command
 from kcal.cli.undistort import undistort_command
 from kcal.errors import KcalError
+from kcal.texts import visible
+
+
+@contextmanager
+def _usage_errors_shown() -> Iterator[None]:
+    """Escapes in messages of Typer, which repeat what was typed: control characters would act on the terminal."""
+    try:
+        yield
+    except Exception as error:
+        if format_message := getattr(error, "format_message", None):
+            shown = visible(format_message())
+            setattr(error, "format_message", lambda: shown)  # noqa: B010
+        raise
+
+
+class _Commands(TyperGroup):
+    def make_context(self, *arguments: Any, **options: Any) -> Any:
+        with _usage_errors_shown():
+            return super().make_context(*arguments, **options)
+
+    def invoke(self, ctx: Any) -> Any:
+        with _usage_errors_shown():
+            return super().invoke(ctx)
+
 
 app = typer.Typer(
     name="kcal",
+    cls=_Commands,
     help="Calibrate cameras, solve stereo rigs, and locate on the Earth what they see.",
     no_args_is_help=True,
     add_completion=False,

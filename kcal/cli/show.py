@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +9,8 @@ import typer
 
 from kcal.cli.console import out, print_table
 from kcal.errors import FileError
+from kcal.files import read_bytes
+from kcal.strict_json import MOST_BYTES, read_json
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
@@ -41,7 +42,7 @@ def show_command(
         if found.is_rig():
             _show_pose(found.rig())
         return
-    content = json.loads(file.read_text(encoding="utf-8"))
+    content = read_json(read_bytes(file, MOST_BYTES), str(file))
     out.print(f"{file}: kcal {content['kcal']} file, version {content.get('version')}", markup=False)
     shown = {"camera": _show_camera_file, "rig": _show_rig_file, "observations": _show_observations}
     if content["kcal"] not in shown:
@@ -129,6 +130,8 @@ def _show_pose(rig: StereoRig) -> None:
         out.print(
             f"solved {record.created:%Y-%m-%d %H:%M %Z}: RMS {record.rms:.4f} px, {record.pairs} pairs", markup=False
         )
+        for text in record.warnings:
+            out.print(f"warning: {text}", markup=False)
 
 
 def _show_observations(file: Path) -> None:

@@ -21,6 +21,7 @@ import pydantic
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError, InputError
+from kcal.files import read_bytes
 
 # (u, v, weight) of a corner, or None where it was not seen.
 Corner = tuple[float, float, float] | None
@@ -105,7 +106,7 @@ def _corner_of_weight(u: str, v: str, weight: float, where: str) -> Corner:
 def _from_vnl(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
     views: dict[str, list[Corner]] = {}
     header: list[str] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+    for number, line in enumerate(read_bytes(path).decode("utf-8").splitlines(), 1):
         where = f"line {number}"
         if line.startswith("##") or not line.strip():
             continue
@@ -131,7 +132,7 @@ def _from_vnl(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
 
 
 def _from_csv(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
-    table = csv.DictReader(io.StringIO(path.read_bytes().decode("utf-8-sig"), newline=""), skipinitialspace=True)
+    table = csv.DictReader(io.StringIO(read_bytes(path).decode("utf-8-sig"), newline=""), skipinitialspace=True)
     names = table.fieldnames or []
     needed, allowed = {"image", "u", "v"}, {"image", "u", "v", "weight", "corner", "column", "row"}
     if not needed <= set(names) <= allowed or ("column" in names) != ("row" in names):
@@ -165,7 +166,7 @@ def _place(column: int, row: int, board: Board, where: str) -> int:
 
 
 def _from_opencv(path: Path, board: Board) -> tuple[dict[str, list[Corner]], tuple[int, int] | None]:
-    text = path.read_text(encoding="utf-8")
+    text = read_bytes(path).decode("utf-8")
     file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     points = file.getNode("image_points").mat()
     if points is None or points.ndim != 3 or points.shape[2] != 2:

@@ -134,6 +134,13 @@ def _fit_table(name: str, exact: _Exact, errors: _Errors, box: _Box, tolerance: 
             return table
         if cells == _MOST:
             break
+        # Errors fall with the fourth power of the step at best; finer tables would take minutes only to fail.
+        hopeless = math.isfinite(worst) and worst * (cells / _MOST) ** 4 > tolerance
+        if hopeless and cells >= 4 * _FEWEST and table.coverage < _REQUIRED:
+            raise InputError(
+                f"bake: a table of {cells} cells is wrong by {worst:.3g} px in `{name}`, and {_MOST} cells would not "
+                f"reach {tolerance:g} px; check the camera's focal lengths, or allow a larger tolerance"
+            )
         # Errors fall with the fourth power of the step; the share lost along a fold falls a little faster than the
         # step.
         lost = (1.0 - table.coverage) / (1.0 - _ENOUGH)

@@ -170,6 +170,7 @@ class RigCalibration:
         flipped: pairs in which one camera's corner order had to be turned by 180°.
         excluded: pairs, landmarks and matches left out, with the reason.
         sources: what the rig was solved from, where that is more than boards.
+        warnings: what should be doubted of it, a sentence each, for example that its geometry is weak.
         relocked: when only the cameras' attitudes were solved again, and from what.
         baseline_m: distance between the cameras' centers, meters; must be the length of the translation.
         frame: what the rig's frame is.
@@ -185,6 +186,7 @@ class RigCalibration:
     flipped: tuple[str, ...] = ()
     excluded: tuple[Exclusion, ...] = ()
     sources: tuple[RigSource, ...] = ()
+    warnings: tuple[str, ...] = ()
     relocked: str | None = None
     baseline_m: float
     frame: Literal["left camera"] = "left camera"

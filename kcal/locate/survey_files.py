@@ -17,9 +17,11 @@ from typing import Any, NamedTuple
 import torch
 
 from kcal.errors import FileError, InputError
+from kcal.files import read_bytes
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.survey import Survey, read_survey
+from kcal.strict_json import MOST_BYTES
 
 
 class _Place(NamedTuple):
@@ -63,10 +65,8 @@ def import_survey(
             f"{path}: elevations of GPX are above sea level; give the geoid's height there (0 if they are ellipsoidal)"
         )
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_bytes(path, MOST_BYTES).decode("utf-8-sig")
         places = _from_gpx(text, geoid or 0.0) if suffix == ".gpx" else _from_geojson(text)
-    except OSError as error:
-        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
     except xml.etree.ElementTree.ParseError as error:
         raise FileError(f"{path}: not XML: {error}") from error
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, InputError) as error:

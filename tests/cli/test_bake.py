@@ -44,3 +44,7 @@ def test_it_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert run(monkeypatch, str(path), "-o", str(path)) == 1
     assert "input" in capsys.readouterr().err
     assert run(monkeypatch, str(path), "--tolerance", "0") == 2
+    # A table fine enough for a focal length of 1 px would take minutes, only to fail.
+    camera = Camera.build(focal=(60, 0.1), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.05])
+    assert run(monkeypatch, str(save_camera(camera, path))) == 1
+    assert "check the camera's focal lengths" in capsys.readouterr().err

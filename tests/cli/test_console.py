@@ -43,6 +43,27 @@ def test_an_error_shows_the_name_of_a_file_as_it_is(
     assert "\x1b" not in shown
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [ESCAPE],
+        ["bake", f"--{ESCAPE}"],
+        ["bake", "camera.json", ESCAPE],
+    ],
+)
+def test_a_wrong_use_shows_what_was_typed(
+    arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["kcal", *arguments])
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as exit_:
+        main()
+    assert exit_.value.code == 2
+    shown = "".join(capsys.readouterr())
+    assert not any(c in shown for c in "\x1b\x07\x9b\x85")
+    assert r"\x1b]0;title\x07" in shown
+
+
 def test_the_library_s_own_colors_stay() -> None:
     assert err.render_str("[red]x[/]").spans[0].style == "red"
 

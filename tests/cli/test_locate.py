@@ -10,7 +10,9 @@ import pytest
 import torch
 
 from kcal.cli.main import main
-from kcal.io.rig_file import save_rig
+from kcal.io.camera_file import provenance
+from kcal.io.rig_file import load_rig, save_rig
+from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
 from kcal.lens.rig import StereoRig
@@ -54,6 +56,25 @@ def test_writes_files_and_a_table(
     with (folder / "out.csv").open() as file:
         assert [row["status"] for row in csv.DictReader(file)] == ["ok", "outside_image"]
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_is_doubted_of_a_rig_travels_with_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig, doubt = load_rig(folder / "rig.json"), "the [landmarks] lie nearly in one line"
+    rig.calibration = RigCalibration(
+        rms=0.1, rms_left=0.1, rms_right=0.1, pairs=0, per_pair_rms={}, baseline_m=10.0, warnings=(doubt,),
+        **provenance(),
+    )  # fmt: skip
+    save_rig(rig, folder / "rig.json")
+    assert run(monkeypatch, "rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--json") == 0
+    shown = capsys.readouterr()
+    assert f"warning: rig.json: {doubt}" in shown.err
+    assert json.loads(shown.out)["warnings"] == [doubt]
+    monkeypatch.setattr(sys, "argv", ["kcal", "show", "rig.json"])
+    with pytest.raises(SystemExit):
+        main()
+    assert f"warning: {doubt}" in capsys.readouterr().out
 
 
 def test_options_for_errors_grids_and_formats(

@@ -77,6 +77,7 @@ def rig_calibration(baseline: float) -> RigCalibration:
         per_pair_rms={"01": 0.3},
         flipped=("01",),
         excluded=(Exclusion(name="02", reason="seen by one camera only"),),
+        warnings=("the landmarks determine the baseline poorly",),
         baseline_m=baseline,
         **provenance(),
     )

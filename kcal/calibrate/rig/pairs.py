@@ -15,8 +15,10 @@ from kcal.calibrate.rig.sources import Boards
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError
+from kcal.files import read_bytes
 from kcal.lens.calibration import BoardRecord
 from kcal.lens.camera import Camera
+from kcal.strict_json import MOST_BYTES
 
 Pair = tuple[str, str]
 _SIDE = re.compile(r"(?<![a-z])(left|right|l|r|cam(?:era)?[ _-]?[0-9]+)(?![a-z])", re.IGNORECASE)
@@ -89,14 +91,12 @@ def read_pairs(path: str | Path, left: Sequence[str], right: Sequence[str]) -> l
         FileError: the file cannot be read, has another header, or has no row.
         InputError: a name that is not among the views, or that is used twice; the line is named.
     """
-    path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        rows = list(csv.reader(io.StringIO(text)))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = list(csv.reader(io.StringIO(read_bytes(path, MOST_BYTES).decode("utf-8-sig"))))
+    except (UnicodeDecodeError, csv.Error) as error:
         raise FileError(f"{path}: cannot read: {error}") from error
     if not rows or [cell.strip() for cell in rows[0]] != ["left", "right"]:
-        header = ",".join(rows[0]) if rows else "nothing"
+        header = ",".join(rows[0])[:200] if rows else "nothing"
         raise FileError(f"{path}: the header must be left,right; it is {header}")
     pairs: list[Pair] = []
     for number, row in enumerate(rows[1:], start=2):

@@ -228,6 +228,7 @@ class RigResult:
                 )
                 for source in self.sources
             ),
+            warnings=self.warnings,
             baseline_m=float(rig.baseline),
             **self._provenance,
         )

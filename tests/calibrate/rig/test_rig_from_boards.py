@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from pathlib import Path
 from typing import Any
 
@@ -494,6 +495,11 @@ class TestPairsFile:
             read_pairs(tmp_path / "none.csv", self.LEFT, self.RIGHT)
         with pytest.raises(FileError, match="cannot read"):
             read_pairs(tmp_path, self.LEFT, self.RIGHT)
+
+    def test_a_pipe_that_nobody_writes_to(self, tmp_path: Path) -> None:
+        os.mkfifo(tmp_path / "pipe.csv")
+        with pytest.raises(FileError, match="not a regular file"):
+            read_pairs(tmp_path / "pipe.csv", self.LEFT, self.RIGHT)
 
     def test_a_field_beyond_all_measure(self, tmp_path: Path) -> None:
         with pytest.raises(FileError, match="cannot read: field larger"):

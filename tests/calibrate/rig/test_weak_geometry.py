@@ -82,6 +82,10 @@ class TestRefused:
         found = solved(row(0, 40.0), dataclasses.replace(HELD, reject=False))
         (text,) = found.warnings
         assert "ranges could be anything" in text
+        # Whoever gets the rig is warned, too.
+        calibration = found.stereo().calibration
+        assert calibration is not None
+        assert calibration.warnings == found.warnings
 
 
 class TestWidened:
