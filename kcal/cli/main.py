@@ -33,8 +33,8 @@ from kcal.texts import visible
 
 
 @contextmanager
-def _usage_errors_shown() -> Iterator[None]:
-    """Escapes in messages of Typer, which repeat what was typed: control characters would act on the terminal."""
+def usage_errors_shown() -> Iterator[None]:
+    """Escape control characters in messages of Typer, some versions of which repeat what was typed as it is."""
     try:
         yield
     except Exception as error:
@@ -46,11 +46,11 @@ def _usage_errors_shown() -> Iterator[None]:
 
 class _Commands(TyperGroup):
     def make_context(self, *arguments: Any, **options: Any) -> Any:
-        with _usage_errors_shown():
+        with usage_errors_shown():
             return super().make_context(*arguments, **options)
 
     def invoke(self, ctx: Any) -> Any:
-        with _usage_errors_shown():
+        with usage_errors_shown():
             return super().invoke(ctx)
 
 

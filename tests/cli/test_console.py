@@ -7,9 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 
 from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
-from kcal.cli.main import main
+from kcal.cli.main import main, usage_errors_shown
 
 ESCAPE = "a\x1b]0;title\x07\x1b[2J\x9b31m\x85:bomb:"
 
@@ -62,6 +63,13 @@ def test_a_wrong_use_shows_what_was_typed(
     shown = "".join(capsys.readouterr())
     assert not any(c in shown for c in "\x1b\x07\x9b\x85")
     assert r"\x1b]0;title\x07" in shown
+
+
+def test_a_message_about_wrong_use_is_cleaned_of_itself() -> None:
+    """Older versions of Typer repeat what was typed as it is."""
+    with pytest.raises(typer.BadParameter) as caught, usage_errors_shown():
+        raise typer.BadParameter(ESCAPE)
+    assert caught.value.format_message() == r"Invalid value: a\x1b]0;title\x07\x1b[2J\x9b31m\x85:bomb:"
 
 
 def test_the_library_s_own_colors_stay() -> None:
