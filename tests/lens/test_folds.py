@@ -48,7 +48,7 @@ class TestRadialFolds:
         lens = torch.tensor(NARROW, dtype=torch.float64)[[0, 1, 4, 5, 6, 7]]
         assert float(valid_region(lens, model).radius) == pytest.approx(0.7071, abs=1e-4)
 
-    @settings(deadline=None, max_examples=25)
+    @settings(deadline=None, max_examples=10)
     @given(
         root=st.floats(0.2, 1.2),
         tiny=st.floats(-10, -3),
@@ -76,12 +76,12 @@ class TestOtherTerms:
     def test_constructed_lenses(self) -> None:
         """A small run of scripts/check/folds.py."""
         generator, unproven, found = np.random.default_rng(5), 0, 0
-        for _ in range(40):
+        for _ in range(16):
             lens = folds.construct(generator)
             unproven += folds.two_rays(lens, folds.sampled(lens), np.random.default_rng(0)) is not None
             region = valid_region(lens.coefficients, lens.model)
             found += folds.two_rays(lens, region, np.random.default_rng(0)) is not None
-        assert unproven >= 5
+        assert unproven >= 2
         assert found == 0
 
     def test_a_plane_that_is_wound_twice_around_the_axis(self) -> None:
