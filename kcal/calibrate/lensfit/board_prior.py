@@ -102,6 +102,13 @@ def multiplied(prior: BoardPrior, messages: Sequence[BoardMessage]) -> BoardPost
     return BoardPosterior(BoardPrior(prior.mean + prior.half.T @ mean, half), float(log_evidence))
 
 
+def merged(messages: Sequence[BoardMessage]) -> BoardMessage:
+    """All that they say, in one message of few rows."""
+    rows = torch.cat([torch.cat([m.root, m.target[:, None]], 1) for m in messages])
+    triangle = torch.linalg.qr(rows, mode="r")[1]
+    return BoardMessage(triangle[:, :-1], triangle[:, -1])
+
+
 def printed_prior(modes: BoardModes, amplitudes: Tensor) -> BoardPrior:
     """The prior of a printed board, from the ln amplitudes (3,) of its families of modes."""
     return BoardPrior(torch.zeros_like(modes.unit), torch.diag(modes.unit * torch.exp(amplitudes[modes.family])))
