@@ -100,8 +100,8 @@ class CameraCalibrationResult:
             be more than 1.4 times as large.
         rejected_corners: corners of the views that were used, left out by `CalibrationOptions.reject`.
         rejected_views: views left out likewise.
-        shared_board: which cameras helped to measure the board, where several were calibrated together; the error bars
-            of such cameras are then not quite independent of each other.
+        shared_board: which cameras helped to measure the board, where several were calibrated together. Errors of such
+            cameras are not quite independent of each other; a rig of them knows that.
     """
 
     camera: Camera

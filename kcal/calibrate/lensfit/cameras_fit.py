@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.lensfit.board_groups import compared, grouped, others_of
-from kcal.calibrate.lensfit.board_prior import BoardPrior, multiplied, printed_board
+from kcal.calibrate.lensfit.board_prior import BoardPrior, multiplied, printed_board, told_by_others
 from kcal.calibrate.lensfit.evidence import Hyperprior, typical_hyperprior
 from kcal.calibrate.lensfit.fleet import LEAST_CAMERAS, LensPrior, fleet_priors, typical_lens
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
@@ -122,7 +122,7 @@ def fit_cameras(
             shape = alone if known is None else known
             if shape == "printed" and same is not None:
                 base, _ = printed_board(camera.fit.board_shapes, [camera.message, same])
-                shape = multiplied(base, [same]).board
+                shape = told_by_others(base, same)
             if fleet or shape is not alone:
                 # Views that were turned since, and lenses of another form, have other unknowns.
                 kept = lenses[i] is None and torch.equal(camera.turns, fitted[i])

@@ -254,9 +254,8 @@ def fit_hybrid(
     half = inverse * deviation
     information = _from_rows(off, problem.shared(state), families.mean, deviation, variance, model)
     if isinstance(board, BoardPrior):
-        # Its modes are not the board's own: what is said of the camera, whatever the board is within its covariance.
-        information = information.without_board()
         state = state._replace(board=board.mean + state.board @ board.half)
+        information = board.in_modes(information, state.board)
         half = torch.cat([half[:, : -len(board.mean)], half[:, -len(board.mean) :] @ board.half], 1)
     return HybridFit(
         camera=Camera(state.params, size=size, model=model),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from pathlib import Path
 
@@ -20,11 +21,12 @@ from kcal.calibrate.camera.calibrate import (
 )
 from kcal.calibrate.camera.options import OutlierRejection
 from kcal.calibrate.lensfit.board_orders import turned_corners
+from kcal.calibrate.rig.knowledge import gathered, joint_unknowns
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError
-from kcal.io.camera_file import load_camera
+from kcal.io.camera_file import load_camera, save_camera
 from kcal.lens.camera import Camera
 
 BOARD = Board(columns=8, rows=6, square=0.03)
@@ -90,6 +92,53 @@ def test_a_shared_board_is_better_known() -> None:
     assert two is not None
     spread = one.half.square().sum(0).sqrt()
     assert float(((one.amplitudes - two.amplitudes) / spread).abs().max()) < 1.0
+
+
+def test_what_others_said_is_told_apart(tmp_path: Path) -> None:
+    """The file holds each camera's own rows beside those of others; together they are the covariance."""
+    for result, other in zip(pair(), reversed(pair()), strict=True):
+        known, said = result.information, other.information
+        assert known is not None
+        assert said is not None
+        assert known.others is not None
+        assert known.board_size == 28
+        # By its own modes, and by the variables of the fit: in units of σ.
+        sigma = result.covariance.diagonal().sqrt().clamp_min(1e-300)
+        unit = known.covariance() / sigma / sigma[:, None]
+        torch.testing.assert_close(unit, result.covariance / sigma / sigma[:, None], rtol=0, atol=1e-6)
+        # Where data and priors are largest together, nothing pulls any more.
+        rows = known.all_rows()
+        pull = known.half() @ (rows[:, :-1].T @ rows[:, -1])
+        assert float(pull.abs().max()) < 0.2
+        # Without others: the camera's own data and its prior.
+        own = dataclasses.replace(known, others=None)
+        assert float(own.covariance()[0, 0]) > float(known.covariance()[0, 0])
+        path = result.save(tmp_path / "camera.json")
+        again = load_camera(path)
+        kept = again.calibration
+        assert kept is not None
+        assert kept.information is not None
+        assert kept.information.others is not None
+        torch.testing.assert_close(kept.information.covariance() / sigma / sigma[:, None], unit, rtol=0, atol=1e-9)
+        assert save_camera(again, tmp_path / "again.json").read_bytes() == path.read_bytes()
+
+
+def test_a_rig_counts_each_camera_once() -> None:
+    """Cameras that told each other of their board bring a rig what they know alone: nothing is counted twice."""
+    shared = joint_half([result.camera for result in pair()])
+    single = joint_half([alone(1).camera, alone(2).camera])
+    assert shared.shape == single.shape
+    # The lenses are linearized elsewhere, and amplitudes of the board's prior are those that both found.
+    torch.testing.assert_close(shared.log(), single.log(), rtol=0, atol=0.15)
+
+
+def joint_half(cameras: list[Camera]) -> Tensor:
+    """σ of the leading parameters of both cameras in a rig."""
+    known = [None if camera.calibration is None else camera.calibration.information for camera in cameras]
+    knowledge = gathered(cameras, known, BOARD)
+    assert knowledge.board == (True, True)
+    unknowns, _ = joint_unknowns(cameras, knowledge, BOARD)
+    return torch.cat([onto.square().sum(1).sqrt()[[0, 2, 3]] for onto in unknowns.cameras])
 
 
 def test_cameras_with_nothing_in_common_stay_as_they_are() -> None:
