@@ -164,10 +164,14 @@ def test_views_read_from_the_other_end_and_views_left_out() -> None:
         update={"views": (*wrong.views[:5], wrong.views[5].model_copy(update={"pixels": tuple(swapped)}))}
     )
     options = CalibrationOptions(reject=OutlierRejection(limit=0.3))
-    first, second = (result_of(one) for one in calibrate_cameras([wrong, seen_by(2, turns=ENDS)], options))
+    twice = seen_by(2, turns=ENDS)
+    twice = twice.model_copy(update={"views": (*twice.views, twice.views[0].model_copy(update={"name": "copy"}))})
+    first, second = (result_of(one) for one in calibrate_cameras([wrong, twice], options))
     assert first.shared_board is not None
     assert [view.view for view in first.rejected_views] == ["v05"]
     assert bool(first.residuals[5].isnan().all())
+    assert [view.view for view in second.rejected_views] == ["copy"]
+    assert any("copy of v00" in text for text in second.warnings)
     read = seen_by(2, turns=ENDS).pixels()
     back = second.observations.pixels()
     changed = [not torch.equal(read[k], back[k]) for k in range(5)]
