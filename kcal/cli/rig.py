@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from kcal.cli.console import with_json
 from kcal.cli.groups import group_with_default
 from kcal.cli.rig_check import check
 from kcal.errors import InputError
@@ -199,5 +200,5 @@ def print_rig(result: RigResult, lines: list[str]) -> None:
         err.print("[yellow]warning:[/]", text)
 
 
-app.command("solve", hidden=True)(solve_command)
-app.command("check")(check)
+app.command("solve", hidden=True)(with_json(solve_command))
+app.command("check")(with_json(check))
