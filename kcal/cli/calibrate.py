@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kcal.cli.console import out, print_table, print_wrote, steps, warn
+from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.report import REQUIRE_HELP, finish, judged
 from kcal.errors import InputError
 from kcal.files import check_writable
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
 
-_PARAMETRIC = "Options of parametric models"
+_PARAMETRIC, _USE = "Options of parametric models", "May it be used?"
 
 
 def calibrate_command(
@@ -42,6 +43,9 @@ def calibrate_command(
     reject_limit: Annotated[
         float, typer.Option(metavar="SHARE", help="Largest share of all corners that --reject may leave out.")
     ] = 0.1,
+    temperature: Annotated[
+        float | None, typer.Option(metavar="°C", help="Of the camera when the views were taken; kept in its file.")
+    ] = None,
     name: Annotated[str, typer.Option(help="Name of the camera; the name of the observations file if not given.")] = "",
     model: Annotated[
         str,
@@ -51,6 +55,20 @@ def calibrate_command(
             "opencv8, opencv12, opencv14, ext16 ... ext24, fisheye4.",
         ),
     ] = "hybrid",
+    require: Annotated[
+        str,
+        typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.", rich_help_panel=_USE),
+    ] = "",
+    report: Annotated[
+        Path | None, typer.Option(help="HTML page to write: may it be used, and why not.", rich_help_panel=_USE)
+    ] = None,
+    baseline: Annotated[
+        float,
+        typer.Option(metavar="M", help="Distance to a second camera like this one.", min=1e-3, rich_help_panel=_USE),
+    ] = 10.0,
+    mark_sigma: Annotated[
+        float, typer.Option(metavar="PX", help="Noise of marks along each axis.", min=0, rich_help_panel=_USE)
+    ] = 0.3,
     focal: Annotated[
         float | None,
         typer.Option(metavar="PX", help="Rough focal length to start from, in pixels; estimated if not given."),
@@ -132,11 +150,17 @@ def calibrate_command(
 
     `kcal calibrate left.obs.json -o left.camera.json --picture left.png --verbose`
 
+    `kcal calibrate left.obs.json -o left.camera.json --require 5km:10% --report left.html`: exit code 3 for a no.
+
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14`: for exchange with OpenCV.
     """
     from kcal.lens.model import LensModel
+    from kcal.report.verdict import Requirement
 
     check_writable(output, observations)
+    needs = Requirement.parse(require) if require else ()
+    if report is not None:
+        check_writable(report, observations)
     if picture is not None:
         from kcal.report.figures import check_picture
 
@@ -176,17 +200,20 @@ def calibrate_command(
     seen = Observations.load(observations)
     with steps("calibrating", None) as advance:
         result = calibrate_camera(seen, options, advance)
-    result.save(output, name=name, source=observations.name)
+    result.save(output, name=name, source=observations.name, temperature=temperature)
     if picture is not None:
         from kcal.report.calibration import save_calibration_picture
 
         save_calibration_picture(picture, result)
     _print_result(result, reject=reject, verbose=verbose or not options.hybrid)
     print_wrote(output, picture)
+    if needs or report is not None:
+        finish(*judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=name), report)
 
 
 def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:
     from kcal.calibrate.camera.summary import summarize
+    from kcal.report.view_findings import distances_text
 
     assert result.camera.calibration is not None
     record = result.camera.calibration.record
@@ -194,9 +221,23 @@ def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: boo
     width, height = result.observations.image_size
     model = "hybrid" if result.hybrid is not None else str(result.camera.model)
     out.print(f"{record.views} views, {record.points} corners, {width}x{height} px, model {model}")
+    out.print(distances_text(result))
     fitted = f"; noise {result.noise:.4f} px along an axis; {result.status.message} ({result.iterations} steps)"
     out.print(f"RMS [bold]{result.rms:.4f} px[/]{fitted}")
     brief = summarize(result)
+    tell(
+        rms_px=result.rms,
+        noise_px=result.noise,
+        views=record.views,
+        corners=record.points,
+        model=model,
+        converged=result.status.name,
+        sigma_px={"center": brief.center, "border": brief.border, "worst": brief.worst},
+        unreached=brief.unreached,
+        parameters=dict(zip(result.camera.names, result.camera.params.tolist(), strict=True)),
+        sigma=result.sigma,
+        advice=result.advice,
+    )
     if brief.worst == brief.worst:
         out.print(
             f"far directions: ± {brief.center:.3f} px in the middle of the image, {brief.border:.3f} px at its border, "

@@ -40,7 +40,7 @@ def tell(**content: Any) -> None:
     _told.update(content)
 
 
-def _listed(name: str, *items: Any) -> None:
+def _tell_more(name: str, *items: Any) -> None:
     _told.setdefault(name, []).extend(items)
 
 
@@ -76,7 +76,7 @@ def with_json(command: Callable[..., None]) -> Callable[..., None]:
 
 def warn(text: str) -> None:
     """Print a warning to the error stream."""
-    _listed("warnings", visible(text))
+    _tell_more("warnings", visible(text))
     err.print("[yellow]warning:[/]", escape(text))
 
 
@@ -84,7 +84,7 @@ def print_wrote(*paths: Path | None) -> None:
     """Print which files were written; None stands for a file that was not asked for."""
     for path in paths:
         if path is not None:
-            _listed("wrote", str(path))
+            _tell_more("wrote", str(path))
             out.print(f"wrote {path}", markup=False)
 
 
@@ -96,7 +96,7 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
         left: columns that are aligned to the left; all others are aligned to the right.
     """
     rows = [[one_line(cell) for cell in row] for row in rows]
-    _listed("tables", rows)
+    _tell_more("tables", rows)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:

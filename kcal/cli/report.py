@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from kcal.lens.camera import Camera
     from kcal.report.verdict import Requirement, Verdict
 
+# A verdict, the pictures of its page by name, and its tables.
+Judged: TypeAlias = "tuple[Verdict, dict[str, bytes], list[list[list[str]]]]"
 # The exit code of a no, apart from errors (1) and wrong usage (2).
 NO = 3
 REQUIRE_HELP = "What you need: ranges and the largest σ of each, for example 5km:10% or 800m:20m,5km:10%."
@@ -104,19 +106,34 @@ def print_verdict(verdict: Verdict) -> None:
 
 def _of_camera(
     path: Path, observations: list[Path], needs: tuple[Requirement, ...], baseline: float, mark_sigma: float
-) -> tuple[Verdict, dict[str, bytes], list[list[list[str]]]]:
-    from kcal.report.camera_verdict import camera_verdict, stored_verdict
-    from kcal.report.verdict_page import camera_rows
+) -> Judged:
+    from kcal.report.camera_verdict import stored_verdict
+    from kcal.report.verdict_page import camera_tables
 
     camera = single_camera(str(path))
     name = (camera.calibration.name if camera.calibration else "") or path.name.split(".")[0]
     if not observations:
         found = stored_verdict(camera, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name)
-        return found, {}, camera_rows(camera)
+        return found, {}, camera_tables(camera)
     if len(observations) > 1:
         raise InputError("a camera has one observations file; give --observations once")
     result, options = _again(camera, observations[0])
+    return judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=name)
+
+
+def judged(
+    result: CameraCalibrationResult,
+    options: CalibrationOptions,
+    needs: tuple[Requirement, ...],
+    *,
+    baseline: float,
+    mark_sigma: float,
+    name: str,
+) -> Judged:
+    """The verdict on a calibration, with the pictures and tables of its page."""
     from kcal.calibrate.camera.trust import examine
+    from kcal.report.camera_verdict import camera_verdict
+    from kcal.report.verdict_page import camera_tables
     from kcal.report.verdict_pictures import camera_pictures
 
     with steps("checking", None) as advance:
@@ -124,7 +141,7 @@ def _of_camera(
     verdict = camera_verdict(
         result, options, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name, examination=examination
     )
-    return verdict, camera_pictures(result, examination), camera_rows(result.camera, result)
+    return verdict, camera_pictures(result, examination), camera_tables(result.camera, result)
 
 
 def _again(camera: Camera, observations: Path) -> tuple[CameraCalibrationResult, CalibrationOptions]:
@@ -146,12 +163,10 @@ def _again(camera: Camera, observations: Path) -> tuple[CameraCalibrationResult,
     return result, options
 
 
-def _of_rig(
-    path: Path, observations: list[Path], needs: tuple[Requirement, ...], mark_sigma: float
-) -> tuple[Verdict, dict[str, bytes], list[list[list[str]]]]:
+def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], mark_sigma: float) -> Judged:
     from kcal.io.rig_file import load_rig
     from kcal.report.rig_verdict import rig_verdict
-    from kcal.report.verdict_page import camera_rows
+    from kcal.report.verdict_page import camera_tables
 
     rig = load_rig(path)
     if observations and len(observations) != 2:
@@ -165,4 +180,4 @@ def _of_rig(
         boards = paired_boards((rig.left, rig.right), (left, right), pair_by_name(left.names, right.names))
         pairs = boards.points, boards.pixels
     verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, pairs=pairs, subject=path.name.split(".")[0])
-    return verdict, {}, [*camera_rows(rig.left), *camera_rows(rig.right)]
+    return verdict, {}, [*camera_tables(rig.left), *camera_tables(rig.right)]

@@ -71,7 +71,7 @@ def camera_verdict(
     found += [Finding(name="calibration", severity="doubt", text=text, picture="residuals") for text in result.warnings]
     sigma = _image_rms(result.camera)
     answers = tuple(
-        _answer(result.camera, requirement, sigma, beyond, baseline, mark_sigma) for requirement in requirements
+        _camera_answer(result.camera, requirement, sigma, beyond, baseline, mark_sigma) for requirement in requirements
     )
     if not all(answer.ok for answer in answers):
         # A fault that the requirements bear is a doubt; one that breaks them is the reason.
@@ -131,7 +131,9 @@ def stored_verdict(
         )
     return Verdict(
         subject=subject,
-        answers=tuple(_answer(camera, requirement, sigma, 0.0, baseline, mark_sigma) for requirement in requirements),
+        answers=tuple(
+            _camera_answer(camera, requirement, sigma, 0.0, baseline, mark_sigma) for requirement in requirements
+        ),
         findings=sorted_findings(found),
         basis=_BASIS.format(baseline, mark_sigma),
     )
@@ -147,7 +149,7 @@ def _image_rms(camera: Camera) -> float:
     return float(sigma.square().mean().sqrt()) if len(sigma) else math.inf
 
 
-def _answer(
+def _camera_answer(
     camera: Camera, requirement: Requirement, sigma: float, beyond: float, baseline: float, mark_sigma: float
 ) -> RangeAnswer:
     """The range of a target by two such cameras: Z² / (f B) for each pixel of disparity, which both cameras spoil."""

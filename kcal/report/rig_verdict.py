@@ -59,10 +59,10 @@ def rig_verdict(
     """
     findings = [finding for verdict in cameras for finding in verdict.findings if finding.severity != "fine"]
     findings += _doubts(rig, result)
-    compared = _compared(rig, result, pairs)
+    compared = _pairs_compared(rig, result, pairs)
     if compared is not None and compared.pairs:
         findings.append(_synchrony_finding(compared))
-    answers = tuple(_answer(rig, requirement, mark_sigma) for requirement in requirements)
+    answers = tuple(_rig_answer(rig, requirement, mark_sigma) for requirement in requirements)
     failed = [answer for answer in answers if not answer.ok]
     return Verdict(
         subject=subject,
@@ -75,7 +75,7 @@ def rig_verdict(
     )
 
 
-def _answer(rig: StereoRig, requirement: Requirement, mark_sigma: float) -> RangeAnswer:
+def _rig_answer(rig: StereoRig, requirement: Requirement, mark_sigma: float) -> RangeAnswer:
     """The worst of several places along the middle row of the left image that both cameras see."""
     width, height = rig.left.size
     worst: RangeSigmas | None = None
@@ -150,7 +150,7 @@ def _doubts(rig: StereoRig, result: RigResult | None) -> list[Finding]:
     return found
 
 
-def _compared(rig: StereoRig, result: RigResult | None, pairs: tuple[Tensor, Tensor] | None) -> Synchrony | None:
+def _pairs_compared(rig: StereoRig, result: RigResult | None, pairs: tuple[Tensor, Tensor] | None) -> Synchrony | None:
     if pairs is not None:
         return synchrony(rig, *pairs)
     boards = None if result is None else result.data.boards

@@ -57,7 +57,7 @@ def verdict_page(
         drawn = {"ranges": range_picture(verdict.answers), **drawn}
     style = (_HERE / "verdict_page.css").read_text(encoding="utf-8")
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_HERE), autoescape=True, undefined=jinja2.StrictUndefined, finalize=_shown
+        loader=jinja2.FileSystemLoader(_HERE), autoescape=True, undefined=jinja2.StrictUndefined, finalize=_visible_text
     )
     environment.filters |= {"distance": range_text, "found": _found, "percent": _percent, "sentence": _sentence}
     return environment.get_template("verdict_page.html").render(
@@ -96,7 +96,7 @@ def range_rows(verdict: Verdict) -> list[list[str]]:
     return rows
 
 
-def camera_rows(camera: Camera, result: CameraCalibrationResult | None = None) -> list[list[list[str]]]:
+def camera_tables(camera: Camera, result: CameraCalibrationResult | None = None) -> list[list[list[str]]]:
     """Tables of a camera: how it was calibrated, its parameters with σ, the strongest correlations."""
     known = camera.calibration
     record = known.record if known else None
@@ -138,7 +138,7 @@ def _correlations(camera: Camera) -> list[list[str]]:
     return [["strongest correlations", ""], *([f"{a}, {b}", f"{value:+.3f}"] for value, a, b in found)]
 
 
-def _shown(value: Any) -> Any:
+def _visible_text(value: Any) -> Any:
     return visible(value) if type(value) is str else value
 
 

@@ -205,9 +205,9 @@ def distances_text(result: CameraCalibrationResult) -> str:
     width, height = (1e3 * board.square * (count - 1) for count in (board.columns, board.rows))
     return (
         f"board {board.columns} x {board.rows} corners, {1e3 * board.square:g} mm squares: {width:g} x {height:g} mm; "
-        f"nearest view {_meters_text(float(distance.min()))}, farthest {_meters_text(float(distance.max()))}"
+        f"nearest view {_distance_text(float(distance.min()))}, farthest {_distance_text(float(distance.max()))}"
     )
 
 
-def _meters_text(value: float) -> str:
+def _distance_text(value: float) -> str:
     return f"{value:.{max(0, 1 - math.floor(math.log10(value)))}f} m" if value > 0 else "0 m"

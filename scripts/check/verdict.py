@@ -156,8 +156,8 @@ def page(lines: list[dict[str, Any]]) -> str:
         f"{len(wrong)} whose truth does not meet it.", "",
         "*Model*: an opencv4 or opencv5 lens forced on a wide or poorly centered lens. *Fronto-parallel*: tilts of 0.5 "
         "to 4°. *Warp*: a board bent by 1 to 4 mm, taken as exact. *Blur*: four fifths of the views have corners "
-        "with a noise of 0.8 to 2 px, as stated with them. *Unsynchronized*: the board moves by 1 to 5 cm an axis (σ) between "
-        "both exposures, at 14 to 25 m. *Pupil*: a wide lens of 4 to 12 mm, near boards, a lens model without pupil. "
+        "with a noise of 0.8 to 2 px, as stated with them. *Unsynchronized*: the board moves by 1 to 5 cm an axis (σ) "
+        "between both exposures, at 14 to 25 m. *Pupil*: a wide lens of 4 to 12 mm, near boards, no pupil in the model. "
         "*Mirrored or mixed*: all views mirrored, some mirrored, or two boards whose squares differ by 1 to 3 % in one "
         "direction. Mirroring does not change a camera's calibration, only everything that is seen with it: there the "
         "truth may meet the requirement although the answer must be no.",
