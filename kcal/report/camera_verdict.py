@@ -69,7 +69,8 @@ def camera_verdict(
     # Faults of the views come first: without tilts or with blur the model looks wrong too.
     found = [*view_findings(result), *against]
     found += [Finding(name="calibration", severity="doubt", text=text, picture="residuals") for text in result.warnings]
-    sigma = _image_rms(result.camera)
+    # What another model that fits as well sees elsewhere is uncertain too, above all where no board was.
+    sigma = max(_image_rms(result.camera), 0.0 if examination.model is None else examination.model.rms)
     answers = tuple(
         _camera_answer(result.camera, requirement, sigma, beyond, baseline, mark_sigma) for requirement in requirements
     )

@@ -8,6 +8,7 @@ from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.summary import summarize
 from kcal.calibrate.camera.trust import Examination, HalvesDifference, unexplained
+from kcal.lens.uncertainty import image_sigma
 from kcal.report.verdict import Finding
 
 # Names of findings by which a camera is wrong beyond its error bars.
@@ -56,6 +57,18 @@ def model_findings(
                     severity="doubt",
                     text=f"{pupil}, which {result.camera.model} does not have: far directions are off by {far:.2g} px",
                     action="calibrate with the default lens (--model hybrid), or show the board from farther away",
+                    picture="model",
+                )
+            )
+        elif not beyond and (reference.hybrid is not None and result.hybrid is None) and far > _image_sigma_of(result):
+            findings.append(
+                Finding(
+                    name="model",
+                    severity="doubt",
+                    text=f"another lens model fits these views as well as {result.camera.model} and differs by "
+                    f"{far:.2g} px, most where no board was",
+                    action="calibrate with the default lens (--model hybrid), and show the board at the borders of the "
+                    "image",
                     picture="model",
                 )
             )
@@ -135,6 +148,12 @@ def _halves_finding(
         else "calibrate with the default lens and --board printed",
         picture="halves",
     )
+
+
+def _image_sigma_of(result: CameraCalibrationResult) -> float:
+    """RMS over the image of the error bars, px."""
+    sigma = image_sigma(result.camera)
+    return float(sigma[sigma.isfinite()].square().mean().sqrt())
 
 
 def _board_fault(

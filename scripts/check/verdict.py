@@ -3,7 +3,7 @@
     python -m scripts.check.verdict --out captures.jsonl --planted 200 --clean 100     continues where it stopped
     python -m scripts.check.verdict --out captures.jsonl --write                       the page, from what is there
 
-Seeds below 100 were for setting the thresholds (`--first 0`); others are reported.
+Seeds below 200 were for setting the thresholds (`--first 0`); others are reported.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from scripts.check.verdict_captures import FAULTS, Planted, PlantedPair, drawn
 from scripts.shared.page import CONCLUSIONS, DOCS, table
 from scripts.shared.timing import show
 
-FIRST = 100
+FIRST = 200
 # What is required of a camera, in a rig with 10 m of baseline; of a rig, from boards alone.
-CAMERA, RIG, MARK = "2km:8%", "500m:5%", 0.1
+CAMERA, RIG, MARK = "2km:10%", "500m:5%", 0.1
 # Which finding names which fault.
 NAMES = {
     "model": {"model"},
@@ -63,18 +63,18 @@ def true_error(lens: TruthLens, camera: Camera) -> float:
     return float((seen - grid)[good].square().sum(-1).mean().sqrt())
 
 
-def judge_camera(planted: Planted) -> tuple[Verdict, float, bool]:
-    """Verdict, true error in px, and whether the truth meets the requirement."""
+def judge_camera(planted: Planted) -> tuple[Verdict, float, float]:
+    """Verdict, true RMS error over the image in px, and that of the range over what is required."""
     result = calibrate_camera(planted.observations, planted.options)
     need = Requirement.parse(CAMERA)
     verdict = camera_verdict(result, planted.options, need, mark_sigma=MARK)
     off = true_error(planted.lens, result.camera)
     slope = math.sqrt(2.0) * need[0].distance ** 2 / (float(result.camera.focal[0]) * 10.0)
-    return verdict, off, slope * math.hypot(off, MARK) <= need[0].meters
+    return verdict, off, slope * math.hypot(off, MARK) / need[0].meters
 
 
-def judge_pair(planted: PlantedPair) -> tuple[Verdict, float, bool]:
-    """Verdict, true RMS error of ranges over the requirement, and whether that is met."""
+def judge_pair(planted: PlantedPair) -> tuple[Verdict, float, float]:
+    """Verdict, true RMS error of ranges in meters, and over what is required."""
     cameras = []
     for seen in planted.alone:
         cameras.append(calibrate_camera(seen, CalibrationOptions()).camera)
@@ -95,7 +95,7 @@ def judge_pair(planted: PlantedPair) -> tuple[Verdict, float, bool]:
     lines = sight_lines(rig, left, right)
     off = (lines.points.norm(dim=-1) - need.distance)[seen_by_both]
     error = float(off.square().mean().sqrt())
-    return verdict, error / need.meters, error <= need.meters
+    return verdict, error, error / need.meters
 
 
 def judge(kind: str, seed: int) -> dict[str, Any]:
@@ -104,17 +104,17 @@ def judge(kind: str, seed: int) -> dict[str, Any]:
     planted = drawn(kind, seed)
     line: dict[str, Any] = {"kind": kind, "seed": seed, "detail": planted.detail}
     try:
-        verdict, off, good = judge_pair(planted) if isinstance(planted, PlantedPair) else judge_camera(planted)
+        verdict, off, over = judge_pair(planted) if isinstance(planted, PlantedPair) else judge_camera(planted)
         line |= {
             "yes": verdict.usable,
             "off": round(off, 4),
-            "deserved": good,
+            "over": round(over, 3),
             "stops": [finding.name for finding in verdict.stops],
             "doubts": [finding.name for finding in verdict.findings if finding.severity == "doubt"],
             "reason": verdict.reason,
         }
     except KcalError as error:
-        line |= {"yes": False, "off": None, "deserved": False, "stops": ["refused"], "doubts": [], "reason": str(error)}
+        line |= {"yes": False, "off": None, "over": None, "stops": ["refused"], "doubts": [], "reason": str(error)}
     return line | {"seconds": round(time.process_time() - clock, 2)}
 
 
@@ -123,47 +123,50 @@ def named(line: dict[str, Any]) -> bool:
     return bool(NAMES[line["kind"]] & {*line["stops"], *line["doubts"]})
 
 
+def broken(line: dict[str, Any], times: float) -> bool:
+    """Whether the true error is so many times what is required, or more; a camera that was refused is broken."""
+    return line["over"] is None or line["over"] > times
+
+
 def page(lines: list[dict[str, Any]]) -> str:
     planted = [line for line in lines if line["kind"] in FAULTS]
     clean = [line for line in lines if line["kind"] not in FAULTS]
     rows = []
-    for kind in [*FAULTS, "all"]:
-        here = [line for line in planted if kind in ("all", line["kind"])]
+    for kind in [*FAULTS, "all planted", "clean"]:
+        here = clean if kind == "clean" else [line for line in planted if kind in ("all planted", line["kind"])]
         if not here:
             continue
-        said = Counter(name for line in here for name in line["stops"][:1] or (["range"] if not line["yes"] else []))
+        yes = [line for line in here if line["yes"]]
+        said = Counter(name for line in here for name in line["stops"][:1] or ([] if line["yes"] else ["range"]))
         rows.append([
-            kind, len(here), sum(line["yes"] for line in here),
-            sum(line["yes"] and not line["deserved"] for line in here),
-            sum(line["deserved"] for line in here), sum(map(named, here)),
+            kind, len(here), len(yes), sum(broken(line, 1.0) for line in yes), sum(broken(line, 2.0) for line in yes),
+            sum(broken(line, 1.0) for line in here), "" if kind == "clean" else sum(map(named, here)),
             ", ".join(f"{name} {count}" for name, count in said.most_common()),
         ])  # fmt: skip
-    head = ["planted", "captures", "yes", "false yes", "truth meets the requirement", "named", "first reason"]
-    deserved = [line for line in clean if line["deserved"]]
-    no = [line for line in deserved if not line["yes"]]
-    wrong = [line for line in clean if line["yes"] and not line["deserved"]]
-    reasons = Counter(name for line in no for name in line["stops"][:1] or ["range"])
+    head = [
+        "captures", "number", "yes", "yes, and off by more than required", "more than twice", "all that are off by more",
+        "fault named", "reasons of the no",
+    ]  # fmt: skip
+    good = [line for line in clean if not broken(line, 1.0)]
     text = [
         f"Made by `scripts/check/verdict.py` with kcal {kcal.__version__} and torch {torch.__version__}, from "
-        f"{len(planted)} captures with one planted fault each and {len(clean)} clean ones; thresholds were set on "
-        f"other seeds. Ray-traced lenses, 24 to 40 views, noise 0.05 to 0.2 px. Required of a camera: {CAMERA}, in a "
-        f"rig with 10 m of baseline; of a pair: {RIG}, from boards alone; marks to {MARK} px. The truth meets a "
-        "requirement where the RMS error over the image does. *False yes*: the answer is yes and the truth does not. "
-        "*Named*: a finding names the planted fault, whatever the answer.", "",
+        f"{len(planted)} captures with one planted fault each and {len(clean)} clean ones; thresholds were set on other "
+        f"seeds. Ray-traced lenses, 18 to 28 views, noise 0.05 to 0.2 px. Required of a camera: {CAMERA}, in a rig with "
+        f"10 m of baseline; of a pair: {RIG}, from boards alone; marks to {MARK} px. *Off*: the RMS error of the range, "
+        "over the image, from the true error of the camera. What is required is a standard deviation: of cameras whose "
+        "error bars just meet it, a third are off by more and one in twenty by more than twice that. *Named*: a finding "
+        "names the planted fault, whatever the answer.", "",
         *table(head, rows), "",
-        f"Clean: {len(clean)} captures; the truth of {len(deserved)} meets the requirement, to {len(no)} of which the "
-        f"answer is no ({', '.join(f'{n} {c}' for n, c in reasons.most_common()) or 'none'}); the answer is yes to "
-        f"{len(wrong)} whose truth does not meet it.", "",
-        "*Model*: an opencv4 or opencv5 lens forced on a wide or poorly centered lens. *Fronto-parallel*: tilts of 0.5 "
-        "to 4°. *Warp*: a board bent by 1 to 4 mm, taken as exact. *Blur*: four fifths of the views have corners "
-        "with a noise of 0.8 to 2 px, as stated with them. *Unsynchronized*: the board moves by 1 to 5 cm an axis (σ) "
-        "between both exposures, at 14 to 25 m. *Pupil*: a wide lens of 4 to 12 mm, near boards, no pupil in the model. "
-        "*Mirrored or mixed*: all views mirrored, some mirrored, or two boards whose squares differ by 1 to 3 % in one "
-        "direction. Mirroring does not change a camera's calibration, only everything that is seen with it: there the "
-        "truth may meet the requirement although the answer must be no.",
+        f"Of the {len(good)} clean captures that are not off by more than required, "
+        f"{sum(not line['yes'] for line in good)} are answered with no.", "",
+        "*Model*: an opencv4 or opencv5 lens forced on a wide webcam lens. *Fronto-parallel*: boards within 0.5 to 4° of "
+        "the image's plane. *Warp*: a board bent by 1 to 4 mm, taken as exact. *Blur*: four fifths of the views have "
+        "corners with a noise of 0.8 to 2 px, as stated with them. *Unsynchronized*: the board moves by 1 to 5 cm an "
+        "axis (σ) between both exposures, at 14 to 25 m. *Pupil*: a wide lens of 4 to 12 mm, near boards, no pupil in "
+        "the model. *Mirrored or mixed*: all views mirrored, some mirrored, or two boards whose squares differ by 1 to "
+        "3 % in one direction. Mirroring does not change a camera's calibration, only everything that is seen with it.",
     ]  # fmt: skip
-    conclusion = CONCLUSIONS.get("verdict.md", "")
-    return "\n".join(["# May it be used?", "", conclusion, "", *text, ""])
+    return "\n".join(["# May it be used?", "", CONCLUSIONS.get("verdict.md", ""), "", *text, ""])
 
 
 def main() -> None:

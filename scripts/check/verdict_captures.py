@@ -81,7 +81,7 @@ def drawn(kind: str, seed: int) -> Planted | PlantedPair:
     generator = torch.Generator().manual_seed(seed)
     if kind in ("unsynchronized", "clean pair"):
         return _pair(kind, draw, seed, generator)
-    views, sigma = draw.randint(24, 40), draw.uniform(0.05, 0.2)
+    views, sigma = draw.randint(18, 28), draw.uniform(0.05, 0.2)
     points, options, names = BOARD.points, CalibrationOptions(), None
     design, strength, wander, fill, tilt = "machine-vision", draw.uniform(0.5, 1.5), 0.3, (0.25, 0.8), 0.0
     detail = ""
@@ -96,7 +96,7 @@ def drawn(kind: str, seed: int) -> Planted | PlantedPair:
         wander = 0.0 if choice == "opencv8" else wander
         detail = f"{choice}, {design}"
     elif kind == "model":
-        design = draw.choice(["surveillance", "webcam"])
+        design = "webcam"
         options = CalibrationOptions(model=draw.choice(["opencv4", "opencv5"]))
         strength, wander, detail = draw.uniform(1.0, 3.0), 0.1, f"{design}, {options.model}"
     elif kind == "fronto-parallel":
@@ -172,8 +172,8 @@ def _pair(kind: str, draw: random.Random, seed: int, generator: torch.Generator)
     sigma = draw.uniform(0.05, 0.15)
     alone = []
     for lens in (rig.left, rig.right):
-        poses = sample_board_poses(lens, BOARD, 30, generator, fill=(0.25, 0.8), options=_ROLLS)
-        noise = sigma * torch.randn(30, BOARD.corners, 2, dtype=torch.float64, generator=generator)
+        poses = sample_board_poses(lens, BOARD, 20, generator, fill=(0.25, 0.8), options=_ROLLS)
+        noise = sigma * torch.randn(20, BOARD.corners, 2, dtype=torch.float64, generator=generator)
         alone.append(observed(corners_of(lens, printed(BOARD.points, seed), poses, noise), lens.size))
     large = BOARD.model_copy(update={"square": 0.3})
     poses = sample_pair_poses(rig, large, 16, generator, distance=(14.0, 25.0), options=PoseOptions())
