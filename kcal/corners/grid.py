@@ -122,10 +122,10 @@ def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, r
         return "the grid found is uneven: not the board, or another number of corners"
     if first_square_dark(image, pixels, columns, rows)[1] < MIN_ALTERNATING:
         return "the squares of the grid found do not alternate between dark and light"
-    if skips(image, pixels, columns, rows):
-        return f"lines of corners lie between those of {columns}x{rows}: the board has more inner corners than that"
     if goes_on(image, pixels, columns, rows):
         return f"the squares go on beyond {columns}x{rows}: the board has more inner corners than that"
+    if skips(image, pixels, columns, rows):
+        return f"lines of corners lie between those of {columns}x{rows}: the board has more inner corners than that"
     return None
 
 

@@ -67,7 +67,8 @@ def camera_verdict(
     examination = examination or examine(result, options, progress)
     against, beyond = model_findings(result, options, examination)
     # Faults of the views come first: without tilts or with blur the model looks wrong too.
-    found = [*view_findings(result), *against]
+    reference = examination.reference or result
+    found = [*view_findings(result, min(result.noise, reference.noise)), *against]
     found += [Finding(name="calibration", severity="doubt", text=text, picture="residuals") for text in result.warnings]
     # What another model that fits as well sees elsewhere is uncertain too, above all where no board was.
     sigma = max(_image_rms(result.camera), 0.0 if examination.model is None else examination.model.rms)

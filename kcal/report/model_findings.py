@@ -22,83 +22,55 @@ _NEIGHBORS = 0.12
 _IMAGE = 2.5
 # Standard deviations by which a board bends, or a pupil moves, before it is named.
 _SURE = 5.0
-# Halves that differ in time by this many times more than halves that are alike: two cameras, or one that changed.
-_CHANGED = 2.5
+# RMS of halves over that of all views, below which these are not of one camera: 0.93 and more in captures of one.
+_OWN = 0.8
+# Mean squares of averages of residuals over parts of the image beyond which the lens is wrong, whatever else is: 11 and
+# more with wrong lenses, at most 2.5 with bent boards and moving pupils.
+_LENS = 5.0
 
 
 def model_findings(
     result: CameraCalibrationResult, options: CalibrationOptions, found: Examination
 ) -> tuple[list[Finding], float]:
     """What speaks against lens model, board and error bars, and by how many px RMS the camera is wrong beyond these."""
-    findings: list[Finding] = []
-    beyond = 0.0
-    reference = found.reference
     structured = found.structure.neighbors > _NEIGHBORS or found.structure.image > _IMAGE
-    bends = _board_fault(result, options, reference)
-    pupil = _pupil_fault(result, reference)
-    if found.model is not None and reference is not None:
-        far = found.model.rms
-        beyond = far if bends or pupil or structured else unexplained(found.model)
-        if bends:
-            findings.append(
-                Finding(
-                    name="board",
-                    severity="doubt",
-                    text=f"{bends}, but was taken as flat and exact: far directions are wrong by {far:.2g} px",
-                    action="calibrate with the default lens and --board printed, which measures the board, or use a "
-                    "stiffer board",
-                    picture="board",
-                )
-            )
-        elif pupil:
-            findings.append(
-                Finding(
-                    name="pupil",
-                    severity="doubt",
-                    text=f"{pupil}, which {result.camera.model} does not have: far directions are off by {far:.2g} px",
-                    action="calibrate with the default lens (--model hybrid), or show the board from farther away",
-                    picture="model",
-                )
-            )
-        elif not beyond and (reference.hybrid is not None and result.hybrid is None) and far > _image_sigma_of(result):
-            findings.append(
-                Finding(
-                    name="model",
-                    severity="doubt",
-                    text=f"another lens model fits these views as well as {result.camera.model} and differs by "
-                    f"{far:.2g} px, most where no board was",
-                    action="calibrate with the default lens (--model hybrid), and show the board at the borders of the "
-                    "image",
-                    picture="model",
-                )
-            )
-        elif beyond:
-            findings.append(
-                Finding(
-                    name="model",
-                    severity="doubt",
-                    text=f"the lens model {result.camera.model} does not fit this lens: it differs by {far:.2g} px "
-                    "from one that does",
-                    action="calibrate with the default lens (--model hybrid)",
-                    picture="model",
-                )
-            )
-    elif structured:
-        findings.append(
-            Finding(
-                name="model",
-                severity="stop",
-                text="residuals are not noise: those of neighboring corners have a correlation of "
-                f"{found.structure.neighbors:.2f}. Lens model or board do not fit, and error bars are too small",
-                action="check that all views show one flat, stiff board, with the camera's focus and zoom unchanged",
-                picture="residuals",
-            )
-        )
     halves = {half.label: unexplained(half.difference, _CHANCE) for half in found.halves}
-    worst = max(halves.values(), default=0.0)
-    beyond = max(beyond, worst)
-    if worst and not findings:
-        findings.append(_halves_finding(found.halves, halves, options))
+    beyond = max(halves.values(), default=0.0)
+    against = _changed(result, found.halves, halves)
+    if found.model is not None and found.reference is not None:
+        named = _against_reference(result, options, found, found.model.rms)
+        certain = named is not None and named.name in ("board", "pupil")
+        beyond = max(beyond, found.model.rms if certain or structured else unexplained(found.model))
+        if named is None and beyond:
+            named = Finding(
+                name="model",
+                severity="doubt",
+                text=f"the lens model {result.camera.model} does not fit this lens: it differs by "
+                f"{found.model.rms:.2g} px from one that does",
+                action="calibrate with the default lens (--model hybrid)",
+                picture="model",
+            )
+        against = against or named
+    elif structured and against is None:
+        against = Finding(
+            name="model",
+            severity="stop",
+            text="residuals are not noise: those of neighboring corners have a correlation of "
+            f"{found.structure.neighbors:.2f}. Lens model or board do not fit, and error bars are too small",
+            action="check that all views show one flat, stiff board, with the camera's focus and zoom unchanged",
+            picture="residuals",
+        )
+    elif beyond and against is None:
+        worst = max(halves, key=lambda label: halves[label])
+        against = Finding(
+            name="model",
+            severity="doubt",
+            text=f"cameras from two halves of the views ({worst}) differ by {halves[worst]:.2g} px beyond their error "
+            "bars: lens model or board do not fit",
+            action="take more views, with one flat, stiff board",
+            picture="halves",
+        )
+    findings = [] if against is None else [against]
     if found.failures or not found.halves:
         findings.append(
             Finding(
@@ -122,13 +94,12 @@ def model_findings(
     return findings, beyond
 
 
-def _halves_finding(
-    halves: Sequence[HalvesDifference], beyond: Mapping[str, float], options: CalibrationOptions
-) -> Finding:
-    """What differing halves mean: halves in time, or by name, that differ more than alike ones are not one camera."""
-    alike = max((half.difference.ratio or 1.0 for half in halves if half.alike), default=1.0)
+def _changed(
+    result: CameraCalibrationResult, halves: Sequence[HalvesDifference], beyond: Mapping[str, float]
+) -> Finding | None:
+    """Whether halves in time, or by name, are not of one camera: each half alone fits, and both together do not."""
     for half in halves:
-        if not half.alike and beyond[half.label] and (half.difference.ratio or 0.0) > _CHANGED * alike:
+        if not half.alike and beyond[half.label] and half.own < _OWN * result.rms:
             return Finding(
                 name="changed",
                 severity="stop",
@@ -137,17 +108,47 @@ def _halves_finding(
                 action="calibrate from the images of one camera with fixed focus and zoom",
                 picture="halves",
             )
-    worst = max(beyond, key=lambda label: beyond[label])
-    return Finding(
-        name="model",
-        severity="doubt",
-        text=f"cameras from two halves of the views ({worst}) differ by {beyond[worst]:.2g} px beyond their error "
-        "bars: the lens model or the board does not fit",
-        action="take more views, with one flat, stiff board"
-        if options.hybrid
-        else "calibrate with the default lens and --board printed",
-        picture="halves",
-    )
+    return None
+
+
+def _against_reference(
+    result: CameraCalibrationResult, options: CalibrationOptions, found: Examination, far: float
+) -> Finding | None:
+    """What the reference finds that was left out: the board's shape, the pupil's movement, or another lens."""
+    plain = found.structure.image < _LENS
+    if plain and (bends := _board_fault(result, options, found.reference)):
+        return Finding(
+            name="board",
+            severity="doubt",
+            text=f"{bends}, but was taken as flat and exact: far directions are wrong by {far:.2g} px",
+            action="calibrate with the default lens and --board printed, which measures the board, or use a stiffer "
+            "board",
+            picture="board",
+        )
+    if plain and (pupil := _pupil_fault(result, found.reference)):
+        return Finding(
+            name="pupil",
+            severity="doubt",
+            text=f"{pupil}, which {result.camera.model} does not have: far directions are off by {far:.2g} px",
+            action="calibrate with the default lens (--model hybrid), or show the board from farther away",
+            picture="model",
+        )
+    if (
+        plain
+        and result.hybrid is None
+        and found.model is not None
+        and not unexplained(found.model)
+        and far > _image_sigma_of(result)
+    ):
+        return Finding(
+            name="model",
+            severity="doubt",
+            text=f"another lens model fits these views as well as {result.camera.model} and differs by {far:.2g} px, "
+            "most where no board was",
+            action="calibrate with the default lens (--model hybrid), and show the board at the borders of the image",
+            picture="model",
+        )
+    return None
 
 
 def _image_sigma_of(result: CameraCalibrationResult) -> float:

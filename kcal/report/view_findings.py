@@ -29,12 +29,21 @@ _TEMPERING = 5.0
 _FEW_VIEWS = 12
 
 
-def view_findings(result: CameraCalibrationResult) -> list[Finding]:
-    """What the views themselves say, whatever was fitted to them."""
+def view_findings(result: CameraCalibrationResult, noise: float | None = None) -> list[Finding]:
+    """What the views themselves say, whatever was fitted to them.
+
+    Args:
+        result: the calibration.
+        noise: of a corner along an axis, px, under a lens that fits; that of the calibration if left out.
+    """
     used = result.cam_from_board_rotation.isfinite().all(-1).all(-1)
     rotation, translation = result.cam_from_board_rotation[used], result.cam_from_board_translation[used]
     found = [_order_finding(seen_pixels(result)[used], result.observations), *_pose_findings(rotation, translation)]
-    found += [_coverage_finding(result.observations), _blur_finding(result), _repetition_finding(result)]
+    found += [
+        _coverage_finding(result.observations),
+        _blur_finding(result, result.noise if noise is None else noise),
+        _repetition_finding(result),
+    ]
     if len(rotation) < _FEW_VIEWS:
         found.append(
             Finding(
@@ -160,8 +169,8 @@ def _coverage_finding(observations: Observations) -> Finding:
     )
 
 
-def _blur_finding(result: CameraCalibrationResult) -> Finding | None:
-    noise, share = result.noise, 0.0
+def _blur_finding(result: CameraCalibrationResult, noise: float) -> Finding | None:
+    share = 0.0
     stated = result.observations.covariances()
     if stated is not None:
         spread = (0.5 * stated.diagonal(dim1=-2, dim2=-1).sum(-1)).sqrt().nanmedian(-1).values

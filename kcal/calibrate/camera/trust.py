@@ -31,6 +31,8 @@ from kcal.solve.lm import LMOptions
 FEWEST_IN_HALF = 6
 # Cells of the image over which residuals are averaged, and corners that each needs.
 _COLUMNS, _ROWS, _FEWEST_IN_CELL = 8, 6, 10
+# Of the ratio of focal lengths: an error of 1e-3 is more than any calibration's, and than any digital sensor's.
+_SQUARE = 1e-3
 _POSES = LMOptions(max_iterations=60, tolerance=1e-12)
 
 
@@ -143,12 +145,7 @@ def examine(
     reference, model = None, None
     if not (options.hybrid and options.board == "printed"):
         try:
-            reference = calibrate_camera(
-                seen,
-                CalibrationOptions(
-                    weighted=options.weighted, reject=options.reject, focal=float(result.camera.focal[0])
-                ),
-            )
+            reference = calibrate_camera(seen, _reference_options(result, options))
             model = camera_difference(result.camera, reference.camera)
         except KcalError as error:
             failures.append(f"reference with a hybrid lens: {error}")
@@ -159,6 +156,17 @@ def examine(
         model=model,
         structure=residual_structure(result.residuals, seen_pixels(result), seen.image_size, result.observations),
         failures=tuple(failures),
+    )
+
+
+def _reference_options(result: CameraCalibrationResult, options: CalibrationOptions) -> CalibrationOptions:
+    fx, fy = result.camera.focal.tolist()
+    # Pixels of a parametric camera may be anything; a hybrid one must be told that they are not square.
+    return CalibrationOptions(
+        weighted=options.weighted,
+        reject=options.reject,
+        focal=fx,
+        analog=options.analog or abs(fy / fx - 1.0) > _SQUARE,
     )
 
 
