@@ -81,6 +81,12 @@ def save_verdict_page(
 
     Raises:
         FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_verdict_page(Path(folder, "left.html"), Verdict(subject="left")).name
+        'left.html'
     """
     return write_atomic(path, verdict_page(verdict, pictures, tables))
 
