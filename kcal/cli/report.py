@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
     from kcal.lens.camera import Camera
     from kcal.report.verdict import Requirement, Verdict
 
-# A verdict, the pictures of its page by name, and its tables.
-Judged: TypeAlias = "tuple[Verdict, dict[str, bytes], list[list[list[str]]]]"
+# A verdict, how the pictures of its page are drawn, and its tables.
+Judged: TypeAlias = "tuple[Verdict, Callable[[], dict[str, bytes]], list[list[list[str]]]]"
 # The exit code of a no, apart from errors (1) and wrong usage (2).
 NO = 3
 REQUIRE_HELP = "What you need: ranges and the largest σ of each, for example 5km:10% or 800m:20m,5km:10%."
@@ -77,14 +78,16 @@ def _is_rig(path: Path) -> bool:
     return recognized(path) == "kcal" and json.loads(path.read_text(encoding="utf-8"))["kcal"] == "rig"
 
 
-def finish(verdict: Verdict, pictures: dict[str, bytes], tables: list[list[list[str]]], page: Path | None) -> None:
+def finish(
+    verdict: Verdict, pictures: Callable[[], dict[str, bytes]], tables: list[list[list[str]]], page: Path | None
+) -> None:
     """Print a verdict, write its page, and exit with 3 for a no."""
     from kcal.report.verdict_page import range_rows, save_verdict_page
 
     print_verdict(verdict)
     if page is not None:
         ranges = [range_rows(verdict)] if verdict.answers else []
-        print_wrote(save_verdict_page(page, verdict, pictures, [*ranges, *tables]))
+        print_wrote(save_verdict_page(page, verdict, pictures(), [*ranges, *tables]))
     if not verdict.usable:
         raise typer.Exit(NO)
 
@@ -114,7 +117,7 @@ def _of_camera(
     name = (camera.calibration.name if camera.calibration else "") or path.name.split(".")[0]
     if not observations:
         found = stored_verdict(camera, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name)
-        return found, {}, camera_tables(camera)
+        return found, dict, camera_tables(camera)
     if len(observations) > 1:
         raise InputError("a camera has one observations file; give --observations once")
     result, options = _again(camera, observations[0])
@@ -141,7 +144,7 @@ def judged(
     verdict = camera_verdict(
         result, options, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name, examination=examination
     )
-    return verdict, camera_pictures(result, examination), camera_tables(result.camera, result)
+    return verdict, lambda: camera_pictures(result, examination), camera_tables(result.camera, result)
 
 
 def _again(camera: Camera, observations: Path) -> tuple[CameraCalibrationResult, CalibrationOptions]:
@@ -180,4 +183,4 @@ def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...]
         boards = paired_boards((rig.left, rig.right), (left, right), pair_by_name(left.names, right.names))
         pairs = boards.points, boards.pixels
     verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, pairs=pairs, subject=path.name.split(".")[0])
-    return verdict, {}, [*camera_tables(rig.left), *camera_tables(rig.right)]
+    return verdict, dict, [*camera_tables(rig.left), *camera_tables(rig.right)]

@@ -174,7 +174,7 @@ def solve_command(
         verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, result=result, subject=output.name.split(".")[0])
         finish(
             verdict,
-            {"rig": png_bytes(rig_figure(result))},
+            lambda: {"rig": png_bytes(rig_figure(result))},
             [*camera_tables(rig.left), *camera_tables(rig.right)],
             report,
         )
