@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
+from rich.markup import escape
 
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
-from kcal.cli.report import REQUIRE_HELP, finish, judged
-from kcal.errors import InputError
-from kcal.files import check_writable
+from kcal.cli.report import NO, REQUIRE_HELP, judged, told_usable
+from kcal.errors import DegenerateError, InputError, KcalError
+from kcal.files import check_writable, make_folder
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
@@ -19,11 +20,22 @@ _PARAMETRIC, _USE = "Options of parametric models", "May it be used?"
 
 
 def calibrate_command(
-    observations: Annotated[Path, typer.Argument(help="Observations file from `kcal detect`.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Camera file to write.")],
+    observations: Annotated[
+        list[Path],
+        typer.Argument(metavar="OBS...", help="Observations file of each camera, from `kcal detect`."),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", help="Camera file to write; of several cameras a folder, for a NAME.camera.json of each."
+        ),
+    ],
     picture: Annotated[
         Path | None,
-        typer.Option(help="PNG file to write: coverage, where the camera is uncertain, residuals, RMS of each view."),
+        typer.Option(
+            help="PNG file to write: coverage, where the camera is uncertain, residuals, RMS of each view; of several "
+            "cameras, NAME.png in this folder."
+        ),
     ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print every parameter with its σ.")] = False,
     board: Annotated[
@@ -36,6 +48,10 @@ def calibrate_command(
     ] = "printed",
     analog: Annotated[
         bool, typer.Option("--analog", help="Pixels may not be square: an analog camera behind a frame grabber.")
+    ] = False,
+    one_type: Annotated[
+        bool,
+        typer.Option("--one-type", help="The cameras, four or more, are of one type: each learns from the others."),
     ] = False,
     reject: Annotated[
         bool, typer.Option("--reject", help="Leave out and list corners and views that noise cannot explain.")
@@ -60,7 +76,11 @@ def calibrate_command(
         typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.", rich_help_panel=_USE),
     ] = "",
     report: Annotated[
-        Path | None, typer.Option(help="HTML page to write: may it be used, and why not.", rich_help_panel=_USE)
+        Path | None,
+        typer.Option(
+            help="HTML page to write: may it be used, and why not; of several cameras, NAME.html in this folder.",
+            rich_help_panel=_USE,
+        ),
     ] = None,
     baseline: Annotated[
         float,
@@ -138,15 +158,19 @@ def calibrate_command(
         typer.Option(metavar="PX", help="Residual at which the robust loss sets in.", rich_help_panel=_PARAMETRIC),
     ] = 1.0,
 ) -> None:
-    """Calibrate one camera: intrinsics, lens and error bars.
+    """Calibrate a camera, or several: intrinsics, lens and error bars.
 
     There is no lens model to choose: the views themselves tell how much of each term of the lens, of the entrance
     pupil's movement and of the board's bending and print errors there is. A small RMS does not prove an accurate
     camera; read the uncertainty of far directions, in pixels, and what to photograph next.
 
+    Calibrate both cameras of a rig in one call: those that saw one printed board measure its errors together.
+
     **Examples**
 
     `kcal calibrate left.obs.json -o left.camera.json`
+
+    `kcal calibrate left.obs.json right.obs.json -o cameras`
 
     `kcal calibrate left.obs.json -o left.camera.json --picture left.png --verbose`
 
@@ -157,15 +181,8 @@ def calibrate_command(
     from kcal.lens.model import LensModel
     from kcal.report.verdict import Requirement
 
-    check_writable(output, observations)
     needs = Requirement.parse(require) if require else ()
-    if report is not None:
-        check_writable(report, observations)
-    if picture is not None:
-        from kcal.report.figures import check_picture
-
-        check_picture(picture)
-    name = name or observations.name.split(".")[0]
+    places = _camera_files(observations, output, picture, report, name)
     if model != "hybrid":
         LensModel.named(model)
     known = None
@@ -174,7 +191,7 @@ def calibrate_command(
 
         known = load_camera(camera)
 
-    from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+    from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.camera.outliers import OutlierRejection
     from kcal.calibrate.lensfit.measured_board import load_measured_board
     from kcal.corners.observations import Observations
@@ -197,18 +214,89 @@ def calibrate_command(
         loss=None if loss is None else RobustLoss(kind=loss, scale=loss_scale),  # type: ignore[arg-type]
         reject=OutlierRejection(limit=reject_limit) if reject else None,
     )
-    seen = Observations.load(observations)
+    sets = [Observations.load(place.observations) for place in places]
     with steps("calibrating", None) as advance:
-        result = calibrate_camera(seen, options, advance)
-    result.save(output, name=name, source=observations.name, temperature=temperature)
-    if picture is not None:
-        from kcal.report.calibration import save_calibration_picture
+        outcomes = (
+            calibrate_cameras(sets, options, advance)
+            if len(sets) > 1
+            else [calibrate_camera(sets[0], options, advance)]
+        )
+    failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
+    usable = True
+    figures: dict[str, dict[str, Any]] = {}
+    for place, result in zip(places, outcomes, strict=True):
+        if len(places) > 1:
+            out.print(f"[bold]{escape(place.name)}[/]")
+        if isinstance(result, KcalError):
+            warn(f"{place.name}: {result}")
+            continue
+        result.save(place.output, name=place.name, source=place.observations.name, temperature=temperature)
+        if place.picture is not None:
+            from kcal.report.calibration import save_calibration_picture
 
-        save_calibration_picture(picture, result)
-    _print_result(result, reject=reject, verbose=verbose or not options.hybrid)
-    print_wrote(output, picture)
-    if needs or report is not None:
-        finish(*judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=name), report)
+            save_calibration_picture(place.picture, result)
+        _print_result(result, reject=reject, verbose=verbose or not options.hybrid)
+        if result.shared_board is not None:
+            others = ", ".join(places[i].name for i in result.shared_board.others)
+            out.print(f"the board is that of {others} (evidence {result.shared_board.evidence:.0f} nats)", markup=False)
+        print_wrote(place.output, place.picture)
+        figures[place.name] = _figures(result)
+        if needs or place.report is not None:
+            found = judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=place.name)
+            figures[place.name]["verdict"] = found[0].to_dict()
+            usable = told_usable(*found, place.report) and usable
+    tell(cameras=figures)
+    if failed:
+        raise DegenerateError(f"{len(failed)} of {len(places)} cameras failed: {', '.join(failed)}")
+    if not usable:
+        raise typer.Exit(NO)
+
+
+class _CameraFiles(NamedTuple):
+    """Where the files of one camera are."""
+
+    observations: Path
+    output: Path
+    picture: Path | None
+    report: Path | None
+    name: str
+
+
+def _camera_files(
+    observations: list[Path], output: Path, picture: Path | None, report: Path | None, name: str
+) -> list[_CameraFiles]:
+    """Files of each camera, all of which can be written."""
+    if len(observations) == 1:
+        places = [_CameraFiles(observations[0], output, picture, report, name or observations[0].name.split(".")[0])]
+    else:
+        if name:
+            raise InputError("--name names one camera; several are named after their observations files")
+        names = [path.name.split(".")[0] for path in observations]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"two observations files are named {twice}: their cameras would overwrite each other")
+        for folder in (output, picture, report):
+            if folder is not None:
+                make_folder(folder)
+        places = [
+            _CameraFiles(
+                path,
+                output / f"{name}.camera.json",
+                picture and picture / f"{name}.png",
+                report and report / f"{name}.html",
+                name,
+            )
+            for path, name in zip(observations, names, strict=True)
+        ]
+    for place in places:
+        check_writable(place.output, *observations)
+        if place.report is not None:
+            check_writable(place.report, *observations)
+        if place.picture is not None:
+            from kcal.report.figures import check_picture
+
+            check_picture(place.picture)
+    return places
 
 
 def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:
@@ -225,19 +313,6 @@ def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: boo
     fitted = f"; noise {result.noise:.4f} px along an axis; {result.status.message} ({result.iterations} steps)"
     out.print(f"RMS [bold]{result.rms:.4f} px[/]{fitted}")
     brief = summarize(result)
-    tell(
-        rms_px=result.rms,
-        noise_px=result.noise,
-        views=record.views,
-        corners=record.points,
-        model=model,
-        converged=result.status.name,
-        sigma_px={"center": brief.center, "border": brief.border, "worst": brief.worst},
-        unreached=brief.unreached,
-        parameters=dict(zip(result.camera.names, result.camera.params.tolist(), strict=True)),
-        sigma=result.sigma,
-        advice=result.advice,
-    )
     if brief.worst == brief.worst:
         out.print(
             f"far directions: ± {brief.center:.3f} px in the middle of the image, {brief.border:.3f} px at its border, "
@@ -270,6 +345,26 @@ def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: boo
         warn(text)
     for text in result.advice:
         out.print(f"next: {text}", markup=False)
+
+
+def _figures(result: CameraCalibrationResult) -> dict[str, Any]:
+    """What programs want to know of a calibration."""
+    from kcal.calibrate.camera.summary import summarize
+
+    brief = summarize(result)
+    return dict(
+        rms_px=result.rms,
+        noise_px=result.noise,
+        views=int(result.per_view_rms.isfinite().sum()),
+        corners=int(result.residuals[..., 0].isfinite().sum()),
+        model="hybrid" if result.hybrid is not None else str(result.camera.model),
+        converged=result.status.name,
+        sigma_px={"center": brief.center, "border": brief.border, "worst": brief.worst},
+        unreached=brief.unreached,
+        parameters=dict(zip(result.camera.names, result.camera.params.tolist(), strict=True)),
+        sigma=result.sigma,
+        advice=result.advice,
+    )
 
 
 def _option_number(text: str, option: str) -> float:

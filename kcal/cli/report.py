@@ -66,10 +66,14 @@ def report_command(
     given = observations or []
     if output is not None:
         check_writable(output, subject, *given)
-    if _is_rig(subject):
-        finish(*_of_rig(subject, given, needs, mark_sigma), output)
-    else:
-        finish(*_of_camera(subject, given, needs, baseline, mark_sigma), output)
+    found = (
+        _of_rig(subject, given, needs, mark_sigma)
+        if _is_rig(subject)
+        else _of_camera(subject, given, needs, baseline, mark_sigma)
+    )
+    tell(verdict=found[0].to_dict())
+    if not told_usable(*found, output):
+        raise typer.Exit(NO)
 
 
 def _is_rig(path: Path) -> bool:
@@ -78,23 +82,21 @@ def _is_rig(path: Path) -> bool:
     return recognized(path) == "kcal" and json.loads(path.read_text(encoding="utf-8"))["kcal"] == "rig"
 
 
-def finish(
+def told_usable(
     verdict: Verdict, pictures: Callable[[], dict[str, bytes]], tables: list[list[list[str]]], page: Path | None
-) -> None:
-    """Print a verdict, write its page, and exit with 3 for a no."""
+) -> bool:
+    """Print a verdict and write its page; returns whether it is a yes."""
     from kcal.report.verdict_page import range_rows, save_verdict_page
 
     print_verdict(verdict)
     if page is not None:
         ranges = [range_rows(verdict)] if verdict.answers else []
         print_wrote(save_verdict_page(page, verdict, pictures(), [*ranges, *tables]))
-    if not verdict.usable:
-        raise typer.Exit(NO)
+    return verdict.usable
 
 
 def print_verdict(verdict: Verdict) -> None:
     """Print answers, reason, next step and findings."""
-    tell(verdict=verdict.to_dict())
     for answer in verdict.answers:
         out.print(f"{'[green]yes[/]' if answer.ok else '[red]no[/]'}: {answer.text}")
     out.print(f"[bold]{'YES' if verdict.usable else 'NO'}[/]:", end=" ")

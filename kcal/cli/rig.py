@@ -10,7 +10,7 @@ import typer
 
 from kcal.cli.console import with_json
 from kcal.cli.groups import group_with_default
-from kcal.cli.report import REQUIRE_HELP, finish
+from kcal.cli.report import NO, REQUIRE_HELP, told_usable
 from kcal.cli.rig_check import check
 from kcal.errors import InputError
 
@@ -172,12 +172,10 @@ def solve_command(
     print_wrote(output, picture)
     if needs or report is not None:
         verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, result=result, subject=output.name.split(".")[0])
-        finish(
-            verdict,
-            lambda: {"rig": png_bytes(rig_figure(result))},
-            [*camera_tables(rig.left), *camera_tables(rig.right)],
-            report,
-        )
+        tables = [*camera_tables(rig.left), *camera_tables(rig.right)]
+        tell(verdict=verdict.to_dict())
+        if not told_usable(verdict, lambda: {"rig": png_bytes(rig_figure(result))}, tables, report):
+            raise typer.Exit(NO)
 
 
 def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
