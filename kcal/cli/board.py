@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from kcal.cli.console import out, print_wrote, steps, warn
+from kcal.cli.console import out, print_wrote, steps, warn, with_json
 from kcal.cli.groups import group_with_default
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
@@ -19,6 +19,7 @@ app = typer.Typer(
 
 
 @app.command("print")
+@with_json
 def print_command(
     size: Annotated[
         str,
@@ -75,6 +76,7 @@ def print_command(
 
 
 @app.command("measure")
+@with_json
 def measure_command(
     observations: Annotated[
         list[Path], typer.Argument(metavar="OBS...", help="Observations files of one or several cameras.")

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 from rich.markup import escape
 
-from kcal.cli.console import out, print_table, print_wrote, steps, warn
+from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.report import NO, REQUIRE_HELP, judged, told_usable
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_writable, make_folder
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
 
-_PARAMETRIC = "Options of parametric models"
+_PARAMETRIC, _USE = "Options of parametric models", "May it be used?"
 
 
 def calibrate_command(
@@ -58,6 +59,9 @@ def calibrate_command(
     reject_limit: Annotated[
         float, typer.Option(metavar="SHARE", help="Largest share of all corners that --reject may leave out.")
     ] = 0.1,
+    temperature: Annotated[
+        float | None, typer.Option(metavar="°C", help="Of the camera when the views were taken; kept in its file.")
+    ] = None,
     name: Annotated[str, typer.Option(help="Name of the camera; the name of the observations file if not given.")] = "",
     model: Annotated[
         str,
@@ -67,6 +71,24 @@ def calibrate_command(
             "opencv8, opencv12, opencv14, ext16 ... ext24, fisheye4.",
         ),
     ] = "hybrid",
+    require: Annotated[
+        str,
+        typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.", rich_help_panel=_USE),
+    ] = "",
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            help="HTML page to write: may it be used, and why not; of several cameras, NAME.html in this folder.",
+            rich_help_panel=_USE,
+        ),
+    ] = None,
+    baseline: Annotated[
+        float,
+        typer.Option(metavar="M", help="Distance to a second camera like this one.", min=1e-3, rich_help_panel=_USE),
+    ] = 10.0,
+    mark_sigma: Annotated[
+        float, typer.Option(metavar="PX", help="Noise of marks along each axis.", min=0, rich_help_panel=_USE)
+    ] = 0.3,
     focal: Annotated[
         float | None,
         typer.Option(metavar="PX", help="Rough focal length to start from, in pixels; estimated if not given."),
@@ -152,11 +174,15 @@ def calibrate_command(
 
     `kcal calibrate left.obs.json -o left.camera.json --picture left.png --verbose`
 
+    `kcal calibrate left.obs.json -o left.camera.json --require 5km:10% --report left.html`: exit code 3 for a no.
+
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14`: for exchange with OpenCV.
     """
     from kcal.lens.model import LensModel
+    from kcal.report.verdict import Requirement
 
-    places = _camera_files(observations, output, picture, name)
+    needs = Requirement.parse(require) if require else ()
+    places = _camera_files(observations, output, picture, report, name)
     if model != "hybrid":
         LensModel.named(model)
     known = None
@@ -196,13 +222,15 @@ def calibrate_command(
             else [calibrate_camera(sets[0], options, advance)]
         )
     failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
+    usable = True
+    figures: dict[str, dict[str, Any]] = {}
     for place, result in zip(places, outcomes, strict=True):
         if len(places) > 1:
             out.print(f"[bold]{escape(place.name)}[/]")
         if isinstance(result, KcalError):
             warn(f"{place.name}: {result}")
             continue
-        result.save(place.output, name=place.name, source=place.observations.name)
+        result.save(place.output, name=place.name, source=place.observations.name, temperature=temperature)
         if place.picture is not None:
             from kcal.report.calibration import save_calibration_picture
 
@@ -212,8 +240,16 @@ def calibrate_command(
             others = ", ".join(places[i].name for i in result.shared_board.others)
             out.print(f"the board is that of {others} (evidence {result.shared_board.evidence:.0f} nats)", markup=False)
         print_wrote(place.output, place.picture)
+        figures[place.name] = _figures(result)
+        if needs or place.report is not None:
+            found = judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=place.name)
+            figures[place.name]["verdict"] = found[0].to_dict()
+            usable = told_usable(*found, place.report) and usable
+    tell(cameras=figures)
     if failed:
         raise DegenerateError(f"{len(failed)} of {len(places)} cameras failed: {', '.join(failed)}")
+    if not usable:
+        raise typer.Exit(NO)
 
 
 class _CameraFiles(NamedTuple):
@@ -222,13 +258,16 @@ class _CameraFiles(NamedTuple):
     observations: Path
     output: Path
     picture: Path | None
+    report: Path | None
     name: str
 
 
-def _camera_files(observations: list[Path], output: Path, picture: Path | None, name: str) -> list[_CameraFiles]:
+def _camera_files(
+    observations: list[Path], output: Path, picture: Path | None, report: Path | None, name: str
+) -> list[_CameraFiles]:
     """Files of each camera, all of which can be written."""
     if len(observations) == 1:
-        places = [_CameraFiles(observations[0], output, picture, name or observations[0].name.split(".")[0])]
+        places = [_CameraFiles(observations[0], output, picture, report, name or observations[0].name.split(".")[0])]
     else:
         if name:
             raise InputError("--name names one camera; several are named after their observations files")
@@ -236,15 +275,23 @@ def _camera_files(observations: list[Path], output: Path, picture: Path | None, 
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f"two observations files are named {twice}: their cameras would overwrite each other")
-        for folder in (output, picture):
+        for folder in (output, picture, report):
             if folder is not None:
                 make_folder(folder)
         places = [
-            _CameraFiles(path, output / f"{name}.camera.json", picture and picture / f"{name}.png", name)
+            _CameraFiles(
+                path,
+                output / f"{name}.camera.json",
+                picture and picture / f"{name}.png",
+                report and report / f"{name}.html",
+                name,
+            )
             for path, name in zip(observations, names, strict=True)
         ]
     for place in places:
         check_writable(place.output, *observations)
+        if place.report is not None:
+            check_writable(place.report, *observations)
         if place.picture is not None:
             from kcal.report.figures import check_picture
 
@@ -254,6 +301,7 @@ def _camera_files(observations: list[Path], output: Path, picture: Path | None, 
 
 def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:
     from kcal.calibrate.camera.summary import summarize
+    from kcal.report.view_findings import distances_text
 
     assert result.camera.calibration is not None
     record = result.camera.calibration.record
@@ -261,6 +309,7 @@ def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: boo
     width, height = result.observations.image_size
     model = "hybrid" if result.hybrid is not None else str(result.camera.model)
     out.print(f"{record.views} views, {record.points} corners, {width}x{height} px, model {model}")
+    out.print(distances_text(result))
     fitted = f"; noise {result.noise:.4f} px along an axis; {result.status.message} ({result.iterations} steps)"
     out.print(f"RMS [bold]{result.rms:.4f} px[/]{fitted}")
     brief = summarize(result)
@@ -296,6 +345,26 @@ def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: boo
         warn(text)
     for text in result.advice:
         out.print(f"next: {text}", markup=False)
+
+
+def _figures(result: CameraCalibrationResult) -> dict[str, Any]:
+    """What programs want to know of a calibration."""
+    from kcal.calibrate.camera.summary import summarize
+
+    brief = summarize(result)
+    return dict(
+        rms_px=result.rms,
+        noise_px=result.noise,
+        views=int(result.per_view_rms.isfinite().sum()),
+        corners=int(result.residuals[..., 0].isfinite().sum()),
+        model="hybrid" if result.hybrid is not None else str(result.camera.model),
+        converged=result.status.name,
+        sigma_px={"center": brief.center, "border": brief.border, "worst": brief.worst},
+        unreached=brief.unreached,
+        parameters=dict(zip(result.camera.names, result.camera.params.tolist(), strict=True)),
+        sigma=result.sigma,
+        advice=result.advice,
+    )
 
 
 def _option_number(text: str, option: str) -> float:

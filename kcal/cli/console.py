@@ -1,12 +1,16 @@
-"""Printing for all commands: output, warnings, tables, and progress bars for long work."""
+"""Printing for all commands: output, warnings, tables, JSON for programs, and progress bars for long work."""
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import orjson
+import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -27,8 +31,52 @@ out = _PlainConsole(soft_wrap=True, highlight=False, emoji=False)
 err = _PlainConsole(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 
+# What the running command tells programs, if it was asked to.
+_told: dict[str, Any] = {}
+
+
+def tell(**content: Any) -> None:
+    """Add to what `--json` prints: plain numbers, texts, lists and dictionaries by name."""
+    _told.update(content)
+
+
+def _tell_more(name: str, *items: Any) -> None:
+    _told.setdefault(name, []).extend(items)
+
+
+def with_json(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with an option `--json`: one JSON object on the standard output, in place of what it prints.
+
+    The object has `exit_code`, what the command tells (`tell`), `wrote`, `tables`, `warnings`, and the lines that a
+    person would read as `text`. Errors go to the error stream, and the exit code is the same, with it and without.
+    """
+
+    @functools.wraps(command)
+    def run(*arguments: Any, as_json: bool = False, **options: Any) -> None:
+        _told.clear()
+        if not as_json:
+            return command(*arguments, **options)
+        code = 0
+        with out.capture() as captured:
+            try:
+                command(*arguments, **options)
+            except typer.Exit as stopped:
+                code = stopped.exit_code
+        print(orjson.dumps({"exit_code": code, **_told, "text": captured.get().splitlines()}).decode())
+        raise typer.Exit(code)
+
+    option = Annotated[bool, typer.Option("--json", help="Print one JSON object for programs in place of text.")]
+    own = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
+    signature = inspect.signature(command, eval_str=True)
+    parameters = [*signature.parameters.values(), own]
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
+
+
 def warn(text: str) -> None:
     """Print a warning to the error stream."""
+    _tell_more("warnings", visible(text))
     err.print("[yellow]warning:[/]", escape(text))
 
 
@@ -36,6 +84,7 @@ def print_wrote(*paths: Path | None) -> None:
     """Print which files were written; None stands for a file that was not asked for."""
     for path in paths:
         if path is not None:
+            _tell_more("wrote", str(path))
             out.print(f"wrote {path}", markup=False)
 
 
@@ -47,6 +96,7 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
         left: columns that are aligned to the left; all others are aligned to the right.
     """
     rows = [[one_line(cell) for cell in row] for row in rows]
+    _tell_more("tables", rows)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from kcal.cli.console import err, out, steps
+from kcal.cli.console import err, out, steps, tell
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable
 
@@ -133,7 +133,10 @@ def detect_command(
 
     width, height = observations.image_size
     found, unseen = len(observations.views), sum(view.pixels.count(None) for view in observations.views)
+    tell(views=found, failures={failure.name: failure.reason for failure in observations.failures})
     out.print(f"{escape(str(output))}: board found in {found} {source} of {width}x{height} px")
+    wide, high = (1e3 * board.square * (count - 1) for count in (board.columns, board.rows))
+    out.print(f"board {board}: {wide:g} x {high:g} mm from the first corner to the last")
     if turned:
         out.print(f"note: {len(turned)} images have an EXIF rotation, which kcal ignores")
     if unseen:

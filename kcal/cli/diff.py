@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.camera_sources import single_camera
-from kcal.cli.console import out, print_wrote
+from kcal.cli.console import out, print_wrote, tell
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
@@ -49,14 +49,34 @@ def diff_command(
     for source, camera in zip((first, second), cameras, strict=True):
         out.print(f"{source}: {_history(camera)}", markup=False)
     found = camera_difference(*cameras, at=at, rotation=None if turn else torch.eye(3))
+    tell(
+        at_m=None if math.isinf(at) else at,
+        rms_px=found.rms,
+        largest_px=found.largest,
+        turn_deg=found.turn_deg,
+        ratio=found.ratio,
+        probability=found.probability,
+        same=found.same,
+        temperature_c=[_temperature(camera) for camera in cameras],
+    )
+    then, now = (_temperature(camera) for camera in cameras)
+    if then is not None and now is not None and now != then:
+        out.print(f"{abs(now - then):g} °C {'warmer' if now > then else 'colder'}", markup=False)
     for line in difference_text(found):
         out.print(line, markup=False)
     if picture is not None:
         print_wrote(save_difference_picture(picture, found, title=f"{first} and {second}"))
 
 
+def _temperature(camera: Camera) -> float | None:
+    record = camera.calibration.record if camera.calibration else None
+    return record.temperature if record else None
+
+
 def _history(camera: Camera) -> str:
     """Model and, if the file tells, when the camera was calibrated."""
     record = camera.calibration.record if camera.calibration else None
     when = f", {record.created:%Y-%m-%d %H:%M}, RMS {record.rms:.3f} px from {record.views} views" if record else ""
+    if record and record.temperature is not None:
+        when += f", at {record.temperature:g} °C"
     return f"{camera.model}{when}"

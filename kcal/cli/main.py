@@ -18,13 +18,14 @@ from kcal.cli.board import app as board
 from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.compare import compare_command
-from kcal.cli.console import err
+from kcal.cli.console import err, with_json
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.diff import diff_command
 from kcal.cli.exchange import export_command, import_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
+from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
 from kcal.cli.show import show_command
 from kcal.cli.undistort import undistort_command
@@ -59,7 +60,6 @@ app = typer.Typer(
     cls=_Commands,
     help="Calibrate cameras, solve stereo rigs, and locate on the Earth what they see.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
@@ -80,22 +80,23 @@ def _global_options(
     pass
 
 
-app.command("demo")(demo_command)
+app.command("demo")(with_json(demo_command))
 app.add_typer(board, name="board")
-app.command("detect")(detect_command)
-app.command("calibrate")(calibrate_command)
-app.command("compare")(compare_command)
-app.command("batch")(batch_command)
+app.command("detect")(with_json(detect_command))
+app.command("calibrate")(with_json(calibrate_command))
+app.command("compare")(with_json(compare_command))
+app.command("batch")(with_json(batch_command))
 app.command("mark")(mark_command)
 app.add_typer(rig, name="rig")
 app.command("locate")(locate_command)
-app.command("budget")(budget_command)
-app.command("undistort")(undistort_command)
-app.command("bake")(bake_command)
-app.command("export")(export_command)
-app.command("import")(import_command)
-app.command("show")(show_command)
-app.command("diff")(diff_command)
+app.command("budget")(with_json(budget_command))
+app.command("undistort")(with_json(undistort_command))
+app.command("bake")(with_json(bake_command))
+app.command("export")(with_json(export_command))
+app.command("import")(with_json(import_command))
+app.command("show")(with_json(show_command))
+app.command("diff")(with_json(diff_command))
+app.command("report")(with_json(report_command))
 
 
 def main() -> None:

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from kcal.cli.console import with_json
 from kcal.cli.groups import group_with_default
+from kcal.cli.report import NO, REQUIRE_HELP, told_usable
 from kcal.cli.rig_check import check
 from kcal.errors import InputError
 
@@ -34,7 +36,10 @@ def solve_command(
     ] = None,
     landmarks: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="Surveyed places: name,lat,lon,height,sigma or name,east,north,up,sigma."),
+        typer.Option(
+            metavar="FILE",
+            help="Surveyed places: CSV (name,lat,lon,height,sigma or name,east,north,up,sigma), GeoJSON, GPX.",
+        ),
     ] = None,
     marks: Annotated[
         Path | None,
@@ -59,6 +64,18 @@ def solve_command(
         str | None,
         typer.Option(metavar="LAT,LON,HEIGHT", help="Of the local frame; the first surveyed place if not given."),
     ] = None,
+    survey_sigma: Annotated[
+        float | None,
+        typer.Option(metavar="M", help="How well places of GeoJSON and GPX files are known, where these do not say."),
+    ] = None,
+    geoid: Annotated[
+        float | None,
+        typer.Option(metavar="M", help="Height of the geoid above the WGS84 ellipsoid, added to elevations of GPX."),
+    ] = None,
+    require: Annotated[
+        str, typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.")
+    ] = "",
+    report: Annotated[Path | None, typer.Option(help="HTML page to write: may it be used, and why not.")] = None,
     mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks and matches along each axis.")] = 0.3,
     intrinsics: Annotated[
         Literal["prior", "fixed", "free"],
@@ -95,10 +112,10 @@ def solve_command(
     `kcal rig left.camera.json right.camera.json --pairs left.obs.json right.obs.json -o rig.json`
 
     `kcal rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv --features far.csv
-    --baseline 10.02±0.005 -o rig.json --picture rig.png`
+    --baseline 10.02±0.005 -o rig.json --require 5km:10% --report rig.html`
     """
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
-    from kcal.cli.console import out, print_table, steps, warn
+    from kcal.cli.console import print_table, print_wrote, steps, tell, warn
     from kcal.cli.rig_sources import Sources, read_sources
     from kcal.files import check_writable
     from kcal.io.camera_file import load_camera
@@ -106,14 +123,21 @@ def solve_command(
     from kcal.locate.mounting import placed_rig
     from kcal.locate.range_sigmas import range_sigmas
     from kcal.report.figures import check_picture
-    from kcal.report.rig import save_rig_picture
+    from kcal.report.rig import rig_figure, save_rig_picture
+    from kcal.report.rig_verdict import rig_verdict
     from kcal.report.tables import range_sigma_rows
+    from kcal.report.verdict import Requirement
+    from kcal.report.verdict_page import camera_tables
+    from kcal.report.verdict_pictures import png_bytes
 
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
-        baseline=baseline, origin=origin, mark_sigma=mark_sigma,
+        baseline=baseline, origin=origin, mark_sigma=mark_sigma, survey_sigma=survey_sigma, geoid=geoid,
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
+    needs = Requirement.parse(require) if require else ()
+    if report is not None:
+        check_writable(report, left, right, *sources.files)
     if picture is not None:
         check_picture(picture)
     if not any((pairs, landmarks, marks, features, positions, baseline)):
@@ -129,6 +153,14 @@ def solve_command(
     rig = result.stereo() if frame is None else placed_rig(result, frame)
     # Everything that can fail comes before the file.
     lines = rig_lines(result, rig, unpaired)
+    tell(
+        rms_px=result.rms,
+        baseline_m=float(rig.baseline),
+        baseline_sigma_m=result.sigma_baseline,
+        pairs=list(result.pairs),
+        left_out={item.label: item.reason for item in result.left_out},
+        warnings=list(result.warnings),
+    )
     save_rig(rig, output)
     if picture is not None:
         save_rig_picture(picture, result)
@@ -137,8 +169,13 @@ def solve_command(
         print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=mark_sigma)))
     except InputError as error:
         warn(f"range errors are not split: {error}")
-    for path in (output, *([picture] if picture else [])):
-        out.print(f"wrote {path}", markup=False)
+    print_wrote(output, picture)
+    if needs or report is not None:
+        verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, result=result, subject=output.name.split(".")[0])
+        tables = [*camera_tables(rig.left), *camera_tables(rig.right)]
+        tell(verdict=verdict.to_dict())
+        if not told_usable(verdict, lambda: {"rig": png_bytes(rig_figure(result))}, tables, report):
+            raise typer.Exit(NO)
 
 
 def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
@@ -199,5 +236,5 @@ def print_rig(result: RigResult, lines: list[str]) -> None:
         err.print("[yellow]warning:[/]", text)
 
 
-app.command("solve", hidden=True)(solve_command)
-app.command("check")(check)
+app.command("solve", hidden=True)(with_json(solve_command))
+app.command("check")(with_json(check))

@@ -29,6 +29,8 @@ class Sources:
     baseline: str | None = None
     origin: str | None = None
     mark_sigma: float = 0.3
+    survey_sigma: float | None = None
+    geoid: float | None = None
 
     @property
     def files(self) -> list[Path]:
@@ -71,7 +73,8 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
     from kcal.corners.observations import Observations
     from kcal.lens.mounting import Origin
     from kcal.locate.marks import read_marks
-    from kcal.locate.survey import camera_positions, match_landmarks, read_features, read_survey
+    from kcal.locate.survey import camera_positions, match_landmarks, read_features
+    from kcal.locate.survey_files import import_survey
 
     if (sources.landmarks is None) != (sources.marks is None):
         raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
@@ -81,10 +84,10 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
     boards, landmarks, unpaired = None, None, 0
     positions: tuple[MeasuredPosition, ...] = ()
     if sources.positions is not None:
-        placed = read_survey(sources.positions, origin)
+        placed = import_survey(sources.positions, origin, sigma=sources.survey_sigma, geoid=sources.geoid)
         origin, positions = placed.origin, camera_positions(placed, CAMERAS)
     if sources.landmarks is not None and sources.marks is not None:
-        survey = read_survey(sources.landmarks, origin)
+        survey = import_survey(sources.landmarks, origin, sigma=sources.survey_sigma, geoid=sources.geoid)
         if sources.positions is not None and survey.origin != origin:
             raise InputError("landmarks and positions: one has latitudes, the other local meters; give an --origin")
         origin = survey.origin

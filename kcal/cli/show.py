@@ -78,6 +78,8 @@ def _show_camera(camera: Camera) -> None:
             f"{record.views} views, {record.points} corners, board {board}, {len(record.excluded)} left out",
             markup=False,
         )
+        if record.temperature is not None:
+            out.print(f"at {record.temperature:g} °C")
     sigma = _sigmas(camera)
     values = camera.params.detach().tolist()
     rows = [["parameter", "value", "sigma"]]

@@ -317,15 +317,35 @@ def _sizes_differ(files: list[Path], names: list[str]) -> str:
 
 
 def _hint(files: list[Path], board: Board) -> str:
-    """Advice where squares were counted instead of inner corners, the usual mistake."""
-    if min(board.columns, board.rows) < 4 or board.dictionary is not None:
+    """Which board the first images show, if they show another one."""
+    if board.dictionary is not None:
         return ""
-    fewer = Board(columns=board.columns - 1, rows=board.rows - 1, square=board.square)
     for file in files[:3]:
         try:
-            image = decode_gray(read_bytes(file), file)
+            image = to_8bit(decode_gray(read_bytes(file), file))
         except FileError:
             continue
-        if _find_in_order(to_8bit(image), fewer)[0] is not None:
-            return f"; a board of {fewer.columns}x{fewer.rows} was found: count inner corners, not squares"
+        found = seen_size(_reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
+        if found is None or found == (max(board.columns, board.rows), min(board.columns, board.rows)):
+            continue
+        squares = found == (max(board.columns, board.rows) - 1, min(board.columns, board.rows) - 1)
+        advice = "count inner corners, not squares" if squares else f"give --board {found[0]}x{found[1]}"
+        return f"; a board of {found[0]}x{found[1]} was found: {advice}"
     return ""
+
+
+def seen_size(image: Gray) -> tuple[int, int] | None:
+    """Inner corners, the larger number first, of the largest checkerboard grid in an image; None if there is none.
+
+    Example:
+        >>> y, x = np.mgrid[:240, :320]
+        >>> on = (x >= 40) & (x < 280) & (y >= 40) & (y < 200)
+        >>> seen_size(np.where(on & ((x // 40 + y // 40) % 2 == 0), 40, 220).astype(np.uint8))
+        (5, 3)
+    """
+    # In a new thread the same image always gives the same corners, as in `_find_sector`.
+    with ThreadPoolExecutor(1) as fresh:
+        found, _, meta = fresh.submit(
+            cv2.findChessboardCornersSBWithMeta, image, (3, 3), _SECTOR | cv2.CALIB_CB_LARGER
+        ).result()
+    return (max(meta.shape), min(meta.shape)) if found else None

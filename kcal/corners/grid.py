@@ -16,6 +16,7 @@ MAX_BEND = 0.25  # of a square: distance of a corner from its neighbors' homogra
 MAX_RATIO = 1.7  # of one square's side to the next along a row; perspective reaches it only 3 squares from the board
 MIN_ALTERNATING = 0.9  # share of neighboring squares that must alternate; glare may spoil a few
 GOES_ON = 0.75  # of the contrast across a corner: the board's outer edge has half of it, another row all
+_FOUR_COLORS = 0.5  # of a corner's contrast, in the middle between two: a skipped corner has all of it, an edge none
 MIN_SHARPNESS = 0.58  # see `sharpness`: a blur of 0.22 of the square's side
 MIN_SQUARE = 5.0  # pixels: below, blur decides where the corner seems to be
 
@@ -106,7 +107,7 @@ def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, r
     * Every square must have the same orientation.
     * Every block of up to 3 x 3 corners must fit a homography; a single one for the board would refuse wide lenses.
     * Sides must change slowly along rows and columns; a homography alone would accept a skipped row.
-    * Dark and light squares must alternate, and must not go on outside.
+    * Dark and light squares must alternate, must not go on outside, and no corners may lie between those of the grid.
     """
     grid = as_grid(pixels, columns, rows)
     if not bool(torch.isfinite(grid).all()):
@@ -123,6 +124,8 @@ def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, r
         return "the squares of the grid found do not alternate between dark and light"
     if goes_on(image, pixels, columns, rows):
         return f"the squares go on beyond {columns}x{rows}: the board has more inner corners than that"
+    if skips(image, pixels, columns, rows):
+        return f"lines of corners lie between those of {columns}x{rows}: the board has more inner corners than that"
     return None
 
 
@@ -136,6 +139,34 @@ def goes_on(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: 
     grid = as_grid(pixels, columns, rows)
     sides = (grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0))
     return any(_goes_on_above(image, side) for side in sides if len(side) >= 3)
+
+
+def skips(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> bool:
+    """Whether the grid leaves out every other line of a larger board.
+
+    Asked for 5x4, OpenCV finds every other row of a 9x6 board in some views; squares seen from the side look the same.
+    In the middle of a square's side two colors meet; in the middle between corners that are two squares apart, four do.
+    """
+    grid = as_grid(pixels, columns, rows)
+    return any(_skips_rows(image, side) for side in (grid, grid.transpose(0, 1)))
+
+
+def _skips_rows(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
+    along = torch.gradient(grid, dim=1)[0]
+    down = torch.gradient(grid, dim=0)[0]
+    middle = 0.5 * (grid[1:] + grid[:-1])
+    between = _contrast(image, middle, 0.5 * (along[1:] + along[:-1]), 0.5 * (grid[1:] - grid[:-1]))
+    own = _contrast(image, grid, along, 0.5 * down)
+    return float(between.abs().median() / own.abs().median().clamp_min(1e-9)) > _FOUR_COLORS
+
+
+def _contrast(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
+    """Twice how much lighter two opposite quadrants around places (..., 2) are than the other two."""
+    share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
+    signs = ((1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0))
+    places, along, down = places[..., None, :], along[..., None, :], down[..., None, :]
+    parts = [sign * _levels(image, places + share * (a * along + b * down)).mean(-1) for a, b, sign in signs]
+    return torch.stack(parts).sum(0)
 
 
 def _alternating(levels: Tensor) -> Tensor:

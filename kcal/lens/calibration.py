@@ -71,6 +71,7 @@ class CalibrationRecord:
             it was not measured.
         tempering: by how much the corners count less because residuals repeat within views; None if not estimated.
         observations: name of the observations file, if there was one.
+        temperature: of the camera when the views were taken, °C; None if nobody said.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
         created: when, with its time zone.
     """
@@ -88,12 +89,15 @@ class CalibrationRecord:
     noise: float | None = None
     tempering: float | None = None
     board_deviation: tuple[tuple[float, float, float], ...] | None = None
+    temperature: float | None = None
     kcal_version: str
     created: datetime.datetime
 
     def __post_init__(self) -> None:
         _refuse_negative(self, ("rms", "per_view_rms", "iterations", "noise", "tempering"))
         _refuse_local_time(self.created)
+        if self.temperature is not None and not -273.15 <= self.temperature < 1000:
+            raise InputError(f"temperature is {self.temperature}; degrees Celsius are needed")
         if min(self.views, self.points) < 1:
             raise InputError(f"views is {self.views} and points is {self.points}; both must be positive")
         if self.views != len(self.per_view_rms):

@@ -30,10 +30,10 @@ def calibration_figure(result: CameraCalibrationResult) -> Figure:
     grid = figure.add_gridspec(
         2, 2, height_ratios=[1.35, 1.0], left=0.05, right=0.94, top=0.92, bottom=0.07, hspace=0.22, wspace=0.12
     )
-    _draw_coverage(figure.add_subplot(grid[0, 0]), observations, result)
-    _draw_uncertainty(figure.add_subplot(grid[0, 1]), observations, result)
-    _draw_residuals(figure.add_subplot(grid[1, 0]), result)
-    _draw_view_rms(figure.add_subplot(grid[1, 1]), observations, result)
+    draw_coverage(figure.add_subplot(grid[0, 0]), observations, result)
+    draw_uncertainty(figure.add_subplot(grid[0, 1]), observations, result)
+    draw_residuals(figure.add_subplot(grid[1, 0]), result)
+    draw_view_rms(figure.add_subplot(grid[1, 1]), observations, result)
     model = "" if result.hybrid is not None else f", model {result.camera.model}"
     figure.suptitle(f"{len(observations.views)} views{model}: RMS {result.rms:.3f} px", x=0.05, ha="left", fontsize=14)
     return figure
@@ -44,7 +44,8 @@ def save_calibration_picture(path: str | Path, result: CameraCalibrationResult) 
     return save_png(path, calibration_figure(result))
 
 
-def _draw_coverage(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
+def draw_coverage(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
+    """Draw corners and magnified residuals."""
     width, height = observations.image_size
     pixels = observations.pixels().numpy()
     errors = -result.residuals.numpy()
@@ -65,7 +66,8 @@ def _draw_coverage(axes: Axes, observations: Observations, result: CameraCalibra
     axes.set_title(f"Corners, one color per view; arrows: observed minus modeled, x {scale:g}", fontsize=10, loc="left")
 
 
-def _draw_uncertainty(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
+def draw_uncertainty(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
+    """Draw σ of far directions over the image."""
     width, height = observations.image_size
     frame_image(axes, observations.image_size, margin=0.03)
     axes.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor=INK, linewidth=1.2))
@@ -101,7 +103,8 @@ def _round_levels(low: float, high: float) -> list[float]:
     return steps[first : max(last, first + 1) + 1]
 
 
-def _draw_residuals(axes: Axes, result: CameraCalibrationResult) -> None:
+def draw_residuals(axes: Axes, result: CameraCalibrationResult) -> None:
+    """Draw all residuals beside a circular Gaussian."""
     error = -result.residuals.numpy().reshape(-1, 2)
     error = error[np.isfinite(error).all(-1)]
     sigma = float(np.sqrt(np.mean(error**2)))
@@ -117,7 +120,8 @@ def _draw_residuals(axes: Axes, result: CameraCalibrationResult) -> None:
     axes.set_title(f"Residuals; σ {sigma:.3f} px per axis, {100 * outside:.1f} % outside the 95 % circle", fontsize=10)
 
 
-def _draw_view_rms(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
+def draw_view_rms(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
+    """Draw the RMS of each view as bars."""
     rms = result.per_view_rms.numpy()
     typical = float(np.nanmedian(rms))
     colors = [WARN if value > 2 * typical else ACCENT for value in rms]

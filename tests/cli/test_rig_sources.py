@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import sys
@@ -141,6 +142,30 @@ def test_from_survey_to_positions(
     assert all(abs(float(row[-4])) < 0.1 * float(row[4]) for row in rows)
     assert '"truth": [[' in (site / "map.html").read_text()
     assert len(json.loads((site / "out.geojson").read_text())["features"]) == 12
+
+
+def test_landmarks_from_geojson_and_a_requirement(
+    site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = list(csv.DictReader((site / "survey.csv").open()))
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"name": row["name"]},
+            "geometry": {"type": "Point", "coordinates": [float(row[key]) for key in ("lon", "lat", "height")]},
+        }
+        for row in rows
+    ]
+    (site / "survey.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    words = ["survey.geojson" if word == "survey.csv" else word for word in SOLVE]
+    assert run(monkeypatch, *words, "-o", "rig.json") == 1
+    assert "say how well the places are known" in capsys.readouterr().err
+    more = ["--survey-sigma", "0.02", "-o", "rig.json", "--report", "rig.html"]
+    assert run(monkeypatch, *words, *more, "--require", "1km:50%") == 0
+    assert ">YES<" in (site / "rig.html").read_text()
+    assert run(monkeypatch, *words, *more, "--require", "4km:0.1%") == 3
+    assert ">NO<" in (site / "rig.html").read_text()
+    assert "NO: at 4 km" in capsys.readouterr().out
 
 
 def test_check_and_relock(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

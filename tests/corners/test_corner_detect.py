@@ -100,6 +100,22 @@ def test_a_part_of_a_real_board_is_not_the_board(stereo, columns, rows):
     assert sum("go on beyond" in one.reason or "uneven" in one.reason for one in found) >= 2
 
 
+def test_no_view_of_a_board_is_taken_for_a_small_board(stereo):
+    """Asked for 5x4, OpenCV finds every other row of the 9x6 board in left05.jpg."""
+    path = next(path for path in stereo if path.name == "left05.jpg")
+    found = detect_board(read_gray(path), Board(columns=5, rows=4, square=0.025))
+    assert found.pixels is None
+    assert found.reason.startswith("lines of corners lie between those of 5x4")
+
+
+def test_another_size_is_told(tmp_path):
+    H = homography(BOARD, (640, 480), 25, (0.2, 0.1), 0.1)
+    image, _ = render(BOARD, (640, 480), H, supersample=2)
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    with pytest.raises(InputError, match="a board of 9x6 was found: give --board 9x6"):
+        detect_images([tmp_path / "a.png"], Board(columns=8, rows=6, square=0.025))
+
+
 @pytest.mark.parametrize(("dx", "dy", "radius"), [(3, 2, 5), (4, 0, 6), (5, 5, 8), (0, 0, 9)])
 def test_covered_corner_becomes_unseen(dx, dy, radius):
     image, truth = scene(SMALL, (240, 200), 22, supersample=3)

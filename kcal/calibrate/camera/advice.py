@@ -61,10 +61,9 @@ def what_to_photograph(observations: Observations, camera: Camera, rotation: Ten
     """
     rotation = rotation[rotation.isfinite().all(-1).all(-1)]
     advice = []
-    tilt = torch.rad2deg(torch.acos(rotation[:, 2, 2].abs().clamp(max=1.0)))
-    if int((tilt > _STEEP).sum()) < 4:
+    if int((board_tilts(rotation) > _STEEP).sum()) < 4:
         advice.append("tilt the board by 30 to 45 degrees in different directions: tilts determine the focal length")
-    if (span := _roll_span(rotation)) < _ROLL_SPAN:
+    if (span := roll_span(rotation)) < _ROLL_SPAN:
         advice.append(
             f"roll the board by 90 degrees in some views (so far within {span:.0f} degrees): otherwise the principal "
             "point and the print of the board cannot be told apart"
@@ -83,7 +82,17 @@ def _raster(observations: Observations) -> Tensor:
     return reached(observations, max(1, round(width / step)), max(1, round(height / step)))
 
 
-def _roll_span(rotation: Tensor) -> float:
+def board_tilts(rotation: Tensor) -> Tensor:
+    """(V,) degrees between the boards' normals and the optical axis, of cam_from_board rotations (V, 3, 3).
+
+    Example:
+        >>> board_tilts(torch.eye(3)[None]).tolist()
+        [0.0]
+    """
+    return torch.rad2deg(torch.acos(rotation[:, 2, 2].abs().clamp(max=1.0)))
+
+
+def roll_span(rotation: Tensor) -> float:
     """Degrees within which the rolls of all views lie; a half turn of a board counts as a roll."""
     roll = torch.rad2deg(torch.atan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1]))
     ordered = roll.sort().values

@@ -231,20 +231,23 @@ class CameraCalibrationResult:
             *(Exclusion(name=f"{c.view} corner {c.corner}", reason=c.reason) for c in self.rejected_corners),
         )
 
-    def file(self, *, name: str = "", source: str | None = None) -> CameraFile:
+    def file(self, *, name: str = "", source: str | None = None, temperature: float | None = None) -> CameraFile:
         """The camera with its error bars and history, in the form in which it is stored.
 
         Args:
             name: free text that tells cameras apart.
             source: name of the observations file, if there is one.
+            temperature: of the camera when the views were taken, °C, if it is known.
         """
-        record = dataclasses.replace(self._record(), observations=source)
+        record = dataclasses.replace(self._record(), observations=source, temperature=temperature)
         return camera_to_file(self.camera, name=name, calibration=record)
 
-    def save(self, path: str | Path, *, name: str = "", source: str | None = None) -> Path:
+    def save(
+        self, path: str | Path, *, name: str = "", source: str | None = None, temperature: float | None = None
+    ) -> Path:
         """Write the camera file, with error bars and record; arguments as in `file`.
 
         Raises:
             FileError: the file cannot be written.
         """
-        return self.file(name=name, source=source).save(path)
+        return self.file(name=name, source=source, temperature=temperature).save(path)

@@ -1,0 +1,269 @@
+"""Check a calibration against itself: halves of its views, a reference fit, and structure in its residuals.
+
+Error bars say what noise does to a camera if its model is right. What a wrong model does shows in other ways: cameras
+from two halves of the views differ by more than their error bars, the hybrid lens with a printed board finds what the
+chosen model leaves out, and residuals repeat in places where noise would not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.bundle.poses import poses_under
+from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection
+from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.search.model_ladder import Progress
+from kcal.corners.observations import Observations
+from kcal.errors import KcalError
+from kcal.lens.camera import Camera
+from kcal.lens.difference import CameraDifference, camera_difference
+from kcal.solve.lm import LMOptions
+
+# Views that each half must have: fewer often do not determine a camera.
+FEWEST_IN_HALF = 6
+# Cells of the image over which residuals are averaged, and corners that each needs.
+_COLUMNS, _ROWS, _FEWEST_IN_CELL = 8, 6, 10
+# Of the ratio of focal lengths: an error of 1e-3 is more than any calibration's, and than any digital sensor's.
+_SQUARE = 1e-3
+_POSES = LMOptions(max_iterations=60, tolerance=1e-12)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class HalvesDifference:
+    """Cameras from two halves of the views.
+
+    Args:
+        label: how the views were divided.
+        alike: whether both halves are alike by construction (every other view), or differ in time or by name.
+        difference: of the two cameras, against what their error bars say.
+        held_out: RMS in pixels of each half's corners under the camera and board of the other, with board poses solved
+            again.
+        own: RMS of the corners in the fits that used them.
+    """
+
+    label: str
+    alike: bool
+    difference: CameraDifference
+    held_out: float
+    own: float
+
+    @property
+    def excess(self) -> float:
+        """RMS over the image of what the error bars do not explain, pixels; 0 where they explain all of it."""
+        return unexplained(self.difference)
+
+
+class ResidualStructure(NamedTuple):
+    """Mean squares of averages of residuals over what independent noise would leave; 1 without structure.
+
+    Attributes:
+        image: of averages over parts of the image, where a wrong lens model shows.
+        board: of averages over views for each corner of the board, where a wrong board shows.
+        neighbors: correlation of residuals of neighboring corners in a view, 0 without structure.
+        neighbors_sigma: its standard deviation by chance.
+    """
+
+    image: float
+    board: float
+    neighbors: float
+    neighbors_sigma: float
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Examination:
+    """What a calibration says against itself.
+
+    Args:
+        halves: cameras from halves of the views; empty where there are too few views.
+        reference: the hybrid lens with a printed board, fitted to the same views; None where that was calibrated.
+        model: difference of the camera from the reference.
+        structure: of the residuals.
+        failures: what could not be checked, and why.
+    """
+
+    halves: tuple[HalvesDifference, ...]
+    reference: CameraCalibrationResult | None
+    model: CameraDifference | None
+    structure: ResidualStructure
+    failures: tuple[str, ...] = ()
+
+
+def unexplained(found: CameraDifference, level: float = 1e-3) -> float:
+    """RMS over the image of a difference beyond its error bars, pixels; 0 where chance may explain it at that level."""
+    if found.probability is None or found.ratio is None or found.probability >= level or found.ratio <= 1.0:
+        return 0.0
+    return found.rms * math.sqrt(1.0 - found.ratio**-2)
+
+
+def examine(
+    result: CameraCalibrationResult, options: CalibrationOptions, progress: Progress = lambda _: None
+) -> Examination:
+    """Calibrate halves of the views, and the reference where another model or board was chosen.
+
+    Args:
+        result: the calibration.
+        options: with which it was made.
+        progress: called after each fit.
+
+    Example:
+        >>> from kcal.corners.board import Board
+        >>> from kcal.corners.observations import View
+        >>> from kcal.lens.camera import Camera
+        >>> from kcal.lens.pose import rotation_from_vector
+        >>> board, views = Board(columns=7, rows=6, square=0.05), []
+        >>> truth = Camera.build(focal=(800, 800), center=(322, 238), size=(640, 480), model="pinhole")
+        >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)
+        >>> for i, rotation in enumerate(rotation_from_vector(tilts)):
+        ...     points = board.points @ rotation.T + torch.tensor([-0.15, -0.12, 0.6], dtype=torch.float64)
+        ...     views.append(View(name=str(i), pixels=truth.project(points)[0].tolist()))
+        >>> options = CalibrationOptions()
+        >>> result = calibrate_camera(Observations(board=board, image_size=(640, 480), views=views), options)
+        >>> examine(result, options).failures
+        ('4 views are too few to compare halves: 12 are needed',)
+    """
+    seen = result.observations
+    used = [name for name, rms in zip(seen.names, result.per_view_rms.tolist(), strict=True) if not math.isnan(rms)]
+    seen = seen.subset(used)
+    halves, failures = [], []
+    if len(used) < 2 * FEWEST_IN_HALF:
+        failures.append(f"{len(used)} views are too few to compare halves: {2 * FEWEST_IN_HALF} are needed")
+    else:
+        for label, alike, parts in _splits(used):
+            try:
+                halves.append(_compare(seen, parts, options, label, alike))
+            except KcalError as error:
+                failures.append(f"{label}: {error}")
+            progress(label)
+    reference, model = None, None
+    if not (options.hybrid and options.board == "printed"):
+        try:
+            reference = calibrate_camera(seen, _reference_options(result, options))
+            model = camera_difference(result.camera, reference.camera)
+        except KcalError as error:
+            failures.append(f"reference with a hybrid lens: {error}")
+        progress("reference")
+    return Examination(
+        halves=tuple(halves),
+        reference=reference,
+        model=model,
+        structure=residual_structure(result.residuals, seen_pixels(result), seen.image_size, result.observations),
+        failures=tuple(failures),
+    )
+
+
+def _reference_options(result: CameraCalibrationResult, options: CalibrationOptions) -> CalibrationOptions:
+    fx, fy = result.camera.focal.tolist()
+    # Pixels of a parametric camera may be anything; a hybrid one must be told that they are not square.
+    return CalibrationOptions(
+        weighted=options.weighted,
+        reject=options.reject,
+        focal=fx,
+        analog=options.analog or abs(fy / fx - 1.0) > _SQUARE,
+    )
+
+
+def options_of(camera: Camera) -> CalibrationOptions:
+    """The options that give a camera again from its views, as far as its file tells.
+
+    Example:
+        >>> options_of(Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="opencv4")).model
+        LensModel.named('opencv4')
+    """
+    record = camera.calibration.record if camera.calibration else None
+    reject = OutlierRejection() if record and record.excluded else None
+    if camera.model.hybrid is None:
+        warp = record is not None and record.board_warp is not None
+        return CalibrationOptions(model=camera.model, board_warp=warp, reject=reject)
+    moved = record.board_deviation if record else None
+    exact = moved is not None and not any(any(corner) for corner in moved)
+    return CalibrationOptions(board="exact" if exact else "printed", reject=reject)
+
+
+def seen_pixels(result: CameraCalibrationResult) -> Tensor:
+    """(V, N, 2) corners that counted; NaN for the others."""
+    return torch.where(result.residuals.isfinite(), result.observations.pixels(), torch.nan)
+
+
+def _splits(names: list[str]) -> list[tuple[str, bool, tuple[list[str], list[str]]]]:
+    """Every other view; and by the beginning of names where there are two kinds of them, else by order."""
+    found = [("every other view", True, (names[::2], names[1::2]))]
+    kinds: dict[str, list[str]] = {}
+    for name in names:
+        kinds.setdefault(re.split(r"\d", name.rpartition("/")[2], maxsplit=1)[0], []).append(name)
+    if len(kinds) == 2 and min(map(len, kinds.values())) >= FEWEST_IN_HALF:
+        (one, first), (other, second) = kinds.items()
+        found.append((f"images {one}… and {other}…", False, (first, second)))
+    else:
+        middle = len(names) // 2
+        found.append(("first and second half", False, (names[:middle], names[middle:])))
+    return found
+
+
+def _compare(
+    seen: Observations, parts: tuple[list[str], list[str]], options: CalibrationOptions, label: str, alike: bool
+) -> HalvesDifference:
+    results = [calibrate_camera(seen.subset(part), options) for part in parts]
+    own = held_out = corners = 0.0
+    for fitted, other in (results, results[::-1]):
+        test = Views(board_points=fitted.board_points, pixels=seen_pixels(other))
+        _, cost = poses_under(fitted.camera, test, _POSES)
+        held_out += 2.0 * float(torch.nan_to_num(cost, nan=math.inf).sum())
+        own += float(other.residuals.square().nansum())
+        corners += int(other.residuals[..., 0].isfinite().sum())
+    return HalvesDifference(
+        label=label,
+        alike=alike,
+        difference=camera_difference(results[0].camera, results[1].camera),
+        held_out=math.sqrt(held_out / corners),
+        own=math.sqrt(own / corners),
+    )
+
+
+def residual_structure(
+    residuals: Tensor, pixels: Tensor, size: tuple[int, int], observations: Observations
+) -> ResidualStructure:
+    """Whether residuals repeat where noise would not.
+
+    Args:
+        residuals: (V, N, 2) pixels, NaN where not seen.
+        pixels: (V, N, 2) where they are.
+        size: of the image.
+        observations: whose board tells which corners are neighbors.
+    """
+    seen = residuals.isfinite().all(-1) & pixels.isfinite().all(-1)
+    variance = float(residuals[seen].square().mean().clamp_min(1e-18))
+    spread = residuals.nan_to_num(0.0)
+    column = (pixels[..., 0] / size[0] * _COLUMNS).nan_to_num(0.0).long().clamp(0, _COLUMNS - 1)
+    row = (pixels[..., 1] / size[1] * _ROWS).nan_to_num(0.0).long().clamp(0, _ROWS - 1)
+    cell = (row * _COLUMNS + column)[seen]
+    counts = torch.zeros(_COLUMNS * _ROWS, dtype=torch.float64).index_add(0, cell, torch.ones_like(cell).double())
+    sums = torch.zeros(len(counts), 2, dtype=torch.float64).index_add(0, cell, residuals[seen])
+    many = counts >= _FEWEST_IN_CELL
+    image = float((sums[many].square() / counts[many, None]).mean() / variance) if bool(many.any()) else 1.0
+    often = seen.sum(0)
+    board = spread.sum(0)[often > 0].square() / often[often > 0, None]
+    grid, shown = (
+        values.unflatten(1, (observations.board.rows, observations.board.columns)) for values in (spread, seen)
+    )
+    products = [
+        ((a * b).sum(-1))[both]
+        for a, b, both in (
+            (grid[:, 1:], grid[:, :-1], shown[:, 1:] & shown[:, :-1]),
+            (grid[:, :, 1:], grid[:, :, :-1], shown[:, :, 1:] & shown[:, :, :-1]),
+        )
+    ]
+    both = torch.cat(products) / (2.0 * variance)
+    return ResidualStructure(
+        image=image,
+        board=float(board.mean()) / variance,
+        neighbors=float(both.mean()) if len(both) else 0.0,
+        neighbors_sigma=math.sqrt(0.5 / max(len(both), 1)),
+    )

@@ -1,0 +1,188 @@
+"""`kcal report`: may this camera or rig be used, and one page that says why."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeAlias
+
+import typer
+
+from kcal.cli.camera_sources import single_camera
+from kcal.cli.console import out, print_wrote, steps, tell, warn
+from kcal.errors import InputError
+from kcal.files import check_writable
+
+if TYPE_CHECKING:
+    from kcal.calibrate.camera.options import CalibrationOptions
+    from kcal.calibrate.camera.result import CameraCalibrationResult
+    from kcal.lens.camera import Camera
+    from kcal.report.verdict import Requirement, Verdict
+
+# A verdict, how the pictures of its page are drawn, and its tables.
+Judged: TypeAlias = "tuple[Verdict, Callable[[], dict[str, bytes]], list[list[list[str]]]]"
+# The exit code of a no, apart from errors (1) and wrong usage (2).
+NO = 3
+REQUIRE_HELP = "What you need: ranges and the largest σ of each, for example 5km:10% or 800m:20m,5km:10%."
+
+
+def report_command(
+    subject: Annotated[Path, typer.Argument(metavar="CAMERA-OR-RIG", help="Camera or rig file.")],
+    observations: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--observations",
+            metavar="OBS",
+            help="Views that it was calibrated from; for a rig once for left, once for right. Faults of lens model and "
+            "board can only be found with them.",
+        ),
+    ] = None,
+    require: Annotated[str, typer.Option(metavar="RANGE:ERROR", help=REQUIRE_HELP)] = "",
+    baseline: Annotated[
+        float, typer.Option(metavar="M", help="For a camera: distance to a second one like it.", min=1e-3)
+    ] = 10.0,
+    mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks along each axis.", min=0)] = 0.3,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="HTML page to write.")] = None,
+) -> None:
+    """May I use this camera or rig? Yes or no for each range, one reason, and the next picture to take.
+
+    Error bars are right if lens model and board are. With the observations kcal looks for what they do not know:
+    cameras from two halves of the views that differ by more than their σ; residuals that are not noise; a bent board;
+    an entrance pupil that moves; blur; views without tilt; mirrored boards; pairs that were not taken at the same
+    moment.
+
+    The exit code is 3 if the answer is no, 0 if it is yes, 1 if an input cannot be used.
+
+    **Examples**
+
+    `kcal report left.camera.json --observations left.obs.json --require 5km:10% -o report.html`
+
+    `kcal report rig.json --require 800m:2%,5km:10% --mark-sigma 0.1 -o report.html`
+    """
+    from kcal.report.verdict import Requirement
+
+    needs = Requirement.parse(require) if require else ()
+    given = observations or []
+    if output is not None:
+        check_writable(output, subject, *given)
+    found = (
+        _of_rig(subject, given, needs, mark_sigma)
+        if _is_rig(subject)
+        else _of_camera(subject, given, needs, baseline, mark_sigma)
+    )
+    tell(verdict=found[0].to_dict())
+    if not told_usable(*found, output):
+        raise typer.Exit(NO)
+
+
+def _is_rig(path: Path) -> bool:
+    from kcal.io.formats import recognized
+
+    return recognized(path) == "kcal" and json.loads(path.read_text(encoding="utf-8"))["kcal"] == "rig"
+
+
+def told_usable(
+    verdict: Verdict, pictures: Callable[[], dict[str, bytes]], tables: list[list[list[str]]], page: Path | None
+) -> bool:
+    """Print a verdict and write its page; returns whether it is a yes."""
+    from kcal.report.verdict_page import range_rows, save_verdict_page
+
+    print_verdict(verdict)
+    if page is not None:
+        ranges = [range_rows(verdict)] if verdict.answers else []
+        print_wrote(save_verdict_page(page, verdict, pictures(), [*ranges, *tables]))
+    return verdict.usable
+
+
+def print_verdict(verdict: Verdict) -> None:
+    """Print answers, reason, next step and findings."""
+    for answer in verdict.answers:
+        out.print(f"{'[green]yes[/]' if answer.ok else '[red]no[/]'}: {answer.text}")
+    out.print(f"[bold]{'YES' if verdict.usable else 'NO'}[/]:", end=" ")
+    out.print(verdict.reason, markup=False)
+    if not verdict.usable:
+        out.print(f"next: {verdict.next_step}", markup=False)
+    for finding in verdict.findings:
+        if finding.severity == "fine" or finding.name in ("calibration", "rig"):
+            continue
+        out.print(f"  {finding.name}: {finding.text}{f'; {finding.action}' if finding.action else ''}", markup=False)
+
+
+def _of_camera(
+    path: Path, observations: list[Path], needs: tuple[Requirement, ...], baseline: float, mark_sigma: float
+) -> Judged:
+    from kcal.report.camera_verdict import stored_verdict
+    from kcal.report.verdict_page import camera_tables
+
+    camera = single_camera(str(path))
+    name = (camera.calibration.name if camera.calibration else "") or path.name.split(".")[0]
+    if not observations:
+        found = stored_verdict(camera, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name)
+        return found, dict, camera_tables(camera)
+    if len(observations) > 1:
+        raise InputError("a camera has one observations file; give --observations once")
+    result, options = _again(camera, observations[0])
+    return judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=name)
+
+
+def judged(
+    result: CameraCalibrationResult,
+    options: CalibrationOptions,
+    needs: tuple[Requirement, ...],
+    *,
+    baseline: float,
+    mark_sigma: float,
+    name: str,
+) -> Judged:
+    """The verdict on a calibration, with the pictures and tables of its page."""
+    from kcal.calibrate.camera.trust import examine
+    from kcal.report.camera_verdict import camera_verdict
+    from kcal.report.verdict_page import camera_tables
+    from kcal.report.verdict_pictures import camera_pictures
+
+    with steps("checking", None) as advance:
+        examination = examine(result, options, advance)
+    verdict = camera_verdict(
+        result, options, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name, examination=examination
+    )
+    return verdict, lambda: camera_pictures(result, examination), camera_tables(result.camera, result)
+
+
+def _again(camera: Camera, observations: Path) -> tuple[CameraCalibrationResult, CalibrationOptions]:
+    """The calibration that the camera file is from, made again: files have no residuals and no poses."""
+    from kcal.calibrate.camera.calibrate import calibrate_camera
+    from kcal.calibrate.camera.trust import options_of
+    from kcal.corners.observations import Observations
+    from kcal.lens.difference import camera_difference
+
+    options = options_of(camera)
+    with steps("calibrating", None) as advance:
+        result = calibrate_camera(Observations.load(observations), options, advance)
+    found = camera_difference(camera, result.camera)
+    if found.ratio is None or found.ratio > 0.5:
+        warn(
+            f"{observations}: these views give a camera that differs by {found.rms:.2g} px (RMS) from the one in the "
+            "file, which was calibrated from others or with other options; the verdict is on what these views give"
+        )
+    return result, options
+
+
+def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], mark_sigma: float) -> Judged:
+    from kcal.io.rig_file import load_rig
+    from kcal.report.rig_verdict import rig_verdict
+    from kcal.report.verdict_page import camera_tables
+
+    rig = load_rig(path)
+    if observations and len(observations) != 2:
+        raise InputError("a rig needs --observations twice: left, then right")
+    pairs = None
+    if observations:
+        from kcal.calibrate.rig.pairs import pair_by_name, paired_boards
+        from kcal.corners.observations import Observations
+
+        left, right = (Observations.load(file) for file in observations)
+        boards = paired_boards((rig.left, rig.right), (left, right), pair_by_name(left.names, right.names))
+        pairs = boards.points, boards.pixels
+    verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, pairs=pairs, subject=path.name.split(".")[0])
+    return verdict, dict, [*camera_tables(rig.left), *camera_tables(rig.right)]

@@ -1,0 +1,206 @@
+"""The verdict on a camera or a rig: may it be used to this range, why not, and what to photograph next."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from kcal.errors import InputError
+from kcal.report.figures import range_text
+
+Severity = Literal["stop", "doubt", "fine"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Requirement:
+    """How well a range must be known: its standard deviation at a distance.
+
+    Args:
+        distance: of the target, meters.
+        meters: largest standard deviation of its range, meters.
+
+    Example:
+        >>> Requirement.parse("5km:10%, 800m:20m")
+        (Requirement(distance=5000.0, meters=500.0), Requirement(distance=800.0, meters=20.0))
+    """
+
+    distance: float
+    meters: float
+
+    @classmethod
+    def parse(cls, text: str) -> tuple[Requirement, ...]:
+        """Read `RANGE:SHARE%` or `RANGE:METERS`, several with commas.
+
+        Raises:
+            InputError: something else, or a number that is not positive.
+        """
+        found = []
+        for part in text.split(","):
+            match = re.fullmatch(r"\s*([0-9.]+)\s*(km|m)\s*:\s*([0-9.]+)\s*(%|km|m)\s*", part)
+            try:
+                distance, allowed = (float(match.group(i)) for i in (1, 3)) if match else (0.0, 0.0)
+            except ValueError:
+                distance = allowed = 0.0
+            if match is None or not (0 < distance < math.inf and 0 < allowed < math.inf):
+                raise InputError(
+                    f"requirement {part.strip()!r}: write RANGE:ERROR, for example 5km:10% or 800m:20m, several with "
+                    "commas"
+                )
+            distance *= 1000.0 if match.group(2) == "km" else 1.0
+            scale = {"%": 0.01 * distance, "km": 1000.0, "m": 1.0}[match.group(4)]
+            found.append(cls(distance=distance, meters=allowed * scale))
+        return tuple(found)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RangeAnswer:
+    """Yes or no to one requirement.
+
+    Args:
+        requirement: what was asked.
+        parts: source -> standard deviation of the range from it, meters.
+        ranged: whether a range can be told at all there: the parallax is three of its sigmas.
+    """
+
+    requirement: Requirement
+    parts: Mapping[str, float]
+    ranged: bool = True
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the range, meters."""
+        return math.hypot(*self.parts.values())
+
+    @property
+    def ok(self) -> bool:
+        """Whether the requirement is met."""
+        return self.ranged and self.sigma <= self.requirement.meters
+
+    @property
+    def most(self) -> str:
+        """The source of most of the error."""
+        return max(self.parts, key=lambda name: self.parts[name])
+
+    @property
+    def text(self) -> str:
+        """One sentence."""
+        far, asked = range_text(self.requirement.distance), self._share(self.requirement.meters)
+        if not self.ranged or not math.isfinite(self.sigma):
+            return f"at {far} no range can be told; {asked} are required"
+        return f"at {far} the range is known to ±{self._share(self.sigma)}; {asked} are required"
+
+    def _share(self, meters: float) -> str:
+        share = 100.0 * meters / self.requirement.distance
+        return f"{share:.0f} %" if share >= 100 else f"{share:.2g} %"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Something that was found about a calibration.
+
+    Args:
+        name: short and fixed, for programs: "model", "pupil", "board", "tilt", "coverage", ...
+        severity: "stop": the answer is no whatever the error bars say; "doubt": read it; "fine": nothing found.
+        text: what was found, and why it matters; one sentence.
+        action: what to do; empty where nothing is needed.
+        picture: name of the picture on the page that shows it.
+    """
+
+    name: str
+    severity: Severity
+    text: str
+    action: str = ""
+    picture: str = ""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """May this camera or rig be used, and why not.
+
+    Args:
+        subject: what is judged.
+        answers: to each requirement.
+        findings: the most severe first.
+        advice: what to photograph or measure next, the most useful first.
+        basis: how ranges were computed; one sentence.
+        unexplained: px RMS over the image by which a camera is wrong beyond its error bars, as far as that was seen.
+
+    Example:
+        >>> need = Requirement(distance=1000.0, meters=50.0)
+        >>> verdict = Verdict(subject="left", answers=(RangeAnswer(requirement=need, parts={"lenses": 20.0}),))
+        >>> verdict.usable, verdict.reason
+        (True, 'at 1 km the range is known to ±2 %; 5 % are required')
+    """
+
+    subject: str
+    answers: tuple[RangeAnswer, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    advice: tuple[str, ...] = ()
+    basis: str = ""
+    unexplained: float = 0.0
+
+    @property
+    def stops(self) -> tuple[Finding, ...]:
+        """The findings for which the answer is no."""
+        return tuple(finding for finding in self.findings if finding.severity == "stop")
+
+    @property
+    def usable(self) -> bool:
+        """Yes to everything that was required, and nothing that forbids the use."""
+        return not self.stops and all(answer.ok for answer in self.answers)
+
+    @property
+    def reason(self) -> str:
+        """The one reason for the answer."""
+        if self.stops:
+            return self.stops[0].text
+        if failed := [answer for answer in self.answers if not answer.ok]:
+            worst = max(failed, key=lambda answer: answer.sigma / answer.requirement.meters)
+            return f"{worst.text}; most of it is from {worst.most}"
+        if self.answers:
+            return max(self.answers, key=lambda answer: answer.sigma / answer.requirement.meters).text
+        return "nothing was found that forbids its use; no range was required"
+
+    @property
+    def next_step(self) -> str:
+        """The next picture to take, or what else to do; empty where nothing is needed."""
+        for finding in self.stops:
+            if finding.action:
+                return finding.action
+        failed = [answer for answer in self.answers if not answer.ok]
+        if any(answer.most == "marks" for answer in failed):
+            return "mark targets more accurately, or use a longer baseline or focal length: no calibration mends this"
+        if self.advice and not self.usable:
+            return self.advice[0]
+        return "none is needed" if self.usable else "take more views of the board, near the borders of the image too"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain numbers and texts, for JSON; a range that cannot be told has no sigma."""
+        return {
+            "subject": self.subject,
+            "usable": self.usable,
+            "reason": self.reason,
+            "next": self.next_step,
+            "ranges": [
+                {
+                    "distance_m": answer.requirement.distance,
+                    "required_m": answer.requirement.meters,
+                    "sigma_m": answer.sigma if answer.ranged and math.isfinite(answer.sigma) else None,
+                    "ok": answer.ok,
+                    "parts_m": {name: v if math.isfinite(v) else None for name, v in answer.parts.items()},
+                }
+                for answer in self.answers
+            ],
+            "findings": [dataclasses.asdict(finding) for finding in self.findings],
+            "advice": list(self.advice),
+            "basis": self.basis,
+            "unexplained_px": self.unexplained,
+        }
+
+
+def sorted_findings(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """The most severe first, otherwise in their order."""
+    return tuple(sorted(findings, key=lambda finding: ("stop", "doubt", "fine").index(finding.severity)))

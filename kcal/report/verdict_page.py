@@ -1,0 +1,167 @@
+"""Write a verdict as one HTML page: the answer on its first screen, findings, numbers and pictures below."""
+
+from __future__ import annotations
+
+import base64
+import datetime
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+import kcal
+from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.files import write_atomic
+from kcal.lens.camera import Camera
+from kcal.report.figures import range_text
+from kcal.report.verdict import RangeAnswer, Verdict
+from kcal.report.verdict_pictures import range_picture
+from kcal.texts import page_policy, visible
+
+_HERE = Path(__file__).parent
+CAPTIONS = {
+    "ranges": "Standard deviations of ranges, and what is required.",
+    "coverage": "Where corners were seen, one color for each view, with magnified residuals. Empty parts of the image, "
+    "its border above all, rest on the lens model alone.",
+    "uncertainty": "Standard deviation of where the camera sees far things; it grows where no board was.",
+    "residuals": "Residuals of all corners beside a circular Gaussian. Noise is round and without structure.",
+    "views": "RMS of each view. A view that stands out is blurred, moved, or has wrong corners.",
+    "poses": "How the board was held. Tilts tell the focal length, rolls the principal point, distances the pupil.",
+    "halves": "Two cameras from halves of the views: what a wrong model, or a camera that changed, leaves.",
+    "model": "The camera beside the hybrid lens fitted to the same views.",
+    "board": "The board as the views show it, beside the one that was ordered.",
+    "rig": "The site from above, and residuals by source and item.",
+}
+_MOST_PARAMETERS = 24
+
+
+def verdict_page(
+    verdict: Verdict, pictures: Mapping[str, bytes] | None = None, tables: Sequence[Sequence[Sequence[str]]] = ()
+) -> str:
+    """Make the page as HTML: self-contained, without scripts, and nothing is fetched.
+
+    Args:
+        verdict: what it says.
+        pictures: PNG data by name, of those in `CAPTIONS`.
+        tables: rows of cells, the heads first.
+
+    Example:
+        >>> page = verdict_page(Verdict(subject="left <camera>"))
+        >>> "left &lt;camera&gt;" in page, "YES" in page, "http:" in page
+        (True, True, False)
+    """
+    drawn = dict(pictures or {})
+    if any(math.isfinite(answer.sigma) for answer in verdict.answers):
+        drawn = {"ranges": range_picture(verdict.answers), **drawn}
+    style = (_HERE / "verdict_page.css").read_text(encoding="utf-8")
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_HERE), autoescape=True, undefined=jinja2.StrictUndefined, finalize=_visible_text
+    )
+    environment.filters |= {"distance": range_text, "found": _found, "percent": _percent, "sentence": _sentence}
+    return environment.get_template("verdict_page.html").render(
+        verdict=verdict,
+        pictures={name: base64.b64encode(data).decode("ascii") for name, data in drawn.items()},
+        captions=CAPTIONS,
+        tables=tables,
+        style=jinja2.filters.Markup(style),
+        policy=jinja2.filters.Markup(page_policy(styles=[style])),
+        made=f"Made by kcal {kcal.__version__}, {datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC.",
+    )
+
+
+def save_verdict_page(
+    path: str | Path,
+    verdict: Verdict,
+    pictures: Mapping[str, bytes] | None = None,
+    tables: Sequence[Sequence[Sequence[str]]] = (),
+) -> Path:
+    """Write the page of `verdict_page`, atomically.
+
+    Raises:
+        FileError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_verdict_page(Path(folder, "left.html"), Verdict(subject="left")).name
+        'left.html'
+    """
+    return write_atomic(path, verdict_page(verdict, pictures, tables))
+
+
+def range_rows(verdict: Verdict) -> list[list[str]]:
+    """What is required, what was found, and from which source."""
+    names = list(verdict.answers[0].parts) if verdict.answers else []
+    rows = [["range", "answer", "required σ", "σ", *names]]
+    for answer in verdict.answers:
+        values = [answer.requirement.meters, answer.sigma, *answer.parts.values()]
+        cells = [_meters_plain(value) if math.isfinite(value) else "none" for value in values]
+        rows.append([range_text(answer.requirement.distance), "yes" if answer.ok else "no", *cells])
+    return rows
+
+
+def camera_tables(camera: Camera, result: CameraCalibrationResult | None = None) -> list[list[list[str]]]:
+    """Tables of a camera: how it was calibrated, its parameters with σ, the strongest correlations."""
+    known = camera.calibration
+    record = known.record if known else None
+    facts = [["camera", ""], ["image", f"{camera.size[0]} x {camera.size[1]} px"], ["lens model", f"{camera.model}"]]
+    if record is not None:
+        facts += [
+            ["calibrated", f"{record.created:%Y-%m-%d %H:%M} UTC, kcal {record.kcal_version}"],
+            ["views, corners", f"{record.views}, {record.points}; {len(record.excluded)} left out"],
+            ["RMS", f"{record.rms:.4f} px"],
+            ["noise of a corner", "" if record.noise is None else f"{record.noise:.4f} px along an axis"],
+            ["board", f"{record.board.columns}x{record.board.rows} corners, {1e3 * record.board.square:g} mm squares"],
+        ]
+    if result is not None:
+        facts.append(["solver", result.status.message])
+    sigma = dict(known.sigma) if known and known.sigma else {}
+    rows = [["parameter", "value", "σ"]]
+    for name, value in list(zip(camera.names, camera.params.detach().tolist(), strict=True))[:_MOST_PARAMETERS]:
+        own = sigma.get(name)
+        rows.append([name, f"{value:.6g}", "" if own is None else f"{own:.2g}"])
+    tables = [facts, rows]
+    if known is not None and known.covariance is not None:
+        tables.append(_correlations(camera))
+    return tables
+
+
+def _correlations(camera: Camera) -> list[list[str]]:
+    assert camera.calibration is not None
+    assert camera.calibration.covariance is not None
+    names = camera.names[:_MOST_PARAMETERS]
+    covariance = camera.calibration.covariance[: len(names), : len(names)]
+    spread = covariance.diagonal().clamp_min(0.0).sqrt()
+    found = []
+    for i in range(len(names)):
+        for j in range(i):
+            if float(spread[i]) > 0 and float(spread[j]) > 0:
+                found.append((float(covariance[i, j] / (spread[i] * spread[j])), names[j], names[i]))
+    # Parameters that are held equal say nothing.
+    found = sorted((one for one in found if abs(one[0]) < 0.99999), key=lambda one: -abs(one[0]))[:5]
+    return [["strongest correlations", ""], *([f"{a}, {b}", f"{value:+.3f}"] for value, a, b in found)]
+
+
+def _visible_text(value: Any) -> Any:
+    return visible(value) if type(value) is str else value
+
+
+def _found(answer: RangeAnswer) -> str:
+    if not answer.ranged or not math.isfinite(answer.sigma):
+        return "no range can be told"
+    return f"±{_percent(100.0 * answer.sigma / answer.requirement.distance)}, {_meters_plain(answer.sigma)}"
+
+
+def _meters_plain(value: float) -> str:
+    return f"{value:.0f} m" if value >= 100 else f"{value:.2g} m"
+
+
+def _percent(value: float) -> str:
+    return f"{value:.0f} %" if value >= 100 else f"{value:.2g} %"
+
+
+def _sentence(text: str) -> str:
+    """With a capital and a full stop."""
+    return text[:1].upper() + text[1:].rstrip(".") + "."

@@ -1,0 +1,137 @@
+"""The pictures of a verdict's page, each small enough for a phone: PNG bytes by name."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from kcal.calibrate.camera.advice import board_tilts
+from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.trust import Examination
+from kcal.lens.difference import CameraDifference
+from kcal.report.board import board_figure
+from kcal.report.calibration import draw_coverage, draw_residuals, draw_uncertainty, draw_view_rms
+from kcal.report.figures import (
+    ACCENT,
+    FAINT,
+    GRAY,
+    INK,
+    WARN,
+    draw_arrows,
+    frame_image,
+    new_figure,
+    range_text,
+)
+from kcal.report.verdict import RangeAnswer
+
+_PART_COLORS = (ACCENT, "#dd7a1f", WARN)
+
+
+def png_bytes(figure: Figure) -> bytes:
+    """A figure as PNG."""
+    data = io.BytesIO()
+    figure.savefig(data, format="png")
+    return data.getvalue()
+
+
+def camera_pictures(result: CameraCalibrationResult, examination: Examination | None = None) -> dict[str, bytes]:
+    """Pictures of a calibration: coverage, uncertainty, residuals, views, poses; halves, model and board if known."""
+    observations = result.observations
+    width, height = observations.image_size
+    tall = 5.2 * height / width + 0.9
+    found = {
+        "coverage": _drawn(lambda axes: draw_coverage(axes, observations, result), tall),
+        "uncertainty": _drawn(lambda axes: draw_uncertainty(axes, observations, result), tall),
+        "residuals": _drawn(lambda axes: draw_residuals(axes, result), 5.6),
+        "views": _drawn(lambda axes: draw_view_rms(axes, observations, result), 4.2),
+        "poses": _drawn(lambda axes: _draw_poses(axes, result), 4.6),
+    }
+    if examination is not None:
+        for half in examination.halves:
+            title = f"Difference of cameras from halves: {half.label}"
+            found.setdefault("halves", png_bytes(_difference_figure(half.difference, title)))
+            if not half.alike and (half.difference.probability or 1.0) < 1e-6:
+                found["halves"] = png_bytes(_difference_figure(half.difference, title))
+        if examination.model is not None:
+            found["model"] = png_bytes(_difference_figure(examination.model, "Difference from the hybrid lens"))
+    board = ((examination and examination.reference) or result).measured_board
+    if board is not None and bool(board.amplitudes.any()):
+        found["board"] = png_bytes(board_figure(board))
+    return found
+
+
+def range_picture(answers: Sequence[RangeAnswer]) -> bytes:
+    """Standard deviation of ranges by their sources, beside what is required."""
+    figure = new_figure(6.4, 1.3 + 0.75 * len(answers), dpi=110)
+    axes = figure.add_subplot()
+    names = list(answers[0].parts)
+    for row, answer in enumerate(answers):
+        far = answer.requirement.distance
+        total = answer.sigma
+        start = 0.0
+        for name, color in zip(names, _PART_COLORS, strict=False):
+            # Shares of the variance, drawn as shares of the bar.
+            length = 100.0 * total / far * (answer.parts[name] / total) ** 2 if 0 < total < math.inf else 0.0
+            axes.barh(row, length, left=start, color=color, height=0.5, label=name if row == 0 else None)
+            start += length
+        allowed = 100.0 * answer.requirement.meters / far
+        axes.plot([allowed, allowed], [row - 0.4, row + 0.4], color=INK, linewidth=2.2)
+    axes.plot([], [], color=INK, linewidth=2.2, label="required")
+    axes.set_yticks(range(len(answers)), [range_text(answer.requirement.distance) for answer in answers])
+    axes.invert_yaxis()
+    axes.set(xlabel="σ of the range, % (colors: shares of its variance)", xlim=(0.0, None))
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(
+        frameon=False, fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, 1.0 + 0.35 / len(answers)), ncols=4
+    )
+    figure.tight_layout()
+    return png_bytes(figure)
+
+
+def _drawn(draw: Callable[[Axes], None], height: float) -> bytes:
+    figure = new_figure(6.4, height, dpi=110)
+    draw(figure.add_subplot())
+    figure.tight_layout()
+    return png_bytes(figure)
+
+
+def _draw_poses(axes: Axes, result: CameraCalibrationResult) -> None:
+    """Tilt of each view against its distance, with a tick that shows its roll."""
+    used = result.cam_from_board_rotation.isfinite().all(-1).all(-1)
+    rotation, translation = result.cam_from_board_rotation[used], result.cam_from_board_translation[used]
+    tilts, distance = board_tilts(rotation).numpy(), translation.norm(dim=-1).numpy()
+    roll = torch.atan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1]).numpy()
+    axes.quiver(
+        distance, tilts, np.cos(roll), -np.sin(roll), color=ACCENT, pivot="mid", scale=26.0, width=0.005, headwidth=4.0
+    )
+    axes.axhspan(0.0, 15.0, color=FAINT, alpha=0.2, linewidth=0)
+    axes.set(xlabel="distance, m", ylabel="tilt, degrees", ylim=(0.0, max(50.0, 1.1 * float(tilts.max()))))
+    axes.margins(x=0.1)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_title("Poses; arrows: roll; gray: too little tilt for the focal length", fontsize=10, loc="left")
+
+
+def _difference_figure(found: CameraDifference, title: str) -> Figure:
+    places, length = found.pixels.numpy(), found.length.numpy()
+    low, high = (found.pixels.reshape(-1, 2)[i] for i in (0, -1))
+    size = round(float(high[0] - low[0]) + 1.0), round(float(high[1] - low[1]) + 1.0)
+    figure = new_figure(6.4, 4.8 * size[1] / size[0] + 1.0, dpi=110)
+    axes = figure.add_subplot()
+    drawn = axes.contourf(places[..., 0], places[..., 1], length, levels=14, cmap="viridis_r", alpha=0.85)
+    figure.colorbar(drawn, ax=axes, shrink=0.8, pad=0.02)
+    some = found.shift.numpy()[::3, ::3]
+    longest = float(np.nanmax(np.linalg.norm(some, axis=-1)))
+    if longest > 0:
+        draw_arrows(axes, places[::3, ::3], np.nan_to_num(some), size[0] / 14.0 / longest, color=INK, width=0.003)
+    frame_image(axes, size)
+    axes.set_title(f"{title}, px", fontsize=10, loc="left")
+    ratio = "" if found.ratio is None else f"; {found.ratio:.1f} times what the error bars predict"
+    axes.set_xlabel(f"RMS {found.rms:.2g} px{ratio}", color=GRAY)
+    figure.tight_layout()
+    return figure

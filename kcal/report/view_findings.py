@@ -1,0 +1,222 @@
+"""Findings about the views of a calibration: order of corners, tilts, rolls, depth, coverage, blur, number."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.camera.advice import board_tilts, roll_span, unreached_share
+from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.trust import seen_pixels
+from kcal.corners.observations import Observations
+from kcal.report.verdict import Finding
+
+# Degrees beyond which a view tells the focal length, and how many views must.
+_TILTED, _FEWEST_TILTED = 15.0, 3
+# Degrees within which rolls leave principal point and print of the board entangled (`kcal.calibrate.camera.advice`).
+_ROLLS = 60.0
+# Farthest over nearest board.
+_DEPTH = 1.3
+# Share of the image, and of its border ring, that no board reached.
+_UNREACHED, _BORDER = 0.25, 0.5
+# Pixels of noise: sharp images give 0.02 to 0.2; blurred corners are shifted by what lies beyond their squares as well.
+_SOFT, _BLURRED = 0.35, 0.7
+# Share of the views whose corners say that they are blurred.
+_MANY = 0.25
+_TEMPERING = 5.0
+_FEW_VIEWS = 12
+
+
+def view_findings(result: CameraCalibrationResult, noise: float | None = None) -> list[Finding]:
+    """What the views themselves say, whatever was fitted to them.
+
+    Args:
+        result: the calibration.
+        noise: of a corner along an axis, px, under a lens that fits; that of the calibration if left out.
+    """
+    used = result.cam_from_board_rotation.isfinite().all(-1).all(-1)
+    rotation, translation = result.cam_from_board_rotation[used], result.cam_from_board_translation[used]
+    found = [_order_finding(seen_pixels(result)[used], result.observations), *_pose_findings(rotation, translation)]
+    found += [
+        _coverage_finding(result.observations),
+        _blur_finding(result, result.noise if noise is None else noise),
+        _repetition_finding(result),
+    ]
+    if len(rotation) < _FEW_VIEWS:
+        found.append(
+            Finding(
+                name="views",
+                severity="doubt",
+                text=f"{len(rotation)} views are few: a wrong one among them could not be noticed",
+                action="take 20 to 40 views",
+                picture="views",
+            )
+        )
+    return [finding for finding in found if finding is not None]
+
+
+def mirrored(pixels: Tensor, observations: Observations) -> Tensor:
+    """(V,) whether the corners run the other way round, as on a board seen in a mirror.
+
+    Args:
+        pixels: (V, N, 2), NaN where not seen.
+        observations: whose board they are of.
+
+    Example:
+        >>> from kcal.corners.board import Board
+        >>> from kcal.corners.observations import View
+        >>> board = Board(columns=2, rows=2, square=0.1)
+        >>> views = (View(name="a", pixels=((9.0, 0.0), (0.0, 0.0), (9.0, 9.0), (0.0, 9.0))),)
+        >>> seen = Observations(board=board, image_size=(10, 10), views=views)
+        >>> mirrored(seen.pixels(), seen).tolist()
+        [True]
+    """
+    points = observations.board.points[:, :2]
+    flipped = []
+    for view in pixels:
+        seen = view.isfinite().all(-1)
+        rows = torch.cat([points[seen], torch.ones(int(seen.sum()), 1, dtype=torch.float64)], 1)
+        affine = torch.linalg.lstsq(rows, view[seen], driver="gelsd").solution[:2]
+        flipped.append(float(torch.linalg.det(affine)) < 0)
+    return torch.tensor(flipped)
+
+
+def _order_finding(pixels: Tensor, observations: Observations) -> Finding | None:
+    wrong = int(mirrored(pixels, observations).sum())
+    if not wrong:
+        return None
+    some = "all views show" if wrong == len(pixels) else f"{wrong} of {len(pixels)} views show"
+    return Finding(
+        name="mirrored",
+        severity="stop",
+        text=f"{some} the board mirrored: the images are flipped (a selfie view, a mirror), or the corners are in "
+        "another order than the board's",
+        action="switch the mirroring off, or correct the order of the corners, and detect again",
+        picture="coverage",
+    )
+
+
+def _pose_findings(rotation: Tensor, translation: Tensor) -> list[Finding]:
+    tilts = board_tilts(rotation)
+    found = []
+    tilted = int((tilts > _TILTED).sum())
+    if tilted < _FEWEST_TILTED:
+        found.append(
+            Finding(
+                name="tilt",
+                severity="stop",
+                text=f"the board faces the camera in {len(tilts) - tilted} of {len(tilts)} views: without tilted views "
+                "focal length and distance cannot be told apart",
+                action="tilt the board by 30 to 45 degrees in different directions",
+                picture="poses",
+            )
+        )
+    if (span := roll_span(rotation)) < _ROLLS:
+        found.append(
+            Finding(
+                name="roll",
+                severity="doubt",
+                text=f"the board was always held the same way up (rolls within {span:.0f}°): its print and the "
+                "principal point cannot be told apart",
+                action="turn the board by 90 degrees in some views",
+                picture="poses",
+            )
+        )
+    distance = translation.norm(dim=-1)
+    if float(distance.max()) < _DEPTH * float(distance.min()):
+        found.append(
+            Finding(
+                name="depth",
+                severity="doubt",
+                text=f"the board was always at the same distance ({float(distance.min()):.2g} to "
+                f"{float(distance.max()):.2g} m)",
+                action="show the board near and far",
+                picture="poses",
+            )
+        )
+    if not found:
+        found.append(
+            Finding(
+                name="poses",
+                severity="fine",
+                text=f"tilts up to {float(tilts.max()):.0f}°, rolls within {span:.0f}°, distances "
+                f"{float(distance.min()):.2g} to {float(distance.max()):.2g} m",
+                picture="poses",
+            )
+        )
+    return found
+
+
+def _coverage_finding(observations: Observations) -> Finding:
+    from kcal.calibrate.camera.advice import reached
+
+    share = unreached_share(observations)
+    seen = reached(observations, 96, 64)
+    ring = torch.ones_like(seen)
+    ring[6:-6, 9:-9] = False
+    border = 1.0 - float(seen[ring].double().mean())
+    text = f"no board reached {100 * share:.0f} % of the image, and {100 * border:.0f} % of its border"
+    if share <= _UNREACHED and border <= _BORDER:
+        return Finding(name="coverage", severity="fine", text=text, picture="coverage")
+    return Finding(
+        name="coverage",
+        severity="doubt",
+        text=f"{text}: there the camera rests on its lens model alone",
+        action="show the board at the borders and in the corners of the image, parts of it outside if need be",
+        picture="coverage",
+    )
+
+
+def _blur_finding(result: CameraCalibrationResult, noise: float) -> Finding | None:
+    share = 0.0
+    stated = result.observations.covariances()
+    if stated is not None:
+        spread = (0.5 * stated.diagonal(dim1=-2, dim2=-1).sum(-1)).sqrt().nanmedian(-1).values
+        share = float((spread > _BLURRED).double().mean())
+    if noise <= _SOFT and share <= _MANY:
+        return None
+    blurred = noise > _BLURRED or share > _MANY
+    what = f"{100 * share:.0f} % of the views are blurred" if share > _MANY else f"corners scatter by {noise:.2g} px"
+    return Finding(
+        name="blur",
+        severity="stop" if blurred else "doubt",
+        text=f"{what}: blurred corners are shifted by what lies next to them, which no error bar knows",
+        action="hold board and camera still, focus, use more light or a shorter exposure, and take the views again",
+        picture="residuals",
+    )
+
+
+def _repetition_finding(result: CameraCalibrationResult) -> Finding | None:
+    if result.hybrid is None or result.hybrid.tempering <= _TEMPERING:
+        return None
+    return Finding(
+        name="unsteady",
+        severity="stop",
+        text=f"residuals repeat within views ({result.hybrid.tempering:.1f} times as much as noise): the board flexes, "
+        "several boards were used, or the images are from a moving camera",
+        action="use one stiff board, held still, and take the views again",
+        picture="views",
+    )
+
+
+def distances_text(result: CameraCalibrationResult) -> str:
+    """The board's size and how far away it was, so that centimeters in place of millimeters are noticed.
+
+    The board in millimeters from outer corner to outer corner, and distances in meters.
+    """
+    board = result.observations.board
+    far = result.cam_from_board_translation
+    middle = (result.cam_from_board_rotation @ board.points.mean(0)) + far
+    distance = middle.norm(dim=-1)
+    distance = distance[distance.isfinite()]
+    width, height = (1e3 * board.square * (count - 1) for count in (board.columns, board.rows))
+    return (
+        f"board {board.columns} x {board.rows} corners, {1e3 * board.square:g} mm squares: {width:g} x {height:g} mm; "
+        f"nearest view {_distance_text(float(distance.min()))}, farthest {_distance_text(float(distance.max()))}"
+    )
+
+
+def _distance_text(value: float) -> str:
+    return f"{value:.{max(0, 1 - math.floor(math.log10(value)))}f} m" if value > 0 else "0 m"

@@ -1,0 +1,163 @@
+"""`kcal report` and `--require`: exit codes, JSON for programs, the page in a browser, completion of shells."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from calibrate_scenes import BOARD, camera, motions
+from locate_rigs import pinhole_rig
+from typer.testing import CliRunner
+
+from kcal.cli.main import app
+from kcal.corners.observations import Observations, View
+from kcal.io.rig_file import save_rig
+from kcal.lens.rig import RigCovariance
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+def kcal(*words: object) -> tuple[int, str]:
+    found = CliRunner().invoke(app, [str(word) for word in words])
+    return found.exit_code, found.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Observations of an opencv5 camera, and that camera calibrated."""
+    here = tmp_path_factory.mktemp("report")
+    truth = camera("opencv5")
+    rotation, translation = motions(truth, 14, 3)
+    pixels, _ = truth.project(BOARD.points @ rotation.transpose(-1, -2) + translation[:, None])
+    pixels = pixels + 0.05 * torch.randn(pixels.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    views = [View(name=f"{i:02}", pixels=[tuple(p) for p in view]) for i, view in enumerate(pixels.tolist())]
+    Observations(board=BOARD, image_size=(640, 480), views=tuple(views)).save(here / "left.obs.json")
+    words = ("calibrate", here / "left.obs.json", "-o", here / "left.camera.json", "--model", "opencv5")
+    code, text = kcal(*words, "--temperature", 21.5)
+    assert code == 0
+    # Centimeters in place of millimeters show here.
+    assert "board 7 x 6 corners, 50 mm squares: 300 x 250 mm; nearest view 0.4" in text
+    return here
+
+
+def test_a_camera_is_judged_by_its_file_and_by_its_views(folder: Path) -> None:
+    code, text = kcal("report", folder / "left.camera.json", "--require", "100m:10%,9km:1%")
+    assert code == 3
+    assert "NO: at 9 km no range can be told; 1 % are required" in text
+    assert "give the observations too" in text
+    code, text = kcal(
+        "report", folder / "left.camera.json", "--observations", folder / "left.obs.json", "--require", "50m:10%",
+        "-o", folder / "left.html", "--json",
+    )  # fmt: skip
+    told = json.loads(text)
+    assert code == told["exit_code"] == 0
+    assert told["verdict"]["usable"] is True
+    assert told["verdict"]["ranges"][0]["sigma_m"] < 5.0
+    assert told["wrote"] == [str(folder / "left.html")]
+    page = (folder / "left.html").read_text()
+    assert ">YES<" in page
+    for name in ("ranges", "coverage", "uncertainty", "residuals", "views", "poses", "halves", "model"):
+        assert f'id="{name}"' in page
+
+
+def test_calibration_ends_with_3_where_what_is_required_is_not_met(folder: Path) -> None:
+    words = ("calibrate", folder / "left.obs.json", "-o", folder / "again.json", "--model", "pinhole")
+    code, text = kcal(*words, "--require", "200m:5%")
+    assert code == 3
+    assert "NO: the lens model pinhole does not fit this lens" in text
+    assert (folder / "again.json").exists()
+    code, _ = kcal(*words, "--require", "200m")
+    assert code == 1
+
+
+def test_a_rig_is_judged_by_its_covariance(tmp_path: Path) -> None:
+    rig = pinhole_rig()
+    yaw = torch.diag(torch.tensor([0, (1e-3 * torch.pi / 180) ** 2, 0, 0, 0, 0], dtype=torch.float64))
+    rig.covariance = RigCovariance.of(rig, pose=yaw)
+    save_rig(rig, tmp_path / "rig.json")
+    code, text = kcal("report", tmp_path / "rig.json", "--require", "1km:5%", "--mark-sigma", 0.1)
+    assert (code, "YES" in text) == (0, True)
+    code, text = kcal("report", tmp_path / "rig.json", "--require", "5km:1%", "--mark-sigma", 0.1)
+    assert (code, "most of it is from marks" in text) == (3, True)
+
+
+def test_the_temperature_is_kept_and_told(folder: Path) -> None:
+    warm = json.loads((folder / "left.camera.json").read_text())
+    warm["calibration"]["temperature"] = 30.0
+    (folder / "warm.json").write_text(json.dumps(warm))
+    code, text = kcal("diff", folder / "left.camera.json", folder / "warm.json", "--json")
+    told = json.loads(text)
+    assert (code, told["temperature_c"], told["same"]) == (0, [21.5, 30.0], True)
+    assert "8.5 °C warmer" in told["text"]
+    assert "at 21.5 °C" in kcal("show", folder / "left.camera.json")[1]
+
+
+def commands(app_or_group: Any, *path: str) -> list[tuple[str, ...]]:
+    """All commands, as words."""
+    found = []
+    for name, command in app_or_group.commands.items():
+        inner = getattr(command, "commands", None)
+        found += commands(command, *path, name) if inner else [(*path, name)]
+    return found
+
+
+def test_every_command_has_json_but_the_one_that_serves_a_page() -> None:
+    from typer.main import get_command
+
+    group: Any = get_command(app)
+    for words in commands(group):
+        command: Any = group
+        for word in words:
+            command = command.commands[word]
+        options = {name for parameter in command.params for name in parameter.opts}
+        assert ("--json" in options) == (words != ("mark",)), words
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_installs(shell: str, tmp_path: Path) -> None:
+    environment = {**os.environ, "HOME": str(tmp_path), "ZDOTDIR": str(tmp_path)}
+    environment["_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"] = "1"
+    script = [sys.executable, "-c", "import sys; sys.argv[0] = 'kcal'; from kcal.cli.main import main; main()"]
+    done = subprocess.run([*script, "--install-completion", shell], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    written = [path for path in tmp_path.rglob("*") if path.is_file() and "kcal" in path.read_text()]
+    assert written
+    # What the installed script asks for when Tab is pressed.
+    asked = {**environment, "_KCAL_COMPLETE": f"complete_{shell}", "COMP_WORDS": "kcal rep", "COMP_CWORD": "1",
+             "_TYPER_COMPLETE_ARGS": "kcal rep", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}  # fmt: skip
+    assert "report" in subprocess.run(script, env=asked, capture_output=True, text=True).stdout
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+@pytest.mark.parametrize(("width", "height"), [(1400, 900), (390, 844)])
+def test_a_browser_shows_the_page_without_errors_and_requests(folder: Path, width: int, height: int) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    page_file = folder / "page.html"
+    kcal("report", folder / "left.camera.json", "--require", "100m:10%,1km:5%,5km:10%", "-o", page_file)
+    complaints: list[str] = []
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on(
+            "request",
+            lambda request: complaints.append(request.url) if not request.url.startswith(("file:", "data:")) else None,
+        )
+        page.goto(page_file.as_uri())
+        # The answer, why, and what to do fit one screen; nothing is wider than it.
+        header = page.locator("header").bounding_box()
+        assert header is not None
+        assert header["height"] <= height
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert page.locator(".answer").inner_text() == "NO"
+        assert page.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
+        browser.close()
+    assert complaints == []

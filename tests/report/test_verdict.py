@@ -1,0 +1,268 @@
+"""The verdict: each planted fault is found and named, a clean capture is not doubted, and the page says so."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable
+
+import pytest
+import torch
+from calibrate_scenes import BOARD, camera, motions
+from torch import Tensor
+
+from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
+from kcal.calibrate.camera.trust import Examination, examine, residual_structure
+from kcal.calibrate.rig.synchrony import synchrony
+from kcal.corners.observations import Observations, View
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import StereoRig
+from kcal.report.camera_verdict import camera_verdict, stored_verdict
+from kcal.report.rig_verdict import rig_verdict
+from kcal.report.verdict import Finding, RangeAnswer, Requirement, Verdict
+from kcal.report.verdict_page import range_rows, verdict_page
+from kcal.report.view_findings import view_findings
+
+VIEWS, NOISE = 14, 0.08
+# Fast: an opencv5 truth, fitted with opencv5 unless a test plants another model.
+OPTIONS = CalibrationOptions(model="opencv5")
+
+
+def seen_by(truth: Camera, points: Tensor, rotation: Tensor, translation: Tensor, seed: int = 0) -> Tensor:
+    """(V, N, 2) corners with noise."""
+    generator = torch.Generator().manual_seed(seed)
+    pixels, _ = truth.project(points @ rotation.transpose(-1, -2) + translation[:, None])
+    return pixels + NOISE * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
+
+
+def observed(pixels: Tensor, names: list[str] | None = None, spread: float | None = None) -> Observations:
+    covariance = None if spread is None else ((spread**2, 0.0, spread**2),) * BOARD.corners
+    views = [
+        View(name=names[i] if names else f"{i:02}", pixels=[tuple(p) for p in view], covariance=covariance)
+        for i, view in enumerate(pixels.tolist())
+    ]
+    return Observations(board=BOARD, image_size=(640, 480), views=tuple(views))
+
+
+@pytest.fixture(scope="module")
+def poses() -> tuple[Tensor, Tensor]:
+    """Boards tilted in all directions and rolled by up to 90 degrees, in no order."""
+    rotation, translation = motions(camera("opencv5"), VIEWS, 3, tilt=40.0)
+    roll = torch.linspace(-1.2, 1.2, VIEWS, dtype=torch.float64)[torch.randperm(VIEWS, generator=torch.Generator())]
+    turn = rotation_from_vector(torch.stack([0 * roll, 0 * roll, roll], -1))
+    middle = BOARD.points.mean(0)
+    turned = rotation @ turn
+    return turned, translation + (rotation @ middle) - (turned @ middle)
+
+
+@pytest.fixture(scope="module")
+def clean(poses: tuple[Tensor, Tensor]) -> CameraCalibrationResult:
+    return calibrate_camera(observed(seen_by(camera("opencv5"), BOARD.points, *poses)), OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def examination(clean: CameraCalibrationResult) -> Examination:
+    return examine(clean, OPTIONS)
+
+
+def names(verdict: Verdict, *severities: str) -> set[str]:
+    return {finding.name for finding in verdict.findings if finding.severity in severities}
+
+
+def test_a_clean_capture_is_allowed_and_has_no_fault(clean: CameraCalibrationResult, examination: Examination) -> None:
+    verdict = camera_verdict(clean, OPTIONS, Requirement.parse("100m:10%"), mark_sigma=0.1, examination=examination)
+    assert verdict.usable
+    assert verdict.unexplained == 0.0
+    assert not names(verdict, "stop")
+    assert names(verdict, "doubt") <= {"coverage", "depth", "roll"}
+    assert {"halves", "poses"} & names(verdict, "fine")
+    for half in examination.halves:
+        # Held-out corners are predicted almost as well as those that were fitted.
+        assert half.own < half.held_out < 1.3 * half.own
+
+
+def test_the_range_asked_for_decides(clean: CameraCalibrationResult, examination: Examination) -> None:
+    needs = Requirement.parse("100m:10%,2km:1%")
+    verdict = camera_verdict(clean, OPTIONS, needs, mark_sigma=0.3, examination=examination)
+    assert [answer.ok for answer in verdict.answers] == [True, False]
+    assert not verdict.usable
+    assert verdict.reason.endswith("most of it is from marks")
+    assert "mark targets more accurately" in verdict.next_step
+    # σ = √2 Z² / (f B) for each pixel.
+    parts = verdict.answers[0].parts
+    assert parts["marks"] == pytest.approx(math.sqrt(2) * 100**2 * 0.3 / (float(clean.camera.focal.mean()) * 10.0))
+    # A baseline twice as long halves it.
+    wide = camera_verdict(clean, OPTIONS, needs, mark_sigma=0.3, baseline=20.0, examination=examination)
+    assert wide.answers[0].sigma == pytest.approx(verdict.answers[0].sigma / 2)
+
+
+def judged(pixels: Tensor | Observations, options: CalibrationOptions = OPTIONS, need: str = "300m:5%") -> Verdict:
+    seen = pixels if isinstance(pixels, Observations) else observed(pixels)
+    result = calibrate_camera(seen, options)
+    return camera_verdict(result, options, Requirement.parse(need), mark_sigma=0.1)
+
+
+def test_a_lens_that_the_model_cannot_hold_is_named(poses: tuple[Tensor, Tensor]) -> None:
+    verdict = judged(seen_by(camera("opencv5"), BOARD.points, *poses), CalibrationOptions(model="pinhole"))
+    assert not verdict.usable
+    assert "model" in names(verdict, "stop")
+    assert "hybrid" in verdict.next_step
+    assert verdict.unexplained > 1.0
+
+
+def test_a_bent_board_that_was_taken_as_flat_is_named(poses: tuple[Tensor, Tensor]) -> None:
+    points = BOARD.points.clone()
+    points[:, 2] = 3e-3 * (1.0 - ((points[:, 0] - 0.15) / 0.15) ** 2)
+    verdict = judged(seen_by(camera("opencv5"), points, *poses))
+    assert "board" in names(verdict, "stop")
+    assert verdict.stops[0].name == "board"
+    assert "bends" in verdict.reason
+
+
+def test_boards_parallel_to_the_image_are_named(clean: CameraCalibrationResult, examination: Examination) -> None:
+    flat = torch.eye(3, dtype=torch.float64).expand(VIEWS, 3, 3)
+    verdict = camera_verdict(dataclasses.replace(clean, cam_from_board_rotation=flat), OPTIONS, examination=examination)
+    assert {"tilt"} == names(verdict, "stop")
+    assert "tilt the board" in verdict.next_step
+
+
+@pytest.mark.parametrize("some", [slice(None), slice(0, 5)], ids=["all", "some"])
+def test_mirrored_views_are_named(clean: CameraCalibrationResult, examination: Examination, some: slice) -> None:
+    pixels = clean.observations.pixels().unflatten(1, (BOARD.rows, BOARD.columns))
+    pixels[some] = pixels[some].flip(2)
+    result = calibrate_camera(observed(pixels.flatten(1, 2)), OPTIONS)
+    verdict = camera_verdict(result, OPTIONS, examination=examination)
+    assert verdict.stops[0].name == "mirrored"
+    assert not verdict.usable
+
+
+def test_blur_is_named_by_noise_and_by_what_corners_say(poses: tuple[Tensor, Tensor]) -> None:
+    pixels = seen_by(camera("opencv5"), BOARD.points, *poses)
+    rough = torch.randn(pixels.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+
+    def blur(seen: Observations) -> list[str]:
+        return [one.severity for one in view_findings(calibrate_camera(seen, OPTIONS)) if one.name == "blur"]
+
+    assert blur(observed(pixels + rough)) == ["stop"]
+    assert blur(observed(pixels + 0.45 * rough)) == ["doubt"]
+    assert blur(observed(pixels, spread=0.9)) == ["stop"]
+    assert blur(observed(pixels, spread=0.1)) == []
+
+
+@pytest.mark.parametrize("prefixed", [True, False], ids=["by name", "by order"])
+def test_images_of_two_cameras_are_noticed(poses: tuple[Tensor, Tensor], prefixed: bool) -> None:
+    one = camera("opencv5")
+    values = one.params.clone()
+    values[:2] *= 1.03
+    other = one.with_parameters(values)
+    pixels, second = (seen_by(lens, BOARD.points, *poses) for lens in (one, other))
+    which = torch.arange(VIEWS) % 2 == 1 if prefixed else torch.arange(VIEWS) >= VIEWS // 2
+    labels = [f"{'right' if which[i] else 'left'}{i:02}.png" for i in range(VIEWS)] if prefixed else None
+    verdict = judged(observed(torch.where(which[:, None, None], second, pixels), labels))
+    assert "changed" in names(verdict, "stop")
+    assert ("left… and right…" if prefixed else "first and second half") in verdict.reason
+
+
+def test_few_views_are_doubted(poses: tuple[Tensor, Tensor]) -> None:
+    few = observed(seen_by(camera("opencv5"), BOARD.points, *(part[:6] for part in poses)))
+    assert {"views", "halves"} <= names(judged(few, need="10m:10%"), "doubt")
+
+
+def test_residuals_that_repeat_have_structure(clean: CameraCalibrationResult) -> None:
+    pixels, size = clean.observations.pixels(), clean.observations.image_size
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
+    plain = residual_structure(noise, pixels, size, clean.observations)
+    assert plain.image < 1.6
+    assert plain.board < 1.6
+    assert abs(plain.neighbors) < 5 * plain.neighbors_sigma
+    assert residual_structure(noise + (pixels - 300) / 100, pixels, size, clean.observations).image > 5
+    assert residual_structure(noise + noise[:1], pixels, size, clean.observations).board > 5
+    shifted = residual_structure(noise + 2 * noise[:, :1], pixels, size, clean.observations)
+    assert shifted.neighbors > 0.5
+
+
+def test_a_file_alone_is_believed_and_said_so(clean: CameraCalibrationResult) -> None:
+    verdict = stored_verdict(clean.camera, Requirement.parse("100m:10%"), mark_sigma=0.1)
+    assert verdict.usable
+    assert names(verdict, "doubt") == {"halves"}
+    bare = stored_verdict(Camera(clean.camera.params, size=clean.camera.size, model=clean.camera.model))
+    assert names(bare, "stop") == {"error-bars"}
+
+
+def pair_pixels(moved: Tensor, poses: tuple[Tensor, Tensor]) -> tuple[StereoRig, Tensor]:
+    lens = camera("opencv5")
+    rig = StereoRig(lens, lens, torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
+    rotation, translation = poses
+    generator = torch.Generator().manual_seed(1)
+    noise = NOISE * torch.randn(2, VIEWS, BOARD.corners, 2, dtype=torch.float64, generator=generator)
+    places = BOARD.points @ rotation.transpose(-1, -2) + translation[:, None]
+    left, right = rig(places)[0], rig(places + moved[:, None])[1]
+    return rig, torch.stack([left, right], 1) + noise.movedim(0, 1)
+
+
+def test_pairs_that_were_not_taken_together_are_named(poses: tuple[Tensor, Tensor]) -> None:
+    still = torch.zeros(VIEWS, 3, dtype=torch.float64)
+    found = synchrony(pair_pixels(still, poses)[0], BOARD.points, pair_pixels(still, poses)[1])
+    assert 0.5 < found.ratio < 1.6
+    moved = 5e-3 * torch.randn(VIEWS, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    rig, pixels = pair_pixels(moved, poses)
+    verdict = rig_verdict(rig, pairs=(BOARD.points, pixels))
+    assert "synchronization" in names(verdict, "stop")
+    calm = rig_verdict(rig, pairs=(BOARD.points, pair_pixels(still, poses)[1]))
+    assert "synchronization" in names(calm, "fine")
+
+
+def test_a_late_camera_is_told_by_how_much(poses: tuple[Tensor, Tensor]) -> None:
+    order = poses[1][:, 0].argsort()
+    ordered = poses[0][order], poses[1][order]
+    centers = ordered[1] + ordered[0] @ BOARD.points.mean(0)
+    rig, pixels = pair_pixels(0.1 * torch.gradient(centers, dim=0)[0], ordered)
+    found = synchrony(rig, BOARD.points, pixels)
+    assert found.delay is not None
+    assert found.delay_sigma is not None
+    assert found.delay == pytest.approx(0.1, abs=0.02)
+    assert found.delay > 5 * found.delay_sigma
+
+
+@pytest.mark.parametrize("text", ["5km", "5km:", "5:10%", "5km:0%", "-5km:1%", "5km:10", "1..2km:3%", "5km:10%,"])
+def test_a_requirement_that_cannot_be_read_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="write RANGE:ERROR"):
+        Requirement.parse(text)
+
+
+def answer(meters: float, **parts: float) -> RangeAnswer:
+    return RangeAnswer(requirement=Requirement(distance=1000.0, meters=meters), parts=parts)
+
+
+@pytest.fixture
+def page() -> Callable[..., str]:
+    def make(*findings: Finding, subject: str = "left") -> str:
+        verdict = Verdict(subject=subject, answers=(answer(50.0, marks=30.0, lenses=20.0),), findings=findings)
+        return verdict_page(verdict, {}, [range_rows(verdict)])
+
+    return make
+
+
+def test_the_page_says_what_the_verdict_says(page: Callable[..., str]) -> None:
+    assert ">YES<" in page()
+    assert "At 1 km the range is known to ±3.6 %; 5 % are required." in page()
+    stop = Finding(name="blur", severity="stop", text="corners scatter by 2 px", action="hold still")
+    refused = page(stop)
+    assert ">NO<" in refused
+    assert "Corners scatter by 2 px." in refused
+    assert "Hold still." in refused
+    assert "36 m" in refused
+
+
+def test_texts_of_others_are_text_and_nothing_is_fetched(page: Callable[..., str]) -> None:
+    nasty = '<script>alert("1")</script>\x1b[2J'
+    made = page(Finding(name=nasty, severity="doubt", text=nasty, action=nasty), subject=nasty)
+    assert "<script" not in made
+    assert "\x1b" not in made
+    assert re.findall(r"(?:src|href)=\"(?!data:|#)", made) == []
+    assert "http:" not in made
+    assert "https:" not in made
