@@ -17,6 +17,7 @@ from kcal.calibrate.camera.refit import refit_camera as refit_camera
 from kcal.calibrate.camera.result import CameraCalibrationResult as CameraCalibrationResult
 from kcal.calibrate.camera.result import RejectedCorner as RejectedCorner
 from kcal.calibrate.camera.result import RejectedView as RejectedView
+from kcal.calibrate.camera.result import SharedBoard as SharedBoard
 from kcal.calibrate.camera.summary import CalibrationSummary as CalibrationSummary
 from kcal.calibrate.camera.summary import summarize as summarize
 from kcal.calibrate.camera.trust import Examination as Examination

@@ -213,7 +213,7 @@ def observations_of(job: CameraJob, pieces: list[Detected], digests: list[str], 
     )
 
 
-def options_of(model: str, options: BatchOptions) -> CalibrationOptions:
+def calibration_options(model: str, options: BatchOptions) -> CalibrationOptions:
     """How cameras of this model are calibrated."""
     return CalibrationOptions(model=model, board_warp=options.board_warp)
 
@@ -222,7 +222,7 @@ def calibrate_again(seen: Observations, options: BatchOptions) -> CameraCalibrat
     """One camera with the hybrid lens, with all that its calibration tells, or why there is none."""
     with _time_limit(options.time_limit):
         try:
-            return calibrate_camera(seen, options_of(HYBRID, options))
+            return calibrate_camera(seen, calibration_options(HYBRID, options))
         except KcalError as error:
             return error
 
@@ -236,7 +236,7 @@ def calibrate_observations(seen: Observations, name: str, model: str, options: B
     """Calibrate one camera."""
     with _time_limit(options.time_limit):
         try:
-            result = calibrate_camera(seen, options_of(model, options))
+            result = calibrate_camera(seen, calibration_options(model, options))
         except KcalError as error:
             return Calibrated(error=str(error))
         return calibrated(result, name)

@@ -16,11 +16,11 @@ from kcal.calibrate.batch.jobs import (
     calibrate_again,
     calibrate_observations,
     calibrated,
+    calibration_options,
     detect_image,
     detection_key,
     hash_of,
     observations_of,
-    options_of,
     pieces,
     sharing_jobs,
 )
@@ -214,7 +214,7 @@ class Results:
                 alone = self._each(calibrate_again, {i: (self._views[i], self.options) for i in good}, crew)
                 found = sharing(
                     [alone[i] for i in good],
-                    options_of(HYBRID, self.options),
+                    calibration_options(HYBRID, self.options),
                     one_type=self.options.one_type,
                     run=lambda function, tasks: self._each(function, tasks, crew).items(),
                 )

@@ -209,6 +209,7 @@ def test_command_line(tmp_path: Path) -> None:
         ([*files, "-o", str(tmp_path / "out"), "--name", "west"], "names one camera"),
         ([files[0], files[0], "-o", str(tmp_path / "out")], "would overwrite each other"),
         ([*files, "-o", files[0]], "cannot make this folder"),
+        ([*files, "-o", str(tmp_path / "out"), "--one-type", "--model", "opencv5"], "hybrid lens only"),
     ):
         refused = run(app, ["calibrate", *arguments])
         assert isinstance(refused.exception, KcalError)
