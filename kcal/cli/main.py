@@ -14,6 +14,7 @@ from kcal.cli.batch import batch_command
 from kcal.cli.board import app as board
 from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
+from kcal.cli.capture import capture_command
 from kcal.cli.compare import compare_command
 from kcal.cli.console import err
 from kcal.cli.demo import demo_command
@@ -54,6 +55,7 @@ def _global_options(
 
 app.command("demo")(demo_command)
 app.add_typer(board, name="board")
+app.command("capture")(capture_command)
 app.command("detect")(detect_command)
 app.command("calibrate")(calibrate_command)
 app.command("compare")(compare_command)
