@@ -197,7 +197,7 @@ class CaptureSession:
             "message": message,
             "finished": self.finished,
             "size": list(size),
-            "corners": _finite(corners),
+            "corners": _seen_pixels(corners),
             "outlines": [] if seen is None else [self._outline(view) for view in seen.pixels()],
             "holds": [] if result is None else _holds(result.cam_from_board_rotation),
             "warnings": [] if result is None else list(result.warnings),
@@ -206,7 +206,7 @@ class CaptureSession:
             else {
                 "words": next_one.words,
                 "outline": self._outline(next_one.pixels),
-                "first": _finite(next_one.pixels[:1]),
+                "first": _seen_pixels(next_one.pixels[:1]),
                 "sigma": next_one.sigma if math.isfinite(next_one.sigma) else None,
             },
         }
@@ -214,7 +214,7 @@ class CaptureSession:
     def _outline(self, pixels: Tensor) -> list[list[float]]:
         """The board's outer corners, around it; those that were not seen are left out."""
         last = self.board.columns - 1
-        return _finite(pixels[[0, last, self.board.corners - 1, self.board.corners - 1 - last]])
+        return _seen_pixels(pixels[[0, last, self.board.corners - 1, self.board.corners - 1 - last]])
 
 
 def follow(session: CaptureSession, *, until: Callable[[], bool]) -> None:
@@ -237,7 +237,7 @@ def _first_view(size: tuple[int, int], board: Board, number: int) -> NextView:
     return NextView(views.rotation[i], views.translation[i], views.pixels[i], views.words[i], math.nan)
 
 
-def _finite(pixels: Tensor | None) -> list[list[float]]:
+def _seen_pixels(pixels: Tensor | None) -> list[list[float]]:
     if pixels is None:
         return []
     return [[u, v] for u, v in pixels.tolist() if math.isfinite(u) and math.isfinite(v)]

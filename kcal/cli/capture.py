@@ -115,7 +115,7 @@ def capture_command(
         if server is None:
             _tell(session, over)
         else:
-            threading.Thread(target=_end, args=(threads, server), daemon=True).start()
+            threading.Thread(target=_stop_server, args=(threads, server), daemon=True).start()
             server.run()
     finally:
         stop.set()
@@ -137,7 +137,7 @@ def capture_command(
     out.print(f"next: kcal calibrate {output} -o {output.with_name(camera)}", markup=False, soft_wrap=True)
 
 
-def _end(threads: list[threading.Thread], server: LocalServer) -> None:
+def _stop_server(threads: list[threading.Thread], server: LocalServer) -> None:
     """Stop the server when all is captured, a moment later: the page still asks how it ended."""
     for thread in threads:
         thread.join()

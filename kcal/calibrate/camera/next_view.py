@@ -28,10 +28,10 @@ _GRID = (13, 9)
 _FILLS, _TILT, _ROLLS = (0.35, 0.65), math.radians(40.0), (0.0, 0.5 * math.pi)
 _TILTS = {
     (0.0, 0.0): "facing the camera",
-    (_TILT, 0.0): "its top away from the camera",
-    (-_TILT, 0.0): "its bottom away from the camera",
-    (0.0, _TILT): "its right side away from the camera",
-    (0.0, -_TILT): "its left side away from the camera",
+    (_TILT, 0.0): "its lower side away from the camera",
+    (-_TILT, 0.0): "its upper side away from the camera",
+    (0.0, _TILT): "its left side away from the camera",
+    (0.0, -_TILT): "its right side away from the camera",
 }
 
 
@@ -99,7 +99,7 @@ def possible_views(camera: Camera, board: Board) -> BoardViews:
             distance = extent * float(camera.focal.min()) / (fill * side)
             place = " ".join(filter(None, (up, across))) or "middle"
             for tilt, leaning in _TILTS.items():
-                turn = _facing(ray) @ _turned(*tilt, 0.0) @ _turned(0.0, 0.0, roll)
+                turn = _facing(ray) @ _rotation(*tilt, 0.0) @ _rotation(0.0, 0.0, roll)
                 rotations.append(turn)
                 translations.append(distance * ray - turn @ middle)
                 size = "near" if fill == _FILLS[-1] else "far"
@@ -121,7 +121,7 @@ def far_sigma(camera: Camera) -> float:
     known = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
     if known is None:
         return math.nan
-    return _rms(_image_slopes(camera, known) @ known.half().T)
+    return _root_mean(_image_slopes(camera, known) @ known.half().T)
 
 
 def next_view(camera: Camera, board: Board, noise: float) -> NextView | None:
@@ -152,7 +152,7 @@ def next_view(camera: Camera, board: Board, noise: float) -> NextView | None:
     return NextView(views.rotation[best], views.translation[best], views.pixels[best], views.words[best], sigma)
 
 
-def _rms(slopes: Tensor) -> float:
+def _root_mean(slopes: Tensor) -> float:
     return math.sqrt(float(slopes.square().sum()) / len(slopes))
 
 
@@ -179,7 +179,7 @@ def _view_rows(camera: Camera, known: CameraInformation, board: Board, rotation:
     return torch.linalg.qr(by_pose, mode="complete").Q[:, by_pose.shape[1] :].T @ rows
 
 
-def _turned(x: float, y: float, z: float) -> Tensor:
+def _rotation(x: float, y: float, z: float) -> Tensor:
     return rotation_from_vector(torch.tensor([x, y, z], dtype=torch.float64))
 
 
