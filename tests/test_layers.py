@@ -16,6 +16,8 @@ FLOORS = {
     "cli": 9,
     "report": 8,
     "mark": 8,
+    "capture": 8,
+    "web": 1,
     "nets": 7,
     "locate": 7,
     "calibrate/batch": 6,

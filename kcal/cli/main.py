@@ -17,6 +17,7 @@ from kcal.cli.batch import batch_command
 from kcal.cli.board import app as board
 from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
+from kcal.cli.capture import capture_command
 from kcal.cli.compare import compare_command
 from kcal.cli.console import err, with_json
 from kcal.cli.demo import demo_command
@@ -86,6 +87,11 @@ app.command("detect")(with_json(detect_command))
 app.command("calibrate")(with_json(calibrate_command))
 app.command("compare")(with_json(compare_command))
 app.command("batch")(with_json(batch_command))
+app.command("capture")(capture_command)
+app.command("detect")(detect_command)
+app.command("calibrate")(calibrate_command)
+app.command("compare")(compare_command)
+app.command("batch")(batch_command)
 app.command("mark")(mark_command)
 app.add_typer(rig, name="rig")
 app.command("locate")(locate_command)

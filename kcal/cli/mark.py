@@ -56,9 +56,8 @@ def mark_command(
     `kcal mark new-left.png new-right.png --reference then.csv --reference-images left.png right.png -o now.csv`
     """
     try:
-        import uvicorn
-
-        from kcal.mark.server import marking_app, new_token
+        from kcal.mark.server import marking_app
+        from kcal.web.serving import LocalServer
     except ImportError as error:
         raise InputError(f"kcal mark needs {error.name}; install it with: pip install 'kcal[mark]'") from error
     import webbrowser
@@ -66,7 +65,6 @@ def mark_command(
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import load_rig
     from kcal.mark.desk import Desk
-    from kcal.mark.listening import listening_socket
     from kcal.mark.pictures import open_pictures
     from kcal.mark.reference import Reference
     from kcal.mark.session import Session
@@ -85,18 +83,13 @@ def mark_command(
     desk = Desk(pictures, session, own, known, old)
     try:
         desk.check_sizes()
-        listener = listening_socket(port, fallback=port == _PORT)
-        bound = listener.getsockname()[1]
-        token = new_token()
-        hosts = tuple(f"{name}:{bound}" for name in ("127.0.0.1", "localhost"))
-        address = f"http://127.0.0.1:{bound}/#{token}"
-        out.print(f"marking page: {address}", markup=False, soft_wrap=True)
+        server = LocalServer(lambda token, hosts: marking_app(desk, token, hosts), port, fallback=port == _PORT)
+        out.print(f"marking page: {server.address}", markup=False, soft_wrap=True)
         if session.version:
             err.print(f"continued after {session.version} actions in {session.files.log}", markup=False)
         if browser:
-            webbrowser.open(address)
-        config = uvicorn.Config(marking_app(desk, token, hosts), log_level="warning", access_log=False)
-        uvicorn.Server(config).run(sockets=[listener])
+            webbrowser.open(server.address)
+        server.run()
     finally:
         desk.close()
     for path in (session.files.marks, session.files.points, session.files.landmarks):

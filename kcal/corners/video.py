@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -28,7 +28,7 @@ MOST_VIEWS = 40
 DURATION = 120.0  # seconds: how long a live stream is read by default
 _STREAM_TIMEOUT_MS = 10_000  # for opening, and for each frame
 _STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|srt)://|camera:\d+$", re.IGNORECASE)
-_MIN_RMS_MOVE = 0.04  # of the image's width: how far the board's corners must have moved from every earlier view
+NEW = 0.04  # of the image's width: how far the board's corners must have moved from every earlier view
 _GROUP = 7  # frames, of which only the sharpest is searched
 
 
@@ -206,7 +206,7 @@ def detect_video(
                 found = Detection(None, str(error))
                 failures.append(Failure(name=name, reason=found.reason))
             reason = found.reason or reason
-            if found.pixels is not None and _is_new(found.pixels, kept, _MIN_RMS_MOVE * size[0]):
+            if found.pixels is not None and is_new_view(found.pixels, kept, NEW * size[0]):
                 kept.append(found.pixels)
                 image = None if is_stream(source) else str(source)
                 if keep is not None:
@@ -222,7 +222,14 @@ def detect_video(
     return Observations(board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures))
 
 
-def _is_new(pixels: Tensor, kept: list[Tensor], least: float) -> bool:
+def is_new_view(pixels: Tensor, kept: Sequence[Tensor], least: float) -> bool:
+    """Whether a board's corners (N, 2) moved, root mean square, by this many pixels at least from each earlier view.
+
+    Args:
+        pixels: NaN where not seen.
+        kept: likewise of the earlier views.
+        least: `NEW` times the image's width is usual.
+    """
     # NaN, which is never less, where two views share no corner: other parts of a ChArUco board.
     moves = [float((pixels - before).square().sum(-1).nanmean().sqrt()) for before in kept]
     return not any(moved < least for moved in moves)

@@ -1,38 +1,23 @@
-"""The local server: routes that check what they are given and ask the `Desk`.
-
-It answers only requests that name this machine as their host (a foreign page could otherwise reach it under a name of
-its own: DNS rebinding) and, beyond the page's own files, only those with the token of this start.
-"""
+"""The marking page's routes, which check what they are given and ask the `Desk`."""
 
 from __future__ import annotations
 
 import json
-import secrets
 from collections.abc import Awaitable, Callable
-from importlib import resources
 from typing import Annotated, Any
 
 import pydantic
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.middleware import Middleware
-from starlette.middleware.base import BaseHTTPMiddleware
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
-from starlette.types import ASGIApp
 
 from kcal.corners.point import enlarge
-from kcal.errors import KcalError
 from kcal.mark.desk import Desk
 from kcal.mark.items import ACTION, Mark, Side
+from kcal.web.gate import local_app, page_files
 
-_LARGEST_BODY = 1 << 20
-_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
-_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 _Coordinate = Annotated[float, pydantic.Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
 _Number = Annotated[int, pydantic.Field(ge=0, le=10_000_000)]
 
@@ -92,11 +77,6 @@ class Tile(_Query):
     high: _Coordinate | None = None
 
 
-def new_token() -> str:
-    """A secret for one start of the server."""
-    return secrets.token_urlsafe(24)
-
-
 def marking_app(desk: Desk, token: str, hosts: tuple[str, ...]) -> Starlette:
     """The application.
 
@@ -154,71 +134,9 @@ def marking_app(desk: Desk, token: str, hosts: tuple[str, ...]) -> Starlette:
     routes = [
         Route(f"/api/{name}", asked(model, answer), methods=[method]) for name, (model, answer, method) in data.items()
     ]
-    pages = page_files()
-    routes += [Route(path, _static_page(content, kind), methods=["GET"]) for path, (content, kind) in pages.items()]
-    return Starlette(
-        routes=routes,
-        middleware=[Middleware(_Gate, token=token, hosts=hosts)],
-        exception_handlers={
-            KcalError: _refuse,
-            pydantic.ValidationError: _refuse,
-            json.JSONDecodeError: _refuse,
-            UnicodeDecodeError: _refuse,
-        },
-    )
+    return local_app(routes, marking_files(), token, hosts)
 
 
-def page_files() -> dict[str, tuple[bytes, str]]:
-    """The page's own files and the map library, by path: there are no others to be had."""
-    found = {}
-    for package, folder in (("kcal.mark", "page"), ("kcal.report", "leaflet")):
-        for file in (resources.files(package) / folder).iterdir():
-            kind = _TYPES.get("." + file.name.rpartition(".")[2])
-            if kind is not None:
-                found["/" if file.name == "index.html" else f"/{folder}/{file.name}"] = file.read_bytes(), kind
-    return found
-
-
-class _Gate(BaseHTTPMiddleware):
-    """Refuse foreign hosts, requests for data without the token, and large bodies."""
-
-    def __init__(self, app: ASGIApp, token: str, hosts: tuple[str, ...]) -> None:
-        super().__init__(app)
-        self._token, self._hosts = token.encode(), hosts
-
-    async def dispatch(self, request: Request, call_next: Callable[[Request], Awaitable[Response]]) -> Response:
-        origin = request.headers.get("origin")
-        allowed = request.headers.get("host") in self._hosts
-        if not allowed or (origin is not None and origin.removeprefix("http://") not in self._hosts):
-            return _secured(JSONResponse({"error": "this host is not served"}, 403))
-        given = request.headers.get("x-kcal-token", "").encode()
-        if request.url.path.startswith("/api/") and not secrets.compare_digest(given, self._token):
-            return _secured(JSONResponse({"error": "the token is wrong: open the address that kcal mark printed"}, 401))
-        length = request.headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > _LARGEST_BODY or "transfer-encoding" in request.headers:
-            return _secured(JSONResponse({"error": "the request is too large"}, 413))
-        return _secured(await call_next(request))
-
-
-def _secured(response: Response) -> Response:
-    response.headers["Content-Security-Policy"] = _POLICY
-    response.headers["X-Content-Type-Options"] = "nosniff"
-    response.headers["Referrer-Policy"] = "no-referrer"
-    response.headers["Cache-Control"] = "no-store"
-    response.headers["Cross-Origin-Resource-Policy"] = "same-origin"
-    return response
-
-
-def _static_page(content: bytes, kind: str) -> Callable[[Request], Awaitable[Response]]:
-    async def endpoint(_: Request) -> Response:
-        return Response(content, media_type=kind)
-
-    return endpoint
-
-
-async def _refuse(_: Request, error: Exception) -> Response:
-    if isinstance(error, pydantic.ValidationError):
-        first = error.errors()[0]
-        text = ": ".join(filter(None, [".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")]))
-        return JSONResponse({"error": text}, 422)
-    return JSONResponse({"error": " ".join(str(error).split())}, 400)
+def marking_files() -> dict[str, tuple[bytes, str]]:
+    """The page's own files and the map library."""
+    return page_files(("kcal.mark", "page"), ("kcal.report", "leaflet"))

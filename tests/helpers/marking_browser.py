@@ -20,10 +20,10 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 class Server:
-    """A running `kcal mark`."""
+    """A running `kcal mark`, or another program with a page."""
 
-    def __init__(self, arguments: list[str], port: int, folder: Path) -> None:
-        command = [sys.executable, "-m", "kcal", "mark", *arguments, "--port", str(port), "--no-browser"]
+    def __init__(self, arguments: list[str], port: int, folder: Path, program: str = "mark") -> None:
+        command = [sys.executable, "-m", "kcal", program, *arguments, "--port", str(port), "--no-browser"]
         self.errors = (folder / "server.err").open("w+")
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=self.errors, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"}

@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 from kcal.io.images import write_png
 from kcal.mark.desk import Desk
 from kcal.mark.pictures import open_pictures
-from kcal.mark.server import marking_app, page_files
+from kcal.mark.server import marking_app, marking_files
 from kcal.mark.session import Session
 
 TOKEN = "secret-of-this-start"
@@ -46,7 +46,7 @@ def test_the_page_loads_nothing_from_elsewhere(client: TestClient) -> None:
     assert answer.status_code == 200
     assert "default-src 'none'" in policy
     assert "unsafe" not in policy
-    for path, (content, kind) in page_files().items():
+    for path, (content, kind) in marking_files().items():
         assert client.get(path).content == content
         if path.startswith("/page/") or path == "/":
             found = content.decode().replace("http://www.w3.org/2000/svg", "")

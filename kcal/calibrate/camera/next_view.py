@@ -1,0 +1,191 @@
+"""Find the view of the board that would tell most about a camera, from what its calibration leaves open.
+
+Of many places, distances, tilts and rolls of the board, each adds rows to the square-root information of the camera
+once its own pose is eliminated. The best one reduces the variance of far directions most, averaged over the image
+(A-optimal design; for calibration: Peng and Sturm, "Calibration wizard", ICCV 2019).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.corners.board import Board
+from kcal.lens.camera import Camera
+from kcal.lens.information import CameraInformation
+from kcal.lens.pose import rotation_from_vector, step_rows
+from kcal.lens.projection import project_components
+from kcal.lens.uncertainty import pixel_slopes
+
+# Grid of the image over which variances are averaged.
+_GRID = (13, 9)
+# What a person can hold: shares of the image's shorter side that a board fills, degrees of tilt, quarter rolls.
+_FILLS, _TILT, _ROLLS = (0.35, 0.65), math.radians(40.0), (0.0, 0.5 * math.pi)
+_TILTS = {
+    (0.0, 0.0): "facing the camera",
+    (_TILT, 0.0): "its lower side away from the camera",
+    (-_TILT, 0.0): "its upper side away from the camera",
+    (0.0, _TILT): "its left side away from the camera",
+    (0.0, -_TILT): "its right side away from the camera",
+}
+
+
+class BoardViews(NamedTuple):
+    """Views of a board that could be taken.
+
+    Attributes:
+        rotation: (C, 3, 3) cam_from_board.
+        translation: (C, 3) meters.
+        pixels: (C, N, 2) of the corners.
+        words: how the board is held.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    pixels: Tensor
+    words: tuple[str, ...]
+
+
+class NextView(NamedTuple):
+    """The view to take next.
+
+    Attributes:
+        rotation: (3, 3) cam_from_board.
+        translation: (3,) meters.
+        pixels: (N, 2) where its corners would be.
+        words: how to hold the board.
+        sigma: pixels, `far_sigma` of the camera after this view.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    pixels: Tensor
+    words: str
+    sigma: float
+
+
+def possible_views(camera: Camera, board: Board) -> BoardViews:
+    """Views of a board all over the image, near and far, facing the camera and tilted, upright and rolled.
+
+    Args:
+        camera: as known so far.
+        board: whose corners are all in the image.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
+        >>> views = possible_views(camera, Board(columns=7, rows=6, square=0.05))
+        >>> len(views.words) > 100, bool((views.pixels > 0).all())
+        (True, True)
+    """
+    width, height = camera.size
+    side, points = min(width, height), board.points
+    middle = 0.5 * (points.amin(0) + points.amax(0))
+    extent = float((points.amax(0) - points.amin(0)).max())
+    rotations, translations, words = [], [], []
+    for fill, roll in itertools.product(_FILLS, _ROLLS):
+        margin = (0.5 * fill + 0.06) * side
+        rows = {"top": margin, "": 0.5 * height, "bottom": height - margin}
+        columns = {"left": margin, "": 0.5 * width, "right": width - margin}
+        for (up, v), (across, u) in itertools.product(rows.items(), columns.items()):
+            rays, valid = camera.unproject(torch.tensor([[u, v]], dtype=torch.float64))
+            if not bool(valid):
+                continue
+            ray = rays[0]
+            distance = extent * float(camera.focal.min()) / (fill * side)
+            place = " ".join(filter(None, (up, across))) or "middle"
+            for tilt, leaning in _TILTS.items():
+                turn = _facing(ray) @ _rotation(*tilt, 0.0) @ _rotation(0.0, 0.0, roll)
+                rotations.append(turn)
+                translations.append(distance * ray - turn @ middle)
+                size = "near" if fill == _FILLS[-1] else "far"
+                rolled = ", rolled by a quarter" if roll else ""
+                words.append(f"{size}, in the {place} of the image, {leaning}{rolled}")
+    rotation, translation = torch.stack(rotations), torch.stack(translations)
+    pixels, valid = camera.project(points @ rotation.mT + translation[:, None])
+    inside = ((pixels >= 0) & (pixels <= torch.tensor([width - 1, height - 1], dtype=pixels.dtype))).all(-1)
+    good = (inside & valid).all(-1)
+    kept = tuple(text for text, fits in zip(words, good.tolist(), strict=True) if fits)
+    return BoardViews(rotation[good], translation[good], pixels[good], kept)
+
+
+def far_sigma(camera: Camera) -> float:
+    """Standard deviation along an axis of where a camera sees far things, RMS over its image, pixels.
+
+    After the best turn of the camera, as `kcal.lens.uncertainty.projection_sigma`. NaN for a camera without error bars.
+    """
+    known = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
+    if known is None:
+        return math.nan
+    return _root_mean(_image_slopes(camera, known) @ known.half().T)
+
+
+def next_view(camera: Camera, board: Board, noise: float) -> NextView | None:
+    """The view that reduces the uncertainty of far directions most.
+
+    Args:
+        camera: with its calibration.
+        board: that is photographed.
+        noise: of its corners along an axis, pixels.
+
+    Returns:
+        None for a camera without error bars, or whose image no board fits into.
+    """
+    known = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
+    views = possible_views(camera, board)
+    if known is None or not views.words:
+        return None
+    half = known.half()
+    slopes = _image_slopes(camera, known) @ half.T
+    rest = []
+    for rotation, translation in zip(views.rotation, views.translation, strict=True):
+        rows = _view_rows(camera, known, board, rotation, translation) @ half.T / noise
+        # Variance that this view takes away: G Aᵀ (1 + A Aᵀ)⁻¹ A Gᵀ.
+        lower = torch.linalg.cholesky(torch.eye(len(rows), dtype=rows.dtype) + rows @ rows.T)
+        rest.append(float(torch.linalg.solve_triangular(lower, rows @ slopes.T, upper=False).square().sum()))
+    best = max(range(len(rest)), key=rest.__getitem__)
+    sigma = math.sqrt(max(float(slopes.square().sum()) - rest[best], 0.0) / len(slopes))
+    return NextView(views.rotation[best], views.translation[best], views.pixels[best], views.words[best], sigma)
+
+
+def _root_mean(slopes: Tensor) -> float:
+    return math.sqrt(float(slopes.square().sum()) / len(slopes))
+
+
+def _image_slopes(camera: Camera, known: CameraInformation) -> Tensor:
+    """(2 G, U) derivatives of the image's grid by the unknowns, far away, after the best turn."""
+    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
+    by_camera, by_motion, good = pixel_slopes(camera, camera.grid(*_GRID).reshape(-1, 2), math.inf, wanted)
+    flat, by_turn = by_camera[good].flatten(0, 1), by_motion[good][..., :3].flatten(0, 1)
+    flat = flat - by_turn @ torch.linalg.lstsq(by_turn, flat).solution
+    return flat @ known.selection()[wanted]
+
+
+def _view_rows(camera: Camera, known: CameraInformation, board: Board, rotation: Tensor, translation: Tensor) -> Tensor:
+    """(2 N - 6, U) derivatives of a view's corners by the unknowns, off the view's pose."""
+    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
+    points = board.points @ rotation.T + translation
+    seen = project_components(points.T, camera.params.detach(), camera.model, wanted)
+    rows = seen.by_camera.flatten(1).T @ known.selection()[wanted]
+    if known.board_size:
+        by_point = torch.einsum("pcn,pk->kcn", seen.by_point, rotation)
+        by_board = torch.einsum("kcn,bkn->cnb", by_point, board_modes(board.points).shapes).flatten(0, 1)
+        rows[:, known.lens_size :] = by_board
+    by_pose = step_rows(seen.by_point, points.T).flatten(1).T
+    return torch.linalg.qr(by_pose, mode="complete").Q[:, by_pose.shape[1] :].T @ rows
+
+
+def _rotation(x: float, y: float, z: float) -> Tensor:
+    return rotation_from_vector(torch.tensor([x, y, z], dtype=torch.float64))
+
+
+def _facing(ray: Tensor) -> Tensor:
+    """The smallest turn of the optical axis into a ray."""
+    axis = torch.stack([-ray[1], ray[0], torch.zeros_like(ray[0])])
+    sine = torch.linalg.vector_norm(axis)
+    angle = torch.atan2(sine, ray[2])
+    return rotation_from_vector(axis / sine.clamp_min(1e-300) * angle)

@@ -1,0 +1,251 @@
+"""Keep the useful frames of a board, calibrate as they come, and say what to photograph next."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.calibrate.camera.calibrate import CameraCalibrationResult, calibrate_camera
+from kcal.calibrate.camera.next_view import NextView, far_sigma, next_view, possible_views
+from kcal.corners.board import Board
+from kcal.corners.detect import detect_board, view_of
+from kcal.corners.images import Gray
+from kcal.corners.observations import Observations
+from kcal.corners.refine import Refinement
+from kcal.corners.video import NEW, is_new_view
+from kcal.errors import InputError, KcalError
+from kcal.files import make_folder, write_atomic
+from kcal.io.images import encode_png
+from kcal.lens.camera import Camera
+
+# Views before the first calibration: four tilts determine a focal length.
+FIRST_VIEWS = 4
+# A board that moves by more than this share of the image's width between two frames is blurred.
+_STILL = 0.003
+# Until a camera is calibrated its focal length is taken for this share of the image's width, 58° across.
+_USUAL_FOCAL = 0.9
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """When to stop, and how frames are searched.
+
+    Args:
+        until: px, standard deviation of far directions along an axis, RMS over the image, at which to stop.
+        most: number of views at which to stop.
+        refine: see `kcal.corners.refine.refine_corners`.
+    """
+
+    until: float = 0.1
+    most: int = 60
+    refine: Refinement = "erf"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.until < math.inf:
+            raise InputError(f"CaptureOptions: until must be positive pixels, got {self.until}")
+        if self.most < FIRST_VIEWS:
+            raise InputError(f"CaptureOptions: most must be at least {FIRST_VIEWS} views, got {self.most}")
+
+
+class CaptureSession:
+    """Views of one camera, from the first frame to a camera that is known well enough.
+
+    Observations and frames are on the disk before the next frame is looked at; a session with an existing observations
+    file continues it. `offer` and `think` may be called from two threads.
+
+    Args:
+        output: observations file; frames that became views go into a folder beside it, NAME.frames.
+        board: that is photographed.
+        options: see `CaptureOptions`.
+
+    Raises:
+        FileError: the file or the folder cannot be written, or an existing file cannot be read.
+        InputError: the existing file is of another board.
+    """
+
+    def __init__(self, output: Path, board: Board, options: CaptureOptions | None = None) -> None:
+        self.output, self.board, self.options = output, board, options or CaptureOptions()
+        self.frames = make_folder(output.parent / (output.name.split(".")[0] + ".frames"))
+        self.seen: Observations | None = None
+        self.result: CameraCalibrationResult | None = None
+        self.suggestion: NextView | None = None
+        self.history: list[tuple[int, float]] = []
+        self.message = "show the board"
+        self.corners: Tensor | None = None
+        self._image: Gray | None = None
+        self._before: Tensor | None = None
+        self._calibrated = 0
+        self._lock = threading.Lock()
+        if output.exists():
+            self.seen = Observations.load(output)
+            if self.seen.board != board:
+                raise InputError(
+                    f"{output}: holds views of another board ({self.seen.board}); give --output another name"
+                )
+
+    @property
+    def views(self) -> int:
+        """How many frames were kept."""
+        return 0 if self.seen is None else len(self.seen.views)
+
+    @property
+    def sigma(self) -> float:
+        """px, of far directions (`far_sigma`); NaN before the first calibration."""
+        return self.history[-1][1] if self.history else math.nan
+
+    @property
+    def finished(self) -> str:
+        """Why no more views are needed; empty while they are."""
+        if self.sigma <= self.options.until:
+            return f"far directions are known to ± {self.sigma:.3f} px: enough"
+        return f"{self.views} views were kept: the most that were asked for" if self.views >= self.options.most else ""
+
+    def offer(self, image: Gray, name: str, *, moving: bool) -> bool:
+        """Look at a frame and keep it if it shows the board, sharp and somewhere new.
+
+        Args:
+            image: (H, W) gray.
+            name: of the frame.
+            moving: the frame is one of many of a moving board: it must have come to rest since the frame before.
+
+        Raises:
+            InputError: an image of another size than the first one.
+            FileError: the frame cannot be written.
+        """
+        size = (image.shape[1], image.shape[0])
+        if self.seen is not None and self.seen.image_size != size:
+            raise InputError(f"{name}: {size[0]}x{size[1]} px, earlier views have another size; one camera at a time")
+        found = detect_board(image, self.board, self.options.refine)
+        with self._lock:
+            self._image, self.corners = image, found.pixels
+            before, self._before = self._before, found.pixels
+            if found.pixels is None:
+                self.message = found.reason
+                return False
+            if moving and (before is None or is_new_view(found.pixels, [before], _STILL * size[0])):
+                self.message = "hold still"
+                return False
+            kept = [] if self.seen is None else list(self.seen.pixels())
+            if not is_new_view(found.pixels, kept, NEW * size[0]):
+                self.message = "kept one like this already; move the board"
+                return False
+            path = self.frames / (re.sub(r"[^\w.-]+", "_", name.removesuffix(".png")) + ".png")
+            write_atomic(path, encode_png(cast(Any, image)))
+            views = () if self.seen is None else self.seen.views
+            view = view_of(found, name, image=str(path))
+            self.seen = Observations(
+                board=self.board, image_size=size, refinement=self.options.refine, views=(*views, view)
+            )
+            self.seen.save(self.output)
+            self.message = f"kept {name}"
+            return True
+
+    def think(self) -> bool:
+        """Calibrate with the views of this moment and find the next one; False if there is nothing new."""
+        with self._lock:
+            seen, image = self.seen, self._image
+        count = 0 if seen is None else len(seen.views)
+        if seen is None or count < FIRST_VIEWS:
+            size = seen.image_size if seen is not None else None if image is None else image.shape[::-1]
+            if size is None or (self.suggestion is not None and count == self._calibrated):
+                return False
+            self._calibrated, self.suggestion = count, _first_view((size[0], size[1]), self.board, count)
+            return True
+        if count == self._calibrated:
+            return False
+        self._calibrated = count
+        try:
+            result = calibrate_camera(seen)
+            assert result.hybrid is not None
+            sigma, suggestion = far_sigma(result.camera), next_view(result.camera, self.board, result.hybrid.sigma)
+        except KcalError as error:
+            self.message = f"cannot be calibrated yet: {error}"
+            return True
+        with self._lock:
+            self.result, self.suggestion = result, suggestion
+            self.history.append((count, sigma))
+        return True
+
+    def picture(self) -> bytes | None:
+        """The last frame as PNG, at most 1280 px wide; None before the first."""
+        image = self._image
+        if image is None:
+            return None
+        step = -(-image.shape[1] // 1280)
+        return encode_png(cast(Any, np.ascontiguousarray(image[::step, ::step])))
+
+    def state(self) -> dict[str, Any]:
+        """All that the page shows."""
+        with self._lock:
+            seen, image, result, next_one = self.seen, self._image, self.result, self.suggestion
+            corners, history, message = self.corners, list(self.history), self.message
+        size = seen.image_size if seen is not None else image.shape[::-1] if image is not None else (0, 0)
+        return {
+            "views": 0 if seen is None else len(seen.views),
+            "most": self.options.most,
+            "until": self.options.until,
+            "history": [[count, sigma] for count, sigma in history if math.isfinite(sigma)],
+            "message": message,
+            "finished": self.finished,
+            "size": list(size),
+            "corners": _seen_pixels(corners),
+            "outlines": [] if seen is None else [self._outline(view) for view in seen.pixels()],
+            "holds": [] if result is None else _holds(result.cam_from_board_rotation),
+            "warnings": [] if result is None else list(result.warnings),
+            "next": None
+            if next_one is None
+            else {
+                "words": next_one.words,
+                "outline": self._outline(next_one.pixels),
+                "first": _seen_pixels(next_one.pixels[:1]),
+                "sigma": next_one.sigma if math.isfinite(next_one.sigma) else None,
+            },
+        }
+
+    def _outline(self, pixels: Tensor) -> list[list[float]]:
+        """The board's outer corners, around it; those that were not seen are left out."""
+        last = self.board.columns - 1
+        return _seen_pixels(pixels[[0, last, self.board.corners - 1, self.board.corners - 1 - last]])
+
+
+def follow(session: CaptureSession, *, until: Callable[[], bool]) -> None:
+    """Think while frames come, until the session is finished or `until` says so; for a thread of its own."""
+    pause = threading.Event()
+    while not until() and not session.finished:
+        if not session.think():
+            pause.wait(0.1)
+
+
+def _first_view(size: tuple[int, int], board: Board, number: int) -> NextView:
+    """One of four tilts in the middle of the image, for a camera of which nothing is known."""
+    width, height = size
+    camera = Camera.build(
+        focal=(_USUAL_FOCAL * width,) * 2, center=(0.5 * width, 0.5 * height), size=size, model="pinhole"
+    )
+    views = possible_views(camera, board)
+    steep = [i for i, text in enumerate(views.words) if "near, in the middle" in text and "away" in text]
+    i = steep[(number * 3) % len(steep)]
+    return NextView(views.rotation[i], views.translation[i], views.pixels[i], views.words[i], math.nan)
+
+
+def _seen_pixels(pixels: Tensor | None) -> list[list[float]]:
+    if pixels is None:
+        return []
+    return [[u, v] for u, v in pixels.tolist() if math.isfinite(u) and math.isfinite(v)]
+
+
+def _holds(rotation: Tensor) -> list[list[float]]:
+    """Of each view: where the board's normal leans (x, y), as the sine of its tilt, and its roll in degrees."""
+    rotation = rotation[rotation.isfinite().all(-1).all(-1)]
+    roll = torch.rad2deg(torch.atan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1]))
+    leaning: list[list[float]] = torch.cat([rotation[:, :2, 2], roll[:, None]], 1).tolist()
+    return leaning

@@ -1,0 +1,157 @@
+"""`kcal capture`: photograph a board with guidance."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kcal.cli.console import err, out
+from kcal.cli.detect import Refine
+from kcal.errors import InputError, KcalError
+from kcal.files import check_writable
+
+if TYPE_CHECKING:
+    from kcal.capture.session import CaptureSession
+    from kcal.web.serving import LocalServer
+
+_PORT = 8348
+
+
+def capture_command(
+    source: Annotated[
+        str, typer.Argument(help="camera:0, a stream (rtsp://...), a video, or a folder into which images come.")
+    ],
+    size: Annotated[
+        str,
+        typer.Option(
+            "--board",
+            metavar="CxR",
+            help="Inner corners, columns by rows: 9x6 has 10x7 squares; charuco:9x6[:DICTIONARY[:MARKER]].",
+        ),
+    ],
+    square: Annotated[
+        str, typer.Option("--square", metavar="LENGTH", help="Side of a square with its unit: 25mm, 2.5cm, 1in.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write, or to continue.")],
+    until: Annotated[
+        float,
+        typer.Option(metavar="PX", help="Stop when far directions are known to this σ, on average over the image."),
+    ] = 0.1,
+    most: Annotated[int, typer.Option(metavar="N", help="Stop at this number of views.", min=4)] = 60,
+    refine: Annotated[
+        Refine, typer.Option("--refine", metavar="METHOD", help="erf (most accurate), saddle, opencv, skimage or none.")
+    ] = Refine.erf,
+    page: Annotated[
+        bool, typer.Option("--page/--no-page", help="Show it on a local page; without, only in this terminal.")
+    ] = True,
+    port: Annotated[int, typer.Option(help="Of the local address; 0 for any that is free.", min=0, max=65535)] = _PORT,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+) -> None:
+    """Photograph a board, and be told what to photograph next, until the camera is known well enough.
+
+    Frames that show the board at rest and somewhere new are kept. From four views on the camera is calibrated as you
+    go; the outline on the page is the view that would tell most. It ends at --until, or with Ctrl+C: everything
+    that was kept is on the disk, and the same command continues.
+
+    The page is served to this machine only. It needs the extra `mark`: `pip install 'kcal[mark]'`.
+
+    **Examples**
+
+    `kcal capture camera:0 --board 9x6 --square 25mm -o left.obs.json`
+
+    `kcal capture incoming/ --board 9x6 --square 25mm -o left.obs.json --until 0.05`
+    """
+    from kcal.capture.session import CaptureOptions, CaptureSession, follow
+    from kcal.capture.sources import shots
+    from kcal.corners.board import Board
+
+    check_writable(output)
+    session = CaptureSession(
+        output, Board.parse(size, square), CaptureOptions(until=until, most=most, refine=refine.value)
+    )
+    if session.views:
+        err.print(f"{output} has {session.views} views; going on", markup=False)
+    stop = threading.Event()
+    failed: list[KcalError] = []
+
+    def over() -> bool:
+        return stop.is_set() or bool(session.finished)
+
+    def watch() -> None:
+        try:
+            for shot in shots(source, over, lambda text: err.print(text, markup=False)):
+                if session.offer(shot.image, shot.name, moving=shot.moving):
+                    out.print(f"{session.views}: {shot.name}", markup=False)
+        except KcalError as error:
+            failed.append(error)
+        stop.set()
+
+    threads = [threading.Thread(target=watch), threading.Thread(target=follow, args=(session,), kwargs={"until": over})]
+    server = None
+    if page:
+        try:
+            from kcal.capture.server import capture_app
+            from kcal.web.serving import LocalServer
+        except ImportError as error:
+            raise InputError(
+                f"the page needs {error.name}; install it with: pip install 'kcal[mark]', or give --no-page"
+            ) from error
+        server = LocalServer(
+            lambda token, hosts: capture_app(session, stop, token, hosts), port, fallback=port == _PORT
+        )
+        out.print(f"capture page: {server.address}", markup=False, soft_wrap=True)
+        if browser:
+            import webbrowser
+
+            webbrowser.open(server.address)
+    for thread in threads:
+        thread.start()
+    try:
+        if server is None:
+            _tell(session, over)
+        else:
+            threading.Thread(target=_stop_server, args=(threads, server), daemon=True).start()
+            server.run()
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+    if failed:
+        raise failed[0]
+    # What came last has not been thought about yet.
+    session.think()
+    if session.finished:
+        out.print(session.finished)
+    elif session.views:
+        known = f"; far directions are known to ± {session.sigma:.3f} px" if session.history else ""
+        out.print(f"{session.views} views kept{known}")
+    if not session.views:
+        raise InputError(f"no frame showed the board: {session.message}")
+    out.print(f"wrote {output} and {session.views} frames in {session.frames}", markup=False)
+    camera = f"{output.name.split('.')[0]}.camera.json"
+    out.print(f"next: kcal calibrate {output} -o {output.with_name(camera)}", markup=False, soft_wrap=True)
+
+
+def _stop_server(threads: list[threading.Thread], server: LocalServer) -> None:
+    """Stop the server when all is captured, a moment later: the page still asks how it ended."""
+    for thread in threads:
+        thread.join()
+    time.sleep(1.5)
+    server.stop()
+
+
+def _tell(session: CaptureSession, over: Callable[[], bool]) -> None:
+    """Print what to photograph next, whenever it changes."""
+    said = ""
+    while not over():
+        words = session.suggestion.words if session.suggestion is not None else session.message
+        if words != said:
+            known = f" (now ± {session.sigma:.3f} px)" if session.history else ""
+            out.print(f"next: the board {words}{known}", markup=False)
+            said = words
+        time.sleep(0.2)

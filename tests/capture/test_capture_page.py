@@ -1,0 +1,47 @@
+"""The capture page in a real browser: it shows what was kept, and asks nothing beyond this machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from capture_frames import BOARD, images
+from marking_browser import CHROMIUM, Server, chromium_page, free_port
+
+from kcal.corners.observations import Observations
+from kcal.io.images import write_png
+
+for library in ("starlette", "uvicorn", "playwright"):
+    pytest.importorskip(library, reason="the extras `mark` and `dev` are not installed")
+if CHROMIUM is None:
+    pytest.skip("Chromium is not installed (Debian: apt-get install chromium)", allow_module_level=True)
+
+
+def test_frames_are_shown_and_the_page_ends_it(tmp_path: Path) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for i, image in enumerate(images()[:2]):
+        write_png(folder / f"{i}.png", image)
+    output = tmp_path / "x.obs.json"
+    board = f"{BOARD.columns}x{BOARD.rows}"
+    port = free_port()
+    server = Server(
+        [str(folder), "--board", board, "--square", "20mm", "-o", str(output)], port, tmp_path, program="capture"
+    )
+    with chromium_page() as page:
+        page.goto(server.address)
+        page.wait_for_function("() => document.documentElement.dataset.views === '2'", timeout=60_000)
+        assert "Match the orange outline" in page.inner_text("#words")
+        assert page.evaluate("document.querySelectorAll('#where polygon').length") == 3
+        # The frame is on the canvas: it is not of one color.
+        colors = page.evaluate(
+            "() => { const c = document.getElementById('view'); const d = c.getContext('2d')"
+            ".getImageData(0, 0, c.width, c.height).data; return new Set(d).size; }"
+        )
+        assert colors > 20
+        page.screenshot(path=str(tmp_path / "page.png"))
+        page.click("#stop")
+        server.process.wait(timeout=60)
+        assert page.complaints == []
+    assert server.process.returncode == 0
+    assert len(Observations.load(output).views) == 2

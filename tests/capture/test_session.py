@@ -1,0 +1,136 @@
+"""Which frames are kept, what is on the disk, and how a session goes on and ends."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from capture_frames import BOARD, images
+from typer.testing import CliRunner
+
+from kcal.capture.session import FIRST_VIEWS, CaptureOptions, CaptureSession, follow
+from kcal.capture.sources import Shot, newest, shots
+from kcal.cli.main import app
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations
+from kcal.corners.video import Frame
+from kcal.errors import FileError, InputError
+from kcal.io.images import write_png
+
+
+def test_useful_frames_are_kept_and_on_the_disk(tmp_path: Path) -> None:
+    session = CaptureSession(tmp_path / "left.obs.json", BOARD)
+    assert session.offer(images()[0], "a.png", moving=False)
+    assert not session.offer(images()[0], "b.png", moving=False)
+    assert "one like this" in session.message
+    assert not session.offer(np.full((240, 320), 90, np.uint8), "c.png", moving=False)
+    assert "no board" in session.message
+    # Of a moving board: only what was at the same place in the frame before.
+    assert not session.offer(images()[1], "d", moving=True)
+    assert session.message == "hold still"
+    assert session.offer(images()[1], "e", moving=True)
+    kept = Observations.load(tmp_path / "left.obs.json")
+    assert kept.names == ("a.png", "e")
+    for view, image in zip(kept.views, images()[:2], strict=True):
+        assert view.image is not None
+        assert np.array_equal(cv2.imread(view.image, cv2.IMREAD_UNCHANGED), image)
+    with pytest.raises(InputError, match="another size"):
+        session.offer(images()[0][:200], "f", moving=False)
+    again = CaptureSession(tmp_path / "left.obs.json", BOARD)
+    assert again.views == 2
+    assert not again.offer(images()[0], "g", moving=False)
+    with pytest.raises(InputError, match="another board"):
+        CaptureSession(tmp_path / "left.obs.json", Board(columns=7, rows=5, square=0.02))
+
+
+def test_from_the_first_view_to_the_goal(tmp_path: Path) -> None:
+    session = CaptureSession(tmp_path / "left.obs.json", BOARD, CaptureOptions(until=50.0))
+    assert not session.think()
+    assert session.state()["next"] is None
+    words = set()
+    for number in range(FIRST_VIEWS):
+        session.offer(images()[number], str(number), moving=False)
+        assert session.think()
+        state = session.state()
+        assert state["views"] == number + 1
+        assert len(state["next"]["outline"]) == 4
+        words.add(state["next"]["words"])
+        assert not session.think()
+    assert len(words) == FIRST_VIEWS
+    state = session.state()
+    assert len(state["history"]) == 1
+    assert len(state["holds"]) == len(state["outlines"]) == FIRST_VIEWS
+    assert 0 < state["next"]["sigma"] < session.sigma < 50.0
+    assert "enough" in state["finished"]
+    follow(session, until=lambda: False)
+    few = CaptureSession(tmp_path / "left.obs.json", BOARD, CaptureOptions(until=1e-9, most=4))
+    assert "the most that were asked for" in few.finished
+
+
+def test_options() -> None:
+    with pytest.raises(InputError, match="until"):
+        CaptureOptions(until=0.0)
+    with pytest.raises(InputError, match="most"):
+        CaptureOptions(most=3)
+
+
+def test_images_that_come_into_a_folder(tmp_path: Path) -> None:
+    """Each once, when it has come to rest; one that is no image is told."""
+    write_png(tmp_path / "1.png", images()[0])
+    (tmp_path / "notes.txt").write_text("x")
+    (tmp_path / "2.png").write_bytes(b"nothing")
+    told: list[str] = []
+    found: list[Shot] = []
+    for shot in shots(str(tmp_path), lambda: len(found) == 2, told.append):
+        found.append(shot)
+        write_png(tmp_path / "3.png", images()[1])
+    assert [shot.name for shot in found] == ["1.png", "3.png"]
+    assert np.array_equal(found[1].image, images()[1])
+    assert not found[0].moving
+    assert len(told) == 1
+    assert "2.png" in told[0]
+    with pytest.raises(FileError, match="no such file"):
+        next(shots(str(tmp_path / "none"), lambda: False, told.append))
+
+
+def test_a_slow_reader_gets_the_newest_frame() -> None:
+    going = threading.Event()
+
+    def frames():  # type: ignore[no-untyped-def]
+        for i in range(5):
+            yield Frame(i, images()[0])
+        going.set()
+
+    found = newest(frames())
+    first = next(found)
+    going.wait(5)
+    rest = [frame.number for frame in found]
+    assert first.number < 5
+    # What came in between is gone, the order is kept.
+    assert rest == sorted(rest)
+    assert len(rest) < 4
+
+    def broken():  # type: ignore[no-untyped-def]
+        yield Frame(0, images()[0])
+        raise FileError("the stream ended")
+
+    with pytest.raises(FileError, match="the stream ended"):
+        list(newest(broken()))
+
+
+def test_command_line(tmp_path: Path) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for i, image in enumerate(images()):
+        write_png(folder / f"{i}.png", image)
+    what = ["--board", "6x5", "--square", "20mm", "--no-page"]
+    done = CliRunner().invoke(app, ["capture", str(folder), *what, "-o", str(tmp_path / "x.obs.json"), "--most", "5"])
+    assert done.exit_code == 0, done.output
+    assert "next: kcal calibrate" in done.output
+    assert len(Observations.load(tmp_path / "x.obs.json").views) == 5
+    assert len(list((tmp_path / "x.frames").iterdir())) == 5
+    failed = CliRunner().invoke(app, ["capture", str(tmp_path / "no"), *what, "-o", str(tmp_path / "y.obs.json")])
+    assert isinstance(failed.exception, FileError)
