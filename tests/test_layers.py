@@ -16,6 +16,7 @@ FLOORS = {
     "cli": 9,
     "report": 8,
     "mark": 8,
+    "pipeline": 8,
     "nets": 7,
     "locate": 7,
     "calibrate/batch": 6,
