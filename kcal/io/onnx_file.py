@@ -6,6 +6,7 @@ import importlib.util
 import os
 import tempfile
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -16,17 +17,18 @@ from kcal.errors import FileError, InputError
 from kcal.files import check_writable
 
 
-def save_onnx(module: nn.Module, example: Tensor, path: str | Path) -> Path:
+def save_onnx(module: nn.Module, example: Tensor | Sequence[Tensor], path: str | Path) -> Path:
     """Write a module that maps points (N, K) as ONNX, for any number of points from two up.
 
-    `Camera` itself is such a module (`project`), `Unproject`, `LookupCamera` and `Triangulate` are others. The graph is
+    `Camera` itself is such a module (`project`), `Unproject` and `LookupCamera` are others. `Triangulate` and
+    `StereoLocalizer` take the pixels of both images, and give all fields of their results in order. The graph is
     written as it was traced: the optimizer of onnxscript 0.7, on by default in `torch.onnx.export`, takes constants
     within 1e-5 of one for one and below 1e-8 for zero, and so drops the cosine of a small tilt or a small coefficient
     without a word. Runtimes optimize on their own when they load the graph.
 
     Args:
         module: its parameters become constants.
-        example: (N, K) points to trace it with, at least two.
+        example: (N, K) points to trace it with, at least two; several such tensors for a module of several inputs.
         path: of the file.
 
     Raises:
@@ -42,9 +44,11 @@ def save_onnx(module: nn.Module, example: Tensor, path: str | Path) -> Path:
         'camera.onnx'
     """
     path = check_writable(path)
-    if not isinstance(example, Tensor) or example.ndim != 2 or len(example) < 2:
-        raise InputError("save_onnx: an example (N, K) of at least two points is needed")
-    example = as_points("example", example, example.shape[-1])
+    examples = (example,) if isinstance(example, Tensor) else tuple(example)
+    if not examples or any(some.ndim != 2 or len(some) < 2 or len(some) != len(examples[0]) for some in examples):
+        raise InputError("save_onnx: an example (N, K) of at least two points is needed, the same N for every input")
+    examples = tuple(as_points("example", some, some.shape[-1]) for some in examples)
+    count = torch.export.Dim("count", min=2)
     if importlib.util.find_spec("onnxscript") is None:
         raise InputError("save_onnx: onnx and onnxscript are needed; install kcal[onnx]")
     training = module.training
@@ -56,10 +60,10 @@ def save_onnx(module: nn.Module, example: Tensor, path: str | Path) -> Path:
                 warnings.simplefilter("ignore", FutureWarning)
                 torch.onnx.export(
                     module.eval(),
-                    (example,),
+                    examples,
                     written,
                     dynamo=True,
-                    dynamic_shapes=({0: torch.export.Dim("count", min=2)},),
+                    dynamic_shapes=tuple({0: count} for _ in examples),
                     external_data=False,
                     optimize=False,
                     verbose=False,
