@@ -20,8 +20,7 @@ from kcal.files import check_writable
 def save_onnx(module: nn.Module, example: Tensor | Sequence[Tensor], path: str | Path) -> Path:
     """Write a module that maps points (N, K) as ONNX, for any number of points from two up.
 
-    `Camera` itself is such a module (`project`), `Unproject` and `LookupCamera` are others. `Triangulate` and
-    `StereoLocalizer` take the pixels of both images, and give all fields of their results in order. The graph is
+    `Camera` itself is such a module (`project`), `Unproject`, `LookupCamera` and `Triangulate` are others. The graph is
     written as it was traced: the optimizer of onnxscript 0.7, on by default in `torch.onnx.export`, takes constants
     within 1e-5 of one for one and below 1e-8 for zero, and so drops the cosine of a small tilt or a small coefficient
     without a word. Runtimes optimize on their own when they load the graph.
@@ -58,6 +57,8 @@ def save_onnx(module: nn.Module, example: Tensor | Sequence[Tensor], path: str |
             with warnings.catch_warnings():
                 # Of torch's own use of its tree library, nothing that a user could change.
                 warnings.simplefilter("ignore", FutureWarning)
+                # Two inputs share one number of points, which is what is wanted.
+                warnings.filterwarnings("ignore", message="# The axis name")
                 torch.onnx.export(
                     module.eval(),
                     examples,
