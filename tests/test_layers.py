@@ -18,6 +18,7 @@ FLOORS = {
     "mark": 8,
     "capture": 8,
     "web": 1,
+    "pipeline": 8,
     "nets": 7,
     "locate": 7,
     "calibrate/batch": 6,

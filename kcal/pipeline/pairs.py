@@ -1,0 +1,129 @@
+"""`ObjectPairs`: objects that both cameras of a rig see at one moment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from kcal.checks import as_points, require_finite
+from kcal.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectPairs:
+    """Objects of one moment, each with its pixels in both images: from association and matching to tracks.
+
+    Args:
+        left: (N, 2) pixels of the left camera's full image.
+        right: (N, 2) pixels of the right camera's full image.
+        covariance: (N, 4, 4) of (u_left, v_left, u_right, v_right), px².
+        time: (N, 2) seconds at which the left and the right image were exposed, float64.
+        score: (N,) of the detections.
+        category: N names.
+        track: N names that the detector's own tracker gave, or None.
+        ambiguous: (N,) bool: another pairing is about as likely.
+
+    Raises:
+        InputError: shapes or lengths that do not fit each other, values that are not finite, or a matrix that is not
+            a covariance.
+
+    Example:
+        >>> pair = ObjectPairs(left=torch.tensor([[960.0, 540.0]]), right=torch.tensor([[944.0, 540.0]]),
+        ...                    covariance=0.01 * torch.eye(4)[None], time=torch.zeros(1, 2).double(),
+        ...                    score=torch.ones(1), category=("ship",), track=(None,),
+        ...                    ambiguous=torch.zeros(1, dtype=torch.bool))
+        >>> len(pair), pair.left.dtype
+        (1, torch.float64)
+    """
+
+    left: Tensor
+    right: Tensor
+    covariance: Tensor
+    time: Tensor
+    score: Tensor
+    category: tuple[str, ...]
+    track: tuple[str | None, ...]
+    ambiguous: Tensor
+
+    def __post_init__(self) -> None:
+        for name, last in (("left", (2,)), ("right", (2,)), ("covariance", (4, 4)), ("time", (2,)), ("score", ())):
+            value = getattr(self, name)
+            if name == "time" and isinstance(value, Tensor) and value.dtype != torch.float64:
+                raise InputError(f"time: float64 is needed, got {value.dtype}; seconds lose milliseconds in float32")
+            value = as_points(name, value, last[-1] if last else len(self.category))
+            if value.shape != (len(self.category), *last):
+                wanted = (len(self.category), *last)
+                raise InputError(f"{name}: shape {wanted} is needed for its objects, got {tuple(value.shape)}")
+            require_finite(name, value)
+            object.__setattr__(self, name, value)
+        if len(self.track) != len(self):
+            raise InputError(f"track: {len(self)} names or None are needed, got {len(self.track)}")
+        if self.ambiguous.dtype != torch.bool or self.ambiguous.shape != (len(self),):
+            raise InputError(f"ambiguous: bool of shape ({len(self)},) is needed, got {tuple(self.ambiguous.shape)}")
+        _require_covariances(self.covariance.detach())
+
+    def __len__(self) -> int:
+        return len(self.category)
+
+    @classmethod
+    def from_matches(
+        cls,
+        matches: Mapping[str, Tensor],
+        *,
+        pixel_sigma: float = 1.0,
+        time: tuple[float, float] = (0.0, 0.0),
+        category: str = "point",
+    ) -> ObjectPairs:
+        """Points that a matcher of kornia found in both full images, for example LoFTR or `LocalFeatureMatcher`.
+
+        Args:
+            matches: `keypoints0` and `keypoints1` (N, 2) of the left and right image, `confidence` (N,), as the
+                matcher returned them. Kornia counts pixels from the center of the first one, as kcal does.
+            pixel_sigma: standard deviation of a keypoint along each axis, pixels.
+            time: seconds at which the left and the right image were exposed.
+            category: of all points.
+
+        Raises:
+            InputError: a key is missing, or matches of several pairs of images.
+
+        Example:
+            >>> found = {"keypoints0": torch.tensor([[960.0, 540.0]]), "keypoints1": torch.tensor([[944.0, 540.0]]),
+            ...          "confidence": torch.tensor([0.9])}
+            >>> ObjectPairs.from_matches(found).right.tolist()
+            [[944.0, 540.0]]
+        """
+        missing = [key for key in ("keypoints0", "keypoints1", "confidence") if key not in matches]
+        if missing:
+            raise InputError(f"matches: {missing[0]} is missing; the dictionary of a matcher of kornia is needed")
+        if not 0 < pixel_sigma < math.inf:
+            raise InputError(f"pixel_sigma: a positive number of pixels is needed, got {pixel_sigma}")
+        if bool((matches.get("batch_indexes", torch.zeros(1)) != 0).any()):
+            raise InputError("matches: one pair of images at a time is needed, not a batch")
+        count = len(matches["keypoints0"])
+        return cls(
+            left=matches["keypoints0"],
+            right=matches["keypoints1"],
+            covariance=(pixel_sigma**2 * torch.eye(4, dtype=torch.float64)).expand(count, 4, 4),
+            time=torch.tensor(time, dtype=torch.float64).expand(count, 2),
+            score=matches["confidence"],
+            category=(category,) * count,
+            track=(None,) * count,
+            ambiguous=torch.zeros(count, dtype=torch.bool),
+        )
+
+
+def _require_covariances(covariance: Tensor) -> None:
+    """Raise unless every one of (N, 4, 4) is symmetric without a negative eigenvalue."""
+    scale = covariance.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(torch.finfo(torch.float64).tiny)
+    unit = covariance / scale[:, None, None]
+    lopsided = (unit - unit.mT).abs().amax((-2, -1)) > 1e-9 if len(unit) else unit.new_zeros(0, dtype=torch.bool)
+    bad = lopsided | (torch.linalg.eigvalsh(unit).amin(-1) < -1e-9)
+    if bool(bad.any()):
+        raise InputError(
+            f"covariance: {int(bad.sum())} of {len(bad)} are not symmetric or have a negative eigenvalue, first "
+            f"number {int(bad.nonzero()[0])}"
+        )
