@@ -50,7 +50,7 @@ def candidates(
     ray = torch.cat([beliefs.mean[:, 0, :2], torch.ones_like(beliefs.mean[:, 0, :1])], -1)
     ray = torch.nn.functional.normalize((frame.mT @ ray[..., None])[..., 0], dim=-1)
     apart = torch.cdist(ray, torch.nn.functional.normalize(seen.direction, dim=-1))
-    spread = (beliefs.shared[:, 0, :2] @ root).square().sum((-2, -1))
+    spread = (beliefs.effect[:, 0, :2] @ root).square().sum((-2, -1))
     own = beliefs.noise[:, 0].diagonal(dim1=-2, dim2=-1)[:, :2].sum(-1)
     # A mark that is late has moved on.
     pace = beliefs.mean[:, 0, 3:5].square().sum(-1) + beliefs.noise[:, 0].diagonal(dim1=-2, dim2=-1)[:, 3:5].sum(-1)

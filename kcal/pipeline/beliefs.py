@@ -11,20 +11,46 @@ from kcal.pipeline.motion import Transition, moved, rates
 from kcal.pipeline.sightings import Anchored
 
 
+class Summary(NamedTuple):
+    """What is believed of T tracks, all models together: the true state is mean + effect b + noise.
+
+    Attributes:
+        mean: (T, 6) as if b were zero.
+        noise: (T, 6, 6) covariance from marks and motion alone.
+        effect: (T, 6, K + 3) of the calibration's errors and the clock's.
+    """
+
+    mean: Tensor
+    noise: Tensor
+    effect: Tensor
+
+    def at(self, which: Tensor) -> Self:
+        """The tracks at some places."""
+        return type(self)(*(value[which] for value in self))
+
+
 class Beliefs(NamedTuple):
     """T tracks under J models; see `kcal.pipeline.motion` for the state and `kcal.pipeline.consider` for b.
 
     Attributes:
         mean: (T, J, 6) as if b were zero.
         noise: (T, J, 6, 6) covariance from marks and motion alone.
-        shared: (T, J, 6, B): the true state is mean + shared b + noise.
+        shared: (T, J, 6, K) effect of the calibration's errors.
+        late: (T, J, 6, 3, 3) effect of the clock's three errors, for each component of the velocity in the state: what
+            was seen before a velocity was known counts with the velocity that is known now.
         weight: (T, J) probabilities of the models.
     """
 
     mean: Tensor
     noise: Tensor
     shared: Tensor
+    late: Tensor
     weight: Tensor
+
+    @property
+    def effect(self) -> Tensor:
+        """(T, J, 6, K + 3): the true state is mean + effect b + noise."""
+        return torch.cat([self.shared, (self.late @ self.mean[..., None, 3:, None])[..., 0]], -1)
 
     def at(self, which: Tensor) -> Self:
         """The tracks at some places."""
@@ -37,7 +63,13 @@ class Beliefs(NamedTuple):
         apart = self.mean - mean
         noise = (weight[..., None] * (self.noise + apart[..., :, None] * apart[..., None, :])).sum(1, keepdim=True)
         shared = (weight[..., None] * self.shared).sum(1, keepdim=True)
-        return type(self)(mean, noise, shared, torch.ones_like(self.weight[:, :1]))
+        late = (weight[..., None, None] * self.late).sum(1, keepdim=True)
+        return type(self)(mean, noise, shared, late, torch.ones_like(self.weight[:, :1]))
+
+    def summary(self) -> Summary:
+        """The same without the axis of models."""
+        merged = self.merged()
+        return Summary(merged.mean[:, 0], merged.noise[:, 0], merged.effect[:, 0])
 
     def mixed(self, stay: float) -> Self:
         """Before a prediction: models may have switched. `stay` is the probability that they did not, by chance too."""
@@ -52,7 +84,8 @@ class Beliefs(NamedTuple):
         apart = self.mean[:, None] - mean[:, :, None]  # (T, to, from, 6)
         noise = torch.einsum("tji,tiab->tjab", share, self.noise) + (share[..., None] * apart).mT @ apart
         shared = torch.einsum("tji,tiab->tjab", share, self.shared)
-        return type(self)(mean, noise, shared, weight)
+        late = torch.einsum("tji,tiabc->tjabc", share, self.late)
+        return type(self)(mean, noise, shared, late, weight)
 
 
 class Predicted(NamedTuple):
@@ -65,7 +98,13 @@ class Predicted(NamedTuple):
 def predicted(beliefs: Beliefs, step: Transition, turn: Tensor | None = None) -> Predicted:
     """Move all by a step; see `moved`."""
     mean, slope, noise = moved(beliefs.mean, step, turn)
-    new = Beliefs(mean, slope @ beliefs.noise @ slope.mT + noise, slope @ beliefs.shared, beliefs.weight)
+    # Velocities of earlier moments are today's, turned back; a memory that fades would let them grow without end.
+    keep = step.keep if turn is None else turn[:, None] @ step.keep
+    # The velocity in the state is divided by z, and z has changed by this.
+    share = 1.0 / slope[..., 2, 2][..., None, None, None]
+    turned = keep / torch.linalg.vector_norm(keep[..., :1], dim=-2, keepdim=True)
+    late = (slope @ beliefs.late.flatten(-2)).unflatten(-1, (-1, 3)) @ (share * turned.mT[..., None, :, :])
+    new = Beliefs(mean, slope @ beliefs.noise @ slope.mT + noise, slope @ beliefs.shared, late, beliefs.weight)
     weight = beliefs.weight[..., None, None]
     before, after = beliefs.merged().mean, new.merged().mean
     apart = (beliefs.mean - before)[..., :, None] * (mean - after)[..., None, :]
@@ -96,13 +135,17 @@ class Innovations(NamedTuple):
     Attributes:
         value: (N, J, 4).
         slope: (N, J, 4, 6) of the measurement by the state.
-        effect: (N, J, 4, B).
+        shared: (N, J, 4, K) effect of the calibration's errors.
+        late: (N, J, 4, 3, 3) of the clock's, for each component of the velocity.
+        effect: (N, J, 4, K + 3) both, with the velocity as predicted.
         noise: (N, J, 4, 4) of innovations.
         marks: (N, J, 4, 4) the part of it that does not come from the belief.
     """
 
     value: Tensor
     slope: Tensor
+    shared: Tensor
+    late: Tensor
     effect: Tensor
     noise: Tensor
     marks: Tensor
@@ -123,11 +166,13 @@ def innovations(beliefs: Beliefs, seen: Anchored, timing: Timing) -> Innovations
     slope = direct + late @ by_state
     padded = torch.nn.functional.pad(beliefs.mean[..., :3], (0, 1))
     value = seen.value[:, None] - padded - (late @ rate[..., None])[..., 0]
-    by_clock = (seen.late[1][:, None] @ rate[..., None]) * timing.clock[:, None, None, :]
-    own = seen.shared[:, None].expand(*rate.shape[:2], *seen.shared.shape[1:])
-    effect = torch.cat([own, by_clock], -1) + slope @ beliefs.shared
+    shared = seen.shared[:, None] + slope @ beliefs.shared
+    by_clock = (seen.late[1][:, None] @ by_state[..., 3:])[..., None, :] * timing.clock[:, None, None, :, None]
+    after = by_clock + (slope @ beliefs.late.flatten(-2)).unflatten(-1, (-1, 3))
+    effect = torch.cat([shared, (after @ beliefs.mean[..., None, 3:, None])[..., 0]], -1)
     marks = seen.noise[:, None] + _unknown_motion(seen, by_state @ beliefs.noise @ by_state.mT, timing.unsure)
-    return Innovations(value, slope, effect, slope @ beliefs.noise @ slope.mT + marks, marks)
+    noise = slope @ beliefs.noise @ slope.mT + marks
+    return Innovations(value, slope, shared, after, effect, noise, marks)
 
 
 def _unknown_motion(seen: Anchored, rate: Tensor, unsure: Tensor) -> Tensor:
@@ -167,7 +212,9 @@ def updated(beliefs: Beliefs, found: Innovations, fit: Fit) -> Beliefs:
     rest = torch.eye(6).to(mean) - gain @ found.slope
     noise = rest @ beliefs.noise @ rest.mT + gain @ found.marks @ gain.mT
     log = beliefs.weight.log() + fit.log_density
-    return Beliefs(mean, noise, beliefs.shared - gain @ found.effect, torch.softmax(log, -1).clamp_min(1e-12))
+    shared = beliefs.shared - gain @ found.shared
+    late = beliefs.late - (gain @ found.late.flatten(-2)).unflatten(-1, (-1, 3))
+    return Beliefs(mean, noise, shared, late, torch.softmax(log, -1).clamp_min(1e-12))
 
 
 def born(seen: Anchored, timing: Timing, speed: float, models: int) -> Beliefs:
@@ -186,8 +233,9 @@ def born(seen: Anchored, timing: Timing, speed: float, models: int) -> Beliefs:
     noise[:, :3, 3:] = -late @ drift
     noise[:, 3:, :3] = noise[:, :3, 3:].mT
     noise[:, 3:, 3:] = drift
-    shared = state.new_zeros(count, 6, seen.shared.shape[-1] + timing.clock.shape[-1])
-    shared[:, :3, : seen.shared.shape[-1]] = -seen.shared[:, :3]
-    start = Beliefs(state[:, None], noise[:, None], shared[:, None], state.new_ones(count, 1))
-    every = [value.repeat_interleave(models, 1) for value in start]
-    return Beliefs(every[0], every[1], every[2], every[3] / models)
+    shared = torch.nn.functional.pad(-seen.shared[:, :3], (0, 0, 0, 3))
+    by_clock = (seen.late[1, :, :3] @ by_state[..., 3:])[..., None, :] * timing.clock[:, None, :, None]
+    late = torch.nn.functional.pad(-by_clock, (0, 0, 0, 0, 0, 3))
+    weight = state.new_full((count, models), 1.0 / models)
+    every = [value[:, None].repeat_interleave(models, 1) for value in (state, noise, shared, late)]
+    return Beliefs(every[0], every[1], every[2], every[3], weight)

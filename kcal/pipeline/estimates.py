@@ -13,7 +13,7 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import by_mounting
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
 from kcal.locate.stereo import PositionStatus, flag_positions
-from kcal.pipeline.beliefs import Beliefs
+from kcal.pipeline.beliefs import Summary
 from kcal.pipeline.consider import CLOCK_TERMS
 
 
@@ -49,23 +49,23 @@ class TrackStates(NamedTuple):
     inverse_range_sigma: Tensor
 
 
-def track_states(localize: StereoLocalizer, frame: Tensor, beliefs: Beliefs, root: Tensor) -> TrackStates:
-    """Place merged beliefs on the Earth.
+def track_states(localize: StereoLocalizer, frame: Tensor, beliefs: Summary, root: Tensor) -> TrackStates:
+    """Place beliefs on the Earth.
 
     Args:
         localize: the rig and where it stands.
         frame: (T, 3, 3) rotations from the rig's axes into the tracks' frames.
-        beliefs: (T, 1, ...), from `Beliefs.merged`.
+        beliefs: of T tracks.
         root: (B, R) of the covariance of the shared errors.
     """
-    spread = beliefs.shared[:, 0] @ root
-    mean = beliefs.mean[:, 0]
+    spread = beliefs.effect @ root
+    mean = beliefs.mean
     axes = localize.enu_from_rig @ frame.mT
     ray = torch.cat([mean[:, :2], torch.ones_like(mean[:, :1])], -1)
     length = torch.linalg.vector_norm(ray, dim=-1)
     inverse_range = mean[:, 2] / length
     slope = torch.cat([-mean[:, 2:3] * ray[:, :2] / length[:, None] ** 3, 1.0 / length[:, None]], -1)
-    noise = beliefs.noise[:, 0]
+    noise = beliefs.noise
     variance = (slope[:, None] @ noise[:, :3, :3])[:, 0].mul(slope).sum(-1)
     variance = variance + (slope[:, None] @ spread[:, :3])[:, 0].square().sum(-1)
     sigma = variance.clamp_min(0.0).sqrt()
@@ -95,7 +95,7 @@ def track_states(localize: StereoLocalizer, frame: Tensor, beliefs: Beliefs, roo
         systematic = systematic + turn @ localize.mounting @ turn.mT
         if localize.link is not None and localize.calibration_factor is not None:
             link = torch.linalg.pinv(localize.calibration_factor) @ localize.link
-            own = beliefs.shared[:, 0, :, :-CLOCK_TERMS]
+            own = beliefs.effect[..., :-CLOCK_TERMS]
             mixed = -by_state @ own @ link @ turn.mT
             systematic = systematic + mixed + mixed.mT
     whole = random + systematic

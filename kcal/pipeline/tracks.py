@@ -146,11 +146,11 @@ class Tracker:
         self.time = -math.inf
         self.records: list[TrackRecord] = []
         self.history: History | None = History() if record else None
-        size, models = self.calibration + CLOCK_TERMS, len(self.options.motions)
+        models = len(self.options.motions)
         empty = torch.zeros(0, dtype=torch.float64, device=device)
         self.frame = empty.reshape(0, 3, 3)
-        shapes = ((models, 6), (models, 6, 6), (models, 6, size), (models,))
-        self.beliefs = Beliefs(*(empty.reshape(0, *shape) for shape in shapes))
+        shapes = ((6,), (6, 6), (6, self.calibration), (6, CLOCK_TERMS, 3), ())
+        self.beliefs = Beliefs(*(empty.reshape(0, models, *shape) for shape in shapes))
         self.next_number = self.next_key = 1
 
     @torch.no_grad()
@@ -178,7 +178,7 @@ class Tracker:
         self._sort_out()
         if self.history is not None:
             keys = [track.key for track in self.records]
-            self.history.filtered(time, keys, self.frame, self.beliefs.merged(), self.shared.values)
+            self.history.filtered(time, keys, self.frame, self.beliefs.summary(), self.shared.values)
         return self.tracks()
 
     def tracks(self) -> Tracks:
@@ -193,7 +193,7 @@ class Tracker:
             category=tuple(track.category for track in records),
             hits=torch.tensor([track.hits for track in records], dtype=torch.long),
             unseen_s=torch.tensor([self.time - track.last for track in records], dtype=torch.float64),
-            state=track_states(self.localize, self.frame[which], beliefs.merged(), self.shared.root),
+            state=track_states(self.localize, self.frame[which], beliefs.summary(), self.shared.root),
             models=beliefs.weight,
         )
 
@@ -226,7 +226,8 @@ class Tracker:
             self.frame = turn @ self.frame
         self.beliefs, cross = predicted(beliefs, transition(self.options.motions, dt, up), turn)
         if self.history is not None:
-            self.history.predicted([track.key for track in self.records], self.beliefs.merged(), cross)
+            keys = [track.key for track in self.records]
+            self.history.predicted(keys, self.beliefs.summary(), cross, self.shared.values)
 
     def _take(self, pairs: ObjectPairs, seen: Sightings) -> None:
         timing = self._delays(seen)
@@ -247,7 +248,7 @@ class Tracker:
             self._begin(torch.tensor(fresh), pairs, seen, timing)
         move = self.shared.settle()
         beliefs = self.beliefs
-        self.beliefs = beliefs._replace(mean=beliefs.mean + beliefs.shared[..., self.calibration :] @ move)
+        self.beliefs = beliefs._replace(mean=beliefs.mean + beliefs.effect[..., self.calibration :] @ move)
 
     def _delays(self, seen: Sightings) -> Timing:
         since = seen.time[:, 1] - (self.shared.start or 0.0)
@@ -330,7 +331,7 @@ class Tracker:
         old, here = self.beliefs.at(which).merged(), self.beliefs.at(torch.tensor([new])).merged()
         still = transition((Motion(acceleration=0.0),), 0.0, self.frame[which] @ self.localize.enu_from_rig[2])
         old = predicted(old, still, self.frame[new] @ self.frame[which].mT).beliefs
-        effect = here.shared - old.shared
+        effect = here.effect - old.effect
         apart = here.mean - old.mean
         spread = effect @ self.shared.root
         covariance = here.noise + old.noise + spread @ spread.mT
