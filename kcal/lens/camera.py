@@ -11,8 +11,7 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import InputError
-from kcal.lens.calibration import CameraCalibration, UntilChanged
-from kcal.lens.camera_parameters import CameraParameters
+from kcal.lens.camera_conversions import ConvertibleCamera
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_points import map_points
 from kcal.lens.hybrid_points_fit import FittedPolynomials, worth_fitting
@@ -26,7 +25,7 @@ from kcal.lens.region import Region, in_region, surely_in_region
 from kcal.lens.tracing import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
 
 
-class Camera(CameraParameters):
+class Camera(ConvertibleCamera):
     """Project points to pixels (`project`) and unproject pixels to rays (`unproject`), both with a validity mask.
 
     Make one from plain numbers with `Camera.build`, or load one with `kcal.load_camera`.
@@ -65,7 +64,6 @@ class Camera(CameraParameters):
     valid_radius: Tensor
     valid_edge: Tensor
     inverse_start: Tensor
-    calibration = UntilChanged[CameraCalibration](lambda camera, value: value.check(len(camera.names)))
 
     def __init__(self, parameters: Tensor, *, size: tuple[int, int], model: LensModel | str = "opencv5") -> None:
         super().__init__(parameters, size, LensModel.named(model))

@@ -199,6 +199,31 @@ class Undistort(nn.Module):
         return super()._apply(moved, recurse)
 
 
+class UndistortImage(nn.Module):
+    """`Undistort` that returns the image alone, for chains of image operations such as kornia's `ImageSequential`.
+
+    Pixels that the source does not show are 0; with the default new camera there are none.
+
+    Args:
+        camera: see `Undistort`.
+        new_camera: see `Undistort`.
+
+    Example:
+        >>> from kornia.augmentation import ImageSequential, RandomHorizontalFlip
+        >>> camera = Camera.build(focal=(500, 500), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.2])
+        >>> ImageSequential(UndistortImage(camera), RandomHorizontalFlip())(torch.rand(2, 3, 480, 640)).shape
+        torch.Size([2, 3, 480, 640])
+    """
+
+    def __init__(self, camera: Camera, new_camera: Camera | None = None) -> None:
+        super().__init__()
+        self.undistort = Undistort(camera, new_camera)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Undistort images (..., C, H, W); see `Undistort.forward`."""
+        return self.undistort(image)[0]
+
+
 def _source_positions(camera: Camera, new_camera: Camera) -> tuple[Tensor, Tensor]:
     """Source pixel (..., H, W, 2) of each pixel of the new image, and mask (..., H, W)."""
     width, height = new_camera.size

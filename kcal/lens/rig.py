@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from kornia.geometry.epipolar import cross_product_matrix, fundamental_from_essential
 from torch import Tensor, nn
 
 from kcal.checks import as_covariance, as_points, keep_float64, require_finite
@@ -80,6 +81,31 @@ class StereoRig(nn.Module):
         """Twelve hex digits that change with either camera and with the relative pose."""
         pose = self.right_from_left_rotation.tolist(), self.right_from_left_translation.tolist()
         return hashlib.sha256(repr((self.left.fingerprint, self.right.fingerprint, pose)).encode()).hexdigest()[:12]
+
+    @property
+    def essential(self) -> Tensor:
+        """(3, 3) essential matrix E: rayᵀ_right E ray_left = 0 for rays of `Camera.unproject` that meet.
+
+        With `Camera.normalize` it serves the functions of `kornia.geometry.epipolar`, whatever the lenses are.
+        """
+        skewed = cross_product_matrix(self.right_from_left_translation[None])[0]
+        return skewed @ self.right_from_left_rotation
+
+    @property
+    def fundamental(self) -> Tensor:
+        """(3, 3) fundamental matrix F: pixelᵀ_right F pixel_left = 0, of cameras without distortion.
+
+        Raises:
+            InputError: a camera whose lens distorts: epipolar lines are curves there. Use `essential` with
+                `Camera.normalize`, or undistort the images.
+        """
+        for word, camera in (("left", self.left), ("right", self.right)):
+            if camera.model.wide or bool((camera.coefficients != 0).any()):
+                raise InputError(
+                    f"the {word} lens distorts, so that epipolar lines are curves and there is no fundamental matrix; "
+                    "use rig.essential with camera.normalize(pixels)"
+                )
+        return fundamental_from_essential(self.essential[None], self.left.matrix[None], self.right.matrix[None])[0]
 
     def right_from_left(self, points_left: Tensor) -> Tensor:
         """Move points (..., N, 3) from the left camera's frame into the right camera's."""

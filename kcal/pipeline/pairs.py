@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -66,6 +68,52 @@ class ObjectPairs:
 
     def __len__(self) -> int:
         return len(self.category)
+
+    @classmethod
+    def from_matches(
+        cls,
+        matches: Mapping[str, Tensor],
+        *,
+        pixel_sigma: float = 1.0,
+        time: tuple[float, float] = (0.0, 0.0),
+        category: str = "point",
+    ) -> ObjectPairs:
+        """Points that a matcher of kornia found in both full images, for example LoFTR or `LocalFeatureMatcher`.
+
+        Args:
+            matches: `keypoints0` and `keypoints1` (N, 2) of the left and right image, `confidence` (N,), as the
+                matcher returned them. Kornia counts pixels from the center of the first one, as kcal does.
+            pixel_sigma: standard deviation of a keypoint along each axis, pixels.
+            time: seconds at which the left and the right image were exposed.
+            category: of all points.
+
+        Raises:
+            InputError: a key is missing, or matches of several pairs of images.
+
+        Example:
+            >>> found = {"keypoints0": torch.tensor([[960.0, 540.0]]), "keypoints1": torch.tensor([[944.0, 540.0]]),
+            ...          "confidence": torch.tensor([0.9])}
+            >>> ObjectPairs.from_matches(found).right.tolist()
+            [[944.0, 540.0]]
+        """
+        missing = [key for key in ("keypoints0", "keypoints1", "confidence") if key not in matches]
+        if missing:
+            raise InputError(f"matches: {missing[0]} is missing; the dictionary of a matcher of kornia is needed")
+        if not 0 < pixel_sigma < math.inf:
+            raise InputError(f"pixel_sigma: a positive number of pixels is needed, got {pixel_sigma}")
+        if bool((matches.get("batch_indexes", torch.zeros(1)) != 0).any()):
+            raise InputError("matches: one pair of images at a time is needed, not a batch")
+        count = len(matches["keypoints0"])
+        return cls(
+            left=matches["keypoints0"],
+            right=matches["keypoints1"],
+            covariance=(pixel_sigma**2 * torch.eye(4, dtype=torch.float64)).expand(count, 4, 4),
+            time=torch.tensor(time, dtype=torch.float64).expand(count, 2),
+            score=matches["confidence"],
+            category=(category,) * count,
+            track=(None,) * count,
+            ambiguous=torch.zeros(count, dtype=torch.bool),
+        )
 
 
 def _require_covariances(covariance: Tensor) -> None:

@@ -4,6 +4,8 @@ import dataclasses
 
 import pytest
 import torch
+from kornia.feature import DescriptorMatcher, LocalFeatureMatcher, SIFTFeature
+from kornia.filters import gaussian_blur2d
 
 from kcal.errors import InputError
 from kcal.pipeline.pairs import ObjectPairs
@@ -57,3 +59,32 @@ def test_no_objects() -> None:
 def test_what_cannot_be_is_refused(changes: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         pairs(**changes)
+
+
+def test_what_kornia_matched() -> None:
+    """SIFT and mutual nearest neighbors, which need no weights; the right image is the left one, shifted."""
+    random = torch.Generator().manual_seed(3)
+    noise = torch.rand(1, 1, 60, 80, generator=random)
+    image = gaussian_blur2d(noise.repeat_interleave(2, 2).repeat_interleave(2, 3), 7, (2.0, 2.0))
+    matcher = LocalFeatureMatcher(SIFTFeature(60), DescriptorMatcher("smnn", 0.9))
+    found = matcher({"image0": image, "image1": image.roll(-12, 3)})
+    points = ObjectPairs.from_matches(found, pixel_sigma=0.5, time=(1.0, 1.1))
+    assert len(points) > 10
+    shift = (points.left - points.right).median(0).values
+    assert torch.allclose(shift, torch.tensor([12.0, 0.0], dtype=torch.float64), atol=0.2)
+    assert points.covariance[0].diagonal().tolist() == [0.25] * 4
+    assert points.time[0].tolist() == [1.0, 1.1]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"confidence": None}, "confidence is missing"),
+        ({"batch_indexes": torch.tensor([0, 1])}, "one pair of images"),
+        ({"keypoints0": torch.ones(2, 3)}, "left: shape"),
+    ],
+)
+def test_what_is_no_match_is_refused(change: dict, message: str) -> None:
+    given = {"keypoints0": torch.ones(2, 2), "keypoints1": torch.ones(2, 2), "confidence": torch.ones(2)} | change
+    with pytest.raises(InputError, match=message):
+        ObjectPairs.from_matches({key: value for key, value in given.items() if value is not None})

@@ -1,0 +1,151 @@
+"""kcal's cameras, rigs and images together with the real kornia."""
+
+from __future__ import annotations
+
+import kornia.geometry.epipolar as epi
+import pytest
+import torch
+from kornia.augmentation import ImageSequential, RandomHorizontalFlip, VideoSequential
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.vector import Vector2, Vector3
+from kornia.image import ImageSize
+from kornia.sensors.camera import CameraModel, CameraModelType
+from lenses import HYBRID, strong
+
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.images import Undistort, UndistortImage
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import StereoRig
+
+POINTS = torch.tensor([[0.1, -0.2, 1.1], [-0.3, 0.2, 1.3], [0.4, 0.3, 2.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+LENSES = {
+    "opencv4": [-0.2, 0.05, 1e-3, -5e-4],
+    "opencv5": [-0.2, 0.05, 1e-3, -5e-4, 0.01],
+    "opencv8": [-0.2, 0.05, 1e-3, -5e-4, 0.01, 0.02, 0.01, 0.003],
+    "fisheye4": [0.02, -0.01, 0.003, -0.0005],
+}
+
+
+def camera_with(model: str, lens: list[float], skew: float = 0.0) -> Camera:
+    return Camera.build(
+        focal=(800, 810), center=(321, 238), size=(640, 480), coefficients=lens, model=model, skew=skew
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_lenses_go_to_kornia_and_come_back(model: str) -> None:
+    camera = camera_with(model, LENSES[model])
+    there = camera.to_kornia()
+    pixels, _ = camera.project(POINTS)
+    assert torch.allclose(there.project(Vector3(POINTS)).data, pixels, rtol=0, atol=1e-10)
+    again = Camera.from_kornia(there)
+    assert again.size == camera.size
+    assert torch.allclose(again.project(POINTS)[0], pixels, rtol=0, atol=1e-12)
+
+
+def test_a_lens_whose_other_coefficients_are_zero_is_held() -> None:
+    camera = camera_with("opencv14", [-0.2, 0.05])
+    pixels, _ = camera.project(POINTS)
+    assert torch.allclose(camera.to_kornia().project(Vector3(POINTS)).data, pixels, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_pinholes_in_batches_and_with_skew(count: int) -> None:
+    values = torch.tensor([800.0, 810, 321, 238, 2.5], dtype=torch.float64) * torch.linspace(1, 1.2, count)[:, None]
+    camera = Camera(values, size=(640, 480), model="pinhole")
+    there = camera.to_kornia()
+    assert isinstance(there, PinholeCamera)
+    points = POINTS.expand(count, -1, 3)
+    pixels, _ = camera.project(points)
+    assert torch.allclose(there.project(points), pixels, rtol=0, atol=1e-9)
+    assert torch.allclose(there.unproject(pixels, points[..., 2:]), points, rtol=0, atol=1e-12)
+    again = Camera.from_kornia(there)
+    assert torch.equal(again.params, values if count > 1 else values[0])
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        (camera_with("opencv12", [-0.2, 0.05, 0, 0, 0, 0, 0, 0, 1e-3]), r"no camera of kornia holds .*refit_camera"),
+        (Camera(torch.cat([torch.tensor([800.0, 800, 320, 240, 0]), strong(HYBRID)]), size=(640, 480), model=HYBRID),
+         "holds this hybrid lens"),
+        (camera_with("opencv5", [-0.2], skew=1.0), "lens with skew"),
+        (Camera(torch.tensor([[8e2, 8e2, 320, 240, 0, -0.1, 0, 0, 0]]).repeat(2, 1), size=(640, 480), model="opencv4"),
+         "one by one"),
+    ],
+)  # fmt: skip
+def test_what_kornia_does_not_hold_is_refused(camera: Camera, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        camera.to_kornia()
+
+
+def test_what_kcal_does_not_take_is_refused() -> None:
+    pinhole = camera_with("pinhole", []).to_kornia()
+    pinhole.extrinsics[:, 0, 3] = 1.0
+    with pytest.raises(InputError, match="has a pose"):
+        Camera.from_kornia(pinhole)
+    orthographic = CameraModel(ImageSize(480, 640), CameraModelType.ORTHOGRAPHIC, torch.tensor([1.0, 1, 320, 240]))
+    for wrong in (orthographic, torch.eye(3)):
+        with pytest.raises(InputError, match="a perspective or Kannala-Brandt camera"):
+            Camera.from_kornia(wrong)
+
+
+def test_unprojection_agrees() -> None:
+    camera = camera_with("opencv5", LENSES["opencv5"])
+    pixels, _ = camera.project(POINTS)
+    theirs = camera.to_kornia().unproject(Vector2(pixels), POINTS[:, 2]).data
+    rays, _ = camera.unproject(pixels)
+    assert torch.allclose(rays * (POINTS[:, 2:] / rays[:, 2:]), POINTS, rtol=0, atol=1e-12)
+    assert torch.allclose(theirs, POINTS, rtol=0, atol=1e-3)  # five steps of a fixed iteration
+
+
+def rig_with(lens: list[float]) -> StereoRig:
+    turn = rotation_from_vector(torch.tensor([0.01, -0.03, 0.02], dtype=torch.float64))
+    right = Camera.build(focal=(700, 705), center=(330, 236), size=(640, 480), coefficients=lens)
+    return StereoRig(camera_with("opencv5", lens), right, turn, torch.tensor([-1.0, 0.05, 0.02]))
+
+
+def test_a_pinhole_rig_in_the_epipolar_functions() -> None:
+    rig = rig_with([])
+    points = POINTS * 5
+    left, right, _ = rig(points)
+    distance = epi.sampson_epipolar_distance(left[None], right[None], rig.fundamental[None])
+    assert float(distance.max()) < 1e-18
+    wrong = epi.sampson_epipolar_distance(left[None], right[None] + torch.tensor([0.0, 1.0]), rig.fundamental[None])
+    assert float(wrong.min()) > 0.1
+    found = epi.find_fundamental(left[None].repeat(1, 2, 1), right[None].repeat(1, 2, 1), torch.ones(1, 8).double())
+    assert found.shape == (1, 3, 3)
+    pose = rig.right_from_left_rotation[None], rig.right_from_left_translation[None, :, None]
+    still = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, 1, dtype=torch.float64)
+    both = (rig.left, still), (rig.right, pose)
+    matrices = [epi.projection_from_KRt(camera.matrix[None], *at) for camera, at in both]
+    back = epi.triangulate_points(*matrices, left[None], right[None], solver="svd")
+    assert torch.allclose(back[0], points, rtol=0, atol=1e-8)
+
+
+def test_a_rig_with_lenses_by_rays() -> None:
+    rig = rig_with([-0.25, 0.05])
+    left, right, _ = rig(POINTS * 5)
+    planes = [camera.normalize(pixels)[0][None] for camera, pixels in ((rig.left, left), (rig.right, right))]
+    assert float(epi.sampson_epipolar_distance(*planes, rig.essential[None]).max()) < 1e-24
+    shift = rig.right_from_left_translation
+    pose = epi.motion_from_essential_choose_solution(
+        rig.essential[None], torch.eye(3).double()[None], torch.eye(3).double()[None], *planes
+    )
+    assert torch.allclose(pose[0][0], rig.right_from_left_rotation, atol=1e-9)
+    assert torch.allclose(pose[1][0, :, 0], shift / shift.norm(), atol=1e-9)
+    with pytest.raises(InputError, match="left lens distorts"):
+        _ = rig.fundamental
+
+
+def test_undistort_in_sequences() -> None:
+    camera = camera_with("opencv5", [-0.2, 0.05])
+    image = torch.rand(2, 3, 480, 640)
+    wanted = Undistort(camera)(image)[0]
+    chain = ImageSequential(UndistortImage(camera), RandomHorizontalFlip(p=1.0))
+    assert torch.equal(chain(image), wanted.flip(-1))
+    video = torch.rand(1, 3, 2, 480, 640)  # B C T H W
+    frames = torch.stack([Undistort(camera)(video[:, :, i])[0] for i in range(2)], 2)
+    flow = VideoSequential(UndistortImage(camera), RandomHorizontalFlip(p=1.0), data_format="BCTHW")
+    assert torch.equal(flow(video), frames.flip(-1))

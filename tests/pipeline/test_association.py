@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.locate.stereo import fit_pairs
+from kcal.pipeline.association import Association, AssociationOptions, associate, epipolar_cost, pair_costs
+from kcal.pipeline.detections import Detections
+
+SIZE = (1920, 1080)
+
+
+def rig_of(baseline: float = 10.0) -> StereoRig:
+    camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=SIZE, coefficients=[-0.1, 0.02])
+    turn = rotation_from_vector(torch.tensor([0.003, -0.01, 0.004], dtype=torch.float64))
+    return StereoRig(camera, camera, turn, torch.tensor([-baseline, 0.2, 0.1]))
+
+
+def seen(pixels: Tensor, half: float = 6.0, **more: object) -> Detections:
+    boxes = torch.cat([pixels - half, pixels + half], -1)
+    count = len(boxes)
+    given = {"category": ("car",) * count, "track": (None,) * count} | more
+    return Detections(boxes=boxes, score=torch.ones(count), size=SIZE, **given)  # type: ignore[arg-type]
+
+
+def site(count: int, seed: int, sigma: float = 1.0) -> tuple[StereoRig, Detections, Detections, Tensor]:
+    """Targets from 100 m to 5 km, and boxes whose middles err; right ones in another order."""
+    random = torch.Generator().manual_seed(seed)
+    rig = rig_of()
+    distance = 10 ** torch.empty(count, dtype=torch.float64).uniform_(2.0, 3.7, generator=random)
+    place = torch.stack([torch.empty(count).uniform_(-low, low, generator=random) for low in (0.4, 0.2)], -1).double()
+    points = torch.cat([place, torch.ones(count, 1)], -1) * distance[:, None]
+    left, right, _ = rig(points)
+    order = torch.randperm(count, generator=random)
+    noise = sigma * torch.randn(2, count, 2, dtype=torch.float64, generator=random)
+    return rig, seen(left + noise[0]), seen((right + noise[1])[order]), order
+
+
+def test_targets_find_each_other() -> None:
+    right_ones = total = 0
+    for seed in range(5):
+        rig, left, right, order = site(20, seed)
+        found = associate(rig, left, right, AssociationOptions(box_sigma=1.0))
+        assert len(set(found.right.tolist())) == len(found.right)
+        right_ones += int((order[found.right] == found.left).sum())
+        total += len(found.left)
+    assert total >= 97
+    assert right_ones >= total - 1
+
+
+def brute(cost: Tensor, alone: float) -> float:
+    """The least sum over all one-to-one assignments, by trying them."""
+    rows, columns = cost.shape
+    best = float("inf")
+    for choice in itertools.product(range(-1, columns), repeat=rows):
+        taken = [c for c in choice if c >= 0]
+        if len(taken) == len(set(taken)):
+            pairs = sum(float(cost[i, c]) for i, c in enumerate(choice) if c >= 0)
+            best = min(best, pairs + 0.5 * alone * (rows + columns - 2 * len(taken)))
+    return best
+
+
+def total(found: Association, shape: tuple[int, int], alone: float) -> float:
+    return float(found.cost.sum()) + 0.5 * alone * (sum(shape) - 2 * len(found.left))
+
+
+def test_the_assignment_is_the_best_one() -> None:
+    random = torch.Generator().manual_seed(5)
+    rig = rig_of()
+    for _ in range(5):
+        points = torch.cat([0.01 * torch.randn(4, 2, generator=random), torch.ones(4, 1)], -1).double() * 800
+        left, right, _ = rig(points)
+        left, right = seen(left), seen((right + torch.randn(4, 2, generator=random))[:3])
+        options = AssociationOptions(box_sigma=2.0)
+        found = associate(rig, left, right, options)
+        cost = torch.where(found.possible, pair_costs(rig, left, right, options), torch.inf)
+        assert total(found, (4, 3), 16.0) == pytest.approx(brute(cost, 16.0))
+
+
+def test_two_that_could_be_swapped_are_ambiguous() -> None:
+    """Side by side at one height: both pairings have a range, and neither is likelier by its epipolar error."""
+    rig = rig_of()
+    near, _, _ = rig(torch.tensor([[0.0, 0, 1000.0]]).double())
+    left, right, _ = rig(torch.tensor([[0.0, 0, 1000.0], [2.0, 0, 1000.0], [0, 200.0, 1000.0]]).double())
+    found = associate(rig, seen(left), seen(right))
+    assert found.left.tolist() == [0, 1, 2]
+    assert found.ambiguous.tolist() == [True, True, False]
+    assert near.shape == (1, 2)
+    # Category or size settles it.
+    for more in ({"category": ("car", "bus", "car")}, {}):
+        half = torch.tensor([[6.0], [14.0], [6.0]]) if not more else 6.0
+        first, second = seen(left, half, **more), seen(right, half, **more)  # type: ignore[arg-type]
+        assert associate(rig, first, second).ambiguous.tolist() == [False] * 3
+
+
+def test_looks_settle_what_geometry_leaves_open() -> None:
+    rig = rig_of()
+    left, right, _ = rig(torch.tensor([[0.0, 0, 400.0], [5.0, 0, 400.0]]).double())
+    random = torch.Generator().manual_seed(0)
+    textures = [80 * torch.rand(12, 12, dtype=torch.float64, generator=random) for _ in range(2)]
+    images = []
+    for pixels in (left, right):
+        image = torch.full(SIZE[::-1], 100.0, dtype=torch.float64)
+        for (u, v), texture in zip(pixels.round().int().tolist(), textures, strict=True):
+            image[v - 6 : v + 6, u - 6 : u + 6] = texture
+        images.append(image)
+    first, second = seen(left.round() - 0.5), seen(right.round() - 0.5)
+    assert associate(rig, first, second).ambiguous.tolist() == [True, True]
+    settled = associate(rig, first, second, images=(images[0], images[1]))
+    assert settled.ambiguous.tolist() == [False, False]
+    assert settled.right.tolist() == [0, 1]
+
+
+def test_range_gate() -> None:
+    rig = rig_of()
+    left, right, _ = rig(torch.tensor([[0.0, 0, 300.0]]).double())
+    options = {"box_sigma": 1.0}
+    assert len(associate(rig, seen(left), seen(right), AssociationOptions(**options)).left) == 1  # type: ignore[arg-type]
+    for limits in ({"nearest": 400.0}, {"farthest": 250.0}):
+        assert len(associate(rig, seen(left), seen(right), AssociationOptions(**options, **limits)).left) == 0  # type: ignore[arg-type]
+    # Diverging rays are no object.
+    assert len(associate(rig, seen(right), seen(left), AssociationOptions(**options)).left) == 0  # type: ignore[arg-type]
+
+
+def test_the_epipolar_cost_is_chi_square_with_the_errors_of_the_rig() -> None:
+    """Over rigs drawn from the covariance and noisy pixels, its mean is one; without the covariance far more."""
+    truth = rig_of()
+    sigma = torch.tensor([5e-4, 5e-4, 1e-3, 1e-2, 1e-2, 1e-2], dtype=torch.float64)
+    known = RigCovariance.of(truth, pose=torch.diag(sigma**2))
+    random = torch.Generator().manual_seed(7)
+    points = torch.tensor([[20.0, 30, 400], [-100, 50, 900], [0, -40, 200]]).double()
+    with_rig, without = [], []
+    spread = 0.25 * torch.eye(4, dtype=torch.float64).expand(3, 4, 4)
+    for _ in range(300):
+        step = sigma * torch.randn(6, dtype=torch.float64, generator=random)
+        drawn = StereoRig(
+            truth.left, truth.right, rotation_from_vector(step[:3]) @ truth.right_from_left_rotation,
+            truth.right_from_left_translation + step[3:],
+        )  # fmt: skip
+        left, right, _ = drawn(points)
+        noise = 0.5 * torch.randn(2, 3, 2, dtype=torch.float64, generator=random)
+        found = fit_pairs(truth, left + noise[0], right + noise[1], spread, by_camera=True)
+        with_rig.append(epipolar_cost(found, 0.25, known))
+        without.append(epipolar_cost(found, 0.25, None))
+    assert float(torch.cat(with_rig).mean()) == pytest.approx(1.0, abs=0.15)
+    assert float(torch.cat(without).mean()) > 2.0
+
+
+def test_nothing_to_pair() -> None:
+    rig = rig_of()
+    none, some = seen(torch.zeros(0, 2).double()), seen(torch.tensor([[900.0, 500.0]]).double())
+    for left, right in ((none, some), (some, none), (none, none)):
+        found = associate(rig, left, right)
+        assert len(found.left) == len(found.cost) == 0
+        assert found.possible.shape == (len(left), len(right))
+
+
+def test_what_cannot_be_is_refused() -> None:
+    rig = rig_of()
+    some = seen(torch.tensor([[900.0, 500.0]]).double())
+    wrong = Detections.read(torch.tensor([[9.0, 5.0, 20.0, 30.0]]), size=(640, 480))
+    with pytest.raises(InputError, match="right detections are of an image"):
+        associate(rig, some, wrong)
+    with pytest.raises(InputError, match="images of the cameras' sizes"):
+        associate(rig, some, some, images=(torch.zeros(4, 5), torch.zeros(4, 5)))
+    for options in ({"box_sigma": 0.0}, {"odds": 0.5}, {"nearest": 9.0, "farthest": 3.0}):
+        with pytest.raises(InputError, match="association"):
+            AssociationOptions(**options)  # type: ignore[arg-type]
