@@ -20,6 +20,7 @@ from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.diff import diff_command
 from kcal.cli.exchange import export_command, import_command
+from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
 from kcal.cli.rig import app as rig
@@ -61,6 +62,7 @@ app.command("batch")(batch_command)
 app.command("mark")(mark_command)
 app.add_typer(rig, name="rig")
 app.command("locate")(locate_command)
+app.command("live")(live_command)
 app.command("budget")(budget_command)
 app.command("undistort")(undistort_command)
 app.command("bake")(bake_command)

@@ -87,12 +87,12 @@ def transition(motions: tuple[Motion, ...], dt: float, up: Tensor) -> Transition
         along = up[:, :, None] * up[:, None, :]
         keep.append(kept.real * (still - along) + kept.imag * cross + math.exp(-decay * dt) * along)
         reach.append(moved.real * (still - along) + moved.imag * cross + upright * along)
-        blocks = up.new_tensor([_integrated(motion, dt)[i] for i in (0, 1, 1, 2)]).reshape(2, 2)
+        blocks = up.new_tensor([_noise_entries(motion, dt)[i] for i in (0, 1, 1, 2)]).reshape(2, 2)
         noise.append(torch.kron(blocks, still).expand(len(up), 6, 6))
     return Transition(torch.stack(reach, 1), torch.stack(keep, 1), torch.stack(noise, 1))
 
 
-def _integrated(motion: Motion, dt: float) -> tuple[float, float, float]:
+def _noise_entries(motion: Motion, dt: float) -> tuple[float, float, float]:
     """Variances of position, of both together, and of velocity, after `dt` of white acceleration.
 
     Turns are left out: over the steps of a video they change these by a share of (rate dt)².

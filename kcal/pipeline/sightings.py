@@ -70,10 +70,10 @@ def sightings(localize: StereoLocalizer, pairs: ObjectPairs) -> Sightings:
     shared = pairs.left.new_zeros(len(pairs), 4, 0)
     if localize.calibration_factor is not None:
         shared = calibration_effect(fourth, scale) @ localize.calibration_factor
-    left = _slopes(fit.projections[0], (*fit.sides.unbind(0), torch.zeros_like(fit.direction)))
+    left = _pixel_slopes(fit.projections[0], (*fit.sides.unbind(0), torch.zeros_like(fit.direction)))
     turn = rig.right_from_left_rotation
     shift = (rig.right_from_left_translation / scale)[:, None].expand_as(fit.direction)
-    right = _slopes(fit.projections[1], (*(turn @ side for side in fit.sides.unbind(0)), shift))
+    right = _pixel_slopes(fit.projections[1], (*(turn @ side for side in fit.sides.unbind(0)), shift))
     gain = fourth.gain.movedim(-1, 0)  # (N, 4, 4 pixels)
     late = torch.stack([gain[..., :2] @ left, gain[..., 2:] @ right])
     # From ρ in units of the rig's size to one over meters.
@@ -109,7 +109,7 @@ def _miss_direction(gain: Tensor, covariance: Tensor) -> Tensor:
     return white / variance.clamp_min(1e-300).sqrt()
 
 
-def _slopes(projection: Projection, columns: tuple[Tensor, ...]) -> Tensor:
+def _pixel_slopes(projection: Projection, columns: tuple[Tensor, ...]) -> Tensor:
     """(N, 2, 3) derivatives of pixels by three unknowns that move the seen point along `columns` (3, N) each."""
     moved = torch.stack(columns)  # (3 unknowns, 3, N)
     return (moved[:, :, None] * projection.by_point).sum(1).permute(2, 1, 0)
