@@ -31,7 +31,7 @@ _MAX_PROJECTED = 1 << 18  # points projected at a time, which bounds the memory
 
 
 class MatchStatus(IntEnum):
-    """Whether a point was matched, or why not."""
+    """Whether a point or an object was matched, or why not; the last two are of objects only (`ObjectDisparity`)."""
 
     GOOD = 0
     NO_RAY = 1  # the pixel is not finite, or the left lens has no ray there
@@ -41,6 +41,8 @@ class MatchStatus(IntEnum):
     AMBIGUOUS = 5  # another place correlates nearly as well
     NOT_CONVERGED = 6  # the fit did not converge
     OFF_LINE = 7  # the fit is too far from the epipolar line
+    OCCLUDED = 8  # most of what is in the box differs between the images
+    SATURATED = 9  # too much of the object is at the brightest gray level
 
 
 class Matches(NamedTuple):

@@ -128,7 +128,7 @@ class Detections:
         return cls(
             boxes=raw.boxes - first_pixel,
             score=torch.ones(count, dtype=torch.float64) if raw.score is None else raw.score,
-            category=_names(raw, count, names or {}),
+            category=_category_names(raw, count, names or {}),
             track=tuple(None if track is None else str(track) for track in raw.track or (None,) * count),
             keypoints=None if raw.keypoints is None else raw.keypoints - (0.0 if raw.centered else first_pixel),
             masks=masks,
@@ -197,7 +197,7 @@ class Detections:
         )
 
 
-def _names(raw: RawDetections, count: int, names: dict[int, str]) -> tuple[str, ...]:
+def _category_names(raw: RawDetections, count: int, names: dict[int, str]) -> tuple[str, ...]:
     if raw.category is None:
         return ("object",) * count
     known = {**(raw.names or {}), **names}

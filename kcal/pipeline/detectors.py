@@ -66,7 +66,7 @@ def raw_detections(source: Any) -> RawDetections:
     )
 
 
-def _numbers(name: str, values: Any) -> Tensor:
+def _as_numbers(name: str, values: Any) -> Tensor:
     """A float64 tensor; boxes that were stored as integers are edges all the same."""
     try:
         found = values.detach() if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values, dtype=np.float64))
@@ -76,20 +76,20 @@ def _numbers(name: str, values: Any) -> Tensor:
 
 
 def _boxes(values: Any) -> Tensor:
-    boxes = _numbers("boxes", values)
+    boxes = _as_numbers("boxes", values)
     return boxes.reshape(0, 4) if boxes.numel() == 0 else boxes
 
 
 def _optional(values: Any, name: str) -> Tensor | None:
-    return None if values is None else _numbers(name, values)
+    return None if values is None else _as_numbers(name, values)
 
 
-def _listed(values: Any) -> list | None:
+def _plain_list(values: Any) -> list | None:
     return None if values is None else [value.item() if hasattr(value, "item") else value for value in values]
 
 
 def _from_array(source: Any) -> RawDetections:
-    table = _numbers("boxes", source)
+    table = _as_numbers("boxes", source)
     if table.numel() == 0:
         return RawDetections(boxes=table.reshape(0, 4))
     if table.ndim != 2 or not 4 <= table.shape[1] <= 6:
@@ -111,8 +111,8 @@ def _from_dict(source: Mapping[str, Any]) -> RawDetections:
     return RawDetections(
         boxes=_boxes(source["boxes"]),
         score=_optional(source.get("scores"), "scores"),
-        category=_listed(source.get("labels")),
-        track=_listed(source.get("tracks")),
+        category=_plain_list(source.get("labels")),
+        track=_plain_list(source.get("tracks")),
         keypoints=None if keypoints is None or not len(keypoints) else keypoints[..., :2],
         masks=None if source.get("masks") is None else torch.as_tensor(source["masks"]),
     )
@@ -157,8 +157,8 @@ def _from_supervision(source: Any) -> RawDetections:
     return RawDetections(
         boxes=_boxes(source.xyxy),
         score=_optional(source.confidence, "confidence"),
-        category=_listed(category),
-        track=_listed(source.tracker_id),
+        category=_plain_list(category),
+        track=_plain_list(source.tracker_id),
         masks=None if masks is None else torch.from_numpy(np.asarray(masks, dtype=bool)),
         size=None if masks is None else (masks.shape[2], masks.shape[1]),
     )
@@ -178,9 +178,9 @@ def _from_ultralytics(source: Any) -> RawDetections:
     return RawDetections(
         boxes=_boxes(boxes.xyxy),
         score=_optional(boxes.conf, "conf"),
-        category=_listed(boxes.cls),
-        track=_listed(None if getattr(boxes, "id", None) is None else [int(i) for i in boxes.id]),
-        keypoints=None if keypoints is None else _numbers("keypoints", keypoints.xy),
+        category=_plain_list(boxes.cls),
+        track=_plain_list(None if getattr(boxes, "id", None) is None else [int(i) for i in boxes.id]),
+        keypoints=None if keypoints is None else _as_numbers("keypoints", keypoints.xy),
         masks=whole,
         size=(int(width), int(height)),
         names=source.names if isinstance(source.names, dict) else dict(enumerate(source.names)),
@@ -203,4 +203,4 @@ def _from_kornia_keypoints(source: Any) -> RawDetections:
 def _one_image(values: Tensor) -> Tensor:
     if values.ndim == 3 and len(values) != 1:
         raise InputError(f"detections: one image at a time is needed, got a batch of {len(values)}")
-    return _numbers("boxes", values.reshape(-1, values.shape[-1]))
+    return _as_numbers("boxes", values.reshape(-1, values.shape[-1]))

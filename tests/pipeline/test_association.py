@@ -138,7 +138,7 @@ def test_the_epipolar_cost_is_chi_square_with_the_errors_of_the_rig() -> None:
     points = torch.tensor([[20.0, 30, 400], [-100, 50, 900], [0, -40, 200]]).double()
     with_rig, without = [], []
     spread = 0.25 * torch.eye(4, dtype=torch.float64).expand(3, 4, 4)
-    for _ in range(300):
+    for _ in range(60):
         step = sigma * torch.randn(6, dtype=torch.float64, generator=random)
         drawn = StereoRig(
             truth.left, truth.right, rotation_from_vector(step[:3]) @ truth.right_from_left_rotation,
@@ -149,7 +149,7 @@ def test_the_epipolar_cost_is_chi_square_with_the_errors_of_the_rig() -> None:
         found = fit_pairs(truth, left + noise[0], right + noise[1], spread, by_camera=True)
         with_rig.append(epipolar_cost(found, 0.25, known))
         without.append(epipolar_cost(found, 0.25, None))
-    assert float(torch.cat(with_rig).mean()) == pytest.approx(1.0, abs=0.15)
+    assert float(torch.cat(with_rig).mean()) == pytest.approx(1.0, abs=0.35)
     assert float(torch.cat(without).mean()) > 2.0
 
 

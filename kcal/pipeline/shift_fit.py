@@ -1,0 +1,241 @@
+"""Shift, contrast and brightness of patches by robust least squares, with covariance and implicit gradients."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.corners.filters import gaussian_kernel
+from kcal.pipeline.patches import IMAGE_BLUR, ImageWindows, sample
+
+_MOST_STEPS = 25
+_CONVERGED = 1e-4  # steps
+# Residuals of pixels nearby, in standard deviations of all, at which the weight is zero. Background and what stands in
+# front are areas, so that the mean square of a few pixels tells them from noise, which is 1 ± 0.3 there.
+_BIWEIGHT = 3.0
+_NEARBY = gaussian_kernel(1.0, 2)
+# Blur of the noise in samples, steps: of the images, and of bilinear samples between pixels, σ² = 1/6 on average.
+_NOISE_BLUR = gaussian_kernel(math.sqrt(IMAGE_BLUR**2 + 1.0 / 6.0), 4)
+_TRIANGLE = 1.0 - torch.arange(-4, 5, dtype=torch.float64).abs() / 5.0
+_MEDIAN = 1.4826  # standard deviations in the median absolute value of Gaussian noise
+
+
+class ShiftFit(NamedTuple):
+    """Shifts of N patches.
+
+    Attributes:
+        shift: (N, 2) steps of the plane.
+        covariance: (N, 2, 2) of the shift.
+        converged: (N,).
+        textured: (N,) whether the template is not flat.
+        share: (N,) share of the weight that robust weights left.
+    """
+
+    shift: Tensor
+    covariance: Tensor
+    converged: Tensor
+    textured: Tensor
+    share: Tensor
+
+
+def weighted_correlation(template: Tensor, weight: Tensor, wide: Tensor, usable: Tensor) -> Tensor:
+    """Normalized correlation (N, rows, columns) of templates (N, h, w) with wider patches, at every whole shift.
+
+    Shifts that touch what is not usable have -1, and so have flat templates.
+    """
+    count = len(template)
+    total = weight.sum((1, 2)).clamp_min(1e-12)
+    mean = (weight * template).sum((1, 2)) / total
+    centered = weight * (template - mean[:, None, None])
+    # Centered, so that squares do not cancel.
+    other = wide - (wide.mean((1, 2)))[:, None, None]
+
+    def over(values: Tensor, kernel: Tensor) -> Tensor:
+        found: Tensor = torch.nn.functional.conv2d(values[None], kernel[:, None], groups=count)[0]
+        return found
+
+    product = over(other, centered)
+    average = over(other, weight) / total[:, None, None]
+    power = (over(other.square(), weight) / total[:, None, None] - average.square()).clamp_min(0.0)
+    own = ((weight * (template - mean[:, None, None]).square()).sum((1, 2)) / total).clamp_min(0.0)
+    norm = total[:, None, None] * (power * own[:, None, None]).sqrt()
+    blocked = over((~usable).double(), (weight > 0).double()) > 0.5
+    good = ~blocked & (norm > 1e-9 * total[:, None, None] * (1.0 + template.abs().amax((1, 2))[:, None, None]))
+    return torch.where(good, product / torch.where(good, norm, 1.0), -1.0)
+
+
+class _Patches(NamedTuple):
+    template: Tensor
+    right: ImageWindows
+    moved: Tensor
+    slopes: Tensor
+    weight: Tensor
+
+
+def _residual(patches: _Patches, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Residual (N, K), slopes (N, K, 2) and design (N, K, 4) at theta (N, 4): shift, gain, offset."""
+    at = patches.moved + (patches.slopes @ theta[:, None, None, :2, None])[..., 0]
+    steps = patches.slopes.unbind(-1)
+    slope = torch.stack([0.5 * (sample(patches.right, at + d) - sample(patches.right, at - d)) for d in steps], -1)
+    values, slope, template = sample(patches.right, at).flatten(1), slope.flatten(1, 2), patches.template.flatten(1)
+    residual = values - theta[:, 2:3] * template - theta[:, 3:]
+    design = torch.cat([slope, -template[..., None], -torch.ones_like(template)[..., None]], -1)
+    return residual, slope, design
+
+
+def _biweight(residual: Tensor, scale: Tensor, patches: _Patches) -> Tensor:
+    """(N, K) weights by the mean square of residuals (N, K) nearby."""
+    kernel = _NEARBY.to(residual)
+    squares = residual.square().reshape(patches.template.shape)[:, None]
+    reach = len(kernel) // 2
+    padded = torch.nn.functional.pad(squares, (reach,) * 4, mode="replicate")
+    mean = torch.nn.functional.conv2d(padded, kernel.reshape(1, 1, 1, -1))
+    mean = torch.nn.functional.conv2d(mean, kernel.reshape(1, 1, -1, 1)).reshape(residual.shape)
+    return (1.0 - mean / (_BIWEIGHT * scale[:, None]).square()).clamp_min(0.0).square()
+
+
+def _scale(residual: Tensor, weight: Tensor) -> Tensor:
+    """(N,) robust standard deviation: from the weighted median of absolute residuals."""
+    ordered, order = residual.abs().sort(dim=1)
+    cumulated = weight.gather(1, order).cumsum(1)
+    at = (cumulated < 0.5 * cumulated[:, -1:]).sum(1).clamp_max(residual.shape[1] - 1)
+    return (_MEDIAN * ordered.gather(1, at[:, None])[:, 0]).clamp_min(1e-9)
+
+
+def _balance(patches: _Patches, theta: Tensor, scale: Tensor) -> Tensor:
+    """(N, 4) what is zero at the solution."""
+    residual, _, design = _residual(patches, theta)
+    weight = patches.weight.flatten(1) * _biweight(residual, scale, patches)
+    return ((weight * residual)[..., None] * design).sum(1)
+
+
+def fit_shifts(template: Tensor, right: ImageWindows, moved: Tensor, slopes: Tensor, weight: Tensor) -> ShiftFit:
+    """Fit right(moved + slopes shift) = gain template + offset.
+
+    Args:
+        template: (N, h, w) of the left image.
+        right: windows of the right image.
+        moved: (N, h, w, 2) pixels of the right image at zero shift.
+        slopes: (N, h, w, 2, 2) their derivatives by a step along the plane's axes (last axis).
+        weight: (N, h, w) of the pixels.
+    """
+    patches = _Patches(template, right, moved, slopes, weight)
+    with torch.no_grad():
+        still = _Patches(template.detach(), right._replace(values=right.values.detach()), moved, slopes, weight)
+        theta, scale, step = _fitted_shifts(still)
+        residual, slope, _ = _residual(still, theta)
+        robust = weight.flatten(1) * _biweight(residual, scale, still)
+        covariance, sound = _covariance(still, theta, residual, slope, robust)
+        full = weight.sum((1, 2))
+        # In a perfect fit a biweight takes a few percent.
+        share = robust.sum(1) / full.clamp_min(1e-12)
+        level = (weight * template.detach()).sum((1, 2)) / full.clamp_min(1e-12)
+        contrast = (weight * (template.detach() - level[:, None, None]).square()).sum((1, 2)) / full.clamp_min(1e-12)
+        textured = contrast.sqrt() > 1e-6 * (1.0 + level.abs())
+        converged = (step < 10 * _CONVERGED) & sound & theta.isfinite().all(1)
+        theta = torch.where(converged[:, None], theta, 0.0)
+    shift = theta[:, :2]
+    if torch.is_grad_enabled() and (template.requires_grad or right.values.requires_grad):
+        shift = _implicit(patches, theta, scale, converged)[:, :2]
+    return ShiftFit(shift, covariance, converged, textured, share)
+
+
+def _fitted_shifts(patches: _Patches) -> tuple[Tensor, Tensor, Tensor]:
+    """Theta, scale of the residuals and length of the last step."""
+    weight = patches.weight.flatten(1)
+    count = len(weight)
+    theta = patches.template.new_zeros(count, 4)
+    theta[:, 2] = 1.0
+    eye = torch.eye(4, dtype=theta.dtype, device=theta.device)
+    step = theta.new_full((count,), torch.inf)
+    scale = theta.new_ones(count)
+    for number in range(_MOST_STEPS):
+        residual, _, design = _residual(patches, theta)
+        if number == 0:
+            robust = weight  # contrast and brightness are not known yet
+        else:
+            # The scale settles, so that the weights do.
+            scale = _scale(residual, weight) if number < 6 else scale
+            robust = weight * _biweight(residual, scale, patches)
+        weighted = robust[..., None] * design
+        normal = weighted.mT @ design
+        size = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).sqrt()
+        normal = normal / (size[:, :, None] * size[:, None, :]) + 1e-9 * eye
+        change = -torch.linalg.solve_ex(normal, (weighted * residual[..., None]).sum(1) / size)[0] / size
+        length = torch.linalg.vector_norm(change[:, :2], dim=1)
+        change = torch.nan_to_num(change * (1.0 / length.clamp_min(1.0))[:, None])
+        theta = theta + change
+        step = length
+        if number > 6 and bool((step < _CONVERGED).all()):
+            break
+    return theta, scale, step
+
+
+def _covariance(
+    patches: _Patches, theta: Tensor, residual: Tensor, slope: Tensor, robust: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(N, 2, 2) of the shift, and where it exists.
+
+    The normal matrix is the product of the slopes of *both* images, whose noise is independent, so that noise does not
+    pass for texture. The noise of neighbors is correlated by the blur, which is applied once more for that.
+    """
+    count, height, width = patches.template.shape
+    template = patches.template
+    padded = torch.nn.functional.pad(template[:, None], (1,) * 4, mode="replicate")[:, 0]
+    own = (
+        torch.stack(
+            [0.5 * (padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]), 0.5 * (padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1])], -1
+        ).flatten(1, 2)
+        * theta[:, 2, None, None]
+    )
+    total = robust.sum(1).clamp_min(1e-12)
+    # Free of contrast and brightness.
+    flat = torch.stack([template.flatten(1), torch.ones_like(residual)], -1)
+    gram = (robust[..., None] * flat).mT @ flat + 1e-9 * torch.eye(2, dtype=flat.dtype, device=flat.device)
+    mixed = 0.5 * (own + slope)
+    share = torch.linalg.solve_ex(gram, (robust[..., None] * flat).mT @ mixed)[0]
+    across = mixed - flat @ share
+    normal = (robust[..., None] * own).mT @ (slope - flat @ torch.linalg.solve_ex(
+        gram, (robust[..., None] * flat).mT @ slope)[0])  # fmt: skip
+    normal = 0.5 * (normal + normal.mT)
+    determinant = normal[:, 0, 0] * normal[:, 1, 1] - normal[:, 0, 1].square()
+    sound = (normal[:, 0, 0] > 0) & (determinant > 1e-6 * normal[:, 0, 0] * normal[:, 1, 1])
+    inverse = torch.linalg.inv_ex(torch.where(sound[:, None, None], normal, torch.eye(2).to(normal)))[0]
+    kernel = _NOISE_BLUR.to(template)
+    share_of_noise = float(kernel.square().sum()) ** 2
+    freedom = (1.0 - 4.0 / (total * share_of_noise)).clamp_min(0.2)
+    noise = (robust * residual.square()).sum(1) / total / (share_of_noise * freedom)
+    force = (robust[..., None] * across).mT.reshape(-1, 1, height, width)
+    beyond = 2 * (len(kernel) // 2)
+    spread = torch.nn.functional.conv2d(force, kernel.reshape(1, 1, 1, -1), padding=(0, beyond))
+    spread = torch.nn.functional.conv2d(spread, kernel.reshape(1, 1, -1, 1), padding=(beyond, 0)).reshape(count, 2, -1)
+    middle = noise[:, None, None] * (spread @ spread.mT)
+    # Residuals of another texture than noise, such as the background's, are correlated farther: then what they add up
+    # to counts (W. Newey and K. West 1987).
+    pull = (robust * residual)[..., None] * across
+    pull = pull.mT.reshape(-1, 1, height, width)
+    reach = _TRIANGLE.to(template)
+    wider = torch.nn.functional.conv2d(pull, reach.reshape(1, 1, 1, -1), padding=(0, len(reach) // 2))
+    wider = torch.nn.functional.conv2d(wider, reach.reshape(1, 1, -1, 1), padding=(len(reach) // 2, 0))
+    found = pull.reshape(count, 2, -1) @ wider.reshape(count, 2, -1).mT / freedom[:, None, None]
+    excess = torch.linalg.solve_ex(middle, found)[0].diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(1.0)
+    return excess[:, None, None] * inverse @ middle @ inverse, sound
+
+
+def _implicit(patches: _Patches, theta: Tensor, scale: Tensor, converged: Tensor) -> Tensor:
+    """Theta with its gradient by both images: one Newton step from the solution has the exact one."""
+    with torch.enable_grad():
+        free = theta.detach().requires_grad_()
+        fixed = patches._replace(
+            template=patches.template.detach(), right=patches.right._replace(values=patches.right.values.detach())
+        )
+        balance = _balance(fixed, free, scale)
+        rows = [torch.autograd.grad(balance[:, i].sum(), free, retain_graph=i < 3)[0] for i in range(4)]
+    jacobian = torch.stack(rows, 1)
+    jacobian = torch.where(converged[:, None, None], jacobian, torch.eye(4).to(jacobian))
+    inverse = torch.linalg.inv_ex(jacobian)[0]
+    change = (inverse @ _balance(patches, theta.detach(), scale)[..., None])[..., 0]
+    return theta.detach() - torch.where(converged[:, None], change, 0.0)

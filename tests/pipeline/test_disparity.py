@@ -1,0 +1,253 @@
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.corners.match import MatchStatus
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import StereoRig
+from kcal.locate.triangulate import Triangulate
+from kcal.pipeline import shift_fit
+from kcal.pipeline.disparity import DisparityOptions, ObjectDisparities, ObjectDisparity
+from scripts.shared.marking_scene import background
+from scripts.shared.object_scene import exposed, paint_plate, plate, texture_gradient, true_box
+
+SIZE = (240, 160)
+FOCAL = 800.0
+
+
+def rig_of(lens: tuple[float, ...] = (-0.3, 0.1), roll: float = 0.02) -> StereoRig:
+    camera = Camera.build(focal=(FOCAL, FOCAL), center=(119.5, 79.5), size=SIZE, coefficients=lens)
+    other = Camera.build(focal=(790, 795), center=(121.0, 78.0), size=SIZE, coefficients=lens)
+    turn = rotation_from_vector(torch.tensor([0.003, -0.002, roll], dtype=torch.float64))
+    return StereoRig(camera, other, turn, torch.tensor([-5.0, 0.2, 0.1]))
+
+
+class Case(NamedTuple):
+    rig: StereoRig
+    left: Tensor
+    right: Tensor
+    boxes: Tensor
+    aims: Tensor
+    truth: Tensor
+
+
+def case(
+    seed: int = 0, size: float = 14.0, noise: float = 0.2, box_sigma: float = 1.0, amplitude: float = 0.8, **rig: object
+) -> Case:
+    """One object at 500 to 2,000 m, rendered; `truth` is where the left anchor's point is in the right image."""
+    random = np.random.default_rng(seed)
+    rig_ = rig_of(**rig)  # type: ignore[arg-type]
+    distance = random.uniform(500, 2000)
+    point = torch.tensor([random.uniform(-0.05, 0.05) * distance, 0.02 * distance, distance], dtype=torch.float64)
+    item = plate(point, (size, size), FOCAL, 40.0, random)
+    images = [background(rig_, side, np.random.default_rng(seed), amplitude) for side in (0, 1)]
+    for side in (0, 1):
+        paint_plate(images[side], rig_, side, item)
+    boxes = [true_box(rig_, side, item) for side in (0, 1)]
+    sigma = noise * texture_gradient(images[0], boxes[0])
+    left, right = (exposed(image, sigma, random) for image in images)
+    seen = [torch.from_numpy(box + random.normal(0, box_sigma, 4)) for box in boxes]
+    middle = 0.5 * (seen[0][:2] + seen[0][2:])
+    ray, _ = rig_.left.unproject(middle[None])
+    truth, _ = rig_.right.project(rig_.right_from_left(ray * distance / ray[:, 2:]))
+    return Case(rig_, left, right, seen[0][None], 0.5 * (seen[1][:2] + seen[1][2:])[None], truth)
+
+
+def match(scene: Case, **changes: Tensor) -> ObjectDisparities:
+    given = scene._asdict() | changes
+    return ObjectDisparity(scene.rig)(given["left"], given["right"], given["boxes"], given["aims"])
+
+
+def test_error_is_small_and_covered() -> None:
+    errors, sigmas = [], []
+    for seed in range(16):
+        scene = case(seed)
+        found = match(scene)
+        if int(found.status[0]) == MatchStatus.GOOD:
+            errors.append((found.pixels - scene.truth)[0].numpy())
+            sigmas.append(found.covariance[0].diagonal().sqrt().numpy())
+    ratio = np.abs(np.array(errors)) / np.array(sigmas)
+    assert len(errors) >= 14
+    assert math.sqrt(np.mean(np.square(errors))) < 0.1
+    assert np.mean(ratio < 1.96) > 0.8
+    assert 0.6 < math.sqrt(np.mean(np.square(ratio))) < 1.5
+
+
+@pytest.mark.parametrize("changes", [{"lens": ()}, {"lens": (-0.3, 0.1), "roll": 0.5}, {"lens": (0.4, 0.2)}])
+def test_lenses_and_roll_do_not_matter(changes: dict) -> None:
+    scene = case(3, noise=0.02, box_sigma=0.5, amplitude=0.0, size=24, **changes)
+    found = match(scene)
+    assert int(found.status[0]) == MatchStatus.GOOD
+    assert float((found.pixels - scene.truth).abs().max()) < 0.03
+    assert float(found.off_line[0]) < 0.05
+
+
+def test_a_large_object_has_larger_steps() -> None:
+    scene = case(1, size=90, box_sigma=1.0, amplitude=0.0)
+    found = match(scene)
+    assert int(found.status[0]) == MatchStatus.GOOD
+    assert float((found.pixels - scene.truth).abs().max()) < 0.1
+
+
+def test_many_objects_at_once_are_as_one_by_one() -> None:
+    scenes = case(0), case(5)
+    rig, left, right = scenes[0].rig, scenes[0].left, scenes[0].right
+    boxes = torch.cat([scene.boxes for scene in scenes] + [torch.tensor([[30.0, 30, 110, 120]])]).double()
+    aims = torch.cat([scene.aims for scene in scenes] + [torch.tensor([[65.0, 75.0]])]).double()
+    together = ObjectDisparity(rig)(left, right, boxes, aims)
+    for number in range(3):
+        alone = ObjectDisparity(rig)(left, right, boxes[number : number + 1], aims[number : number + 1])
+        assert int(alone.status[0]) == int(together.status[number])
+        # The patch is as large as the largest object's, which adds pixels of no weight.
+        assert torch.allclose(alone.pixels[0], together.pixels[number], atol=2e-3)
+
+
+def test_a_mask_replaces_the_ellipse() -> None:
+    scene = case(2, amplitude=1.6, box_sigma=0.5)
+    mask = torch.zeros(1, *SIZE[::-1], dtype=torch.bool)
+    left, top, right, bottom = scene.boxes[0].round().int().tolist()
+    mask[0, top + 1 : bottom, left + 1 : right] = True
+    found = ObjectDisparity(scene.rig)(scene.left, scene.right, scene.boxes, scene.aims, masks=mask)
+    assert int(found.status[0]) == MatchStatus.GOOD
+    assert float((found.pixels - scene.truth).abs().max()) < 0.3
+    empty = ObjectDisparity(scene.rig)(scene.left, scene.right, scene.boxes, scene.aims, masks=mask & False)
+    assert int(empty.status[0]) != MatchStatus.GOOD
+
+
+class TestRefusals:
+    """What cannot be known is refused, with the reason; nothing is NaN."""
+
+    def check(self, found: ObjectDisparities, *statuses: MatchStatus) -> None:
+        assert MatchStatus(int(found.status[0])) in statuses
+        assert bool(found.pixels.isfinite().all())
+        assert bool(torch.isinf(found.covariance[0].diagonal()).all())
+
+    def test_flat(self) -> None:
+        scene = case()
+        flat = torch.full_like(scene.left, 100.0)
+        self.check(match(scene, left=flat, right=flat), MatchStatus.FLAT)
+        noise = torch.Generator().manual_seed(0)
+        images = {side: flat + torch.randn(flat.shape, generator=noise) for side in ("left", "right")}
+        self.check(match(scene, **images), MatchStatus.FLAT, MatchStatus.NO_MATCH)
+
+    def test_one_straight_edge_along_the_epipolar_line(self) -> None:
+        """Rows that do not change along the line say nothing of the disparity."""
+        scene = case(lens=(), roll=0.0)
+        rows = torch.sigmoid((torch.arange(SIZE[1]) - 80.0)[:, None].expand(SIZE[::-1]).double()) * 100
+        random = torch.Generator().manual_seed(0)
+        left, right = (rows + 0.5 * torch.randn(rows.shape, generator=random) for _ in range(2))
+        self.check(match(scene, left=left, right=right), MatchStatus.FLAT, MatchStatus.NO_MATCH,
+                   MatchStatus.AMBIGUOUS, MatchStatus.NOT_CONVERGED)  # fmt: skip
+
+    def test_absent(self) -> None:
+        scene, other = case(0), case(9)
+        self.check(match(scene, right=other.right), MatchStatus.NO_MATCH, MatchStatus.OCCLUDED)
+
+    def test_hidden_by_half(self) -> None:
+        scene = case(0, size=20, amplitude=0.0, box_sigma=0.0)
+        right = scene.right.clone()
+        u, v = scene.truth[0].round().int().tolist()
+        noise = torch.rand(60, 40, generator=torch.Generator().manual_seed(1)).double()
+        right[v - 30 : v + 30, u - 2 : u + 38] = 100 + 60 * noise
+        self.check(match(scene, right=right), MatchStatus.OCCLUDED, MatchStatus.NO_MATCH)
+
+    def test_a_corner_hidden_does_not_move_it(self) -> None:
+        scene = case(0, size=24, amplitude=0.0, box_sigma=0.0)
+        right = scene.right.clone()
+        u, v = scene.truth[0].round().int().tolist()
+        right[v + 3 : v + 30, u - 20 : u - 2] = 130.0
+        found = match(scene, right=right)
+        assert int(found.status[0]) == MatchStatus.GOOD
+        assert float((found.pixels - scene.truth).abs().max()) < 0.15
+
+    def test_repeated(self) -> None:
+        rig = rig_of((), 0.0)
+        wave = torch.sin(torch.arange(SIZE[0]) * 2 * math.pi / 6.0).expand(SIZE[::-1]).double()
+        rows = torch.sin(torch.arange(SIZE[1]) / 2.0)[:, None].double()
+        image = 100 + 30 * wave + 10 * rows
+        boxes = torch.tensor([[100.0, 60, 130, 90]])
+        found = ObjectDisparity(rig)(image, image.roll(-3, 1), boxes, torch.tensor([[112.0, 75.0]]))
+        self.check(found, MatchStatus.AMBIGUOUS)
+
+    def test_saturated(self) -> None:
+        scene = case(0, size=20, amplitude=0.0)
+        left, right = ((image * 4.0).clamp(0, 255).to(torch.uint8) for image in (scene.left, scene.right))
+        self.check(match(scene, left=left, right=right), MatchStatus.SATURATED, MatchStatus.FLAT)
+        # The same brightness without a limit is a picture.
+        assert int(match(scene, left=scene.left * 4, right=scene.right * 4).status[0]) == MatchStatus.GOOD
+
+    def test_at_the_border_and_without_ray(self) -> None:
+        scene = case()
+        edge = torch.tensor([[-8.0, 40, 4, 52]], dtype=torch.float64)
+        self.check(match(scene, boxes=edge, aims=torch.tensor([[5.0, 46.0]])), MatchStatus.OUTSIDE)
+        self.check(match(scene, boxes=torch.full((1, 4), torch.nan)), MatchStatus.NO_RAY)
+        nowhere = torch.full((1, 2), torch.inf)
+        found = ObjectDisparity(scene.rig)(scene.left, scene.right, scene.boxes, nowhere)
+        assert int(found.status[0]) == MatchStatus.NO_RAY
+
+    def test_off_the_line(self) -> None:
+        scene = case(0, size=24, amplitude=0.0, box_sigma=0.0)
+        options = DisparityOptions(max_off_line=0.5)
+        found = ObjectDisparity(scene.rig, options)(scene.left, scene.right.roll(1, 0), scene.boxes, scene.aims)
+        self.check(found, MatchStatus.OFF_LINE)
+
+
+def test_gradients_to_both_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against differences, in the direction of the gradient and in random ones, at a constant scale of residuals."""
+    scene = case(4, noise=0.1, amplitude=0.0)
+    monkeypatch.setattr(shift_fit, "_scale", lambda residual, weight: residual.new_full((len(residual),), 1.5))
+    images = [scene.left.clone().requires_grad_(), scene.right.clone().requires_grad_()]
+    module = ObjectDisparity(scene.rig)
+    found = module(*images, scene.boxes, scene.aims)
+    weight = torch.tensor([[1.0, 0.3]], dtype=torch.float64)
+    gradients = torch.autograd.grad((found.pixels * weight).sum(), images)
+    random = torch.Generator().manual_seed(1)
+    for number, gradient in enumerate(gradients):
+        assert float(gradient.abs().max()) > 0
+        noise = torch.randn(gradient.shape, generator=random, dtype=torch.float64)
+        for direction in (gradient, noise * (gradient != 0)):
+            wanted = float((gradient * direction).sum())
+            step = 0.01 / abs(wanted)  # moves the result by 0.01 px each way
+            values = []
+            for sign in (-1, 1):
+                moved = [image.detach().clone() for image in images]
+                moved[number] += sign * step * direction
+                values.append(float((module(*moved, scene.boxes, scene.aims).pixels * weight).sum()))
+            assert (values[1] - values[0]) / (2 * step) == pytest.approx(wanted, rel=0.05)
+
+
+def test_range_of_an_object() -> None:
+    """With the rig, boxes err by tens of percent and matching by one."""
+    scene = case(3, noise=0.1, amplitude=0.0, box_sigma=1.5)
+    middle = 0.5 * (scene.boxes[:, :2] + scene.boxes[:, 2:])
+    locate = Triangulate(scene.rig)
+    ranges = [float(locate(middle, pixels).points[0, 2]) for pixels in (scene.truth, match(scene).pixels, scene.aims)]
+    assert abs(ranges[1] / ranges[0] - 1) < 0.03
+    assert abs(ranges[2] / ranges[0] - 1) > 0.05
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"left": torch.zeros(5, 5)}, "left camera needs"),
+        ({"right": torch.full(SIZE[::-1], torch.nan)}, "not finite"),
+        ({"boxes": torch.zeros(2, 4)}, "boxes"),
+    ],
+)
+def test_what_cannot_be_is_refused(changes: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        match(case(), **changes)
+
+
+@pytest.mark.parametrize("options", [{"search": 0.0}, {"min_score": 1.5}, {"max_sigma": 0.0}])
+def test_bad_options(options: dict) -> None:
+    with pytest.raises(InputError, match="disparity options"):
+        DisparityOptions(**options)
