@@ -157,6 +157,15 @@ from kcal.nets.inverse import InverseFit as InverseFit
 from kcal.nets.inverse import InverseNet as InverseNet
 from kcal.nets.inverse import InverseNetOptions as InverseNetOptions
 from kcal.nets.inverse import train_inverse as train_inverse
+from kcal.pipeline.consider import ClockEstimate as ClockEstimate
+from kcal.pipeline.consider import ClockPrior as ClockPrior
+from kcal.pipeline.estimates import TrackStates as TrackStates
+from kcal.pipeline.motion import Motion as Motion
+from kcal.pipeline.pairs import ObjectPairs as ObjectPairs
+from kcal.pipeline.smoothing import SmoothedTrack as SmoothedTrack
+from kcal.pipeline.tracks import Tracker as Tracker
+from kcal.pipeline.tracks import TrackOptions as TrackOptions
+from kcal.pipeline.tracks import Tracks as Tracks
 from kcal.report.board import save_board_picture as save_board_picture
 from kcal.report.budget import save_budget_picture as save_budget_picture
 from kcal.report.calibration import save_calibration_picture as save_calibration_picture

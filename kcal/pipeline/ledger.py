@@ -20,7 +20,7 @@ from kcal.files import write_atomic
 _HEAD = {"kcal": "live journal", "version": 1}
 
 
-class Place(NamedTuple):
+class StreamPlace(NamedTuple):
     """How far a stream has come.
 
     Attributes:
@@ -51,7 +51,7 @@ class Ledger:
     def __init__(self, path: Path, outputs: Sequence[Path]) -> None:
         self.path, self.outputs = path, tuple(outputs)
         self.state: dict[str, Any] | None = None
-        self.checkpoint_at = self.place = Place(0, None, 0, (0,) * len(self.outputs))
+        self.checkpoint_at = self.place = StreamPlace(0, None, 0, (0,) * len(self.outputs))
         if path.exists():
             self._read()
         self._files = [self._opened(file, size) for file, size in zip(self.outputs, self.place.sizes, strict=True)]
@@ -65,7 +65,7 @@ class Ledger:
             file.write(part)
             file.flush()
         sizes = tuple(size + len(part) for size, part in zip(self.place.sizes, parts, strict=True))
-        self.place = Place(self.place.sequence + 1, time, offset, sizes)
+        self.place = StreamPlace(self.place.sequence + 1, time, offset, sizes)
         self._log.write(orjson.dumps(list(self.place)) + b"\n")
         self._log.flush()
 
@@ -90,7 +90,7 @@ class Ledger:
         lines = self.path.read_bytes().split(b"\n")[:-1]  # what is cut off was not complete
         try:
             head = orjson.loads(lines[0])
-            places = [Place(*head["place"]), *(Place(*orjson.loads(line)) for line in lines[1:])]
+            places = [StreamPlace(*head["place"]), *(StreamPlace(*orjson.loads(line)) for line in lines[1:])]
             if {name: head[name] for name in _HEAD} != _HEAD:
                 raise FileError(f"{self.path}: not a journal of this version of `kcal live`")
             if head["outputs"] != [str(path.resolve()) for path in self.outputs]:

@@ -20,8 +20,9 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
-from kcal.pipeline.association import AssociationOptions, associate
+from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.detections import Detections
+from kcal.pipeline.pairing import pair_objects
 from kcal.pipeline.pairs import ObjectPairs
 
 _PAIR_KEYS = {"time", "left", "right", "sigma", "covariance", "scores", "categories", "ambiguous"}
@@ -65,39 +66,10 @@ def read_moment(line: str | bytes, rig: StereoRig, options: AssociationOptions, 
             Detections.read(orjson.dumps(content[side]), size=camera.size)
             for side, camera in (("left", rig.left), ("right", rig.right))
         )
-        return paired(rig, left, right, options)
+        if left.time is None or right.time is None:
+            raise InputError("detections of both images need a time")
+        return Moment(left.time, pair_objects(rig, left, right, options=options))
     return _pairs_of_line(content, pixel_sigma)
-
-
-def paired(
-    rig: StereoRig,
-    left: Detections,
-    right: Detections,
-    options: AssociationOptions,
-    images: tuple[Tensor, Tensor] | None = None,
-) -> Moment:
-    """Associate the detections of two images that say their time.
-
-    Raises:
-        InputError: a time is missing, or as `associate`.
-    """
-    if left.time is None or right.time is None:
-        raise InputError("detections of both images need a time")
-    found = associate(rig, left, right, options, images)
-    count = len(found.left)
-    time = torch.tensor([left.time, right.time], dtype=torch.float64)
-    names = found.left.tolist()
-    pairs = ObjectPairs(
-        left=left.anchors(options.anchor)[found.left],
-        right=right.anchors(options.anchor)[found.right],
-        covariance=options.box_sigma**2 * torch.eye(4, dtype=torch.float64).expand(count, 4, 4),
-        time=time.expand(count, 2),
-        score=torch.minimum(left.score[found.left], right.score[found.right]),
-        category=tuple(left.category[i] for i in names),
-        track=tuple(left.track[i] for i in names),
-        ambiguous=found.ambiguous,
-    )
-    return Moment(left.time, pairs)
 
 
 def _pairs_of_line(content: dict[str, Any], pixel_sigma: float) -> Moment:

@@ -36,7 +36,7 @@ _LONGEST = 1 << 22
 _CALENDAR = 1e9
 
 
-class Item(NamedTuple):
+class SourceItem(NamedTuple):
     """What a source gives: a moment, or why there is none; `offset` bytes of the source have been read by then."""
 
     moment: Moment | InputError
@@ -110,7 +110,7 @@ class Stream:
         """End after the present moment; may be called from another thread or a signal's handler."""
         self._stop.set()
 
-    def follow(self, source: Callable[[int], Iterator[Item]], *, waits: bool, resumes: bool) -> StreamCounts:
+    def follow(self, source: Callable[[int], Iterator[SourceItem]], *, waits: bool, resumes: bool) -> StreamCounts:
         """Follow a source until it ends or `stop` is called.
 
         Args:
@@ -119,7 +119,7 @@ class Stream:
             resumes: whether it can begin at an offset; else it gives what comes now.
         """
         place, checkpoint = self.ledger.place, self.ledger.checkpoint_at
-        items: queue.Queue[Item | None] = queue.Queue(_WAITING)
+        items: queue.Queue[SourceItem | None] = queue.Queue(_WAITING)
         begin = checkpoint.offset if resumes else 0
         reader = threading.Thread(target=self._read, args=(source, begin, items, waits), daemon=True)
         since = place.sequence - checkpoint.sequence
@@ -193,7 +193,11 @@ class Stream:
         return datetime.datetime.fromtimestamp(0, datetime.UTC)
 
     def _read(
-        self, source: Callable[[int], Iterator[Item]], begin: int, items: queue.Queue[Item | None], waits: bool
+        self,
+        source: Callable[[int], Iterator[SourceItem]],
+        begin: int,
+        items: queue.Queue[SourceItem | None],
+        waits: bool,
     ) -> None:
         try:
             for item in source(begin):
@@ -215,7 +219,7 @@ class Stream:
             except queue.Full:
                 continue
 
-    def _drop(self, items: queue.Queue[Item | None]) -> None:
+    def _drop(self, items: queue.Queue[SourceItem | None]) -> None:
         try:
             items.get_nowait()
             self.counts.dropped += 1
@@ -223,7 +227,7 @@ class Stream:
             pass
 
 
-def lines_of(path: Path | None, read: Callable[[bytes], Moment]) -> Callable[[int], Iterator[Item]]:
+def lines_of(path: Path | None, read: Callable[[bytes], Moment]) -> Callable[[int], Iterator[SourceItem]]:
     """The lines of a file, or of the standard input if None, as a source; blank ones are skipped.
 
     A last line without its end is still being written, and is left for the next run.
@@ -233,7 +237,7 @@ def lines_of(path: Path | None, read: Callable[[bytes], Moment]) -> Callable[[in
         read: turns a line into a moment, or raises `InputError`.
     """
 
-    def items(offset: int) -> Iterator[Item]:
+    def items(offset: int) -> Iterator[SourceItem]:
         try:
             file = sys.stdin.buffer if path is None else open(path, "rb")  # noqa: SIM115
         except OSError as error:
@@ -251,13 +255,13 @@ def lines_of(path: Path | None, read: Callable[[bytes], Moment]) -> Callable[[in
                     while (rest := file.readline(_LONGEST)) and not rest.endswith(b"\n"):
                         offset += len(rest)
                     offset += len(rest)
-                    yield Item(InputError(f"a line of more than {_LONGEST} bytes"), offset)
+                    yield SourceItem(InputError(f"a line of more than {_LONGEST} bytes"), offset)
                     continue
                 if not line.strip():
                     continue
                 try:
-                    yield Item(read(line), offset)
+                    yield SourceItem(read(line), offset)
                 except InputError as error:
-                    yield Item(error, offset)
+                    yield SourceItem(error, offset)
 
     return items

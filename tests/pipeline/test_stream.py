@@ -26,7 +26,7 @@ from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.consider import ClockPrior
 from kcal.pipeline.lines import Moment, read_moment
 from kcal.pipeline.senders import CotSender, sender_to
-from kcal.pipeline.stream import Item, Stream, lines_of
+from kcal.pipeline.stream import SourceItem, Stream, lines_of
 from kcal.pipeline.tracks import Tracker
 
 SITE = tracked_site(0.002)
@@ -151,7 +151,7 @@ def test_a_source_that_does_not_resume_skips_what_was_written(
     lines = whole[0].read_bytes().splitlines(keepends=True)
 
     def pipe(first: int, last: int):
-        return lambda _: (Item(read(line), 0) for line in lines[first:last] if b"noon" not in line)
+        return lambda _: (SourceItem(read(line), 0) for line in lines[first:last] if b"noon" not in line)
 
     new_stream(tmp_path).follow(pipe(0, 20), waits=True, resumes=False)
     counts = new_stream(tmp_path).follow(pipe(14, 46), waits=True, resumes=False)
@@ -163,10 +163,10 @@ def test_a_camera_that_does_not_wait_drops_the_oldest(whole: tuple[Path, dict[st
     moments = [read(line) for line in whole[0].read_bytes().splitlines() if b"noon" not in line]
     release = threading.Event()
 
-    def camera(_: int) -> Iterator[Item]:
+    def camera(_: int) -> Iterator[SourceItem]:
         # More than can wait, before the first is dealt with.
         for number in range(200):
-            yield Item(moments[0]._replace(time=1.7e9 + number), 0)
+            yield SourceItem(moments[0]._replace(time=1.7e9 + number), 0)
         release.set()
 
     stream = new_stream(tmp_path)
@@ -217,8 +217,8 @@ def test_a_shorter_input(whole: tuple[Path, dict[str, bytes]], tmp_path: Path) -
 def test_a_source_that_fails_ends_the_stream(whole: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
     moment = read(whole[0].read_bytes().splitlines()[0])
 
-    def broken(_: int) -> Iterator[Item]:
-        yield Item(moment, 1)
+    def broken(_: int) -> Iterator[SourceItem]:
+        yield SourceItem(moment, 1)
         raise RuntimeError("the detector has a bug")
 
     with pytest.raises(RuntimeError, match="has a bug"):
