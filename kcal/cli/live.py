@@ -16,6 +16,8 @@ from kcal.errors import InputError
 
 if TYPE_CHECKING:
     from kcal.locate.columns import PositionColumns
+    from kcal.locate.positions import Located
+    from kcal.pipeline.live_map import LiveMap
     from kcal.pipeline.stream import StreamCounts
     from kcal.pipeline.tracks import Tracks
 
@@ -35,6 +37,10 @@ def live_command(
             help="Where positions go besides: udp://HOST:PORT or tcp://HOST:PORT for Cursor-on-Target, "
             "mqtt://HOST/TOPIC; may be repeated.",
         ),
+    ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option("--map", metavar="PORT", help="Serve the live map to this machine's browser; 0: any free port."),
     ] = None,
     journal: Annotated[
         Path | None, typer.Option(help="Remembers what was written; the first output with .journal if not given.")
@@ -113,12 +119,17 @@ def live_command(
             Tracker(locate.localize, clock=clock), located_by(locate), output, log,
             senders=[sender_to(address) for address in to or []], start=moment_zero, shown=None,
         )  # fmt: skip
-        stream.shown = _progress(advance, stream.counts)
+        page = None if port is None else _live_map(stream.run, port)
+        stream.shown = _progress(advance, stream.counts, page)
         if stream.ledger.place.sequence:
             err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: stream.stop())
-        counts = stream.follow(lines_of(source, read), waits=True, resumes=source is not None)
+        try:
+            counts = stream.follow(lines_of(source, read), waits=True, resumes=source is not None)
+        finally:
+            if page is not None:
+                page.close()
     err.print(summary(counts), markup=False)
     if counts.malformed:
         err.print(f"last malformed line: {counts.last_error}", markup=False)
@@ -140,12 +151,26 @@ def summary(counts: StreamCounts) -> str:
     return "; ".join(parts)
 
 
-def _progress(advance: Callable[..., None], counts: StreamCounts) -> Callable[[PositionColumns, Tracks], None]:
-    """Show how it goes, twice a second."""
+def _live_map(run: Located, port: int) -> LiveMap:
+    try:
+        from kcal.pipeline.live_map import LiveMap
+    except ImportError as error:
+        raise InputError(f"--map needs {error.name}; install it with: pip install 'kcal[mark]'") from error
+    page = LiveMap(run, port)
+    err.print(f"live map: {page.address}", markup=False)
+    return page
+
+
+def _progress(
+    advance: Callable[..., None], counts: StreamCounts, page: LiveMap | None
+) -> Callable[[PositionColumns, Tracks], None]:
+    """Show the tracks on the map, and how it goes, twice a second."""
     next_time = 0.0
 
     def show(columns: PositionColumns, tracks: Tracks) -> None:
         nonlocal next_time
+        if page is not None:
+            page.show(columns, counts.moments)
         if clocks.monotonic() >= next_time:
             next_time = clocks.monotonic() + 0.5
             advance(f"{len(tracks.number)} tracks; {summary(counts)}", 0)

@@ -123,6 +123,7 @@ class StoneSoupFilter:
         self.states: dict[int, Any] = {}
 
     def take(self, targets: Tensor, enu: Tensor, covariance: Tensor, ok: Tensor, time: float) -> None:
+        """Take in positions with covariances."""
         linear, detection, hypothesis, gaussian, updater = self._types
         when = datetime.datetime(2026, 1, 1) + datetime.timedelta(seconds=time)
         for i, target in enumerate(targets.tolist()):
@@ -140,6 +141,7 @@ class StoneSoupFilter:
             self.states[target] = gaussian(made.state_vector, made.covar, timestamp=when)
 
     def places(self, time: float) -> tuple[list[int], Tensor]:
+        """Targets and where they are believed to be."""
         when = datetime.datetime(2026, 1, 1) + datetime.timedelta(seconds=time)
         found = [self._predictor.predict(state, timestamp=when) for state in self.states.values()]
         rows = [np.asarray(state.state_vector, float).ravel()[::2] for state in found]
@@ -171,12 +173,14 @@ class Figures:
         self.numbers: dict[str, list[float]] = {}
 
     def add(self, name: str, values: Tensor | float) -> None:
+        """Keep values under a name."""
         if isinstance(values, Tensor):
             self.errors.setdefault(name, []).append(values.double().flatten())
         else:
             self.numbers.setdefault(name, []).append(values)
 
     def all(self, name: str) -> Tensor:
+        """All that was kept."""
         return torch.cat(self.errors[name])
 
 
@@ -205,7 +209,7 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
             # The rival is told the offset, and whose each sighting is: filter against filter.
             pace = site.velocity[which] @ site.localize.enu_from_rig.T
             late = (pairs.time[:, 1:] - pairs.time[:, :1] + OFFSET) * (pace[:, :1] / float(site.localize.rig.baseline))
-            ahead = one.enu * (1.0 + late)
+            ahead = one.enu * (1.0 - late)
             rival.take(which, ahead, one.covariance, one.status == 0, time)
         far = which >= TARGETS - 6
         lost = torch.linalg.vector_norm(places, dim=-1)
@@ -233,10 +237,10 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
                 kept = torch.isin(owner(exact, site, places), there)
                 figures.add("gospa kcal", gospa(exact.state.enu[kept], enu[there], 300.0))
                 figures.add("gospa stonesoup", gospa(guessed, enu[there], 300.0))
-    offset, sigma = tracker.clock_estimate().offset(seconds / 2)
-    figures.add("clock", torch.tensor([(offset - OFFSET) / sigma]))
+    offset, doubt = tracker.clock_estimate().offset(seconds / 2)
+    figures.add("clock", torch.tensor([(offset - OFFSET) / doubt]))
     figures.add("clock ms", torch.tensor([1e3 * (offset - OFFSET)]))
-    figures.add("clock sigma ms", torch.tensor([1e3 * sigma]))
+    figures.add("clock sigma ms", torch.tensor([1e3 * doubt]))
     for track in tracker.smoothed():
         step = len(track.time) // 2
         true = site.start + track.time[step] * site.velocity
