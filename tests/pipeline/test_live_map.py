@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 import orjson
 import pytest
 import torch
+from marking_browser import CHROMIUM
 from track_scenes import pairs_of, tracked_site
 
 pytest.importorskip("uvicorn")
@@ -71,11 +72,10 @@ def test_others_are_refused(page: LiveMap, path: str, host: str | None) -> None:
 
 def test_the_page_in_a_browser(page: LiveMap) -> None:
     playwright = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("no browser")
     with playwright.sync_playwright() as driver:
-        try:
-            browser = driver.chromium.launch()
-        except playwright.Error as error:
-            pytest.skip(f"no browser: {error}")
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         tab = browser.new_page()
         errors: list[str] = []
         tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
