@@ -123,11 +123,12 @@ def live_command(
         stream.shown = _progress(advance, stream.counts, page)
         if stream.ledger.place.sequence:
             err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: stream.stop())
+        before = {number: signal.signal(number, lambda *_: stream.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
             counts = stream.follow(lines_of(source, read), waits=True, resumes=source is not None)
         finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
             if page is not None:
                 page.close()
     err.print(summary(counts), markup=False)

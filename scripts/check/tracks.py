@@ -317,9 +317,9 @@ def report(figures: Figures, seeds: int, seconds: float) -> str:
         missed, doubled, followed = (sum(figures.numbers[name]) for name in ("missed", "doubled", "followed"))
         lines += [
             "",
-            f"GOSPA (cutoff 300 m) of the targets that both follow: kcal {ours:.0f} m, Stone Soup's Kalman filter, which "
-            f"is told which sighting is whose, {theirs:.0f} m. Of {followed:,.0f} targets in all moments kcal's tracker "
-            f"has no position for {missed:,.0f} and two for {doubled:,.0f}.",
+            f"GOSPA (cutoff 300 m) of the targets that both follow: kcal {ours:.0f} m, Stone Soup's Kalman filter, "
+            f"which is told which sighting is whose, {theirs:.0f} m. Of {followed:,.0f} targets in all moments kcal's "
+            f"tracker has no position for {missed:,.0f} and two for {doubled:,.0f}.",
         ]
     return "\n".join(lines)
 
