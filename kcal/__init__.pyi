@@ -123,6 +123,10 @@ from kcal.locate.export import write_positions as write_positions
 from kcal.locate.geodesy import enu_from_cam as enu_from_cam
 from kcal.locate.geodesy import enu_to_geodetic as enu_to_geodetic
 from kcal.locate.geodesy import geodetic_to_enu as geodetic_to_enu
+from kcal.locate.ground import GroundPlaces as GroundPlaces
+from kcal.locate.ground import level_ground as level_ground
+from kcal.locate.ground import locate_on_ground as locate_on_ground
+from kcal.locate.ground import terrain as terrain
 from kcal.locate.localizer import Localization as Localization
 from kcal.locate.localizer import Sensitivity as Sensitivity
 from kcal.locate.localizer import StereoLocalizer as StereoLocalizer

@@ -80,7 +80,11 @@ PUBLIC = {
     "Misfit",
     "Mounting",
     "Observations",
+    "GroundPlaces",
     "Origin",
+    "level_ground",
+    "locate_on_ground",
+    "terrain",
     "Tracks",
     "TrackOptions",
     "Tracker",
@@ -207,6 +211,7 @@ RECORDS = {
     "Baseline",
     "ClockEstimate",
     "ClockPrior",
+    "GroundPlaces",
     "Motion",
     "SmoothedTrack",
     "TrackStates",
@@ -263,8 +268,9 @@ RECORDS = {
     "Viewpoint",
     "ViewsResult",
 }
-# They write a picture or page of a whole result, or need a video or observations: the tests of their rooms show them.
+# They write a picture or page of a whole result, or need a video, a raster or observations: tests of their rooms show them.
 WITHOUT_EXAMPLE = {
+    "terrain",
     "FieldModes",
     "detect_video",
     "paired_boards",
