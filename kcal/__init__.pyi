@@ -185,3 +185,14 @@ from kcal.solve.result import SolverStatus as SolverStatus
 from kcal.solve.robust import RobustLoss as RobustLoss
 
 __version__: str
+from kcal.lens.image_transform import ImageTransform as ImageTransform
+from kcal.lens.images import UndistortImage as UndistortImage
+from kcal.pipeline.association import Association as Association
+from kcal.pipeline.association import AssociationOptions as AssociationOptions
+from kcal.pipeline.association import associate as associate
+from kcal.pipeline.detections import Detections as Detections
+from kcal.pipeline.disparity import DisparityOptions as DisparityOptions
+from kcal.pipeline.disparity import ObjectDisparities as ObjectDisparities
+from kcal.pipeline.disparity import ObjectDisparity as ObjectDisparity
+from kcal.pipeline.pairing import pair_objects as pair_objects
+from kcal.pipeline.pairs import ObjectPairs as ObjectPairs

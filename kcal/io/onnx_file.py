@@ -6,6 +6,7 @@ import importlib.util
 import os
 import tempfile
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -16,7 +17,7 @@ from kcal.errors import FileError, InputError
 from kcal.files import check_writable
 
 
-def save_onnx(module: nn.Module, example: Tensor, path: str | Path) -> Path:
+def save_onnx(module: nn.Module, example: Tensor | Sequence[Tensor], path: str | Path) -> Path:
     """Write a module that maps points (N, K) as ONNX, for any number of points from two up.
 
     `Camera` itself is such a module (`project`), `Unproject`, `LookupCamera` and `Triangulate` are others. The graph is
@@ -26,7 +27,7 @@ def save_onnx(module: nn.Module, example: Tensor, path: str | Path) -> Path:
 
     Args:
         module: its parameters become constants.
-        example: (N, K) points to trace it with, at least two.
+        example: (N, K) points to trace it with, at least two; several such tensors for a module of several inputs.
         path: of the file.
 
     Raises:
@@ -42,9 +43,11 @@ def save_onnx(module: nn.Module, example: Tensor, path: str | Path) -> Path:
         'camera.onnx'
     """
     path = check_writable(path)
-    if not isinstance(example, Tensor) or example.ndim != 2 or len(example) < 2:
-        raise InputError("save_onnx: an example (N, K) of at least two points is needed")
-    example = as_points("example", example, example.shape[-1])
+    examples = (example,) if isinstance(example, Tensor) else tuple(example)
+    if not examples or any(some.ndim != 2 or len(some) < 2 or len(some) != len(examples[0]) for some in examples):
+        raise InputError("save_onnx: an example (N, K) of at least two points is needed, the same N for every input")
+    examples = tuple(as_points("example", some, some.shape[-1]) for some in examples)
+    count = torch.export.Dim("count", min=2)
     if importlib.util.find_spec("onnxscript") is None:
         raise InputError("save_onnx: onnx and onnxscript are needed; install kcal[onnx]")
     training = module.training
@@ -54,12 +57,14 @@ def save_onnx(module: nn.Module, example: Tensor, path: str | Path) -> Path:
             with warnings.catch_warnings():
                 # Of torch's own use of its tree library, nothing that a user could change.
                 warnings.simplefilter("ignore", FutureWarning)
+                # Two inputs share one number of points, which is what is wanted.
+                warnings.filterwarnings("ignore", message="# The axis name")
                 torch.onnx.export(
                     module.eval(),
-                    (example,),
+                    examples,
                     written,
                     dynamo=True,
-                    dynamic_shapes=({0: torch.export.Dim("count", min=2)},),
+                    dynamic_shapes=tuple({0: count} for _ in examples),
                     external_data=False,
                     optimize=False,
                     verbose=False,

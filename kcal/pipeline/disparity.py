@@ -2,8 +2,8 @@
 
 The box or mask of the left image says which pixels count. They are compared on a common plane
 (`kcal.pipeline.patches`): correlation finds the shift, and a least-squares fit with contrast and brightness refines it
-(W. Förstner 1982; F. Ackermann, "Digital image correlation", 1984). Pixels that do not fit, of the background or of what
-stands in front, lose their weight (J. W. Tukey's biweight).
+(W. Förstner 1982; F. Ackermann, "Digital image correlation", 1984). Pixels that do not fit, of the background or of
+what stands in front, lose their weight (J. W. Tukey's biweight).
 """
 
 from __future__ import annotations
