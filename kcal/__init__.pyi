@@ -195,4 +195,3 @@ from kcal.pipeline.disparity import DisparityOptions as DisparityOptions
 from kcal.pipeline.disparity import ObjectDisparities as ObjectDisparities
 from kcal.pipeline.disparity import ObjectDisparity as ObjectDisparity
 from kcal.pipeline.pairing import pair_objects as pair_objects
-from kcal.pipeline.pairs import ObjectPairs as ObjectPairs

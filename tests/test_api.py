@@ -102,7 +102,6 @@ PUBLIC = {
     "NetworkModes",
     "ObjectDisparities",
     "ObjectDisparity",
-    "ObjectPairs",
     "OutlierRejection",
     "Position",
     "PositionStatus",
@@ -283,7 +282,7 @@ RECORDS = {
     "Viewpoint",
     "ViewsResult",
 }
-# They write a picture or page of a whole result, or need a video, a raster or observations: tests of their rooms show them.
+# They write a picture or page of a whole result, or need a video, raster or observations: see the tests of their rooms.
 WITHOUT_EXAMPLE = {
     "terrain",
     "FieldModes",
