@@ -128,6 +128,10 @@ from kcal.locate.export import write_positions as write_positions
 from kcal.locate.geodesy import enu_from_cam as enu_from_cam
 from kcal.locate.geodesy import enu_to_geodetic as enu_to_geodetic
 from kcal.locate.geodesy import geodetic_to_enu as geodetic_to_enu
+from kcal.locate.ground import GroundPlaces as GroundPlaces
+from kcal.locate.ground import level_ground as level_ground
+from kcal.locate.ground import locate_on_ground as locate_on_ground
+from kcal.locate.ground import terrain as terrain
 from kcal.locate.localizer import Localization as Localization
 from kcal.locate.localizer import Sensitivity as Sensitivity
 from kcal.locate.localizer import StereoLocalizer as StereoLocalizer
@@ -162,6 +166,15 @@ from kcal.nets.inverse import InverseFit as InverseFit
 from kcal.nets.inverse import InverseNet as InverseNet
 from kcal.nets.inverse import InverseNetOptions as InverseNetOptions
 from kcal.nets.inverse import train_inverse as train_inverse
+from kcal.pipeline.consider import ClockEstimate as ClockEstimate
+from kcal.pipeline.consider import ClockPrior as ClockPrior
+from kcal.pipeline.estimates import TrackStates as TrackStates
+from kcal.pipeline.motion import Motion as Motion
+from kcal.pipeline.pairs import ObjectPairs as ObjectPairs
+from kcal.pipeline.smoothing import SmoothedTrack as SmoothedTrack
+from kcal.pipeline.tracks import Tracker as Tracker
+from kcal.pipeline.tracks import TrackOptions as TrackOptions
+from kcal.pipeline.tracks import Tracks as Tracks
 from kcal.report.board import save_board_picture as save_board_picture
 from kcal.report.budget import save_budget_picture as save_budget_picture
 from kcal.report.calibration import save_calibration_picture as save_calibration_picture
@@ -195,4 +208,3 @@ from kcal.pipeline.disparity import DisparityOptions as DisparityOptions
 from kcal.pipeline.disparity import ObjectDisparities as ObjectDisparities
 from kcal.pipeline.disparity import ObjectDisparity as ObjectDisparity
 from kcal.pipeline.pairing import pair_objects as pair_objects
-from kcal.pipeline.pairs import ObjectPairs as ObjectPairs

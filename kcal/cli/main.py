@@ -24,6 +24,7 @@ from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.diff import diff_command
 from kcal.cli.exchange import export_command, import_command
+from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
 from kcal.cli.report import report_command
@@ -91,6 +92,7 @@ app.command("batch")(with_json(batch_command))
 app.command("mark")(mark_command)
 app.add_typer(rig, name="rig")
 app.command("locate")(locate_command)
+app.command("live")(live_command)
 app.command("budget")(with_json(budget_command))
 app.command("undistort")(with_json(undistort_command))
 app.command("bake")(with_json(bake_command))

@@ -118,10 +118,37 @@ _FORMATS = {
 }
 
 
+# Rows of these can be appended one after another; a .cot file then lacks the end of its document.
+APPENDED = (".geojsonl", ".csv", ".cot")
+
+
 def check_format(path: str | Path) -> None:
     """Raise `InputError` unless the suffix of `path` is one that `write_positions` knows."""
     if Path(path).suffix.lower() not in _FORMATS:
         raise InputError(f"{path}: unknown format; the file name must end with {', '.join(_FORMATS)}")
+
+
+def appended(suffix: str, run: Located, columns: PositionColumns, time: datetime, *, first: bool) -> bytes:
+    """Some rows of a file that grows, with its beginning before the first of them.
+
+    Args:
+        suffix: .geojsonl, .csv or .cot, whose rows stand by themselves.
+        run: how the positions were located.
+        columns: the rows.
+        time: of the rows.
+        first: whether the file is empty so far.
+
+    Raises:
+        InputError: another suffix.
+    """
+    if suffix not in APPENDED:
+        raise InputError(f"{suffix}: a file that grows needs one of {', '.join(APPENDED)}")
+    made = _FORMATS[suffix]
+    start = made.start(run, columns) if first else b""
+    if suffix == ".geojsonl":
+        # Without the regions, which are most of a file: a stream never ends.
+        return start + b"".join(line + b"\n" for line in point_features(columns))
+    return start + made.rows(run, columns, time)
 
 
 class PositionWriter:

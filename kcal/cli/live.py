@@ -1,0 +1,187 @@
+"""`kcal live`: detections of two cameras to tracks on the map, as they come."""
+
+from __future__ import annotations
+
+import datetime
+import signal
+import time as clocks
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kcal.cli.console import err, steps
+from kcal.errors import InputError
+
+if TYPE_CHECKING:
+    from kcal.locate.columns import PositionColumns
+    from kcal.locate.positions import Located
+    from kcal.pipeline.live_map import LiveMap
+    from kcal.pipeline.stream import StreamCounts
+    from kcal.pipeline.tracks import Tracks
+
+
+def live_command(
+    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
+    detections: Annotated[
+        str, typer.Option(metavar="JSONL", help="Lines of JSON, one for each moment; - for the standard input.")
+    ],
+    output: Annotated[
+        list[Path], typer.Option("-o", "--output", help="File that grows: .geojsonl, .csv or .cot; may be repeated.")
+    ],
+    to: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Where positions go besides: udp://HOST:PORT or tcp://HOST:PORT for Cursor-on-Target, "
+            "mqtt://HOST/TOPIC; may be repeated.",
+        ),
+    ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option("--map", metavar="PORT", help="Serve the live map to this machine's browser; 0: any free port."),
+    ] = None,
+    journal: Annotated[
+        Path | None, typer.Option(help="Remembers what was written; the first output with .journal if not given.")
+    ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(metavar="LAT,LON,HEIGHT", help="Position of the left camera; from the rig file if not given."),
+    ] = None,
+    heading: Annotated[
+        float | None, typer.Option(metavar="DEG", help="Azimuth of the left camera's axis; needed with --origin.")
+    ] = None,
+    pixel_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of pairs that state none, each axis.")] = 0.3,
+    box_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of the middle of a box, each axis.")] = 2.0,
+    clock_offset: Annotated[
+        float, typer.Option(metavar="S", help="Seconds by which the right images are later than their times.")
+    ] = 0.0,
+    clock_sigma: Annotated[
+        float,
+        typer.Option(
+            metavar="S", help="Its standard deviation, also as a drift in an hour; above 0 it is estimated.", min=0
+        ),
+    ] = 0.0,
+    start: Annotated[
+        str | None,
+        typer.Option(metavar="ISO", help="Calendar time of second 0, if times are not Unix seconds; for events."),
+    ] = None,
+) -> None:
+    """Follow what two cameras see: tracks with latitude, longitude, velocity and honest errors, written as they come.
+
+    A line of the input is one moment: `{"left": {"time": T, "boxes": [[x1,y1,x2,y2], ...]}, "right": {...}}`, or pairs
+    that are matched already: `{"time": T, "left": [[u,v], ...], "right": [[u,v], ...], "sigma": PX}`.
+
+    Frames reduce the noise of the marks, never what calibration, mounting and clocks contribute. With `--clock-sigma`
+    the offset between the cameras' clocks is estimated from targets that move.
+
+    Stop it with Ctrl-C or SIGTERM. Started again with the same outputs, it continues where it was, after a crash too:
+    nothing is lost or written twice. Receivers of `--to` may get the last moments twice.
+
+    **Examples**
+
+    `kcal live rig.json --detections boxes.jsonl -o tracks.geojsonl`
+
+    `detector | kcal live rig.json --detections - -o tracks.csv --to udp://239.2.3.1:6969`
+    """
+    from kcal.files import check_writable
+    from kcal.io.rig_file import load_rig
+    from kcal.lens.mounting import Origin
+    from kcal.locate.locator import Locator
+    from kcal.locate.positions import located_by
+    from kcal.pipeline.association import AssociationOptions
+    from kcal.pipeline.consider import ClockPrior
+    from kcal.pipeline.lines import Moment, read_moment
+    from kcal.pipeline.senders import sender_to
+    from kcal.pipeline.stream import Stream, lines_of
+    from kcal.pipeline.tracks import Tracker
+
+    if (origin is None) != (heading is None):
+        raise typer.BadParameter("--origin and --heading belong together")
+    source = None if detections == "-" else Path(detections)
+    for path in output:
+        check_writable(path, rig, *([source] if source else []))
+    moment_zero = None if start is None else _calendar_time(start)
+    clock = ClockPrior(offset_s=clock_offset, offset_sigma_s=clock_sigma, drift_sigma=clock_sigma / 3600.0)
+    options = AssociationOptions(box_sigma=box_sigma)
+    place = None if origin is None else Origin.parse(origin)
+    locate = Locator(load_rig(rig), origin=place, heading_deg=heading, pixel_sigma=pixel_sigma)
+    solved = locate.localize.rig
+
+    def read(line: bytes) -> Moment:
+        return read_moment(line, solved, options, pixel_sigma)
+
+    log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
+    size = source.stat().st_size if source is not None and source.is_file() else None
+    with steps("live", size) as advance:
+        stream = Stream(
+            Tracker(locate.localize, clock=clock), located_by(locate), output, log,
+            senders=[sender_to(address) for address in to or []], start=moment_zero, shown=None,
+        )  # fmt: skip
+        page = None if port is None else _live_map(stream.run, port)
+        stream.shown = _progress(advance, stream.counts, page)
+        if stream.ledger.place.sequence:
+            err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)
+        before = {number: signal.signal(number, lambda *_: stream.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
+        try:
+            counts = stream.follow(lines_of(source, read), waits=True, resumes=source is not None)
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+            if page is not None:
+                page.close()
+    err.print(summary(counts), markup=False)
+    if counts.malformed:
+        err.print(f"last malformed line: {counts.last_error}", markup=False)
+    if clock_sigma:
+        offset, sigma = stream.tracker.clock_estimate().offset(stream.tracker.time)
+        err.print(f"the right camera's images are {1e3 * offset:.1f} ± {1e3 * sigma:.1f} ms later than their times say")
+
+
+def summary(counts: StreamCounts) -> str:
+    """What happened, in one line."""
+    parts = [f"{counts.moments:,} moments, {counts.positions:,} positions"]
+    for count, what in (
+        (counts.repeated, "moments not after the last one, skipped"),
+        (counts.malformed, "malformed lines"),
+        (counts.dropped, "moments dropped for lack of time"),
+        (counts.unsent, "moments that a receiver did not get"),
+    ):
+        parts += [f"{count:,} {what}"] if count else []
+    return "; ".join(parts)
+
+
+def _live_map(run: Located, port: int) -> LiveMap:
+    try:
+        from kcal.pipeline.live_map import LiveMap
+    except ImportError as error:
+        raise InputError(f"--map needs {error.name}; install it with: pip install 'kcal[mark]'") from error
+    page = LiveMap(run, port)
+    err.print(f"live map: {page.address}", markup=False)
+    return page
+
+
+def _progress(
+    advance: Callable[..., None], counts: StreamCounts, page: LiveMap | None
+) -> Callable[[PositionColumns, Tracks], None]:
+    """Show the tracks on the map, and how it goes, twice a second."""
+    next_time = 0.0
+
+    def show(columns: PositionColumns, tracks: Tracks) -> None:
+        nonlocal next_time
+        if page is not None:
+            page.show(columns, counts.moments)
+        if clocks.monotonic() >= next_time:
+            next_time = clocks.monotonic() + 0.5
+            advance(f"{len(tracks.number)} tracks; {summary(counts)}", 0)
+
+    return show
+
+
+def _calendar_time(text: str) -> datetime.datetime:
+    try:
+        moment = datetime.datetime.fromisoformat(text)
+    except ValueError as error:
+        raise InputError(f"--start {text!r}: write a time such as 2026-05-01T12:00:00Z") from error
+    return moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)

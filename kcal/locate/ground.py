@@ -1,0 +1,238 @@
+"""One camera: pixels to places on the ground, a level surface or a terrain model, with their errors.
+
+A line of sight is followed outward until it is below the ground for the first time: what lies behind is hidden. Light
+bends as for `StereoLocalizer`, and the ellipsoid falls away below the tangent plane.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.checks import as_points
+from kcal.errors import FileError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Mounting
+from kcal.locate.ellipsoid import mean_radius
+from kcal.locate.geodesy import anchor, enu_from_cam, place_enu
+from kcal.locate.mounting import by_mounting
+from kcal.locate.ranges import QUANTILE
+from kcal.locate.stereo import PositionStatus
+
+# Height above the ellipsoid, meters, of latitudes and longitudes (degrees, of one shape); NaN where it is not known.
+Ground = Callable[[Tensor, Tensor], Tensor]
+# Steps of the search along a line of sight over a level surface, of equal ratio; then each is halved this often.
+_STEPS, _HALVINGS = 512, 50
+# Of a tangent that is found by differences, meters.
+_STEP_M = 0.5
+# A place whose range is not known to a third is told as a bearing only.
+_BEARING_SIGMAS = 3.0
+
+
+class GroundPlaces(NamedTuple):
+    """Result of `locate_on_ground`; nothing is NaN.
+
+    Attributes:
+        enu: (N, 3) meters east, north, up of the camera; zeros unless the status is OK.
+        covariance: (N, 3, 3), an infinite diagonal unless OK; along the ground, which a line of sight meets slantingly.
+        geodetic: (N, 3) latitude, longitude, ellipsoidal height of the place on the ground; the camera's unless OK.
+        range_low: (N,) meters, lower end of the 95 % interval; zero unless OK.
+        range_high: (N,) upper end; infinite unless OK.
+        bearing: (N, 3) unit vector east, north, up at the camera; zeros where the lens has no ray.
+        status: (N,) int8 codes of `PositionStatus`. BEARING_ONLY: the line of sight meets no ground within reach, meets
+            ground of unknown height, or meets it so flatly that the range is not known to a third.
+    """
+
+    enu: Tensor
+    covariance: Tensor
+    geodetic: Tensor
+    range_low: Tensor
+    range_high: Tensor
+    bearing: Tensor
+    status: Tensor
+
+
+def level_ground(height: float) -> Ground:
+    """Ground at one height above the WGS84 ellipsoid, meters: a plain, or the sea with its geoid height.
+
+    Example:
+        >>> level_ground(12.0)(torch.tensor([19.07]), torch.tensor([72.87])).tolist()
+        [12.0]
+    """
+    if not math.isfinite(height):
+        raise InputError(f"ground height {height}: finite meters above the ellipsoid are needed")
+    return lambda lat, lon: torch.full_like(lat, height)
+
+
+def terrain(path: str | Path, geoid_height: float = 0.0) -> Ground:
+    """Ground from a raster of heights, for example a GeoTIFF, interpolated between the middles of its cells.
+
+    Args:
+        path: a raster that rasterio reads, with a coordinate system; the extra `terrain` is needed.
+        geoid_height: meters that are added, for a raster of heights above the sea: the height of the geoid there.
+
+    Raises:
+        InputError: rasterio is missing, or a height that is not finite.
+        FileError: not a raster, or one without coordinate system.
+    """
+    try:
+        import rasterio
+    except ImportError as error:
+        raise InputError("terrain needs rasterio; install it with: pip install 'kcal[terrain]'") from error
+    import pyproj
+
+    if not math.isfinite(geoid_height):
+        raise InputError(f"geoid height {geoid_height}: finite meters are needed")
+    try:
+        with rasterio.open(path) as raster:
+            heights = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
+            system, to_cell = raster.crs, ~raster.transform
+    except rasterio.errors.RasterioError as error:
+        raise FileError(f"{path}: cannot be read as a raster: {error}") from error
+    if system is None:
+        raise FileError(f"{path}: the raster has no coordinate system")
+    into = pyproj.Transformer.from_crs("EPSG:4326", system.to_wkt(), always_xy=True)
+    rows, columns = heights.shape
+
+    def height(lat: Tensor, lon: Tensor) -> Tensor:
+        x, y = into.transform(lon.numpy(), lat.numpy())
+        x, y = np.asarray(x), np.asarray(y)
+        column = to_cell.a * x + to_cell.b * y + to_cell.c - 0.5
+        row = to_cell.d * x + to_cell.e * y + to_cell.f - 0.5
+        left, top = np.floor(column), np.floor(row)
+        with np.errstate(invalid="ignore"):
+            inside = (left >= 0) & (top >= 0) & (left < columns - 1) & (top < rows - 1)
+        i, j = np.where(inside, top, 0).astype(int), np.where(inside, left, 0).astype(int)
+        a, b = column - left, row - top
+        found = (1 - b) * ((1 - a) * heights[i, j] + a * heights[i, j + 1])
+        found = found + b * ((1 - a) * heights[i + 1, j] + a * heights[i + 1, j + 1])
+        return torch.from_numpy(np.where(inside, found + geoid_height, np.nan))
+
+    return height
+
+
+@torch.no_grad()
+def locate_on_ground(
+    camera: Camera,
+    mounting: Mounting,
+    pixels: Tensor,
+    ground: Ground,
+    *,
+    pixel_sigma: float = 1.0,
+    ground_sigma: float = 0.0,
+    farthest: float = 20_000.0,
+    step: float | None = None,
+) -> GroundPlaces:
+    """Where lines of sight meet the ground for the first time.
+
+    Args:
+        camera: calibrated.
+        mounting: where it stands and looks, with its covariance, and the refraction if it was found.
+        pixels: (N, 2), for example the bottom of a box, where a thing stands.
+        ground: from `level_ground` or `terrain`.
+        pixel_sigma: standard deviation of a pixel along each axis, px.
+        ground_sigma: standard deviation of the ground's height, meters.
+        farthest: end of the search, meters.
+        step: of the search, meters, at most the size of a raster's cell so that no crest is jumped over; growing steps
+            for level ground if left out.
+
+    Raises:
+        InputError: wrong shapes, or a value that is not positive.
+
+    Example:
+        >>> from kcal.lens.mounting import Origin
+        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+        >>> stands = Mounting(origin=Origin(lat=19.07, lon=72.87, height=30.0), heading_deg=0.0, refraction=0.0)
+        >>> found = locate_on_ground(camera, stands, torch.tensor([[960.0, 600.0], [960.0, 500.0]]), level_ground(10.0))
+        >>> round(found.enu[0, 1].item(), 1), found.status.tolist()
+        (533.9, [0, 6])
+    """
+    pixels = as_points("pixels", pixels, 2)
+    if pixels.ndim != 2 or not (pixel_sigma > 0 and ground_sigma >= 0 and 1.0 < farthest < math.inf):
+        raise InputError("ground: pixels (N, 2), a positive pixel_sigma and farthest, and no negative ground_sigma")
+    if step is not None and not 0 < step < farthest:
+        raise InputError(f"step {step}: meters between 0 and {farthest:g} are needed")
+    origin = mounting.origin
+    turn = enu_from_cam(mounting.heading_deg, mounting.pitch_deg, mounting.roll_deg)
+    curve = 0.5 / mean_radius(origin.lat)
+    bend = (REFRACTION if mounting.refraction is None else mounting.refraction) * curve
+    rays, seen = camera.unproject(pixels)
+    sight, place = rays @ turn.T, anchor(origin)
+    seen = seen & torch.isfinite(pixels).all(-1)
+
+    def along(distance: Tensor, ray: Tensor) -> Tensor:
+        straight = distance[..., None] * ray
+        lower = torch.nn.functional.pad(straight[..., :2].square().sum(-1, keepdim=True), (2, 0))
+        return straight - bend * lower
+
+    def above(enu: Tensor) -> Tensor:
+        lat, lon, height = place_enu(enu, *place).unbind(-1)
+        return height - ground(lat, lon)
+
+    if step is None:
+        distances = torch.logspace(0.0, math.log10(farthest), _STEPS, dtype=torch.float64)
+    else:
+        distances = torch.arange(step, farthest + step, step, dtype=torch.float64)
+    heights = above(along(distances[None], sight[:, None]))
+    # The first place that is not above known ground ends the search.
+    ended = ~(heights > 0)
+    first = torch.where(ended.any(1), ended.to(torch.int8).argmax(1), 0)
+    met = seen & ended.any(1) & torch.isfinite(heights.gather(1, first[:, None])[:, 0]) & (first > 0)
+    far, near = distances[first], distances[(first - 1).clamp_min(0)]
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (near + far)
+        high = above(along(middle, sight)) > 0
+        near, far = torch.where(high, middle, near), torch.where(high, far, middle)
+    distance = 0.5 * (near + far)
+    enu = along(distance, sight)
+    steps = _STEP_M * torch.eye(3, dtype=torch.float64)
+    normal = (above(enu[:, None] + steps) - above(enu[:, None] - steps)) / (2 * _STEP_M)
+    tangent = along(distance + 0.5, sight) - along(distance - 0.5, sight)
+    approach = (normal * tangent).sum(-1)
+    met = met & torch.isfinite(normal).all(-1) & (approach < 0)
+    approach = torch.where(met, approach, -1.0)
+
+    # How the place moves: by the four errors, and then along the line of sight back to the ground.
+    ends = [camera.unproject(pixels + shift)[0] for shift in 0.5 * torch.eye(2, dtype=torch.float64)]
+    starts = [camera.unproject(pixels - shift)[0] for shift in 0.5 * torch.eye(2, dtype=torch.float64)]
+    by_pixel = torch.stack([distance[:, None] * (b - a) @ turn.T for a, b in zip(starts, ends, strict=True)], -1)
+    known = torch.zeros(7, 7, dtype=torch.float64)
+    if mounting.covariance is not None:
+        size = len(mounting.covariance)
+        known[:size, :size] = mounting.covariance
+    if mounting.covariance is None or len(mounting.covariance) == 6:
+        known[6, 6] = REFRACTION_SIGMA**2
+    level = enu[:, :2].square().sum(-1)
+    bent = torch.nn.functional.pad(-curve * level[:, None, None], (0, 0, 2, 0))
+    moves = torch.cat([pixel_sigma * by_pixel, torch.cat([by_mounting(enu), bent], -1) @ _root(known)], -1)
+    moves = moves - tangent[..., None] * (normal[:, None] @ moves / approach[:, None, None])
+    by_height = ground_sigma * tangent[..., None] / approach[:, None, None]
+    moves = torch.where(met[:, None, None], torch.cat([moves, by_height], -1), 0.0)
+    covariance = moves @ moves.mT
+    span = torch.linalg.vector_norm(enu, dim=-1)
+    sigma = (enu[:, None] @ moves)[:, 0].square().sum(-1).sqrt() / span.clamp_min(1e-9)
+    ok = met & (span > _BEARING_SIGMAS * sigma)
+    status = torch.where(ok, int(PositionStatus.OK), int(PositionStatus.BEARING_ONLY)).to(torch.int8)
+    status = torch.where(seen, status, int(PositionStatus.OUTSIDE_LENS)).to(torch.int8)
+    status = torch.where(camera.inside(pixels) | ~seen, status, int(PositionStatus.OUTSIDE_IMAGE)).to(torch.int8)
+    ok = status == int(PositionStatus.OK)
+    return GroundPlaces(
+        enu=torch.where(ok[:, None], enu, 0.0),
+        covariance=torch.where(ok[:, None, None], covariance, torch.diag(covariance.new_full((3,), math.inf))),
+        geodetic=torch.where(ok[:, None], place_enu(enu, *place), origin.geodetic),
+        range_low=torch.where(ok, (span - QUANTILE * sigma).clamp_min(0.0), 0.0),
+        range_high=torch.where(ok, span + QUANTILE * sigma, math.inf),
+        bearing=torch.where(seen[:, None], sight, 0.0),
+        status=status,
+    )
+
+
+def _root(covariance: Tensor) -> Tensor:
+    values, vectors = torch.linalg.eigh(covariance)
+    return vectors * values.clamp_min(0.0).sqrt()

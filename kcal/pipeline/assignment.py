@@ -1,0 +1,127 @@
+"""Which pair belongs to which track: gates, one-to-one assignment, and marks that several pairs claim."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from kcal.pipeline.beliefs import Beliefs, Innovations, Timing, fit_of, innovations
+from kcal.pipeline.sightings import Anchored, Sightings, anchored
+
+
+class Candidates(NamedTuple):
+    """Possible matches, one a row.
+
+    Attributes:
+        track: (L,) numbers of tracks.
+        pair: (L,) numbers of pairs.
+        seen: the pair in the track's frame.
+        found: innovations of the merged belief.
+        squared: (L,) squared Mahalanobis distance.
+        log_density: (L,).
+    """
+
+    track: Tensor
+    pair: Tensor
+    seen: Anchored
+    found: Innovations
+    squared: Tensor
+    log_density: Tensor
+
+
+def candidates(
+    beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, gate: float
+) -> Candidates:
+    """Compare all tracks with all pairs near them.
+
+    Args:
+        beliefs: merged, (T, 1, ...), predicted.
+        frame: (T, 3, 3).
+        seen: N pairs.
+        timing: of the pairs.
+        root: of the covariance of the shared errors.
+        gate: largest squared Mahalanobis distance.
+    """
+    ray = torch.cat([beliefs.mean[:, 0, :2], torch.ones_like(beliefs.mean[:, 0, :1])], -1)
+    ray = torch.nn.functional.normalize((frame.mT @ ray[..., None])[..., 0], dim=-1)
+    apart = torch.cdist(ray, torch.nn.functional.normalize(seen.direction, dim=-1))
+    spread = (beliefs.effect[:, 0, :2] @ root).square().sum((-2, -1))
+    own = beliefs.noise[:, 0].diagonal(dim1=-2, dim2=-1)[:, :2].sum(-1)
+    # A mark that is late has moved on.
+    pace = beliefs.mean[:, 0, 3:5].square().sum(-1) + beliefs.noise[:, 0].diagonal(dim1=-2, dim2=-1)[:, 3:5].sum(-1)
+    late = timing.delay.abs().amax(-1) + timing.unsure
+    reach = (own + spread)[:, None] + seen.noise.diagonal(dim1=-2, dim2=-1)[:, :2].sum(-1)
+    reach = reach + seen.shared[:, :2].square().sum((-2, -1)) + pace[:, None] * late.square()
+    track, pair = ((apart.square() <= 2.0 * gate * reach) & seen.usable).nonzero(as_tuple=True)
+    local = anchored(seen.at(pair), frame[track])
+    found = innovations(beliefs.at(track), local, timing.at(pair))
+    fit = fit_of(found, root)
+    good = local.ahead & (fit.squared[:, 0] <= gate)
+    return Candidates(
+        track[good], pair[good], Anchored(*(v[:, good] if i == 3 else v[good] for i, v in enumerate(local))),
+        Innovations(*(value[good] for value in found)), fit.squared[good, 0], fit.log_density[good, 0],
+    )  # fmt: skip
+
+
+def mark_numbers(left: Tensor, right: Tensor) -> NDArray[np.int64]:
+    """(N, 2) numbers of the left and right marks: pairs with the same number share a mark.
+
+    Example:
+        >>> left = torch.tensor([[1.0, 2.0], [1.0, 2.0]])
+        >>> mark_numbers(left, left + torch.tensor([[0.0], [1.0]])).tolist()
+        [[0, 0], [0, 1]]
+    """
+    numbers = [torch.unique(marks, dim=0, return_inverse=True)[1] for marks in (left, right)]
+    return torch.stack(numbers, -1).cpu().numpy()
+
+
+def assigned(
+    possible: Candidates, marks: NDArray[np.int64], evidence: NDArray[np.float64], tiers: NDArray[np.int64]
+) -> list[int]:
+    """Rows of `possible` to accept: each track, pair and mark at most once, with the largest sum of log densities.
+
+    Args:
+        possible: all matches inside the gates.
+        marks: from `mark_numbers`.
+        evidence: (T,) of each track so far: settles between tracks that want the same mark by different pairs.
+        tiers: (T,) tracks of tier 0 choose before those of tier 1; tracks of a negative tier do not choose.
+    """
+    track, pair = possible.track.cpu().numpy(), possible.pair.cpu().numpy()
+    density = possible.log_density.cpu().numpy()
+    left: set[int] = set()
+    right: set[int] = set()
+    done: set[int] = set()
+    accepted: list[int] = []
+    for tier in (0, 1):
+        rows = [i for i in range(len(track)) if tiers[track[i]] == tier]
+        while rows := [
+            i for i in rows if track[i] not in done and marks[pair[i], 0] not in left and marks[pair[i], 1] not in right
+        ]:
+            chosen = _best(rows, track, pair, density)
+            for i in sorted(chosen, key=lambda i: -(evidence[track[i]] + density[i])):
+                ends = int(marks[pair[i], 0]), int(marks[pair[i], 1])
+                if ends[0] not in left and ends[1] not in right:
+                    accepted.append(i)
+                    done.add(int(track[i]))
+                    left.add(ends[0])
+                    right.add(ends[1])
+    return accepted
+
+
+def _best(
+    rows: list[int], track: NDArray[np.int64], pair: NDArray[np.int64], density: NDArray[np.float64]
+) -> list[int]:
+    tracks, at_track = np.unique(track[rows], return_inverse=True)
+    pairs, at_pair = np.unique(pair[rows], return_inverse=True)
+    # Worse than any that is possible: such a match is dropped afterwards.
+    worst = density[rows].min() - (np.ptp(density[rows]) + 1.0) * (len(tracks) + 1)
+    gain = np.full((len(tracks), len(pairs)), worst)
+    number = np.full(gain.shape, -1)
+    gain[at_track, at_pair] = density[rows]
+    number[at_track, at_pair] = rows
+    return [int(i) for i in number[linear_sum_assignment(gain, maximize=True)] if i >= 0]

@@ -1,0 +1,128 @@
+"""What all tracks share: errors of calibration, mounting and clocks, which more frames do not average away.
+
+A state's error is noise plus `shared @ b`, with the same unknown b for every track and frame: K independent errors of
+the calibration, and three of the clock. The filter's gain follows the noise alone, and the effect of b is carried along
+exactly. Two things follow: the covariance, noise + shared cov(b) sharedᵀ, never falls below the systematic part; and
+innovations tell what they know of b, the calibration included, which `SharedErrors` collects to estimate the clock.
+
+Source: Friedland, "Treatment of bias in recursive filtering" (1969); Schmidt (1966) for considered states.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+
+# Offset, drift, slope over the rows.
+CLOCK_TERMS = 3
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ClockPrior:
+    """What is known of the clocks before any target moved: the right camera's images are later than their times say.
+
+    Args:
+        offset_s: seconds by which they are later.
+        offset_sigma_s: its standard deviation.
+        drift_sigma: of the change of the offset, seconds per second.
+        slope_sigma_s: of the difference between the bottom and the top row: two rolling shutters that are unlike.
+
+    Raises:
+        InputError: a value that is not finite, or a negative sigma.
+    """
+
+    offset_s: float = 0.0
+    offset_sigma_s: float = 0.0
+    drift_sigma: float = 0.0
+    slope_sigma_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.offset_s) or not all(0 <= value < math.inf for value in self.sigmas):
+            raise InputError("clock: a finite offset and finite sigmas, not negative, are needed")
+
+    @property
+    def sigmas(self) -> tuple[float, float, float]:
+        """Of offset, drift and slope."""
+        return self.offset_sigma_s, self.drift_sigma, self.slope_sigma_s
+
+
+class ClockEstimate(NamedTuple):
+    """What the tracks say of the clocks.
+
+    Attributes:
+        values: (3,) offset (s) at the time of the first frame, drift (s/s), slope (s from top to bottom).
+        covariance: (3, 3); calibration errors are included.
+        start: seconds, the time at which the drift counts from.
+    """
+
+    values: Tensor
+    covariance: Tensor
+    start: float
+
+    def offset(self, time: float) -> tuple[float, float]:
+        """The offset at a time, with its standard deviation: seconds."""
+        row = self.values.new_tensor([1.0, time - self.start, 0.0])
+        return float(row @ self.values), float((row @ self.covariance @ row).clamp_min(0).sqrt())
+
+
+class SharedErrors:
+    """What is known of b: the calibration's errors stay as they are, the clock's are estimated.
+
+    b counts from `values` for the clock: after each `settle`, the best estimate of b is zero.
+
+    Args:
+        calibration: K, how many independent unit errors the calibration has.
+        clock: what is known of the clocks.
+        device: of the tensors.
+    """
+
+    def __init__(self, calibration: int, clock: ClockPrior, device: torch.device | None = None) -> None:
+        self.calibration = calibration
+        sigmas = torch.tensor(clock.sigmas, dtype=torch.float64, device=device)
+        self.scale = torch.cat([sigmas.new_ones(calibration), sigmas])
+        self.values = sigmas.new_tensor([clock.offset_s, 0.0, 0.0])
+        size = len(self.scale)
+        # In units of the prior's sigmas: a sigma of zero is no exception.
+        self.information = torch.eye(size, dtype=torch.float64, device=device)
+        self.score = torch.zeros(size, dtype=torch.float64, device=device)
+        self.start: float | None = None
+        self.root = torch.diag(self.scale)
+
+    def add(self, effect: Tensor, innovation: Tensor, covariance: Tensor) -> None:
+        """Collect independent innovations (N, 4) = effect (N, 4, K + 3) b + noise of the covariance (N, 4, 4)."""
+        scaled = effect * self.scale
+        white = torch.linalg.solve_ex(covariance, torch.cat([scaled, innovation[..., None]], -1))[0]
+        both = (scaled.mT @ white).sum(0)
+        self.information = self.information + both[:, :-1]
+        self.score = self.score + both[:, -1]
+
+    def settle(self) -> Tensor:
+        """Move `values` to what was collected, and return the move (3,); `root` is then that of what remains of b.
+
+        The clock's error and the calibration's are correlated as in the joint posterior; the calibration keeps its
+        prior, because its errors must not average away where the model of its errors is not exact.
+        """
+        k = self.calibration
+        if not bool((self.scale[k:] > 0).any()):
+            return torch.zeros_like(self.values)
+        joint = torch.linalg.inv(self.information)
+        move = joint @ self.score
+        move[:k] = 0.0
+        self.score = self.score - self.information @ move
+        joint[:k, :k] = torch.eye(k).to(joint)
+        values, vectors = torch.linalg.eigh(0.5 * (joint + joint.T))
+        self.root = self.scale[:, None] * vectors * values.clamp_min(0.0).sqrt()
+        change = (self.scale * move)[k:]
+        self.values = self.values + change
+        return change
+
+    def clock_estimate(self) -> ClockEstimate:
+        """The clocks as now known."""
+        part = self.root[self.calibration :]
+        return ClockEstimate(self.values.clone(), part @ part.T, self.start or 0.0)

@@ -1,0 +1,113 @@
+"""The journal of a stream: which moments are in the outputs, so that a restart neither loses nor doubles any.
+
+The first line is a checkpoint with the state of the tracker; each further line is a moment whose positions are in the
+outputs. A moment is written to the outputs first. What a crash left of a moment that is not in the journal is cut off
+the outputs at the next start, and the moment is done again.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import orjson
+
+from kcal.errors import FileError
+from kcal.files import write_atomic
+
+_HEAD = {"kcal": "live journal", "version": 1}
+
+
+class StreamPlace(NamedTuple):
+    """How far a stream has come.
+
+    Attributes:
+        sequence: how many moments are in the outputs.
+        time: seconds of the last one; None before the first.
+        offset: bytes of the input that were read.
+        sizes: bytes of each output.
+    """
+
+    sequence: int
+    time: float | None
+    offset: int
+    sizes: tuple[int, ...]
+
+
+class Ledger:
+    """Outputs that are appended to, and their journal.
+
+    Args:
+        path: of the journal; made if it is missing.
+        outputs: files; they are made, or cut to what the journal says.
+
+    Raises:
+        FileError: a file that cannot be opened, a damaged journal, one of other outputs, or an output that has lost
+            what the journal says it has.
+    """
+
+    def __init__(self, path: Path, outputs: Sequence[Path]) -> None:
+        self.path, self.outputs = path, tuple(outputs)
+        self.state: dict[str, Any] | None = None
+        self.checkpoint_at = self.place = StreamPlace(0, None, 0, (0,) * len(self.outputs))
+        if path.exists():
+            self._read()
+        self._files = [self._opened(file, size) for file, size in zip(self.outputs, self.place.sizes, strict=True)]
+        self._log: BinaryIO | None = None
+
+    def append(self, parts: Sequence[bytes], time: float, offset: int) -> None:
+        """Write a moment's bytes to the outputs, and then to the journal."""
+        if self._log is None:
+            raise FileError(f"{self.path}: no checkpoint was written yet")
+        for file, part in zip(self._files, parts, strict=True):
+            file.write(part)
+            file.flush()
+        sizes = tuple(size + len(part) for size, part in zip(self.place.sizes, parts, strict=True))
+        self.place = StreamPlace(self.place.sequence + 1, time, offset, sizes)
+        self._log.write(orjson.dumps(list(self.place)) + b"\n")
+        self._log.flush()
+
+    def checkpoint(self, state: dict[str, Any]) -> None:
+        """Begin the journal again with the state after the last moment."""
+        for file in self._files:
+            os.fsync(file.fileno())
+        names = [str(path.resolve()) for path in self.outputs]
+        head = {**_HEAD, "outputs": names, "place": list(self.place), "state": state}
+        if self._log is not None:
+            self._log.close()
+        write_atomic(self.path, orjson.dumps(head) + b"\n")
+        self._log = open(self.path, "ab")  # noqa: SIM115
+        self.state, self.checkpoint_at = state, self.place
+
+    def close(self) -> None:
+        """Close all files."""
+        for file in (*self._files, *([self._log] if self._log else [])):
+            file.close()
+
+    def _read(self) -> None:
+        lines = self.path.read_bytes().split(b"\n")[:-1]  # what is cut off was not complete
+        try:
+            head = orjson.loads(lines[0])
+            places = [StreamPlace(*head["place"]), *(StreamPlace(*orjson.loads(line)) for line in lines[1:])]
+            if {name: head[name] for name in _HEAD} != _HEAD:
+                raise FileError(f"{self.path}: not a journal of this version of `kcal live`")
+            if head["outputs"] != [str(path.resolve()) for path in self.outputs]:
+                raise FileError(f"{self.path}: a journal of other outputs, {head['outputs']}; delete it to begin anew")
+            self.state = head["state"]
+        except (orjson.JSONDecodeError, KeyError, TypeError, IndexError) as error:
+            raise FileError(f"{self.path}: the journal is damaged ({error}); delete it to begin anew") from error
+        self.checkpoint_at, self.place = places[0], places[-1]._replace(sizes=tuple(places[-1].sizes))
+
+    def _opened(self, path: Path, size: int) -> BinaryIO:
+        try:
+            file = open(path, "r+b" if size else "wb")  # noqa: SIM115
+            there = file.seek(0, os.SEEK_END)
+            if there < size:
+                raise FileError(f"{path}: {there} bytes, but the journal {self.path} says {size}; delete both")
+            file.truncate(size)
+            file.seek(size)
+        except OSError as error:
+            raise FileError(f"{path}: cannot write: {error.strerror or error}") from error
+        return file

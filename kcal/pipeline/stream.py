@@ -1,0 +1,267 @@
+"""The stream: lines or frames in, tracks out, moment by moment, in bounded memory, and stopped at any time.
+
+One thread reads and puts moments into a short queue; when it is full, reading waits (a file or pipe), or the oldest
+moment is dropped and counted (a camera, which does not wait).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import math
+import os
+import queue
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from kcal.errors import FileError, InputError
+from kcal.locate.columns import PositionColumns
+from kcal.locate.export import APPENDED, appended
+from kcal.locate.positions import Located
+from kcal.pipeline.ledger import Ledger
+from kcal.pipeline.lines import Moment
+from kcal.pipeline.senders import Sender
+from kcal.pipeline.snapshots import restore, snapshot
+from kcal.pipeline.track_columns import track_columns
+from kcal.pipeline.tracks import Tracker, Tracks
+
+# Moments that wait, and moments between checkpoints: about ten seconds of video.
+_WAITING, _CHECKPOINT = 32, 250
+# Bytes; a longer line is malformed, so that memory stays bounded.
+_LONGEST = 1 << 22
+# The year 2001 in Unix seconds: smaller times are not of the calendar.
+_CALENDAR = 1e9
+
+
+class SourceItem(NamedTuple):
+    """What a source gives: a moment, or why there is none; `offset` bytes of the source have been read by then."""
+
+    moment: Moment | InputError
+    offset: int
+
+
+@dataclasses.dataclass
+class StreamCounts:
+    """What happened so far: all that went in is in one of these.
+
+    Attributes:
+        moments: written to the outputs in this run.
+        repeated: skipped, because their time is not after that of the last one.
+        malformed: lines that could not be read.
+        dropped: moments of a camera for which there was no time.
+        positions: written.
+        unsent: moments that a receiver did not get.
+        last_error: of the last malformed line.
+    """
+
+    moments: int = 0
+    repeated: int = 0
+    malformed: int = 0
+    dropped: int = 0
+    positions: int = 0
+    unsent: int = 0
+    last_error: str = ""
+
+
+class Stream:
+    """Follow what a source shows and write it down; continue where the journal ends.
+
+    Args:
+        tracker: new; its state comes from the journal if there is one.
+        run: how positions are located, for the heads of files.
+        outputs: files .geojsonl, .csv or .cot, which grow.
+        journal: the file that remembers what was written.
+        senders: where positions go besides.
+        start: calendar time of second zero, for sources that count from elsewhere than 1970.
+        shown: called with the columns and tracks of each moment, for a map.
+
+    Raises:
+        InputError: an output of another kind.
+        FileError: as `Ledger`, or a journal of another rig.
+    """
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        run: Located,
+        outputs: Sequence[Path],
+        journal: Path,
+        *,
+        senders: Sequence[Sender] = (),
+        start: datetime.datetime | None = None,
+        shown: Callable[[PositionColumns, Tracks], None] | None = None,
+    ) -> None:
+        wrong = [path for path in outputs if path.suffix.lower() not in APPENDED]
+        if wrong:
+            raise InputError(f"{wrong[0]}: the output of a stream ends with {', '.join(APPENDED)}")
+        self.tracker, self.run, self.senders = tracker, run, tuple(senders)
+        self.start, self.shown = start, shown
+        self.counts = StreamCounts()
+        self._stop = threading.Event()
+        self._error: BaseException | None = None
+        self.ledger = Ledger(journal, outputs)
+        if self.ledger.state is not None:
+            restore(tracker, self.ledger.state)
+
+    def stop(self) -> None:
+        """End after the present moment; may be called from another thread or a signal's handler."""
+        self._stop.set()
+
+    def follow(self, source: Callable[[int], Iterator[SourceItem]], *, waits: bool, resumes: bool) -> StreamCounts:
+        """Follow a source until it ends or `stop` is called.
+
+        Args:
+            source: gives items from an offset on.
+            waits: whether the source waits when there is no time for more; else the oldest moments are dropped.
+            resumes: whether it can begin at an offset; else it gives what comes now.
+        """
+        place, checkpoint = self.ledger.place, self.ledger.checkpoint_at
+        items: queue.Queue[SourceItem | None] = queue.Queue(_WAITING)
+        begin = checkpoint.offset if resumes else 0
+        reader = threading.Thread(target=self._read, args=(source, begin, items, waits), daemon=True)
+        since = place.sequence - checkpoint.sequence
+        if self.ledger.state is None or not since or not resumes:
+            self.ledger.checkpoint(snapshot(self.tracker))
+            since = 0
+        again = place.sequence - since
+        latest = place.time if place.time is not None and not resumes else -math.inf
+        reader.start()
+        try:
+            while not self._stop.is_set():
+                try:
+                    item = items.get(timeout=0.2)
+                except queue.Empty:
+                    continue
+                if item is None:
+                    break
+                if isinstance(item.moment, InputError):
+                    # Of lines that are read again after a restart, each was counted in the run before.
+                    if item.offset > place.offset or not resumes:
+                        self.counts.malformed += 1
+                        self.counts.last_error = str(item.moment)
+                    continue
+                if item.moment.time <= max(self.tracker.time, latest):
+                    self.counts.repeated += 1
+                    continue
+                again += 1
+                if again <= place.sequence:
+                    self.tracker(item.moment.pairs, item.moment.time)
+                    if again == place.sequence:
+                        self.ledger.checkpoint(snapshot(self.tracker))
+                    continue
+                self._write(item.moment, item.offset, again)
+                if again % _CHECKPOINT == 0:
+                    self.ledger.checkpoint(snapshot(self.tracker))
+        finally:
+            self._stop.set()
+            if again >= self.ledger.place.sequence:
+                self.ledger.checkpoint(snapshot(self.tracker))
+            self.ledger.close()
+            for sender in self.senders:
+                sender.close()
+        if self._error is not None:
+            raise self._error
+        return self.counts
+
+    def _write(self, moment: Moment, offset: int, sequence: int) -> None:
+        when = self._calendar(moment.time)
+        tracks = self.tracker(moment.pairs, moment.time)
+        columns = track_columns(tracks, sequence)
+        parts = [
+            appended(path.suffix.lower(), self.run, columns, when, first=size == 0)
+            for path, size in zip(self.ledger.outputs, self.ledger.place.sizes, strict=True)
+        ]
+        self.ledger.append(parts, moment.time, offset)
+        for sender in self.senders:
+            sender.send(columns, self.run, when)
+        if self.shown is not None:
+            self.shown(columns, tracks)
+        self.counts.moments += 1
+        self.counts.positions += len(columns.names)
+        self.counts.unsent = sum(sender.failed for sender in self.senders)
+
+    def _calendar(self, time: float) -> datetime.datetime:
+        if self.start is not None:
+            return self.start + datetime.timedelta(seconds=time)
+        if time > _CALENDAR:
+            return datetime.datetime.fromtimestamp(time, datetime.UTC)
+        if self.senders or any(path.suffix.lower() == ".cot" for path in self.ledger.outputs):
+            raise InputError(f"time {time:g} s is not in Unix seconds, which events need; give the start of the count")
+        return datetime.datetime.fromtimestamp(0, datetime.UTC)
+
+    def _read(
+        self,
+        source: Callable[[int], Iterator[SourceItem]],
+        begin: int,
+        items: queue.Queue[SourceItem | None],
+        waits: bool,
+    ) -> None:
+        try:
+            for item in source(begin):
+                while not self._stop.is_set():
+                    try:
+                        items.put(item, timeout=0.2 if waits else 0.0)
+                        break
+                    except queue.Full:
+                        if not waits:
+                            self._drop(items)
+                if self._stop.is_set():
+                    return
+        except BaseException as error:  # whatever it is, the other thread must not wait for ever
+            self._error = error
+        while not self._stop.is_set():
+            try:
+                items.put(None, timeout=0.2)
+                return
+            except queue.Full:
+                continue
+
+    def _drop(self, items: queue.Queue[SourceItem | None]) -> None:
+        try:
+            items.get_nowait()
+            self.counts.dropped += 1
+        except queue.Empty:
+            pass
+
+
+def lines_of(path: Path | None, read: Callable[[bytes], Moment]) -> Callable[[int], Iterator[SourceItem]]:
+    """The lines of a file, or of the standard input if None, as a source; blank ones are skipped.
+
+    A last line without its end is still being written, and is left for the next run.
+
+    Args:
+        path: of the file.
+        read: turns a line into a moment, or raises `InputError`.
+    """
+
+    def items(offset: int) -> Iterator[SourceItem]:
+        try:
+            file = sys.stdin.buffer if path is None else open(path, "rb")  # noqa: SIM115
+        except OSError as error:
+            raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
+        with file:
+            if path is not None:
+                if os.fstat(file.fileno()).st_size < offset:
+                    raise FileError(f"{path}: shorter than the journal says; another file? Delete the journal")
+                file.seek(offset)
+            while line := file.readline(_LONGEST):
+                offset += len(line)
+                if not line.endswith(b"\n"):
+                    if len(line) < _LONGEST:
+                        return
+                    while (rest := file.readline(_LONGEST)) and not rest.endswith(b"\n"):
+                        offset += len(rest)
+                    offset += len(rest)
+                    yield SourceItem(InputError(f"a line of more than {_LONGEST} bytes"), offset)
+                    continue
+                if not line.strip():
+                    continue
+                try:
+                    yield SourceItem(read(line), offset)
+                except InputError as error:
+                    yield SourceItem(error, offset)
+
+    return items

@@ -1,0 +1,351 @@
+"""`Tracker`: pairs of one moment after another become tracks with places, velocities and honest errors."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.lens.pose import side_axes
+from kcal.locate.localizer import StereoLocalizer
+from kcal.pipeline.assignment import Candidates, assigned, candidates, mark_numbers
+from kcal.pipeline.beliefs import Beliefs, Timing, born, fit_of, innovations, predicted, updated
+from kcal.pipeline.consider import CLOCK_TERMS, ClockEstimate, ClockPrior, SharedErrors
+from kcal.pipeline.estimates import TrackStates, track_states
+from kcal.pipeline.motion import MOTIONS, Motion, transition
+from kcal.pipeline.pairs import ObjectPairs
+from kcal.pipeline.sightings import Anchored, Sightings, anchored, sightings
+from kcal.pipeline.smoothing import History, SmoothedTrack
+
+# A frame is turned toward its target when that is farther from the axis than this tangent: 17°.
+_TURN = 0.3
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrackOptions:
+    """When tracks begin and end, and how targets move.
+
+    Args:
+        motions: models among which each track may switch.
+        switch_s: mean time between switches, seconds.
+        speed_mps: standard deviation of a new target's velocity along each axis.
+        confirm_hits: sightings after which a track is told of; twice as many if its pairs are ambiguous.
+        lose_after_s: seconds without a sighting after which a track is told of no more.
+        forget_after_s: seconds without a sighting in which it may still be recognized by its motion.
+        gate: largest squared Mahalanobis distance of a sighting from its track; 23.5 loses one in 10,000.
+        recognize: the same of a new track from a lost one, in place and velocity; 16.8 loses one in 100.
+
+    Raises:
+        InputError: a value that is not positive, or a forgetting before the losing.
+    """
+
+    motions: tuple[Motion, ...] = MOTIONS
+    switch_s: float = 20.0
+    speed_mps: float = 15.0
+    confirm_hits: int = 4
+    lose_after_s: float = 1.5
+    forget_after_s: float = 15.0
+    gate: float = 23.5
+    recognize: float = 16.8
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name != "motions" and not 0 < value < math.inf:
+                raise InputError(f"{field.name} {value}: a positive number is needed")
+        if not self.motions or self.forget_after_s < self.lose_after_s:
+            raise InputError("tracks: at least one motion is needed, and forget_after_s not below lose_after_s")
+
+
+@dataclasses.dataclass
+class TrackRecord:
+    """What is remembered of a track besides its state; `number` is 0 until it is confirmed."""
+
+    number: int
+    key: int
+    first: float
+    last: float
+    hits: int
+    needed: int
+    evidence: float
+    categories: dict[str, float]
+
+    @property
+    def category(self) -> str:
+        """The one with the highest sum of scores."""
+        return max(self.categories, key=lambda name: self.categories[name])
+
+
+class Tracks(NamedTuple):
+    """The confirmed tracks at one moment.
+
+    Attributes:
+        time: seconds.
+        number: T numbers, from 1; a track keeps its number after an occlusion if its motion recognizes it.
+        category: T names.
+        hits: (T,) sightings so far.
+        unseen_s: (T,) seconds since the last one; zero if seen now.
+        state: places and velocities.
+        models: (T, J) probabilities of `TrackOptions.motions`.
+    """
+
+    time: float
+    number: tuple[int, ...]
+    category: tuple[str, ...]
+    hits: Tensor
+    unseen_s: Tensor
+    state: TrackStates
+    models: Tensor
+
+
+class Tracker:
+    """Follow targets through pairs of marks; call it with the pairs of each moment in turn.
+
+    Errors of calibration, mounting and clocks are shared by all tracks and frames: frames reduce the noise of the
+    marks, and never what these contribute.
+
+    Args:
+        localize: the rig, where it stands, and how well both are known.
+        options: when tracks begin and end.
+        clock: what is known of the clocks; with sigmas above zero they are estimated from the tracks.
+        record: keep what `smoothed` needs; memory then grows with time.
+
+    Example:
+        >>> from kcal.lens.mounting import Origin
+        >>> from kcal.locate.budget import planned_rig
+        >>> rig = planned_rig()
+        >>> tracker = Tracker(StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0))
+        >>> for time in torch.arange(10).double() / 10:
+        ...     left, right, _ = rig(torch.tensor([[0.0, 0.0, 500.0]]) + time * torch.tensor([8.0, 0.0, 0.0]))
+        ...     pairs = ObjectPairs(left=left, right=right, covariance=0.04 * torch.eye(4)[None],
+        ...                         time=time.expand(1, 2), score=torch.ones(1), category=("car",), track=(None,),
+        ...                         ambiguous=torch.zeros(1, dtype=torch.bool))
+        ...     tracks = tracker(pairs)
+        >>> tracks.number, round(tracks.state.enu[0, 1].item()), round(tracks.state.velocity[0, 0].item())
+        ((1,), 500, 8)
+    """
+
+    def __init__(
+        self,
+        localize: StereoLocalizer,
+        options: TrackOptions | None = None,
+        *,
+        clock: ClockPrior | None = None,
+        record: bool = False,
+    ) -> None:
+        self.localize, self.options = localize, options or TrackOptions()
+        factor = localize.calibration_factor
+        self.calibration = 0 if factor is None else factor.shape[1]
+        device = localize.enu_from_rig.device
+        self.shared = SharedErrors(self.calibration, clock or ClockPrior(), device)
+        self.time = -math.inf
+        self.records: list[TrackRecord] = []
+        self.history: History | None = History() if record else None
+        models = len(self.options.motions)
+        empty = torch.zeros(0, dtype=torch.float64, device=device)
+        self.frame = empty.reshape(0, 3, 3)
+        shapes = ((6,), (6, 6), (6, self.calibration), (6, CLOCK_TERMS, 3), ())
+        self.beliefs = Beliefs(*(empty.reshape(0, models, *shape) for shape in shapes))
+        self.next_number = self.next_key = 1
+
+    @torch.no_grad()
+    def __call__(self, pairs: ObjectPairs, time: float | None = None) -> Tracks:
+        """Take in the pairs of one moment; moments must not go back in time.
+
+        Args:
+            pairs: may be empty if `time` is given.
+            time: seconds to which tracks are moved; the latest exposure of the left camera if left out.
+
+        Raises:
+            InputError: a time before that of the last call, or none.
+        """
+        if time is None:
+            if not len(pairs):
+                raise InputError("no pairs: give the time to which the tracks are to be moved")
+            time = float(pairs.time[:, 0].max())
+        if not self.time <= time < math.inf:
+            raise InputError(f"time {time}: it must be finite and not before the last one, {self.time}")
+        if self.shared.start is None:
+            self.shared.start = time
+        self._predict(time)
+        if len(pairs):
+            self._take(pairs, sightings(self.localize, pairs))
+        self._sort_out()
+        if self.history is not None:
+            keys = [track.key for track in self.records]
+            self.history.filtered(time, keys, self.frame, self.beliefs.summary(), self.shared.values)
+        return self.tracks()
+
+    def tracks(self) -> Tracks:
+        """The confirmed tracks as they are now."""
+        told = [i for i, track in enumerate(self.records) if self._is_told(track)]
+        which = torch.tensor(told, dtype=torch.long, device=self.frame.device)
+        beliefs = self.beliefs.at(which)
+        records = [self.records[i] for i in told]
+        return Tracks(
+            time=self.time,
+            number=tuple(track.number for track in records),
+            category=tuple(track.category for track in records),
+            hits=torch.tensor([track.hits for track in records], dtype=torch.long),
+            unseen_s=torch.tensor([self.time - track.last for track in records], dtype=torch.float64),
+            state=track_states(self.localize, self.frame[which], beliefs.summary(), self.shared.root),
+            models=beliefs.weight,
+        )
+
+    def clock_estimate(self) -> ClockEstimate:
+        """What the tracks have told of the clocks so far."""
+        return self.shared.clock_estimate()
+
+    def smoothed(self) -> list[SmoothedTrack]:
+        """Every confirmed track with the knowledge of all moments, if `record` was set; it may be called at any time.
+
+        Raises:
+            InputError: nothing was recorded.
+        """
+        if self.history is None:
+            raise InputError("nothing was recorded; make the tracker with record=True")
+        return self.history.smoothed(self.localize, self.shared.values, self.shared.root)
+
+    def _is_told(self, track: TrackRecord) -> bool:
+        return track.number > 0 and self.time - track.last <= self.options.lose_after_s
+
+    def _predict(self, time: float) -> None:
+        dt, self.time = time - self.time, time
+        if not self.records:
+            return
+        beliefs = self.beliefs.mixed(math.exp(-dt / self.options.switch_s))
+        up, turn = self.frame @ self.localize.enu_from_rig[2], None
+        aim = beliefs.merged().mean[:, 0, :2]
+        if bool((aim.abs().amax(-1) > _TURN).any()):
+            turn = _toward(aim)
+            self.frame = turn @ self.frame
+        self.beliefs, cross = predicted(beliefs, transition(self.options.motions, dt, up), turn)
+        if self.history is not None:
+            keys = [track.key for track in self.records]
+            self.history.predicted(keys, self.beliefs.summary(), cross, self.shared.values)
+
+    def _take(self, pairs: ObjectPairs, seen: Sightings) -> None:
+        timing = self._delays(seen)
+        marks = mark_numbers(pairs.left, pairs.right)
+        taken = np.zeros(len(pairs), dtype=bool)
+        if self.records:
+            merged = self.beliefs.merged()
+            possible = candidates(merged, self.frame, seen, timing, self.shared.root, self.options.gate)
+            tiers = np.array([self._tier(track) for track in self.records])
+            evidence = np.array([track.evidence for track in self.records])
+            accepted = assigned(possible, marks, evidence, tiers)
+            if accepted:
+                self._update(possible, torch.tensor(accepted), pairs, timing)
+                used = marks[possible.pair[accepted].cpu().numpy()]
+                taken = np.isin(marks[:, 0], used[:, 0]) | np.isin(marks[:, 1], used[:, 1])
+        fresh = [i for i in range(len(pairs)) if not taken[i] and bool(seen.usable[i])]
+        if fresh:
+            self._begin(torch.tensor(fresh), pairs, seen, timing)
+        move = self.shared.settle()
+        beliefs = self.beliefs
+        self.beliefs = beliefs._replace(mean=beliefs.mean + beliefs.effect[..., self.calibration :] @ move)
+
+    def _delays(self, seen: Sightings) -> Timing:
+        since = seen.time[:, 1] - (self.shared.start or 0.0)
+        clock = torch.stack([torch.ones_like(since), since, seen.row], -1)
+        delay = seen.time - self.time
+        delay[:, 1] += clock @ self.shared.values
+        unsure = torch.linalg.vector_norm(clock @ self.shared.root[self.calibration :], dim=-1)
+        return Timing(delay, clock, unsure)
+
+    def _tier(self, track: TrackRecord) -> int:
+        if track.number == 0:
+            return 1
+        return 0 if self.time - track.last <= self.options.lose_after_s else -1
+
+    def _update(self, possible: Candidates, rows: Tensor, pairs: ObjectPairs, timing: Timing) -> None:
+        track, pair = possible.track[rows], possible.pair[rows]
+        seen = Anchored(*(v[:, rows] if i == 3 else v[rows] for i, v in enumerate(possible.seen)))
+        merged = possible.found
+        sure = (possible.squared[rows] < 13.3) & torch.tensor([self.records[i].number > 0 for i in track.tolist()])
+        which = rows[sure]
+        self.shared.add(merged.effect[which, 0], merged.value[which, 0], merged.noise[which, 0])
+        beliefs = self.beliefs.at(track)
+        found = innovations(beliefs, seen, timing.at(pair))
+        new = updated(beliefs, found, fit_of(found, self.shared.root))
+        self.beliefs = Beliefs(*(old.index_copy(0, track, value) for old, value in zip(self.beliefs, new, strict=True)))
+        densities = possible.log_density[rows].tolist()
+        for t, p, density in zip(track.tolist(), pair.tolist(), densities, strict=True):
+            record = self.records[t]
+            record.last, record.hits = self.time, record.hits + 1
+            record.evidence += density
+            name = pairs.category[p]
+            record.categories[name] = record.categories.get(name, 0.0) + float(pairs.score[p])
+
+    def _begin(self, which: Tensor, pairs: ObjectPairs, seen: Sightings, timing: Timing) -> None:
+        seen = seen.at(which)
+        ray = torch.nn.functional.normalize(seen.direction, dim=-1)
+        frame = torch.stack([*side_axes(ray), ray], -2)
+        models = len(self.options.motions)
+        local = anchored(seen, frame)
+        new = born(local, timing.at(which), self.options.speed_mps, models)
+        self.beliefs = Beliefs(*(torch.cat(both) for both in zip(self.beliefs, new, strict=True)))
+        self.frame = torch.cat([self.frame, frame])
+        for i in which.tolist():
+            needed = self.options.confirm_hits * (2 if bool(pairs.ambiguous[i]) else 1)
+            scores = {pairs.category[i]: float(pairs.score[i])}
+            self.records.append(TrackRecord(0, self.next_key, self.time, self.time, 1, needed, 0.0, scores))
+            self.next_key += 1
+
+    def _sort_out(self) -> None:
+        """Confirm, recognize and forget."""
+        for i, track in enumerate(self.records):
+            if track.number == 0 and track.hits >= track.needed:
+                lost = self._recognized(i)
+                if lost is None:
+                    track.number, self.next_number = self.next_number, self.next_number + 1
+                else:
+                    old = self.records[lost]
+                    track.number, track.first, track.hits = old.number, old.first, old.hits + track.hits
+                    track.categories = old.categories | track.categories
+                    # Forgotten below: its number lives on.
+                    old.last = -math.inf
+                if self.history is not None:
+                    self.history.confirmed(track.key, track.number)
+        limits = [self.options.forget_after_s if t.number else 0.5 * self.options.lose_after_s for t in self.records]
+        kept = [i for i, track in enumerate(self.records) if self.time - track.last <= limits[i]]
+        if len(kept) < len(self.records):
+            which = torch.tensor(kept, dtype=torch.long, device=self.frame.device)
+            self.beliefs, self.frame = self.beliefs.at(which), self.frame[which]
+            self.records = [self.records[i] for i in kept]
+
+    def _recognized(self, new: int) -> int | None:
+        """The lost track that a new one continues, if there is one and only one."""
+        lost = [
+            i for i, track in enumerate(self.records)
+            if track.number and not self._is_told(track) and track.last < self.records[new].first
+        ]  # fmt: skip
+        if not lost:
+            return None
+        which = torch.tensor(lost, device=self.frame.device)
+        old, here = self.beliefs.at(which).merged(), self.beliefs.at(torch.tensor([new])).merged()
+        still = transition((Motion(acceleration=0.0),), 0.0, self.frame[which] @ self.localize.enu_from_rig[2])
+        old = predicted(old, still, self.frame[new] @ self.frame[which].mT).beliefs
+        effect = here.effect - old.effect
+        apart = here.mean - old.mean
+        spread = effect @ self.shared.root
+        covariance = here.noise + old.noise + spread @ spread.mT
+        unit = covariance.diagonal(dim1=-2, dim2=-1).rsqrt()
+        white = unit[..., :, None] * covariance * unit[..., None, :]
+        scaled = (apart * unit)[..., None]
+        squared = (scaled.mT @ torch.linalg.solve_ex(white, scaled)[0])[:, 0, 0, 0]
+        near = [i for i, value in zip(lost, squared.tolist(), strict=True) if value <= self.options.recognize]
+        return near[0] if len(near) == 1 else None
+
+
+def _toward(aim: Tensor) -> Tensor:
+    """Rotations (T, 3, 3) that bring the directions (x, y, 1) onto the axis; none where they are near it."""
+    ray = torch.nn.functional.normalize(torch.cat([aim, torch.ones_like(aim[:, :1])], -1), dim=-1)
+    turned = torch.stack([*side_axes(ray), ray], -2)
+    still = torch.eye(3).to(turned).expand_as(turned)
+    return torch.where((aim.abs().amax(-1) > _TURN)[:, None, None], turned, still)

@@ -1,0 +1,154 @@
+"""`kcal live` for an hour: killed again and again, nothing lost, nothing doubled, memory flat; and what a track costs.
+
+python -m scripts.bench.live --hours 1 --rate 2 --targets 5 --kills 10 --write
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import orjson
+import torch
+
+from kcal.io.rig_file import save_rig
+from kcal.lens.mounting import Mounting, Origin
+from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.locate.budget import planned_rig
+from kcal.locate.localizer import StereoLocalizer
+from kcal.pipeline.pairs import ObjectPairs
+from kcal.pipeline.tracks import Tracker
+from scripts.shared.page import table, write_section
+
+
+def site_rig() -> StereoRig:
+    rig = planned_rig()
+    sigma = torch.tensor([0, 3e-5, 0, 0, 0, 0], dtype=torch.float64)
+    rig.covariance = RigCovariance.of(rig, pose=torch.diag(sigma**2))
+    rig.mounting = Mounting(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+    return rig
+
+
+def marks(rig: StereoRig, targets: int, second: float, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Targets that circle before the rig, each at its own range."""
+    number = torch.arange(targets, dtype=torch.float64)
+    z = 300.0 + 80.0 * number
+    angle = second * 3.0 / 20.0 + number
+    across = (number / max(targets - 1, 1) - 0.5) * 0.7 * z
+    places = torch.stack([across + 20.0 * angle.cos(), 0.02 * z * number.cos(), z + 20.0 * angle.sin()], -1)
+    left, right, _ = rig(places)
+    noise = 0.2 * torch.randn(2, targets, 2, generator=generator, dtype=torch.float64)
+    return left + noise[0], right + noise[1]
+
+
+def cost_of_tracks(targets: int = 50, moments: int = 60) -> float:
+    """Processor milliseconds of one moment of the tracker."""
+    rig, generator = site_rig(), torch.Generator().manual_seed(0)
+    tracker = Tracker(StereoLocalizer(rig))
+    spent = 0.0
+    for moment in range(moments):
+        left, right = marks(rig, targets, moment / 30.0, generator)
+        pairs = ObjectPairs(
+            left=left, right=right, covariance=0.04 * torch.eye(4, dtype=torch.float64).expand(targets, 4, 4),
+            time=torch.full((targets, 2), moment / 30.0, dtype=torch.float64), score=torch.ones(targets),
+            category=("car",) * targets, track=(None,) * targets, ambiguous=torch.zeros(targets, dtype=torch.bool),
+        )  # fmt: skip
+        before = time.process_time()
+        tracker(pairs)
+        # The first moments have no tracks yet.
+        spent += time.process_time() - before if moment >= 10 else 0.0
+    return 1e3 * spent / (moments - 10)
+
+
+def resident_mb(process: subprocess.Popen[bytes]) -> float:
+    """Memory of a process, MB; zero once it has ended."""
+    try:
+        pages = Path(f"/proc/{process.pid}/statm").read_text(encoding="utf-8").split()[1]
+    except OSError:
+        return 0.0
+    return int(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--hours", type=float, default=1.0)
+    parser.add_argument("--rate", type=float, default=2.0)
+    parser.add_argument("--targets", type=int, default=5)
+    parser.add_argument("--kills", type=int, default=10)
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    cost = cost_of_tracks()
+    print(f"50 tracks: {cost:.1f} ms a moment", flush=True)
+    moments = round(options.hours * 3600 * options.rate)
+    with tempfile.TemporaryDirectory() as folder:
+        rig, generator = site_rig(), torch.Generator().manual_seed(0)
+        file, lines, output = (str(Path(folder, name)) for name in ("rig.json", "lines.jsonl", "tracks.csv"))
+        save_rig(rig, file)
+        malformed = 0
+        with open(lines, "wb") as writer:
+            for moment in range(moments):
+                left, right = marks(rig, options.targets, moment / options.rate, generator)
+                line = {"time": 1.7e9 + moment / options.rate, "left": left.tolist(), "right": right.tolist()}
+                writer.write(orjson.dumps(line | {"sigma": 0.2}) + b"\n")
+                if moment % 1000 == 500:
+                    malformed += 1
+                    writer.write(b'{"time": \n')
+        command = [sys.executable, "-m", "kcal", "live", file, "--detections", lines, "-o", output]
+        chance, kills, memory = random.Random(0), 0, []
+        size = 0
+        while True:
+            process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+            # Killed after it has written a random share of what one of `kills` equal parts would be.
+            until = size + (0.5 + chance.random()) * 460.0 * options.targets * moments / (options.kills + 1)
+            while process.poll() is None:
+                time.sleep(0.05)
+                there = Path(output).stat().st_size if Path(output).exists() else 0
+                memory.append(resident_mb(process))
+                if kills < options.kills and there > until:
+                    process.kill()
+                    kills += 1
+                    break
+            process.wait()
+            size = Path(output).stat().st_size
+            if process.returncode == 0:
+                break
+            print(f"killed {kills} times, {size / 1e6:.1f} MB written", flush=True)
+        with open(output, encoding="utf-8") as reader:
+            seen = Counter((row["sequence"], row["name"]) for row in csv.DictReader(reader))
+        sequences = {int(sequence) for sequence, _ in seen}
+        lost = moments - 3 - len(sequences & set(range(4, moments + 1)))
+        doubled = sum(count - 1 for count in seen.values())
+    settled = [value for value in memory if value > 0]
+    quarter = max(1, len(settled) // 4)
+    early, late = max(settled[: 2 * quarter]), max(settled[-quarter:])
+    share = cost * 30.0 / 10.0
+    text = "\n".join([
+        f"{options.hours:g} h of {options.rate:g} moments a second with {options.targets} targets, replayed as fast as "
+        "it goes. Made by `scripts/bench/live.py`.",
+        "",
+        *table(["", "found"], [
+            ["moments, positions", f"{moments:,}, {sum(seen.values()):,}"],
+            ["malformed lines among them", malformed],
+            ["kills (SIGKILL)", kills],
+            ["moments lost", lost],
+            ["positions doubled", doubled],
+            ["most memory, first half and last quarter", f"{early:.0f} and {late:.0f} MB"],
+            ["50 tracks, one moment", f"{cost:.1f} ms of a core, {share:.0f} % at 30 Hz"],
+        ]),
+    ])  # fmt: skip
+    print(text)
+    if options.write:
+        write_section("tracks.md", "live", text)
+
+
+if __name__ == "__main__":
+    main()

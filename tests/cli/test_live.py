@@ -1,0 +1,107 @@
+"""`kcal live`: tracks into files, stopped by SIGTERM and continued, and told what is wrong."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from track_scenes import ORIGIN, seen_by, tracked_site
+from typer.testing import CliRunner
+
+from kcal.cli.main import app
+from kcal.errors import FileError, InputError
+from kcal.io.rig_file import save_rig
+from kcal.lens.mounting import Mounting
+from kcal.pipeline.stream import Stream
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A rig file that says where it stands, and lines of two cars for two seconds; the right clock is 50 ms late."""
+    rig = tracked_site().rig
+    rig.mounting = Mounting(origin=ORIGIN, heading_deg=0.0)
+    save_rig(rig, tmp_path / "rig.json")
+    generator = torch.Generator().manual_seed(0)
+    start = torch.tensor([[-30.0, 5.0, 150.0], [20.0, -10.0, 200.0]]).double()
+    velocity = torch.tensor([[8.0, 4.0, 0.0], [-5.0, 3.0, 2.0]]).double()
+    with open(tmp_path / "lines.jsonl", "w", encoding="utf-8") as file:
+        for frame in range(20):
+            places = start + frame / 10.0 * velocity
+            left, right = seen_by(rig, places, 0.2, generator, places + 0.05 * velocity)
+            line = {"time": 1.7e9 + frame / 10, "left": left.tolist(), "right": right.tolist(), "sigma": 0.2}
+            file.write(json.dumps(line) + "\n")
+        file.write("oops\n")
+    return tmp_path
+
+
+def live(folder: Path, *options: str) -> str:
+    command = ["live", str(folder / "rig.json"), "--detections", str(folder / "lines.jsonl")]
+    done = CliRunner().invoke(app, [*command, "-o", str(folder / "tracks.csv"), *options], catch_exceptions=False)
+    assert done.exit_code == 0
+    return done.output
+
+
+def test_the_whole_job(folder: Path) -> None:
+    told = live(folder, "--clock-sigma", "0.1")
+    assert "20 moments, 34 positions; 1 malformed lines" in told
+    assert "last malformed line: not a line of JSON" in told
+    offset = float(told.split("images are ")[1].split(" ")[0])
+    sigma = float(told.split("± ")[1].split(" ")[0])
+    assert abs(offset - 50.0) < 3 * sigma < 20.0
+    with open(folder / "tracks.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 34
+    assert {row["name"] for row in rows} == {"track 1", "track 2"}
+    assert float(rows[-2]["north_m"]) == pytest.approx(150.0, rel=0.02)
+
+
+def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    live(folder, "--clock-sigma", "0.1")
+    whole = (folder / "tracks.csv").read_bytes()
+    for path in folder.glob("tracks.csv*"):
+        path.unlink()
+    before = signal.getsignal(signal.SIGTERM)
+    write = Stream._write
+
+    def terminated(self: Stream, *what: object) -> None:
+        write(self, *what)  # type: ignore[arg-type]
+        if self.counts.moments == 7:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Stream, "_write", terminated)
+    assert "7 moments, 8 positions" in live(folder, "--clock-sigma", "0.1")
+    assert signal.getsignal(signal.SIGTERM) is before
+    monkeypatch.setattr(Stream, "_write", write)
+    assert "continuing after 7 moments" in live(folder, "--clock-sigma", "0.1")
+    assert (folder / "tracks.csv").read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        (["-o", "positions.kml"], InputError, "output of a stream"),
+        (["--to", "http://host"], InputError, "udp://HOST:PORT"),
+        (["--start", "noon"], InputError, "2026-05-01T12:00:00Z"),
+        (["--clock-offset", "nan"], InputError, "clock"),
+        (["--box-sigma", "0"], InputError, "box_sigma"),
+        (["--detections", "nowhere.jsonl"], FileError, "cannot read"),
+    ],
+)
+def test_what_is_wrong(
+    folder: Path, options: list[str], error: type[Exception], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    with pytest.raises(error, match=message):
+        live(folder, *options)
+
+
+def test_a_rig_that_does_not_say_where_it_stands(folder: Path) -> None:
+    save_rig(tracked_site().rig, folder / "rig.json")
+    with pytest.raises(InputError, match="give origin and heading_deg"):
+        live(folder)
+    assert "20 moments" in live(folder, "--origin", "19.07,72.87,14", "--heading", "35")

@@ -1,0 +1,60 @@
+"""Targets that move before a rig of known errors, for tests and measurements of tracks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from kcal.lens.mounting import Origin
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.rig import RigCovariance, StereoRig
+from kcal.locate.budget import planned_rig
+from kcal.locate.localizer import StereoLocalizer
+from kcal.pipeline.pairs import ObjectPairs
+
+ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
+
+
+def yawed_rig(rig: StereoRig, yaw: float) -> StereoRig:
+    """The rig with its right camera turned about its y axis, radians."""
+    turn = rotation_from_vector(torch.tensor([0.0, yaw, 0.0], dtype=torch.float64))
+    return StereoRig(rig.left, rig.right, turn @ rig.right_from_left_rotation, rig.right_from_left_translation)
+
+
+def tracked_site(yaw_deg: float = 0.0, **options: object) -> StereoLocalizer:
+    """The planned rig, f = 1600 px and 10 m of baseline, whose relative yaw is known to a sigma; straight light."""
+    rig = planned_rig()
+    pose = torch.zeros(6, 6, dtype=torch.float64)
+    pose[1, 1] = math.radians(yaw_deg) ** 2
+    known = {"origin": ORIGIN, "heading_deg": 0.0, "refraction": 0.0, "refraction_sigma": 0.0} | options
+    return StereoLocalizer(rig, calibration=RigCovariance.of(rig, pose=pose), **known)  # type: ignore[arg-type]
+
+
+def pairs_of(
+    left: Tensor, right: Tensor, time: float | Tensor, sigma: float = 0.3, ambiguous: Sequence[bool] | None = None
+) -> ObjectPairs:
+    """Pairs of one category; `time` is that of both, or (2,)."""
+    count = len(left)
+    return ObjectPairs(
+        left=left,
+        right=right,
+        covariance=sigma**2 * torch.eye(4, dtype=torch.float64).expand(count, 4, 4),
+        time=torch.as_tensor(time, dtype=torch.float64).expand(count, 2).clone(),
+        score=torch.ones(count),
+        category=("car",) * count,
+        track=(None,) * count,
+        ambiguous=torch.tensor(ambiguous or [False] * count, dtype=torch.bool),
+    )
+
+
+def seen_by(
+    rig: StereoRig, places: Tensor, sigma: float, generator: torch.Generator, later: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Marks of places (N, 3) in the rig frame with noise; the right camera sees them where they are `later`."""
+    left = rig.left.project(places)[0]
+    right = rig.right.project(rig.right_from_left(places if later is None else later))[0]
+    noise = sigma * torch.randn(2, len(places), 2, generator=generator, dtype=torch.float64)
+    return left + noise[0], right + noise[1]

@@ -1,0 +1,147 @@
+"""One camera: places on level ground and terrain, hidden ones, and errors as large as stated."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+import torch
+
+from kcal.errors import FileError, InputError
+from kcal.lens.camera import Camera
+from kcal.lens.mounting import Mounting, Origin
+from kcal.locate.geodesy import enu_from_cam, geodetic_to_enu
+from kcal.locate.ground import level_ground, locate_on_ground, terrain
+from kcal.locate.mounting import mounting_covariance
+
+CAMERA = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+ORIGIN = Origin(lat=19.07, lon=72.87, height=60.0)
+
+
+def stands(**more: object) -> Mounting:
+    known = {"origin": ORIGIN, "heading_deg": 35.0, "pitch_deg": -2.0, "roll_deg": 1.0, "refraction": 0.0}
+    return Mounting(**(known | more))  # type: ignore[arg-type]
+
+
+def pixels_of(mounting: Mounting, enu: torch.Tensor) -> torch.Tensor:
+    turn = enu_from_cam(mounting.heading_deg, mounting.pitch_deg, mounting.roll_deg)
+    return CAMERA.project(enu @ turn)[0]
+
+
+@pytest.mark.parametrize("distance", [200.0, 1000.0, 5000.0])
+def test_a_place_on_the_ellipsoid_is_found_again(distance: float) -> None:
+    """Pyproj says where the ground is at that distance: the ellipsoid has fallen 1.96 m at 5 km."""
+    lon, lat, _ = pyproj.Geod(ellps="WGS84").fwd(ORIGIN.lon, ORIGIN.lat, 40.0, distance)
+    true = geodetic_to_enu(torch.tensor([[lat, lon, 12.0]], dtype=torch.float64), ORIGIN)
+    found = locate_on_ground(CAMERA, stands(), pixels_of(stands(), true), level_ground(12.0), pixel_sigma=0.1)
+    torch.testing.assert_close(found.enu, true, rtol=0, atol=1e-6 * distance)
+    assert found.geodetic[0].tolist() == pytest.approx([lat, lon, 12.0], abs=1e-4)
+
+
+def test_refraction_lowers_what_is_far() -> None:
+    """Bent light comes from lower places: the ground is met nearer."""
+    true = torch.tensor([[0.0, 4000.0, 0.0]]).double() @ torch.eye(3).double()
+    mark = pixels_of(stands(heading_deg=0.0), true - torch.tensor([0.0, 0.0, 50.0]))
+    straight = locate_on_ground(CAMERA, stands(heading_deg=0.0), mark, level_ground(10.0), pixel_sigma=0.1)
+    bent = locate_on_ground(CAMERA, stands(heading_deg=0.0, refraction=0.5), mark, level_ground(10.0), pixel_sigma=0.1)
+    lower = 0.5 * 4000.0**2 / 2 / 6.35e6
+    slope = 50.0 / 4000.0 - 4000.0 / 6.35e6
+    assert float(straight.enu[0, 1] - bent.enu[0, 1]) == pytest.approx(lower / slope, rel=0.1)
+
+
+def test_errors_are_as_large_as_stated() -> None:
+    generator = torch.Generator().manual_seed(0)
+    known = mounting_covariance(origin_m=(0.5, 0.5, 0.3), attitude_deg=(0.01, 0.01, 0.02))
+    true = geodetic_to_enu(torch.tensor([[19.076, 72.874, 12.0]], dtype=torch.float64), ORIGIN)
+    mounting = stands(covariance=torch.block_diag(known, torch.zeros(1, 1).double()))
+    pixel = pixels_of(mounting, true)
+    stated = locate_on_ground(CAMERA, mounting, pixel, level_ground(12.0), pixel_sigma=0.5, ground_sigma=0.4)
+    marks, places = [], []
+    for _ in range(400):
+        error = known.diagonal().sqrt() * torch.randn(6, generator=generator).double()
+        # The true camera stands and looks otherwise; the ground has another height.
+        turn = enu_from_cam(35.0, -2.0, 1.0)
+        angle = torch.linalg.matrix_exp(torch.tensor([[0, -error[5], error[4]], [error[5], 0, -error[3]],
+                                                      [-error[4], error[3], 0]]).double())  # fmt: skip
+        height = 12.0 + 0.4 * torch.randn((), generator=generator).item()
+        real = geodetic_to_enu(torch.tensor([[19.076, 72.874, height]], dtype=torch.float64), ORIGIN)
+        noise = 0.5 * torch.randn(1, 2, generator=generator).double()
+        marks.append(CAMERA.project((real - error[:3]) @ angle @ turn)[0] + noise)
+        places.append(real)
+    found = locate_on_ground(CAMERA, mounting, torch.cat(marks), level_ground(12.0), pixel_sigma=0.5).enu
+    found = found - torch.cat(places)
+    spread = torch.cov(found.T)[:2, :2]
+    ratio = torch.linalg.eigvals(torch.linalg.solve(stated.covariance[0, :2, :2], spread)).real
+    assert float(ratio.min()) > 0.8
+    assert float(ratio.max()) < 1.25
+    span = float(torch.linalg.vector_norm(true))
+    assert float(stated.range_low) < span < float(stated.range_high)
+
+
+def raster_file(folder: Path) -> Path:
+    """Flat at 10 m, with a ridge of 60 m that runs east and west 500 m north, and a hole without heights beyond."""
+    rasterio = pytest.importorskip("rasterio")
+    heights = np.full((300, 100), 10.0, dtype=np.float32)
+    heights[194:206] = 60.0
+    heights[:40] = -9999.0
+    zone = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32643", always_xy=True)
+    x, y = zone.transform(ORIGIN.lon, ORIGIN.lat)
+    transform = rasterio.transform.from_origin(x - 500.0, y + 2500.0, 10.0, 10.0)
+    path = folder / "terrain.tif"
+    with rasterio.open(path, "w", driver="GTiff", height=300, width=100, count=1, dtype="float32", crs="EPSG:32643",
+                       transform=transform, nodata=-9999.0) as file:  # fmt: skip
+        file.write(heights, 1)
+    return path
+
+
+def test_a_ridge_hides_what_is_behind_it(tmp_path: Path) -> None:
+    ground = terrain(raster_file(tmp_path))
+    level = stands(heading_deg=0.0, pitch_deg=0.0, roll_deg=0.0)
+    # The camera is at 60 m. Down to the plain before the ridge; toward the plain behind it; into the sky.
+    true = torch.tensor([[0.0, 300.0, -50.0], [0.0, 1000.0, -50.0], [0.0, 1000.0, 50.0]]).double()
+    found = locate_on_ground(CAMERA, level, pixels_of(level, true), ground, pixel_sigma=0.3, step=5.0)
+    assert found.status.tolist() == [0, 0, 6]
+    assert float(found.enu[0, 1]) == pytest.approx(300.0, abs=1.0)
+    assert 430.0 < float(found.enu[1, 1]) < 450.0, "the near slope of the ridge"
+    assert found.range_high[2] == math.inf
+    plain = locate_on_ground(CAMERA, level, pixels_of(level, true), level_ground(10.0), pixel_sigma=0.3)
+    assert float(plain.enu[1, 1]) == pytest.approx(1000.0, rel=0.01)
+
+
+def test_unknown_ground_is_not_guessed(tmp_path: Path) -> None:
+    """Over the ridge, into the hole of the raster."""
+    ground = terrain(raster_file(tmp_path))
+    level = stands(heading_deg=0.0, pitch_deg=0.0, roll_deg=0.0)
+    true = torch.tensor([[0.0, 2000.0, 1.0]]).double()
+    assert locate_on_ground(CAMERA, level, pixels_of(level, true), ground, step=5.0).status.tolist() == [6]
+    assert terrain(raster_file(tmp_path), geoid_height=-60.0)(
+        torch.tensor([ORIGIN.lat]).double(), torch.tensor([ORIGIN.lon]).double()
+    ).tolist() == [-50.0]
+
+
+def test_a_flat_line_of_sight_is_a_bearing_only() -> None:
+    level = stands(pitch_deg=0.0, roll_deg=0.0)
+    grazing = torch.tensor([[960.0, 549.0], [5000.0, 700.0], [math.nan, 0.0]]).double()
+    found = locate_on_ground(CAMERA, level, grazing, level_ground(58.0), pixel_sigma=4.0)
+    assert found.status.tolist() == [6, 5, 1]
+    assert all(bool(torch.isfinite(value).all()) for value in (found.enu, found.geodetic, found.bearing))
+    assert found.bearing[2].tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("wrong", [{"pixel_sigma": 0.0}, {"ground_sigma": -1.0}, {"step": 0.0}, {"farthest": 0.5}])
+def test_impossible_values(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError):
+        locate_on_ground(CAMERA, stands(), torch.zeros(1, 2), level_ground(0.0), **wrong)
+    with pytest.raises(InputError, match="ground height"):
+        level_ground(math.nan)
+
+
+def test_a_file_that_is_no_raster(tmp_path: Path) -> None:
+    pytest.importorskip("rasterio")
+    path = tmp_path / "terrain.tif"
+    path.write_text("no raster")
+    with pytest.raises(FileError, match="cannot be read"):
+        terrain(path)

@@ -1,0 +1,79 @@
+"""MQTT: messages arrive at a broker; one that is not there is named, without its password."""
+
+from __future__ import annotations
+
+import datetime
+import socket
+import threading
+
+import numpy as np
+import orjson
+import pytest
+from track_scenes import tracked_site
+
+pytest.importorskip("paho.mqtt.client")
+from kcal.errors import InputError
+from kcal.locate.columns import NUMBERS, PositionColumns
+from kcal.locate.locator import Locator
+from kcal.locate.positions import located_by
+from kcal.pipeline.senders import sender_to
+
+
+class Broker(threading.Thread):
+    """The least that a broker does for a publisher: accept, and acknowledge."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self.listener.getsockname()[1]
+        self.messages: list[tuple[str, bytes]] = []
+        self.start()
+
+    def run(self) -> None:
+        link, _ = self.listener.accept()
+        with link, link.makefile("rb") as file:
+            while head := file.read(1):
+                size, shift = 0, 0
+                while True:
+                    byte = file.read(1)[0]
+                    size |= (byte & 127) << shift
+                    shift += 7
+                    if byte < 128:
+                        break
+                body = file.read(size)
+                if head[0] >> 4 == 1:
+                    link.sendall(b"\x20\x02\x00\x00")
+                elif head[0] >> 4 == 3:
+                    end = 2 + int.from_bytes(body[:2], "big")
+                    self.messages.append((body[2:end].decode(), body[end + 2 :]))
+                    link.sendall(b"\x40\x02" + body[end : end + 2])
+
+
+def test_each_track_has_a_topic() -> None:
+    broker, site = Broker(), tracked_site()
+    sender = sender_to(f"mqtt://127.0.0.1:{broker.port}/site/tracks")
+    numbers = np.full((2, len(NUMBERS)), np.nan)
+    numbers[:, :3] = 19.0, 72.0, 5.0
+    columns = PositionColumns(["track 1", "track 2"], np.zeros(2, np.int8), ["", ""], numbers, {"sequence": ["9", "9"]})
+    run = located_by(Locator(site.rig, origin=site.origin, heading_deg=0.0))
+    sender.send(columns, run, datetime.datetime.now(datetime.UTC))
+    deadline = threading.Event()
+    for _ in range(100):
+        if len(broker.messages) == 2:
+            break
+        deadline.wait(0.05)
+    sender.close()
+    assert sender.failed == 0
+    assert [topic for topic, _ in broker.messages] == ["site/tracks/track-1", "site/tracks/track-2"]
+    feature = orjson.loads(broker.messages[1][1])
+    assert feature["geometry"]["coordinates"] == [72.0, 19.0, 5.0]
+    assert feature["properties"]["sequence"] == 9
+
+
+def test_a_broker_that_is_not_there() -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        address = f"mqtt://user:secret@127.0.0.1:{unused.getsockname()[1]}/tracks"
+    with pytest.raises(InputError, match="does not answer") as caught:
+        sender_to(address)
+    assert "secret" not in str(caught.value)

@@ -1,0 +1,221 @@
+"""Tracks: the localizer's own numbers at birth, consistent afterwards, never below the systematic part, names kept."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from locate_rigs import real_rig, tensor
+from track_scenes import ORIGIN, pairs_of, seen_by, tracked_site, yawed_rig
+
+from kcal.errors import InputError
+from kcal.lens.rig import RigCovariance
+from kcal.locate.localizer import StereoLocalizer
+from kcal.pipeline.beliefs import Timing, born
+from kcal.pipeline.consider import ClockPrior, SharedErrors
+from kcal.pipeline.estimates import track_states
+from kcal.pipeline.motion import Motion
+from kcal.pipeline.sightings import anchored, sightings
+from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
+
+STEADY = TrackOptions(motions=(Motion(acceleration=1e-4),), speed_mps=10.0, confirm_hits=2)
+
+
+def test_one_sighting_is_what_the_localizer_says() -> None:
+    """A real lens, correlated errors of calibration and mounting, refraction: all as `StereoLocalizer` has them."""
+    rig = real_rig()
+    mix = torch.randn(12, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    scale = tensor(*[2e-5] * 3, *[5e-3] * 3, *[0.02] * 3, *[3e-5] * 3)
+    whole = (scale[:, None] * mix) @ (scale[:, None] * mix).T / 12.0
+    known = RigCovariance.of(rig, pose=whole[:6, :6])
+    link = torch.cat([torch.zeros(len(known.matrix) - 6, 6, dtype=torch.float64), whole[:6, 6:]])
+    localize = StereoLocalizer(rig, origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, calibration=known,
+                               mounting=whole[6:, 6:], link=link)  # fmt: skip
+    points = tensor([10.0, -3.0, 120.0], [-150.0, 20.0, 900.0], [300.0, 60.0, 2500.0], [0.0, 40.0, 90_000.0])
+    left, right, _ = rig(points)
+    pairs = pairs_of(left, right + tensor([0.0, 0.4]), 7.0)
+    expected = localize(pairs.left, pairs.right, pairs.covariance)
+    seen = sightings(localize, pairs)
+    turned = torch.linalg.qr(torch.eye(3).double() + 0.2 * mix[:3, :3])[0]
+    frame = (turned * torch.sign(turned.diagonal())).T.expand(4, 3, 3)
+    timing = Timing(torch.zeros(4, 2).double(), torch.zeros(4, 3).double(), torch.zeros(4).double())
+    shared = SharedErrors(localize.calibration_factor.shape[1], ClockPrior())
+    found = track_states(localize, frame, born(anchored(seen, frame), timing, 10.0, 1).summary(), shared.root)
+    assert found.status.tolist() == expected.status.tolist() == [0, 0, 0, 6]
+    for name in ("enu", "covariance", "geodetic", "bearing", "inverse_range", "inverse_range_sigma", "range_low"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-9, msg=name)
+    # The miss: 0.4 px between two marks of 0.3 px each.
+    torch.testing.assert_close(seen.miss.abs(), torch.full((4,), 0.4 / 0.3 / math.sqrt(2)).double(), rtol=0.02, atol=0)
+
+
+def followed(
+    tracker: Tracker, rigs: list, start: torch.Tensor, velocity: torch.Tensor, frames: int, seed: int, late: float = 0.0
+) -> tuple[Tracks, torch.Tensor]:
+    """Tracks at the end, one for each target in order, and the true places; each target has a true rig of its own."""
+    generator = torch.Generator().manual_seed(seed)
+    for frame in range(frames):
+        time = frame / 10.0
+        places, later = start + time * velocity, start + (time + late) * velocity
+        marks = [seen_by(rig, places[i : i + 1], 0.3, generator, later[i : i + 1]) for i, rig in enumerate(rigs)]
+        left, right = (torch.cat(side) for side in zip(*marks, strict=True))
+        tracks = tracker(pairs_of(left, right, time))
+    return tracks, places
+
+
+def scattered(count: int, seed: int, speed: float = 10.0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    across = torch.linspace(-0.45, 0.45, count).double()[torch.randperm(count, generator=generator)]
+    z = torch.linspace(math.log(300.0), math.log(5000.0), count).double().exp()
+    up = 0.4 * (torch.rand(count, generator=generator).double() - 0.5)
+    velocity = speed * torch.randn(count, 3, generator=generator).double()
+    return torch.stack([across * z, up * z, z], -1), velocity
+
+
+def test_errors_are_as_large_as_stated() -> None:
+    """Each target has its own true rig, so that errors of the calibration are independent too: 6 degrees of freedom."""
+    localize, count = tracked_site(0.003), 60
+    yaws = math.radians(0.003) * torch.randn(count, generator=torch.Generator().manual_seed(3)).double()
+    start, velocity = scattered(count, 1)
+    tracker = Tracker(localize, STEADY)
+    tracks, places = followed(tracker, [yawed_rig(localize.rig, float(y)) for y in yaws], start, velocity, 12, 5)
+    assert tracks.number == tuple(range(1, count + 1))
+    ray = (tracker.frame @ places[..., None])[..., 0]
+    pace = (tracker.frame @ velocity[..., None])[..., 0]
+    true = torch.cat([ray[:, :2] / ray[:, 2:], 1.0 / ray[:, 2:], pace / ray[:, 2:]], -1)
+    belief = tracker.beliefs.summary()
+    spread = belief.effect @ tracker.shared.root
+    covariance = belief.noise + spread @ spread.mT
+    unit = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    error = ((true - belief.mean) / unit)[..., None]
+    white = torch.linalg.solve(covariance / unit[:, :, None] / unit[:, None, :], error)
+    nees = float((error * white).sum((-2, -1)).mean())
+    # The mean of 60 values of chi-squared with 6 degrees of freedom: 95 % between.
+    assert 5.15 < nees < 6.9, nees
+    state = tracks.state
+    truth = 1.0 / torch.linalg.vector_norm(places, dim=-1)
+    ratio = (state.inverse_range - truth) / state.inverse_range_sigma
+    assert 0.8 < float(ratio.square().mean().sqrt()) < 1.2
+    ok = state.status == 0
+    assert int(ok.sum()) > 50
+    moving = (state.velocity - velocity @ localize.enu_from_rig.T)[ok, :, None]
+    speed = (moving * torch.linalg.solve(state.velocity_covariance[ok], moving)).sum((-2, -1)).mean()
+    assert 2.3 < float(speed) < 3.7
+
+
+def test_frames_reduce_noise_but_never_the_systematic_part() -> None:
+    localize = tracked_site(0.01)
+    start, still = torch.tensor([[0.0, 0.0, 2000.0]]).double(), torch.zeros(1, 3).double()
+    options = TrackOptions(motions=(Motion(acceleration=0.0),), speed_mps=1e-6, confirm_hits=1)
+    sigmas, systematic = [], []
+    for frames in (1, 49):
+        tracks, _ = followed(Tracker(localize, options), [localize.rig], start, still, frames, 0)
+        square = float(tracks.state.enu[0, 1]) ** 2
+        sigmas.append(float(tracks.state.covariance[0, 1, 1].sqrt()) / square)
+        systematic.append(float(tracks.state.systematic[0, 1, 1].sqrt()) / square)
+    # 0.01° of yaw over 10 m; the marks' 0.42 px of 1600 are 1.5 times as much.
+    assert systematic == pytest.approx([math.radians(0.01) / 10.0] * 2, rel=1e-3)
+    noise = [math.sqrt(a**2 - b**2) for a, b in zip(sigmas, systematic, strict=True)]
+    assert noise[1] / noise[0] == pytest.approx(1 / 7, rel=1e-3)
+
+
+def test_a_wide_sweep_turns_the_frame_and_stays_exact() -> None:
+    localize = tracked_site()
+    start, velocity = torch.tensor([[-56.0, 0.0, 100.0]]).double(), torch.tensor([[28.0, 0.0, 0.0]]).double()
+    tracker = Tracker(localize, TrackOptions(motions=(Motion(acceleration=0.1),)))
+    tracks, places = followed(tracker, [localize.rig], start, velocity, 40, 1)
+    assert tracks.number == (1,)
+    assert not torch.allclose(tracker.frame[0] @ torch.nn.functional.normalize(start[0], dim=0), tensor(0.0, 0.0, 1.0))
+    error = (tracks.state.enu - places @ localize.enu_from_rig.T)[..., None]
+    assert float((error.mT @ torch.linalg.solve(tracks.state.covariance, error)).squeeze()) < 16.3
+
+
+def test_models_find_out_how_a_target_moves() -> None:
+    localize = tracked_site()
+    generator = torch.Generator().manual_seed(0)
+    tracker = Tracker(localize)
+    rate, speed = 0.2, 12.0
+    for frame in range(60):
+        time = frame / 10.0
+        turning = [
+            -30.0 + speed / rate * math.sin(rate * time),
+            0.0,
+            150.0 + speed / rate * (1 - math.cos(rate * time)),
+        ]
+        places = torch.tensor([turning, [20.0, 0.0, 150.0], [-60.0 + 10 * time, -10.0, 200.0]]).double()
+        tracks = tracker(pairs_of(*seen_by(localize.rig, places, 0.3, generator), time))
+    best = tracks.models.argmax(-1).tolist()
+    assert best[0] == 2
+    assert best[1] == 0
+    assert best[2] == 1
+    assert torch.allclose(tracks.models.sum(-1), torch.ones(3).double())
+
+
+def test_a_target_behind_another_keeps_its_number() -> None:
+    """One crosses behind a nearer one; meanwhile every pairing on the common line is offered, ambiguous."""
+    localize = tracked_site()
+    generator = torch.Generator().manual_seed(2)
+    tracker = Tracker(localize)
+    for frame in range(60):
+        time = frame / 10.0
+        places = torch.tensor([[-20.0 + 10.0 * time, 0.0, 400.0], [45.0 - 20.0 * time, 0.0, 600.0]]).double()
+        left, right = seen_by(localize.rig, places, 0.2, generator)
+        both = torch.cat([torch.stack([left[0], right[1]])[None], torch.stack([left[1], right[0]])[None]])
+        near = frame > 10
+        if near:
+            left, right = torch.cat([left, both[:, 0]]), torch.cat([right, both[:, 1]])
+        tracks = tracker(pairs_of(left, right, time, 0.2, [near] * len(left)))
+    assert sorted(tracks.number) == [1, 2]
+    order = [tracks.number.index(n) for n in (1, 2)]
+    assert tracks.state.enu[order, 1].tolist() == pytest.approx([400.0, 600.0], rel=0.03)
+
+
+@pytest.mark.parametrize(("again", "number"), [(10.0, 1), (-10.0, 2)])
+def test_recognized_by_its_motion_after_an_occlusion(again: float, number: int) -> None:
+    localize = tracked_site()
+    generator = torch.Generator().manual_seed(4)
+    tracker = Tracker(localize, TrackOptions(motions=(Motion(acceleration=0.2),)))
+    told = []
+    for frame in range(70):
+        time = frame / 10.0
+        if 20 <= frame < 55:
+            tracks = tracker(pairs_of(torch.zeros(0, 2).double(), torch.zeros(0, 2).double(), time), time)
+        else:
+            velocity = 10.0 if frame < 20 else again
+            places = torch.tensor([[20.0 + velocity * (time - 5.5), 0.0, 400.0]]).double()
+            tracks = tracker(pairs_of(*seen_by(localize.rig, places, 0.2, generator), time))
+        told.append(tracks.number)
+    assert told[19] == (1,)
+    assert told[25] == (1,), "carried on for a while"
+    assert float(tracks.unseen_s[0]) == 0.0
+    assert told[40] == (), "lost"
+    assert told[-1] == (number,)
+
+
+def test_what_is_seen_once_is_not_told() -> None:
+    localize = tracked_site()
+    tracker = Tracker(localize)
+    left, right, _ = localize.rig(torch.tensor([[0.0, 0.0, 300.0]]).double())
+    assert tracker(pairs_of(left, right, 0.0)).number == ()
+    nothing = pairs_of(left[:0], right[:0], 0.0)
+    assert tracker(nothing, 5.0).number == ()
+    assert tracker.records == []
+
+
+def test_time_must_be_given_and_must_not_go_back() -> None:
+    localize = tracked_site()
+    tracker = Tracker(localize)
+    nothing = pairs_of(torch.zeros(0, 2).double(), torch.zeros(0, 2).double(), 0.0)
+    with pytest.raises(InputError, match="give the time"):
+        tracker(nothing)
+    tracker(nothing, 3.0)
+    with pytest.raises(InputError, match="not before the last one"):
+        tracker(nothing, 2.0)
+    with pytest.raises(InputError, match="record=True"):
+        tracker.smoothed()
+
+
+@pytest.mark.parametrize("wrong", [{"gate": 0.0}, {"motions": ()}, {"forget_after_s": 1.0}])
+def test_impossible_options(wrong: dict[str, object]) -> None:
+    with pytest.raises(InputError):
+        TrackOptions(**wrong)  # type: ignore[arg-type]
