@@ -1,0 +1,176 @@
+"""Guided photography of a board against views at random: how many views give the same camera.
+
+    python -m scripts.check.capture --out cells.jsonl --seeds 8      # cells in the file are kept
+    python -m scripts.check.capture --out cells.jsonl --write        # docs/measured/capture.md
+
+Each seed has a lens with five coefficients of its own, 1280 x 720, and a board of 9 x 6 corners 25 mm apart. Frames are
+rendered, with noise and a little blur, and corners are detected in them. *Random*: 20 views drawn by
+`kcal.sim.poses.sample_board_poses`: over the whole image, near and far, tilted and rolled. *Guided*: the first four
+views and each next one as `kcal capture` asks for them, held by a person: off by 5 % of the distance across and by 10 %
+along, by 8 degrees of tilt and 10 degrees of roll. A view that is not seen whole is held again.
+
+Guided capture goes on until its σ is that of the 20 random views (far directions, RMS over the image; both as kcal
+predicts it), or to 20 views. True errors are those of far directions after the best turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal.calibrate.camera.next_view import NextView, far_sigma
+from kcal.capture.session import CaptureOptions, CaptureSession
+from kcal.corners.board import Board
+from kcal.corners.detect import detect_board, view_of
+from kcal.corners.observations import Observations, View
+from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector
+from kcal.sim.board import BoardPose, BoardSize
+from kcal.sim.poses import sample_board_poses
+from kcal.sim.render import RenderOptions, render_board
+from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.timing import show
+
+BOARD = Board(columns=9, rows=6, square=0.025)
+PRINT = BoardSize(BOARD.columns, BOARD.rows, BOARD.square)
+SIZE, RANDOM = (1280, 720), 20
+ACROSS, ALONG, TILT, ROLL = 0.05, 0.10, math.radians(8.0), math.radians(10.0)
+PAGE = "capture.md"
+
+
+def lens(seed: int) -> Camera:
+    """A webcam of no particular make."""
+    u = torch.randn(7, generator=torch.Generator().manual_seed(9000 + seed)).tolist()
+    return Camera.build(
+        focal=(950 + 60 * u[0],) * 2,
+        center=(639.5 + 10 * u[1], 359.5 + 10 * u[2]),
+        size=SIZE,
+        coefficients=[-0.15 + 0.05 * u[3], 0.05 + 0.02 * u[4], 4e-4 * u[5], 4e-4 * u[6], 0.0],
+        model="opencv5",
+    )
+
+
+def held(wanted: NextView, generator: torch.Generator) -> BoardPose:
+    """The view as a person holds the board."""
+    u = torch.randn(6, generator=generator, dtype=torch.float64)
+    turn = rotation_from_vector(torch.tensor([TILT, TILT, ROLL], dtype=torch.float64) * u[:3])
+    middle = 0.5 * (BOARD.points.amin(0) + BOARD.points.amax(0))
+    center = wanted.rotation @ middle + wanted.translation
+    distance = float(center.norm())
+    center = center * (1.0 + ALONG * float(u[3])) + ACROSS * distance * torch.cat([u[4:], u.new_zeros(1)])
+    rotation = turn @ wanted.rotation
+    return BoardPose(rotation, center - rotation @ middle)
+
+
+def true_error(found: Camera, truth: Camera) -> float:
+    """RMS of far directions over the image along an axis, after the best turn, pixels."""
+    pixels = truth.grid(33, 19).reshape(-1, 2)
+    there, here = truth.unproject(pixels)[0], found.unproject(pixels)[0]
+    u, _, vh = torch.linalg.svd(there.T @ here)
+    return float(((found.project(there @ (u @ vh))[0] - pixels).square().sum(-1).mean() / 2).sqrt())
+
+
+def at_random(truth: Camera, seed: int) -> tuple[float, float]:
+    """σ and true error of 20 random views."""
+    generator = torch.Generator().manual_seed(100 + seed)
+    views: list[View] = []
+    for i, pose in enumerate(sample_board_poses(truth, PRINT, RANDOM, generator)):
+        found = detect_board(frame(truth, pose, generator), BOARD)
+        if found.pixels is not None:
+            views.append(view_of(found, str(i)))
+    camera = calibrate_camera(Observations(board=BOARD, image_size=SIZE, views=tuple(views))).camera
+    return far_sigma(camera), true_error(camera, truth)
+
+
+def frame(truth: Camera, pose: BoardPose, generator: torch.Generator) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """A rendered frame."""
+    return np.asarray(render_board(truth, pose, PRINT, RenderOptions(), generator).numpy(), np.uint8)
+
+
+def guided(truth: Camera, goal: float, seed: int) -> list[dict[str, float]]:
+    """σ and true error after each calibration, until the goal."""
+    generator = torch.Generator().manual_seed(200 + seed)
+    out: list[dict[str, float]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        session = CaptureSession(Path(folder) / "x.obs.json", BOARD, CaptureOptions(until=goal, most=RANDOM))
+        # The first suggestion needs a frame, to know the image's size.
+        session.offer(np.full((SIZE[1], SIZE[0]), 90, np.uint8), "dark", moving=False)
+        attempt = 0
+        while not session.finished:
+            session.think()
+            if session.result is not None and (not out or out[-1]["views"] < session.views):
+                error = true_error(session.result.camera, truth)
+                out.append({"views": session.views, "sigma": session.sigma, "error": error})
+                continue
+            if session.suggestion is None or attempt > 3 * RANDOM:
+                break
+            attempt += 1
+            pose = held(session.suggestion, generator)
+            if seen_whole(truth, pose):
+                session.offer(frame(truth, pose, generator), f"{attempt}.png", moving=False)
+    return out
+
+
+def seen_whole(truth: Camera, pose: BoardPose) -> bool:
+    """All corners are inside the image, with a margin for the outer squares."""
+    pixels, valid = truth.project(BOARD.points @ pose.rotation.T + pose.translation)
+    inside: Tensor = (pixels > 25) & (pixels < torch.tensor(SIZE) - 26)
+    return bool((inside.all(-1) & valid).all())
+
+
+def tables(records: list[dict[str, Any]]) -> list[str]:
+    """One row for each seed, and the means."""
+    head = ["seed", "σ of 20 random views, px", "true error, px", "guided views to this σ", "true error then, px"]
+    body, views, ratios = [], [], []
+    for record in sorted(records, key=lambda r: r["seed"]):
+        last, (sigma, error) = record["guided"][-1], record["random"]
+        reached = last["sigma"] <= sigma
+        views.append(last["views"])
+        ratios.append(last["error"] / error)
+        count = f"{last['views']:.0f}" if reached else f"not in {last['views']:.0f} ({last['sigma']:.3f} px)"
+        body.append([str(record["seed"]), f"{sigma:.4f}", f"{error:.4f}", count, f"{last['error']:.4f}"])
+    ratio = math.exp(sum(map(math.log, ratios)) / len(ratios))
+    median = sorted(views)[len(views) // 2]
+    body.append(["all", "", "", f"median {median:.0f}", f"{ratio:.2f} of random (geometric mean)"])
+    return table(head, body)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="JSON lines; what is in it is kept")
+    parser.add_argument("--first", type=int, default=300, help="first seed; those below 100 are for tuning")
+    parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--write", action="store_true", help="only write the page")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    records = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.exists() else []
+    if not arguments.write:
+        for seed in range(arguments.first, arguments.first + arguments.seeds):
+            if seed not in {record["seed"] for record in records}:
+                truth, start = lens(seed), time.process_time()
+                random = at_random(truth, seed)
+                record = {"seed": seed, "random": random, "guided": guided(truth, random[0], seed)}
+                records.append({**record, "cpu_s": time.process_time() - start})
+                with arguments.out.open("a") as file:
+                    file.write(json.dumps(records[-1]) + "\n")
+                print(json.dumps(records[-1]), flush=True)
+    lines = tables(records)
+    show(lines)
+    if arguments.write:
+        text = (__doc__ or "").split("\n\n", 2)[2].strip()
+        page = ["# Guided photography, measured", "", CONCLUSIONS[PAGE], "", "Made by `scripts/check/capture.py`."]
+        (DOCS / PAGE).write_text("\n".join([*page, text, "", *lines, ""]), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
