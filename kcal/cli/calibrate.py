@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.markup import escape
 
-from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.calibrate_result import calibration_numbers, print_calibration
+from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.report import NO, REQUIRE_HELP, judged, told_usable
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_writable, make_folder
-
-if TYPE_CHECKING:
-    from kcal.calibrate.camera.result import CameraCalibrationResult
 
 _PARAMETRIC, _USE = "Options of parametric models", "May it be used?"
 
@@ -235,12 +233,12 @@ def calibrate_command(
             from kcal.report.calibration import save_calibration_picture
 
             save_calibration_picture(place.picture, result)
-        _print_result(result, reject=reject, verbose=verbose or not options.hybrid)
+        print_calibration(result, reject=reject, verbose=verbose or not options.hybrid)
         if result.shared_board is not None:
             others = ", ".join(places[i].name for i in result.shared_board.others)
             out.print(f"the board is that of {others} (evidence {result.shared_board.evidence:.0f} nats)", markup=False)
         print_wrote(place.output, place.picture)
-        figures[place.name] = _figures(result)
+        figures[place.name] = calibration_numbers(result)
         if needs or place.report is not None:
             found = judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=place.name)
             figures[place.name]["verdict"] = found[0].to_dict()
@@ -299,74 +297,6 @@ def _camera_files(
     return places
 
 
-def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:
-    from kcal.calibrate.camera.summary import summarize
-    from kcal.report.view_findings import distances_text
-
-    assert result.camera.calibration is not None
-    record = result.camera.calibration.record
-    assert record is not None
-    width, height = result.observations.image_size
-    model = "hybrid" if result.hybrid is not None else str(result.camera.model)
-    out.print(f"{record.views} views, {record.points} corners, {width}x{height} px, model {model}")
-    out.print(distances_text(result))
-    fitted = f"; noise {result.noise:.4f} px along an axis; {result.status.message} ({result.iterations} steps)"
-    out.print(f"RMS [bold]{result.rms:.4f} px[/]{fitted}")
-    brief = summarize(result)
-    if brief.worst == brief.worst:
-        out.print(
-            f"far directions: ± {brief.center:.3f} px in the middle of the image, {brief.border:.3f} px at its border, "
-            f"{brief.worst:.3f} px at worst; no board reached {100 * brief.unreached:.0f} % of it"
-        )
-    if result.hybrid is not None:
-        (f, _, cx, cy), (sf, sx, sy) = result.camera.params[:4].tolist(), (result.sigma[n] for n in ("fx", "cx", "cy"))
-        out.print(f"focal length {f:.3f} ± {sf:.3f} px; principal point {cx:.2f} ± {sx:.2f}, {cy:.2f} ± {sy:.2f} px")
-    if brief.pupil is not None and brief.pupil_sigma is not None:
-        out.print(f"entrance pupil: {1e3 * brief.pupil:+.2f} ± {1e3 * brief.pupil_sigma:.2f} mm at the image's corner")
-    if (board := result.measured_board) is not None and bool(board.amplitudes.any()):
-        (bend, bend_s), (wide, wide_s), (skew, skew_s), (rest, rest_s) = (
-            board.bending, board.stretch, board.shear, board.print_error,
-        )  # fmt: skip
-        out.print(
-            f"board: bends by {1e3 * bend:.2f} ± {1e3 * bend_s:.2f} mm; "
-            f"stretch {100 * wide:+.3f} ± {100 * wide_s:.3f} %, shear {100 * skew:+.3f} ± {100 * skew_s:.3f} %, "
-            f"print {1e3 * rest:.3f} ± {1e3 * rest_s:.3f} mm"
-        )
-    if verbose:
-        print_table([["parameter", "value", "± σ"], *_parameters(result)])
-    if result.board_warp is not None:
-        x, y = (1e3 * result.board_warp).tolist()
-        out.print(f"board warp: {x:+.3f} mm along its rows, {y:+.3f} mm along its columns")
-    if reject:
-        out.print(f"left out: {100 * result.rejected_share:.2f} % of the corners")
-    for entry in result.excluded:
-        out.print(f"  {entry.name}: {entry.reason}", markup=False)
-    for text in result.warnings:
-        warn(text)
-    for text in result.advice:
-        out.print(f"next: {text}", markup=False)
-
-
-def _figures(result: CameraCalibrationResult) -> dict[str, Any]:
-    """What programs want to know of a calibration."""
-    from kcal.calibrate.camera.summary import summarize
-
-    brief = summarize(result)
-    return dict(
-        rms_px=result.rms,
-        noise_px=result.noise,
-        views=int(result.per_view_rms.isfinite().sum()),
-        corners=int(result.residuals[..., 0].isfinite().sum()),
-        model="hybrid" if result.hybrid is not None else str(result.camera.model),
-        converged=result.status.name,
-        sigma_px={"center": brief.center, "border": brief.border, "worst": brief.worst},
-        unreached=brief.unreached,
-        parameters=dict(zip(result.camera.names, result.camera.params.tolist(), strict=True)),
-        sigma=result.sigma,
-        advice=result.advice,
-    )
-
-
 def _option_number(text: str, option: str) -> float:
     try:
         return float(text)
@@ -397,17 +327,3 @@ def _priors(texts: list[str]) -> dict[str, tuple[float, float]]:
             raise InputError(f"--prior {text}: {name} has a prior already")
         found[name] = _option_number(mean, f"--prior {text}"), _option_number(sigma, f"--prior {text}")
     return found
-
-
-def _parameters(result: CameraCalibrationResult) -> list[list[str]]:
-    """Name, value and σ of each parameter."""
-    rows = []
-    values = dict(zip(result.camera.names, result.camera.params.tolist(), strict=True))
-    for name, sigma in result.sigma.items():
-        digits = 3 if name in ("fx", "fy", "cx", "cy") else 6
-        unknown = "fixed" if name in result.fixed else "not determined"
-        spread = unknown if sigma is None else f"{sigma:.{digits}f}"
-        if name in result.led_by_prior:
-            spread += " (by its prior)"
-        rows.append([name, f"{values[name]:.{digits}f}", spread])
-    return rows
