@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.markup import escape
 
+from kcal.cli.calibrate_result import calibration_numbers, print_calibration
 from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.report import NO, REQUIRE_HELP, judged, told_usable
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_writable, make_folder
-
-if TYPE_CHECKING:
-    pass
 
 _PARAMETRIC, _USE = "Options of parametric models", "May it be used?"
 
@@ -194,7 +192,6 @@ def calibrate_command(
     from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.camera.outliers import OutlierRejection
     from kcal.calibrate.lensfit.measured_board import load_measured_board
-    from kcal.cli.calibrate_text import print_result, result_figures
     from kcal.corners.observations import Observations
     from kcal.solve.robust import RobustLoss
 
@@ -236,12 +233,12 @@ def calibrate_command(
             from kcal.report.calibration import save_calibration_picture
 
             save_calibration_picture(place.picture, result)
-        print_result(result, reject=reject, verbose=verbose or not options.hybrid)
+        print_calibration(result, reject=reject, verbose=verbose or not options.hybrid)
         if result.shared_board is not None:
             others = ", ".join(places[i].name for i in result.shared_board.others)
             out.print(f"the board is that of {others} (evidence {result.shared_board.evidence:.0f} nats)", markup=False)
         print_wrote(place.output, place.picture)
-        figures[place.name] = result_figures(result)
+        figures[place.name] = calibration_numbers(result)
         if needs or place.report is not None:
             found = judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=place.name)
             figures[place.name]["verdict"] = found[0].to_dict()

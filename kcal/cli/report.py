@@ -152,11 +152,11 @@ def judged(
 def _again(camera: Camera, observations: Path) -> tuple[CameraCalibrationResult, CalibrationOptions]:
     """The calibration that the camera file is from, made again: files have no residuals and no poses."""
     from kcal.calibrate.camera.calibrate import calibrate_camera
-    from kcal.calibrate.camera.trust import options_of
+    from kcal.calibrate.camera.trust import stored_options
     from kcal.corners.observations import Observations
     from kcal.lens.difference import camera_difference
 
-    options = options_of(camera)
+    options = stored_options(camera)
     with steps("calibrating", None) as advance:
         result = calibrate_camera(Observations.load(observations), options, advance)
     found = camera_difference(camera, result.camera)

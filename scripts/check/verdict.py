@@ -42,13 +42,15 @@ CAMERA, RIG, MARK = "2km:10%", "500m:5%", 0.1
 # Which finding names which fault.
 NAMES = {
     "model": {"model"},
-    "fronto-parallel": {"tilt", "refused"},
+    "fronto-parallel": {"tilt"},
     "warp": {"board"},
     "blur": {"blur"},
     "unsynchronized": {"synchronization"},
     "pupil": {"pupil"},
     "mirrored or mixed": {"mirrored", "unsteady"},
 }
+# What the error says where kcal refuses the capture.
+REFUSALS = {"fronto-parallel": ("parallel to the image",), "unsynchronized": ("boards contradict the rest",)}
 CLEAN = ("clean", "clean", "clean", "clean pair")
 
 
@@ -120,7 +122,8 @@ def judge(kind: str, seed: int) -> dict[str, Any]:
 
 def named(line: dict[str, Any]) -> bool:
     """Whether the planted fault was named."""
-    return bool(NAMES[line["kind"]] & {*line["stops"], *line["doubts"]})
+    refused = any(text in line["reason"] for text in REFUSALS.get(line["kind"], ()))
+    return refused or bool(NAMES[line["kind"]] & {*line["stops"], *line["doubts"]})
 
 
 def broken(line: dict[str, Any], times: float) -> bool:

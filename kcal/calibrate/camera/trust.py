@@ -170,11 +170,11 @@ def _reference_options(result: CameraCalibrationResult, options: CalibrationOpti
     )
 
 
-def options_of(camera: Camera) -> CalibrationOptions:
+def stored_options(camera: Camera) -> CalibrationOptions:
     """The options that give a camera again from its views, as far as its file tells.
 
     Example:
-        >>> options_of(Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="opencv4")).model
+        >>> stored_options(Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="opencv4")).model
         LensModel.named('opencv4')
     """
     record = camera.calibration.record if camera.calibration else None

@@ -1,17 +1,20 @@
-"""What `kcal calibrate` prints of a camera."""
+"""What `kcal calibrate` tells of a calibration: to persons, and to programs."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.calibrate.camera.summary import summarize
 from kcal.cli.console import out, print_table, warn
-from kcal.report.view_findings import distances_text
+
+if TYPE_CHECKING:
+    from kcal.calibrate.camera.result import CameraCalibrationResult
 
 
-def print_result(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:
-    """Print a calibration: what to read first, then warnings and what to photograph next."""
+def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:
+    """Print what a person reads: noise, uncertainty, parameters, board, warnings, what to photograph next."""
+    from kcal.calibrate.camera.summary import summarize
+    from kcal.report.view_findings import distances_text
+
     assert result.camera.calibration is not None
     record = result.camera.calibration.record
     assert record is not None
@@ -56,8 +59,10 @@ def print_result(result: CameraCalibrationResult, *, reject: bool, verbose: bool
         out.print(f"next: {text}", markup=False)
 
 
-def result_figures(result: CameraCalibrationResult) -> dict[str, Any]:
+def calibration_numbers(result: CameraCalibrationResult) -> dict[str, Any]:
     """What programs want to know of a calibration."""
+    from kcal.calibrate.camera.summary import summarize
+
     brief = summarize(result)
     return dict(
         rms_px=result.rms,
