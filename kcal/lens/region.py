@@ -9,7 +9,7 @@ inside which a pixel has several preimages), the region is shrunk until it does.
 A walk in steps misses narrow folds. So it is then proven that every direction meets at most one fold within the region
 (`kcal.lens.fold_proof`), and the region is shrunk to where this can be proven. For a lens without prism terms that is
 all: its Jacobian is symmetric, and a disc where it is positive definite is one-to-one. With prism terms, and beyond the
-disc, it is 64 directions that tell whether the edge goes once around.
+disc, it is samples of the edge, 1024 around, that tell whether it goes once around.
 
 For a lens without tangential, prism and tilt terms the region is a disc. For others it is the union of the largest disc
 about the axis and the regular part of what a short Fourier series encloses. The series describes the reciprocal of the
@@ -222,9 +222,9 @@ def sampled_region(coefficients: Tensor, model: LensModel, limits: Tensor, singl
     # An infinite cap times a limit of zero would be NaN.
     capped = torch.minimum(limits[..., None, :], torch.nan_to_num(caps * smallest[..., None, :], nan=0.0, posinf=1e9))
     candidates = Region(capped.amin(-1), _fit_series(capped))
-    outline = candidates.outline(DIRECTIONS).flatten(-3, -2)
+    outline = candidates.outline(SECTORS).flatten(-3, -2)
     lens = distort_components(outline[..., 0], outline[..., 1], coefficients, model, slopes=False)
-    fits = _winds_once(lens.x.unflatten(-1, (-1, DIRECTIONS)), lens.y.unflatten(-1, (-1, DIRECTIONS)))
+    fits = _winds_once(lens.x.unflatten(-1, (-1, SECTORS)), lens.y.unflatten(-1, (-1, SECTORS)))
     if single is not None:
         fits = fits & (candidates.sector_reach() <= single[..., None, :]).all(-1)
     # The first cap that fits, or the last one, with which nothing is valid.
