@@ -63,6 +63,7 @@ class Camera(ConvertibleCamera):
 
     valid_radius: Tensor
     valid_edge: Tensor
+    valid_cuts: Tensor
     inverse_start: Tensor
 
     def __init__(self, parameters: Tensor, *, size: tuple[int, int], model: LensModel | str = "opencv5") -> None:
@@ -99,14 +100,14 @@ class Camera(ConvertibleCamera):
     @property
     def valid_region(self) -> Region:
         """The region where the lens is valid, on the plane z = 1 (for a fisheye, on the plane of angles)."""
-        return Region(self.valid_radius, self.valid_edge)
+        return Region(self.valid_radius, self.valid_edge, self.valid_cuts)
 
     def valid_polygon(self) -> Tensor:
         """The part of the image whose pixels have a ray, as a polygon (V, 2) in pixels, clockwise as seen in the image.
 
         For most cameras this is the whole image: four corners, half a pixel beyond the outermost pixel centers. Where
-        the lens folds inside the image, the polygon follows the fold at 256 directions. It is empty if no pixel has a
-        ray.
+        the lens folds inside the image, the polygon follows the fold at 256 directions; wedges behind the end of a
+        fold (`Region.cuts`) are not left out. It is empty if no pixel has a ray.
 
         Raises:
             InputError: a batch of cameras.
@@ -124,7 +125,8 @@ class Camera(ConvertibleCamera):
             corners = values.new_tensor([[-0.5, -0.5], [width, -0.5], [-0.5, height], [width, height]])
             x, y = from_pixels(corners[:, 0], corners[:, 1], values)
             ready = prepare_inverse(values[..., 5:], self.model, torch.hypot(x, y).amax(-1))
-        return {"valid_radius": ready.region.radius, "valid_edge": ready.region.edge, "inverse_start": ready.start}
+        radius, edge, cuts = ready.region
+        return {"valid_radius": radius, "valid_edge": edge, "valid_cuts": cuts, "inverse_start": ready.start}
 
     def update_valid_region(self) -> None:
         """Compute the valid region again; call this after changing parameters in place."""

@@ -58,7 +58,8 @@ def solve_safeguarded(
     lenses = coefficients.expand(*lead, model.size).reshape(cameras, model.size)
     radius = region.radius.expand(lead).reshape(cameras)
     edges = region.edge.expand(*lead, -1).reshape(cameras, -1)
-    sample_x, sample_y, image_x, image_y = _region_samples(lenses, model, Region(radius, edges))
+    cuts = region.cuts.expand(*lead, -1, -1).reshape(cameras, -1, 4)
+    sample_x, sample_y, image_x, image_y = _region_samples(lenses, model, Region(radius, edges, cuts))
     inner_x, inner_y = image_x[:, :-DIRECTIONS], image_y[:, :-DIRECTIONS]
 
     outward = _edge_fraction(target_x, target_y, image_x, image_y)
@@ -73,7 +74,7 @@ def solve_safeguarded(
         tail = (-1, 1) if cameras > 1 else (-1,)
         goal_x, goal_y, enough = (value[c, n].reshape(tail) for value in (target_x, target_y, tolerance))
         lens = lenses[c] if cameras > 1 else lenses[0]
-        here = Region(radius[c], edges[c]) if cameras > 1 else Region(radius[0], edges[0])
+        here = Region(radius[c], edges[c], cuts[c]) if cameras > 1 else Region(radius[0], edges[0], cuts[0])
         distances = (inner_x[c] - goal_x.reshape(-1, 1)) ** 2 + (inner_y[c] - goal_y.reshape(-1, 1)) ** 2
         nearest = distances.argmin(-1)
         start_x, start_y = (value[c, nearest].reshape(tail) for value in (sample_x, sample_y))

@@ -6,10 +6,9 @@ describe the lens. `valid_region` walks outward along 64 directions to that plac
 edge of a region once around the origin is one-to-one inside. Where the edge does not (two folds can meet in a cusp,
 inside which a pixel has several preimages), the region is shrunk until it does.
 
-A walk in steps misses narrow folds. So it is then proven that every direction meets at most one fold within the region
-(`kcal.lens.fold_proof`), and the region is shrunk to where this can be proven. For a lens without prism terms that is
-all: its Jacobian is symmetric, and a disc where it is positive definite is one-to-one. With prism terms, and beyond the
-disc, it is 64 directions that tell whether the edge goes once around.
+A walk in steps misses narrow folds. So it is then proven that each direction has no fold before the end of the region
+or a single one (`kcal.lens.fold_proof`). Where this cannot be proven, narrow wedges are cut out of the region, or it is
+shrunk.
 
 For a lens without tangential, prism and tilt terms the region is a disc. For others it is the union of the largest disc
 about the axis and the regular part of what a short Fourier series encloses. The series describes the reciprocal of the
@@ -41,6 +40,9 @@ SURE = 0.95
 _FARTHEST = 1e3
 # A region that is shrunk stays so far inside what is proven, because its series is smooth and the proof is not.
 _INSIDE = 0.999
+# Sectors of 1024 by which a cut is wider, on either side, than what could not be proven: around the end of a fold, the
+# images of points beside it overlap, too.
+_BESIDE = 2
 
 
 class Region(NamedTuple):
@@ -50,10 +52,13 @@ class Region(NamedTuple):
         radius: (...) radius of the largest disc about the axis inside the region.
         edge: (..., 13) Fourier series of the reciprocal distance of the edge: the constant, then cosine and sine of
             once, twice, ... the direction.
+        cuts: (..., K, 4) wedges that do not belong to it: the points at a distance beyond the last number in directions
+            whose cosine to (first, second) is above the third. K is zero for nearly all lenses.
     """
 
     radius: Tensor
     edge: Tensor
+    cuts: Tensor
 
     def covers(self, x: Tensor, y: Tensor, fraction: float = 1.0) -> Tensor:
         """Whether points (..., N) lie in the disc, or in a fraction of it."""
@@ -67,8 +72,14 @@ class Region(NamedTuple):
         return distance * _evaluate_series(self.edge, x * scale, y * scale)
 
     def encloses(self, x: Tensor, y: Tensor) -> Tensor:
-        """Whether points (..., N) lie within the outline, as the whole valid region does."""
-        return self.covers(x, y) | (self.fraction(x, y) < 1.0)
+        """Whether points (..., N) lie within the outline and in no cut, as the whole valid region does."""
+        enclosed = self.covers(x, y) | (self.fraction(x, y) < 1.0)
+        if not self.cuts.shape[-2]:
+            return enclosed
+        along_x, along_y, cosine, start = self.cuts[..., None].unbind(-2)
+        distance = torch.sqrt(torch.addcmul(x * x, y, y))[..., None, :]
+        inside = along_x * x[..., None, :] + along_y * y[..., None, :] > cosine * distance
+        return enclosed & ~(inside & (distance > start)).any(-2)
 
     def outline(self, count: int) -> Tensor:
         """Points (..., count, 2) on the edge of the region, clockwise as seen in the image, the first on the x axis."""
@@ -191,23 +202,59 @@ def valid_region(coefficients: Tensor, model: LensModel | str) -> Region:
     proofs = [prove_regular(c, model, r, d) for c, r, d in zip(*(value.split(16) for value in wanted), strict=True)]
     positive, single = (torch.cat(part) for part in zip(*proofs, strict=True))
     positive, single = positive.reshape(limits.shape[:-1]), single.reshape(reach.shape)
-    proven = (single >= reach).all(-1)
-    if not bool(proven.all()):
-        if model.radial:
-            within = prove_regular(lenses, model, wanted[1], wanted[1][:, 0])[0].reshape(limits.shape)
-        else:
-            # Each of the 64 directions stays within what is proven on both sides of it.
-            blocks = single.unflatten(-1, (DIRECTIONS, -1)).amin(-1)
-            within = torch.minimum(limits, _INSIDE * torch.minimum(blocks, blocks.roll(1, -1)))
-        shrunk = sampled_region(coefficients, model, within, single)
-        region = Region(
-            torch.where(proven, region.radius, shrunk.radius), torch.where(proven[..., None], region.edge, shrunk.edge)
-        )
+    settled = bool((single >= reach).all())
     if model.radial:
-        return region
+        if settled:
+            return region
+        positive = prove_regular(lenses, model, wanted[1], wanted[1][:, 0])[0].reshape(limits.shape)
+        return sampled_region(coefficients, model, torch.where(single >= reach, limits, positive))
+    if not settled:
+        region = _proven_part(coefficients, model, limits, region, single)
     # The disc in which no further check is needed must be proven, too.
     smaller = positive < SURE * region.radius
     return region._replace(radius=torch.where(smaller, positive / SURE, region.radius))
+
+
+def _proven_part(coefficients: Tensor, model: LensModel, limits: Tensor, region: Region, single: Tensor) -> Region:
+    """The part of a region where each direction has at most one fold, up to the radii `single` of the sectors."""
+    # The two sixty-fourths of the circle beside each direction.
+    blocks = single.unflatten(-1, (DIRECTIONS, -1)).amin(-1)
+    within = torch.minimum(limits, _INSIDE * torch.minimum(blocks, blocks.roll(1, -1)))
+    shrunk = sampled_region(coefficients, model, within, single)
+    cuts = [
+        _narrow_cuts(own, reach)
+        for own, reach in zip(single.reshape(-1, SECTORS), region.sector_reach().reshape(-1, SECTORS), strict=True)
+    ]
+    count = max(0 if own is None else len(own) for own in cuts)
+    none = single.new_tensor([0.0, 0.0, 1.0, math.inf])
+    padded = [
+        none.expand(count, 4) if own is None else torch.cat([own, none.expand(count - len(own), 4)]) for own in cuts
+    ]
+    narrow = torch.tensor([own is not None for own in cuts], device=single.device).reshape(single.shape[:-1])
+    return Region(
+        torch.where(narrow, region.radius, shrunk.radius),
+        torch.where(narrow[..., None], region.edge, shrunk.edge),
+        torch.stack(padded).reshape(*single.shape[:-1], count, 4),
+    )
+
+
+def _narrow_cuts(single: Tensor, reach: Tensor) -> Tensor | None:
+    """Wedges (K, 4) around the sectors (1024,) whose `single` falls short of `reach`; None if they are not narrow."""
+    short = single < reach
+    if int(short.sum()) > SECTORS // 16:
+        return None
+    wide = short.clone()
+    for shift in range(1, _BESIDE + 1):
+        wide |= short.roll(shift) | short.roll(-shift)
+    first, last = ((wide & ~wide.roll(shift)).nonzero()[:, 0].tolist() for shift in (1, -1))
+    wedges = []
+    for begin in first:
+        count = min((end - begin) % SECTORS for end in last) + 1
+        members = torch.arange(begin, begin + count, device=single.device) % SECTORS
+        middle, half = (begin + 0.5 * count) * (2 * math.pi / SECTORS), count * (math.pi / SECTORS)
+        start = float(torch.where(short[members], single[members], math.inf).amin())
+        wedges.append([math.cos(middle), math.sin(middle), math.cos(half), start])
+    return single.new_tensor(wedges).reshape(-1, 4)
 
 
 def sampled_region(coefficients: Tensor, model: LensModel, limits: Tensor, single: Tensor | None = None) -> Region:
@@ -215,23 +262,24 @@ def sampled_region(coefficients: Tensor, model: LensModel, limits: Tensor, singl
 
     With `single`, it also stays within these radii (..., 1024) in each sector.
     """
+    none = limits.new_zeros(*limits.shape[:-1], 0, 4)
     if model.radial:
-        return Region(limits[..., 0], _fit_series(limits.expand(*limits.shape[:-1], DIRECTIONS)))
+        return Region(limits[..., 0], _fit_series(limits.expand(*limits.shape[:-1], DIRECTIONS)), none)
     smallest = limits.amin(-1, keepdim=True)
     caps = torch.tensor(_CAPS, dtype=torch.float64, device=limits.device)[:, None]
     # An infinite cap times a limit of zero would be NaN.
     capped = torch.minimum(limits[..., None, :], torch.nan_to_num(caps * smallest[..., None, :], nan=0.0, posinf=1e9))
-    candidates = Region(capped.amin(-1), _fit_series(capped))
-    outline = candidates.outline(DIRECTIONS).flatten(-3, -2)
+    candidates = Region(capped.amin(-1), _fit_series(capped), none[..., None, :, :])
+    outline = candidates.outline(SECTORS).flatten(-3, -2)
     lens = distort_components(outline[..., 0], outline[..., 1], coefficients, model, slopes=False)
-    fits = _winds_once(lens.x.unflatten(-1, (-1, DIRECTIONS)), lens.y.unflatten(-1, (-1, DIRECTIONS)))
+    fits = _winds_once(lens.x.unflatten(-1, (-1, SECTORS)), lens.y.unflatten(-1, (-1, SECTORS)))
     if single is not None:
         fits = fits & (candidates.sector_reach() <= single[..., None, :]).all(-1)
     # The first cap that fits, or the last one, with which nothing is valid.
     first = (fits.to(torch.int64).cumsum(-1) == 0).sum(-1).clamp(max=len(_CAPS) - 1)[..., None]
     radius = torch.gather(candidates.radius, -1, first)[..., 0]
     edge = torch.gather(candidates.edge, -2, first[..., None].expand(*first.shape, candidates.edge.shape[-1]))
-    return Region(radius, edge[..., 0, :])
+    return Region(radius, edge[..., 0, :], none)
 
 
 def in_region(

@@ -15,13 +15,20 @@ from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort
 from kcal.lens.jets import Jet, Span
 from kcal.lens.model import LensModel
-from kcal.lens.region import valid_region
+from kcal.lens.region import in_region, valid_region
 from scripts.check import folds
 from scripts.check.uncertainty import LENS
 from tests.helpers.lenses import MODELS, strong
 from tests.lens.test_whole_region import BENT
 
 NARROW = [-3.99999958, 3.99999958, 0, 0, 0, -3.9999996, 3.9999996, 0]
+
+# Strongly tilted and decentered.
+CUSP = [
+    0.4906688414378017, 0.6196398857144331, -0.03566072384144904, -0.8170457463408914, 0.28638828387970944,
+    -0.10748996625727007, -0.34266925372018825, 0.5654486645213991, 0.7754243240635172, -0.4821760661559888,
+    0.21348189927875633, 0.3613066779086383, -1.3398265686041242, 0.36778917746958295,
+]  # fmt: skip
 
 
 def along_x(camera: Camera, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -95,6 +102,15 @@ class TestOtherTerms:
         normalized = distort(points[:, :2], lens, "opencv12")
         torch.testing.assert_close(normalized[0], normalized[1], rtol=0, atol=1e-15)
         assert camera.project(points)[1].tolist() == [True, False]
+
+    def test_a_cusp_between_two_of_64_directions(self) -> None:
+        """The edge of the region goes back and forth within 2°; the lens was found by scripts/check/folds.py."""
+        lens = torch.tensor(CUSP, dtype=torch.float64)
+        points = torch.tensor([[0.41027282959, -0.09644074454], [0.46236123257, -0.14250184100]], dtype=torch.float64)
+        normalized = distort(points, lens, "opencv14")
+        torch.testing.assert_close(normalized[0], normalized[1], rtol=0, atol=1e-9)
+        valid = in_region(*points.T, lens, LensModel.named("opencv14"), valid_region(lens, "opencv14"))
+        assert not bool(valid.all())
 
     def test_several_lenses_are_judged_each_on_its_own(self) -> None:
         lenses = torch.stack([strong("opencv14"), torch.tensor(BENT, dtype=torch.float64), torch.zeros(14).double()])
