@@ -79,6 +79,20 @@ def check_writable(path: str | Path, *inputs: str | Path) -> Path:
     return path
 
 
+def make_folder(path: str | Path) -> Path:
+    """Make a folder, with those that it is in, unless it is there.
+
+    Raises:
+        FileError: it cannot be made, for example because a file has its name.
+    """
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path}: cannot make this folder: {_reason(error)}") from error
+    return path
+
+
 @contextmanager
 def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
     """Open a file beside `path` for writing, and move it into place when the block ends.

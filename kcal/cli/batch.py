@@ -37,6 +37,10 @@ def batch_command(
         Refine, typer.Option("--refine", metavar="METHOD", help="erf (most accurate), saddle, opencv, skimage or none.")
     ] = Refine.erf,
     board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how each board bends.")] = False,
+    one_type: Annotated[
+        bool,
+        typer.Option("--one-type", help="The cameras, four or more, are of one type: each learns from the others."),
+    ] = False,
     workers: Annotated[
         int,
         typer.Option(help="Processes on this machine; one per core if not given.", min=0, show_default=False),
@@ -51,10 +55,12 @@ def batch_command(
 ) -> None:
     """Calibrate many cameras: images in, observations, camera files and one table out.
 
-    Writes NAME.obs.json and NAME.camera.json for each camera, and summary.csv. Finished work is kept in a folder
-    .work: the same command continues an interrupted run, and does only what is new when images, options or cameras
-    were added. A camera or an image that fails is listed with its reason and does not stop the others; the exit code
-    is then 1. Dask workers should have one thread each (--nthreads 1).
+    Writes NAME.obs.json and NAME.camera.json for each camera, and summary.csv. Cameras that saw one printed board
+    measure its errors together.
+
+    Finished work is kept in a folder .work: the same command continues an interrupted run, and does only what is new
+    when images, options or cameras were added. A camera or an image that fails is listed with its reason and does not
+    stop the others; the exit code is then 1. Dask workers should have one thread each (--nthreads 1).
 
     **Examples**
 
@@ -75,7 +81,7 @@ def batch_command(
     if model != "hybrid":
         LensModel.named(model)
     jobs = read_jobs(cameras, board, model)
-    options = BatchOptions(refine=refine.value, board_warp=board_warp, time_limit=time_limit)
+    options = BatchOptions(refine=refine.value, board_warp=board_warp, one_type=one_type, time_limit=time_limit)
     try:
         with steps("images and cameras", pieces(jobs)) as advance:
             report = calibrate_batch(jobs, output, options, workers=workers, scheduler=scheduler, progress=advance)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
+from rich.markup import escape
 
 from kcal.cli.console import out, print_table, print_wrote, steps, warn
-from kcal.errors import InputError
-from kcal.files import check_writable
+from kcal.errors import DegenerateError, InputError, KcalError
+from kcal.files import check_writable, make_folder
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
@@ -18,11 +19,22 @@ _PARAMETRIC = "Options of parametric models"
 
 
 def calibrate_command(
-    observations: Annotated[Path, typer.Argument(help="Observations file from `kcal detect`.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Camera file to write.")],
+    observations: Annotated[
+        list[Path],
+        typer.Argument(metavar="OBS...", help="Observations file of each camera, from `kcal detect`."),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", help="Camera file to write; of several cameras a folder, for a NAME.camera.json of each."
+        ),
+    ],
     picture: Annotated[
         Path | None,
-        typer.Option(help="PNG file to write: coverage, where the camera is uncertain, residuals, RMS of each view."),
+        typer.Option(
+            help="PNG file to write: coverage, where the camera is uncertain, residuals, RMS of each view; of several "
+            "cameras, NAME.png in this folder."
+        ),
     ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print every parameter with its σ.")] = False,
     board: Annotated[
@@ -35,6 +47,10 @@ def calibrate_command(
     ] = "printed",
     analog: Annotated[
         bool, typer.Option("--analog", help="Pixels may not be square: an analog camera behind a frame grabber.")
+    ] = False,
+    one_type: Annotated[
+        bool,
+        typer.Option("--one-type", help="The cameras, four or more, are of one type: each learns from the others."),
     ] = False,
     reject: Annotated[
         bool, typer.Option("--reject", help="Leave out and list corners and views that noise cannot explain.")
@@ -120,15 +136,19 @@ def calibrate_command(
         typer.Option(metavar="PX", help="Residual at which the robust loss sets in.", rich_help_panel=_PARAMETRIC),
     ] = 1.0,
 ) -> None:
-    """Calibrate one camera: intrinsics, lens and error bars.
+    """Calibrate a camera, or several: intrinsics, lens and error bars.
 
     There is no lens model to choose: the views themselves tell how much of each term of the lens, of the entrance
     pupil's movement and of the board's bending and print errors there is. A small RMS does not prove an accurate
     camera; read the uncertainty of far directions, in pixels, and what to photograph next.
 
+    Calibrate both cameras of a rig in one call: those that saw one printed board measure its errors together.
+
     **Examples**
 
     `kcal calibrate left.obs.json -o left.camera.json`
+
+    `kcal calibrate left.obs.json right.obs.json -o cameras`
 
     `kcal calibrate left.obs.json -o left.camera.json --picture left.png --verbose`
 
@@ -136,12 +156,7 @@ def calibrate_command(
     """
     from kcal.lens.model import LensModel
 
-    check_writable(output, observations)
-    if picture is not None:
-        from kcal.report.figures import check_picture
-
-        check_picture(picture)
-    name = name or observations.name.split(".")[0]
+    places = _camera_files(observations, output, picture, name)
     if model != "hybrid":
         LensModel.named(model)
     known = None
@@ -150,7 +165,7 @@ def calibrate_command(
 
         known = load_camera(camera)
 
-    from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+    from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.camera.outliers import OutlierRejection
     from kcal.calibrate.lensfit.measured_board import load_measured_board
     from kcal.corners.observations import Observations
@@ -173,16 +188,68 @@ def calibrate_command(
         loss=None if loss is None else RobustLoss(kind=loss, scale=loss_scale),  # type: ignore[arg-type]
         reject=OutlierRejection(limit=reject_limit) if reject else None,
     )
-    seen = Observations.load(observations)
+    sets = [Observations.load(place.observations) for place in places]
     with steps("calibrating", None) as advance:
-        result = calibrate_camera(seen, options, advance)
-    result.save(output, name=name, source=observations.name)
-    if picture is not None:
-        from kcal.report.calibration import save_calibration_picture
+        outcomes = (
+            calibrate_cameras(sets, options, advance)
+            if len(sets) > 1
+            else [calibrate_camera(sets[0], options, advance)]
+        )
+    failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
+    for place, result in zip(places, outcomes, strict=True):
+        if len(places) > 1:
+            out.print(f"[bold]{escape(place.name)}[/]")
+        if isinstance(result, KcalError):
+            warn(f"{place.name}: {result}")
+            continue
+        result.save(place.output, name=place.name, source=place.observations.name)
+        if place.picture is not None:
+            from kcal.report.calibration import save_calibration_picture
 
-        save_calibration_picture(picture, result)
-    _print_result(result, reject=reject, verbose=verbose or not options.hybrid)
-    print_wrote(output, picture)
+            save_calibration_picture(place.picture, result)
+        _print_result(result, reject=reject, verbose=verbose or not options.hybrid)
+        if result.shared_board is not None:
+            others = ", ".join(places[i].name for i in result.shared_board.others)
+            out.print(f"the board is that of {others} (evidence {result.shared_board.evidence:.0f} nats)", markup=False)
+        print_wrote(place.output, place.picture)
+    if failed:
+        raise DegenerateError(f"{len(failed)} of {len(places)} cameras failed: {', '.join(failed)}")
+
+
+class _CameraFiles(NamedTuple):
+    """Where the files of one camera are."""
+
+    observations: Path
+    output: Path
+    picture: Path | None
+    name: str
+
+
+def _camera_files(observations: list[Path], output: Path, picture: Path | None, name: str) -> list[_CameraFiles]:
+    """Files of each camera, all of which can be written."""
+    if len(observations) == 1:
+        places = [_CameraFiles(observations[0], output, picture, name or observations[0].name.split(".")[0])]
+    else:
+        if name:
+            raise InputError("--name names one camera; several are named after their observations files")
+        names = [path.name.split(".")[0] for path in observations]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"two observations files are named {twice}: their cameras would overwrite each other")
+        for folder in (output, picture):
+            if folder is not None:
+                make_folder(folder)
+        places = [
+            _CameraFiles(path, output / f"{name}.camera.json", picture and picture / f"{name}.png", name)
+            for path, name in zip(observations, names, strict=True)
+        ]
+    for place in places:
+        check_writable(place.output, *observations)
+        if place.picture is not None:
+            from kcal.report.figures import check_picture
+
+            check_picture(place.picture)
+    return places
 
 
 def _print_result(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:

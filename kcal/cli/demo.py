@@ -9,7 +9,7 @@ import typer
 
 from kcal.cli.demo_pairs import real_pairs
 from kcal.cli.demo_site import simulated_site
-from kcal.errors import FileError
+from kcal.files import make_folder
 
 
 def demo_command(
@@ -50,10 +50,7 @@ def demo_command(
 
     `kcal demo --images calibration/ --board 9x6 --square 25mm -o results`
     """
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"{output}: cannot make this folder: {error.strerror}") from error
+    make_folder(output)
     if images is None:
         simulated_site(output, seed)
         return

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from kcal.cli.console import out, print_table, steps
 from kcal.cli.demo_steps import SIDES, locate_again, print_results, run
-from kcal.files import write_atomic
+from kcal.files import make_folder, write_atomic
 
 if TYPE_CHECKING:
     from kcal.locate.positions import Located
@@ -103,8 +103,7 @@ def _render(scene: DemoScene, folder: Path) -> None:
 
     with steps("rendering", scene.images) as advance:
         for view in render_demo(scene, advance):
-            place = folder / f"{view.camera}-{view.kind}"
-            place.mkdir(parents=True, exist_ok=True)
+            place = make_folder(folder / f"{view.camera}-{view.kind}")
             write_png(place / f"{view.name}.png", view.image.numpy())
 
 

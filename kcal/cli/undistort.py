@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from kcal.cli.console import err, out, print_wrote, steps
 from kcal.errors import FileError, InputError
-from kcal.files import check_writable, read_bytes
+from kcal.files import check_writable, make_folder, read_bytes
 
 if TYPE_CHECKING:
     from kcal.lens.images import Undistort
@@ -111,10 +111,7 @@ def _outputs(paths: list[Path], folder: Path, others: list[Path]) -> list[Path]:
 
 def _prepare(folder: Path, files: list[Path]) -> None:
     """Make the folder, and refuse now what could not be written later."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"{folder}: cannot be made a folder: {error.strerror or error}") from error
+    make_folder(folder)
     for path in files:
         check_writable(path)
 

@@ -8,7 +8,7 @@ import pydantic
 import torch
 
 from kcal.io.record import Packed, Record
-from kcal.lens.information import CameraInformation
+from kcal.lens.information import CameraInformation, upper
 
 
 class InformationRecord(Record):
@@ -23,6 +23,7 @@ class InformationRecord(Record):
         triangle: upper triangle of R, row by row, each row followed by its element of r.
         mean: of the prior.
         sigma: of the prior; None where nothing was assumed.
+        others: what other cameras say of the board's unknowns, as `triangle`; None: nothing.
     """
 
     unknowns: tuple[tuple[str, ...], ...]
@@ -30,6 +31,7 @@ class InformationRecord(Record):
     triangle: Packed
     mean: tuple[float, ...]
     sigma: tuple[pydantic.PositiveFloat | None, ...]
+    others: Packed | None = None
 
     @pydantic.model_validator(mode="after")
     def _fits(self) -> InformationRecord:
@@ -39,6 +41,8 @@ class InformationRecord(Record):
             raise ValueError("information: a name occurs twice, or an unknown has none")
         if (len(self.mean), len(self.sigma), self.triangle.shape) != (count, count, (count * (count + 3) // 2,)):
             raise ValueError(f"information: mean, sigma and triangle must be those of {count} unknowns")
+        if self.others is not None and self.others.shape != (len(self.board) * (len(self.board) + 3) // 2,):
+            raise ValueError(f"information: others must be about the {len(self.board)} unknowns of the board")
         return self
 
     @classmethod
@@ -48,23 +52,21 @@ class InformationRecord(Record):
         for name, slot in zip(names, known.slots, strict=True):
             if slot >= 0:
                 groups[slot].append(name)
-        rows = known.triangle()
-        row, column = torch.triu_indices(*rows.shape)
+        others = None if known.others is None else Packed.of(_above(upper(known.others)))
         return cls(
             unknowns=tuple(map(tuple, groups)),
             board=tuple(known.estimate[known.lens_size :].tolist()),
-            triangle=Packed.of(rows[row, column]),
+            triangle=Packed.of(_above(known.triangle())),
             mean=tuple(known.mean.tolist()),
             sigma=tuple(value if math.isfinite(value) else None for value in known.sigma.tolist()),
+            others=others,
         )
 
     def information(self, values: dict[str, float]) -> CameraInformation:
         """What is known of a camera with these values of its parameters, by name, in their order."""
         slots = {name: slot for slot, group in enumerate(self.unknowns) for name in group}
         lens, count = [values[group[0]] for group in self.unknowns], len(self.mean)
-        rows = torch.zeros(count, count + 1, dtype=torch.float64)
-        row, column = torch.triu_indices(count, count + 1)
-        rows[row, column] = self.triangle.tensor()
+        rows = _triangle_of(self.triangle.tensor(), count)
         return CameraInformation(
             slots=tuple(slots.get(name, -1) for name in values),
             estimate=torch.tensor([*lens, *self.board], dtype=torch.float64),
@@ -72,4 +74,19 @@ class InformationRecord(Record):
             residuals=rows[:, -1],
             mean=torch.tensor(self.mean, dtype=torch.float64),
             sigma=torch.tensor([math.inf if value is None else value for value in self.sigma], dtype=torch.float64),
+            others=None if self.others is None else _triangle_of(self.others.tensor(), len(self.board)),
         )
+
+
+def _above(rows: torch.Tensor) -> torch.Tensor:
+    """Elements of rows (C, C + 1) from the diagonal on."""
+    row, column = torch.triu_indices(*rows.shape)
+    return rows[row, column]
+
+
+def _triangle_of(elements: torch.Tensor, count: int) -> torch.Tensor:
+    """(C, C + 1) rows with these elements."""
+    rows = torch.zeros(count, count + 1, dtype=torch.float64)
+    row, column = torch.triu_indices(count, count + 1)
+    rows[row, column] = elements
+    return rows

@@ -36,6 +36,8 @@ class CameraInformation:
         residuals: (R,) of these rows at the estimate.
         mean: (U,) of the prior.
         sigma: (U,) of the prior; infinite where nothing was assumed.
+        others: (Q, B + 1) what other cameras say of the board's unknowns, in standard deviations; the last column holds
+            the residuals at the estimate. None: nothing. A rig with such a camera and these others uses their own rows.
 
     Raises:
         InputError: shapes that do not fit each other, or values that are not finite.
@@ -53,6 +55,7 @@ class CameraInformation:
     residuals: Tensor
     mean: Tensor
     sigma: Tensor
+    others: Tensor | None = None
 
     def __post_init__(self) -> None:
         count = len(self.estimate)
@@ -61,7 +64,12 @@ class CameraInformation:
             raise InputError(f"information: shapes that do not fit each other: {shapes}")
         if self.lens_size > count or not all(slot >= -1 for slot in self.slots):
             raise InputError(f"information: slots up to {self.lens_size - 1}, but {count} unknowns")
-        if not all(bool(t.isfinite().all()) for t in (self.estimate, self.rows, self.residuals, self.mean)):
+        others = [] if self.others is None else [self.others]
+        if any(rows.shape[-1] != self.board_size + 1 for rows in others):
+            raise InputError(
+                f"information: rows of others have {others[0].shape[-1]} columns, not {self.board_size + 1}"
+            )
+        if not all(bool(t.isfinite().all()) for t in (self.estimate, self.rows, self.residuals, self.mean, *others)):
             raise InputError("information: values that are not finite")
         if not bool((self.sigma > 0).all()):
             raise InputError("information: sigmas of the prior must be positive")
@@ -111,17 +119,20 @@ class CameraInformation:
         rows = torch.cat([torch.diag(weight), ((self.estimate - self.mean) * weight)[:, None]], 1)
         return rows[known]
 
+    def board_rows(self) -> Tensor:
+        """(Q, U + 1) likewise of all that is known of the board otherwise: its prior, and what other cameras say."""
+        prior = self.prior_rows(board=True)
+        if self.others is None:
+            return prior
+        return torch.cat([prior, torch.cat([self.others.new_zeros(len(self.others), self.lens_size), self.others], 1)])
+
     def all_rows(self) -> Tensor:
-        """(R + Q, U + 1) rows of data and prior."""
-        return torch.cat([self.data_rows(), self.prior_rows(board=False), self.prior_rows(board=True)])
+        """(R + Q, U + 1) rows of data, priors, and what other cameras say of the board."""
+        return torch.cat([self.data_rows(), self.prior_rows(board=False), self.board_rows()])
 
     def triangle(self) -> Tensor:
         """(U, U + 1) upper triangle of the data's rows, their residuals last; the rest says nothing of the unknowns."""
-        together = self.data_rows()
-        square = len(together) == len(self.estimate)
-        if square and not bool(together.tril(-1).any()):
-            return together
-        return triangular(together)[:-1]
+        return upper(self.data_rows())
 
     def half(self) -> Tensor:
         """(U, U): halfᵀ half is the covariance of the unknowns; what nothing determines has a very large one."""
@@ -150,7 +161,7 @@ class CameraInformation:
         if not self.board_size:
             return self
         # The board's columns first: below its triangle, rows say nothing of it.
-        rows, board = torch.cat([self.data_rows(), self.prior_rows(board=True)]), self.board_size
+        rows, board = torch.cat([self.data_rows(), self.board_rows()]), self.board_size
         order = [*range(count, count + board), *range(count), count + board]
         triangle = triangular(rows[:, order])[board : board + count, board:]
         return CameraInformation(
@@ -168,6 +179,13 @@ def triangular(rows: Tensor) -> Tensor:
     missing = max(0, rows.shape[1] - len(rows))
     padded = torch.cat([rows, rows.new_zeros(missing, rows.shape[1])])
     return torch.linalg.qr(padded, mode="r")[1]
+
+
+def upper(rows: Tensor) -> Tensor:
+    """(C, C + 1) upper triangle of rows (R, C + 1); what is one already stays as it is, to the last bit."""
+    if len(rows) == rows.shape[1] - 1 and not bool(rows.tril(-1).any()):
+        return rows
+    return triangular(rows)[:-1]
 
 
 def unit_scale(rows: Tensor) -> Tensor:

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import kcal
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
+from kcal.calibrate.camera.options import HYBRID
 from kcal.checks import ImageSize
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
@@ -39,11 +40,13 @@ class BatchOptions:
     Args:
         refine: how corners are refined, see `kcal.corners.refine.refine_corners`.
         board_warp: also estimate how each board bends.
+        one_type: the cameras are of one type: each learns from the others what its lens is like.
         time_limit: seconds for one image or one calibration, after which it is given up.
     """
 
     refine: Refinement = "erf"
     board_warp: bool = False
+    one_type: bool = False
     time_limit: float = 300.0
 
 
@@ -111,8 +114,15 @@ def read_jobs(source: Path, board: Board | None, model: str) -> list[CameraJob]:
 
 
 def pieces(jobs: Sequence[CameraJob]) -> int:
-    """Count the pieces of work: one for each image and one for each camera."""
-    return sum(len(job.images) + (not job.error) for job in jobs)
+    """Count the pieces of work: one for each image, for each camera, and for each that shares its kind of board."""
+    return sum(len(job.images) + (not job.error) for job in jobs) + sum(map(len, sharing_jobs(jobs)))
+
+
+def sharing_jobs(jobs: Sequence[CameraJob]) -> list[list[int]]:
+    """Which cameras may have seen one board: those with the hybrid lens and boards of one kind."""
+    hybrid = [i for i, job in enumerate(jobs) if not job.error and job.model == HYBRID]
+    kinds = {str(jobs[i].board): [j for j in hybrid if jobs[j].board == jobs[i].board] for i in hybrid}
+    return [numbers for numbers in kinds.values() if len(numbers) > 1]
 
 
 def _job(source: Path, row: dict[str, str], board: Board | None, model: str) -> CameraJob:
@@ -203,14 +213,33 @@ def observations_of(job: CameraJob, pieces: list[Detected], digests: list[str], 
     )
 
 
+def options_of(model: str, options: BatchOptions) -> CalibrationOptions:
+    """How cameras of this model are calibrated."""
+    return CalibrationOptions(model=model, board_warp=options.board_warp)
+
+
+def calibrate_again(seen: Observations, options: BatchOptions) -> CameraCalibrationResult | KcalError:
+    """One camera with the hybrid lens, with all that its calibration tells, or why there is none."""
+    with _time_limit(options.time_limit):
+        try:
+            return calibrate_camera(seen, options_of(HYBRID, options))
+        except KcalError as error:
+            return error
+
+
+def calibrated(result: CameraCalibrationResult, name: str) -> Calibrated:
+    """What is kept of a calibration."""
+    return Calibrated(camera=result.file(name=name, source=f"{name}.obs.json"), warnings=result.warnings)
+
+
 def calibrate_observations(seen: Observations, name: str, model: str, options: BatchOptions) -> Calibrated:
     """Calibrate one camera."""
     with _time_limit(options.time_limit):
         try:
-            result = calibrate_camera(seen, CalibrationOptions(model=model, board_warp=options.board_warp))
+            result = calibrate_camera(seen, options_of(model, options))
         except KcalError as error:
             return Calibrated(error=str(error))
-        return Calibrated(camera=result.file(name=name, source=f"{name}.obs.json"), warnings=result.warnings)
+        return calibrated(result, name)
 
 
 @contextmanager

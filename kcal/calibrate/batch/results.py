@@ -13,17 +13,24 @@ from kcal.calibrate.batch.jobs import (
     Calibrated,
     CameraJob,
     Detected,
+    calibrate_again,
     calibrate_observations,
+    calibrated,
     detect_image,
     detection_key,
     hash_of,
     observations_of,
+    options_of,
     pieces,
+    sharing_jobs,
 )
-from kcal.calibrate.batch.workers import Task, WorkerDiedError, pool, run_tasks
+from kcal.calibrate.batch.workers import Pool, Task, WorkerDiedError, pool, run_tasks
+from kcal.calibrate.camera.options import HYBRID
+from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.sharing import sharing
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, KcalError
-from kcal.files import NativeFile, dump_json, read_bytes, write_atomic
+from kcal.files import NativeFile, dump_json, make_folder, read_bytes, write_atomic
 from kcal.strict_json import MOST_BYTES, read_json
 from kcal.texts import csv_line
 
@@ -79,7 +86,8 @@ def calibrate_batch(
     """Calibrate many cameras from their images, in parallel.
 
     Writes NAME.obs.json and NAME.camera.json for each camera, and summary.csv. Finished pieces of work are kept in a
-    folder `.work`: the same call continues an interrupted run. A camera that fails does not stop the others.
+    folder `.work`: the same call continues an interrupted run. A camera that fails does not stop the others. When all
+    are done, cameras with the hybrid lens that saw one printed board share what they know of it.
 
     Args:
         jobs: the cameras, from `kcal.calibrate.batch.jobs.read_jobs`.
@@ -97,6 +105,8 @@ def calibrate_batch(
     results = Results(folder, jobs, options or BatchOptions())
     with pool(workers or os.cpu_count() or 1, scheduler) as crew:
         run_tasks(results.tasks(progress), results.done, crew)
+        for numbers in sharing_jobs(jobs):
+            results.share(numbers, crew)
     rows = results.rows()
     return BatchReport(rows, write_summary(folder / "summary.csv", rows), results.reused, pieces(jobs))
 
@@ -116,11 +126,7 @@ class Results:
     def __init__(self, folder: Path, jobs: Sequence[CameraJob], options: BatchOptions) -> None:
         self.folder, self.jobs, self.options = folder, jobs, options
         self.reused = 0
-        self._work = folder / ".work"
-        try:
-            self._work.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FileError(f"{folder}: cannot make this folder: {error.strerror}") from error
+        self._work = make_folder(folder / ".work")
         self._advance: Callable[[str], None] = lambda _: None
         self._pieces: list[list[Detected | None]] = [[None] * len(job.images) for job in jobs]
         self._digests: list[list[str]] = [[""] * len(job.images) for job in jobs]
@@ -196,6 +202,51 @@ class Results:
         else:
             path.unlink(missing_ok=True)  # of an earlier run with other images: not this one's result
         self._advance(self.jobs[number].name)
+
+    def share(self, numbers: Sequence[int], crew: Pool) -> None:
+        """Calibrate cameras that may have seen one board again, each with the board as the others measured it."""
+        good = [i for i in numbers if self._calibrated[i].camera is not None]
+        everything = hash_of("together", self.options, [self._views[i].dump() for i in good])
+        keys = {i: hash_of("shared", everything, self.jobs[i].name) for i in good}
+        kept = {i: self._load(Calibrated, key) for i, key in keys.items()} if len(good) > 1 else {}
+        if len(good) > 1 and any(piece is None for piece in kept.values()):
+            try:
+                alone = self._each(calibrate_again, {i: (self._views[i], self.options) for i in good}, crew)
+                found = sharing(
+                    [alone[i] for i in good],
+                    options_of(HYBRID, self.options),
+                    one_type=self.options.one_type,
+                    run=lambda function, tasks: self._each(function, tasks, crew).items(),
+                )
+            except WorkerDiedError as error:
+                # What is there is good: cameras that know their own views only.
+                note = f"calibrated alone, without what other cameras tell of the board: {error}"
+                for i in good:
+                    before = self._calibrated[i]
+                    kept[i] = before.model_copy(update={"warnings": (*before.warnings, note)})
+                found = []
+            for i, result in zip(good, found, strict=False):
+                if isinstance(result, CameraCalibrationResult):
+                    piece = calibrated(result, self.jobs[i].name)
+                    self._keep(keys[i], piece)
+                    kept[i] = piece
+        for i in numbers:
+            self._finish(i, kept.get(i) or self._calibrated[i])
+
+    def _each(self, function: Callable[..., Any], tasks: dict[int, tuple[Any, ...]], crew: Pool) -> dict[int, Any]:
+        """Call a function with each of the numbered arguments on the workers."""
+        found: dict[int, Any] = {}
+
+        def done(task: Task, outcome: Any) -> list[Task]:
+            if isinstance(outcome, Exception) and not isinstance(outcome, KcalError):
+                raise outcome
+            if isinstance(outcome, WorkerDiedError):
+                raise outcome
+            found[task.tag] = outcome
+            return []
+
+        run_tasks((Task(i, function, arguments) for i, arguments in tasks.items()), done, crew)
+        return found
 
     def rows(self) -> list[SummaryRow]:
         """The table, in the order of the cameras."""

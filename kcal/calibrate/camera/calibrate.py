@@ -13,6 +13,7 @@ from kcal.calibrate.camera.hybrid import calibrate_hybrid
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.outliers import solve_without_outliers
 from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.sharing import sharing
 from kcal.calibrate.camera.solve import solve
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
@@ -86,9 +87,14 @@ def calibrate_cameras(
     options: CalibrationOptions | None = None,
     progress: Progress = _silent,
     *,
+    one_type: bool = False,
     device: torch.device | str = "cpu",
 ) -> list[CameraCalibrationResult | KcalError]:
-    """Calibrate many cameras with the same options, as `calibrate_camera` calibrates one.
+    """Calibrate several cameras with the same options.
+
+    Each is calibrated as by `calibrate_camera`. Cameras with the hybrid lens that saw one printed board then share
+    what they know of its bending and print errors; the evidence tells which of them saw one
+    (`CameraCalibrationResult.shared_board`). Five views of a camera are worth more with the board that others measured.
 
     Alike minimizations of several cameras are solved as one batch (`kcal.calibrate.bundle.batching`). Cameras with few
     views, where most time is overhead of operations on small tensors, take a fraction of the time of single calls.
@@ -98,12 +104,16 @@ def calibrate_cameras(
         observations: the views of each camera; numbers of views, image sizes and missing corners may differ.
         options: for all of them.
         progress: called with how many are finished.
+        one_type: the cameras are of one type: from four cameras on, each learns from the others what its lens is like.
         device: where batches are minimized. Results are on the CPU.
 
     Returns:
-        for each camera what `calibrate_camera` returns, within the solver's tolerance, or the error that it would have
-        raised: one bad set does not affect the others. Where a rich model has several minima with nearly equal cost,
-        rounding may lead to another one.
+        for each camera what `calibrate_camera` returns, or the error that it would have raised: one bad set does not
+        affect the others. Parametric models agree within the solver's tolerance; where a rich one has several minima
+        with nearly equal cost, rounding may lead to another one.
+
+    Raises:
+        InputError: `one_type` with a parametric model, or with images of several sizes.
 
     Example:
         >>> from kcal.corners.board import Board
@@ -115,8 +125,9 @@ def calibrate_cameras(
     """
     options = options or CalibrationOptions()
     count = len(observations)
-    return together(
+    alone = together(
         [functools.partial(calibrate_camera, seen, options) for seen in observations],
         torch.device(device),
         lambda done: progress(f"{done} of {count} cameras"),
     )
+    return sharing(alone, options, one_type=one_type, advance=lambda name: progress(f"camera {name} with the others"))

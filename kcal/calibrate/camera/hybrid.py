@@ -51,7 +51,7 @@ def calibrate_hybrid(
     fit = _fit_views(observations, pixels, torch.ones_like(pixels[..., 0]), None, options, progress)
     if options.weighted and observations.covariances() is not None:
         fit = _fit_views(observations, pixels, _weights(observations, fit.residuals), fit, options, progress)
-    return _result(observations, fit, options)
+    return hybrid_result(observations, fit, options)
 
 
 def _fit_views(
@@ -137,11 +137,11 @@ def _without_outliers(
         )
         for i, n in rejected.nonzero().tolist()
     )
-    result = _result(observations, fit, options)
+    result = hybrid_result(observations, fit, options)
     return dataclasses.replace(result, rejected_corners=corners, rejected_views=tuple(views))
 
 
-def _result(observations: Observations, fit: HybridFit, options: CalibrationOptions) -> CameraCalibrationResult:
+def hybrid_result(observations: Observations, fit: HybridFit, options: CalibrationOptions) -> CameraCalibrationResult:
     """The result of a fit, with its warnings.
 
     Raises:

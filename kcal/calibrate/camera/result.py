@@ -55,6 +55,19 @@ class RejectedView:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class SharedBoard:
+    """That a camera shared its board with others with which it was calibrated.
+
+    Args:
+        others: their places among the cameras, from 0.
+        evidence: nats by which one board for all is better than another one for this camera.
+    """
+
+    others: tuple[int, ...]
+    evidence: float
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class CameraCalibrationResult:
     """A calibrated camera with its residuals and error bars.
 
@@ -87,6 +100,8 @@ class CameraCalibrationResult:
             be more than 1.4 times as large.
         rejected_corners: corners of the views that were used, left out by `CalibrationOptions.reject`.
         rejected_views: views left out likewise.
+        shared_board: which cameras helped to measure the board, where several were calibrated together. Errors of such
+            cameras are not quite independent of each other; a rig of them knows that.
     """
 
     camera: Camera
@@ -110,6 +125,7 @@ class CameraCalibrationResult:
     led_by_prior: tuple[str, ...] = ()
     rejected_corners: tuple[RejectedCorner, ...] = ()
     rejected_views: tuple[RejectedView, ...] = ()
+    shared_board: SharedBoard | None = None
 
     def __post_init__(self) -> None:
         """Give the camera its error bars and history, which it keeps until its parameters change."""

@@ -7,6 +7,7 @@ multiply: their rows are stacked, and one QR decomposition gives mean, covarianc
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,30 +19,7 @@ from torch import Tensor
 
 from kcal.calibrate.lensfit.board_modes import KNOWN, BoardModes
 from kcal.calibrate.lensfit.evidence import BOARD, Hyperprior, typical_hyperprior
-
-
-class BoardPrior(NamedTuple):
-    """A Gaussian over the amplitudes of a board's modes.
-
-    Attributes:
-        mean: (B,) meters.
-        half: (B, B); halfᵀ half is the covariance.
-    """
-
-    mean: Tensor
-    half: Tensor
-
-    def applied(self, points: Tensor, modes: BoardModes) -> tuple[Tensor, BoardModes]:
-        """Change variables: the mean board, and modes whose amplitudes have unit variance and no hyperparameter.
-
-        Args:
-            points: (N, 3) the board as ordered, meters.
-            modes: of that board.
-        """
-        shapes = torch.einsum("ab,bkn->akn", self.half, modes.shapes)
-        unit = torch.ones_like(modes.unit)
-        known = BoardModes(shapes, unit, torch.full_like(modes.family, KNOWN))
-        return points + torch.einsum("b,bkn->nk", self.mean, modes.shapes), known
+from kcal.lens.information import CameraInformation
 
 
 class BoardMessage(NamedTuple):
@@ -58,6 +36,56 @@ class BoardMessage(NamedTuple):
     def turned(self, turn: Tensor) -> BoardMessage:
         """The same message about the amplitudes a' = turn a; turns (B, B) are orthogonal."""
         return self._replace(root=self.root @ turn.T)
+
+
+class BoardPrior(NamedTuple):
+    """A Gaussian over the amplitudes of a board's modes.
+
+    Attributes:
+        mean: (B,) meters.
+        half: (B, B); halfᵀ half is the covariance.
+        sigma: (B,) of a printed board's modes, whose mean is zero, before others told of it; None: it is not made so.
+        told: what they told.
+    """
+
+    mean: Tensor
+    half: Tensor
+    sigma: Tensor | None = None
+    told: BoardMessage | None = None
+
+    def applied(self, points: Tensor, modes: BoardModes) -> tuple[Tensor, BoardModes]:
+        """Change variables: the mean board, and modes whose amplitudes have unit variance and no hyperparameter.
+
+        Args:
+            points: (N, 3) the board as ordered, meters.
+            modes: of that board.
+        """
+        shapes = torch.einsum("ab,bkn->akn", self.half, modes.shapes)
+        unit = torch.ones_like(modes.unit)
+        known = BoardModes(shapes, unit, torch.full_like(modes.family, KNOWN))
+        return points + torch.einsum("b,bkn->nk", self.mean, modes.shapes), known
+
+    def in_modes(self, known: CameraInformation, amplitudes: Tensor) -> CameraInformation:
+        """What is known of a camera and of the variables of `applied`, by the board's own modes and what others told.
+
+        Args:
+            known: with these variables as the board's unknowns.
+            amplitudes: (B,) of the modes at the estimate.
+        """
+        if self.sigma is None or self.told is None:
+            # Modes of a board that was measured are not its own: what is said of the camera, whatever the board is.
+            return known.without_board()
+        lens = known.lens_size
+        by_modes = torch.linalg.solve_triangular(self.half, known.rows[:, lens:].T, upper=False).T
+        residuals = self.told.root @ amplitudes - self.told.target
+        return dataclasses.replace(
+            known,
+            estimate=torch.cat([known.estimate[:lens], amplitudes]),
+            rows=torch.cat([known.rows[:, :lens], by_modes], 1),
+            mean=torch.cat([known.mean[:lens], torch.zeros_like(amplitudes)]),
+            sigma=torch.cat([known.sigma[:lens], self.sigma]),
+            others=torch.cat([self.told.root, residuals[:, None]], 1),
+        )
 
 
 class BoardPosterior(NamedTuple):
@@ -102,6 +130,18 @@ def multiplied(prior: BoardPrior, messages: Sequence[BoardMessage]) -> BoardPost
     return BoardPosterior(BoardPrior(prior.mean + prior.half.T @ mean, half), float(log_evidence))
 
 
+def merged(messages: Sequence[BoardMessage]) -> BoardMessage:
+    """All that they say, in one message of few rows."""
+    rows = torch.cat([torch.cat([m.root, m.target[:, None]], 1) for m in messages])
+    triangle = torch.linalg.qr(rows, mode="r")[1]
+    return BoardMessage(triangle[:, :-1], triangle[:, -1])
+
+
+def told_by_others(prior: BoardPrior, message: BoardMessage) -> BoardPrior:
+    """A printed board after others told of it."""
+    return multiplied(prior, [message]).board._replace(sigma=prior.half.diagonal(), told=message)
+
+
 def printed_prior(modes: BoardModes, amplitudes: Tensor) -> BoardPrior:
     """The prior of a printed board, from the ln amplitudes (3,) of its families of modes."""
     return BoardPrior(torch.zeros_like(modes.unit), torch.diag(modes.unit * torch.exp(amplitudes[modes.family])))
@@ -122,7 +162,7 @@ def printed_board(
 
     def objective(h: np.ndarray) -> tuple[float, np.ndarray]:
         prior = printed_prior(modes, torch.from_numpy(h))
-        (at, half), log_evidence = multiplied(prior, messages)
+        (at, half, *_), log_evidence = multiplied(prior, messages)
         by_deviation = 1.0 - ((at.square() + half.square().sum(0)) / prior.half.diagonal().square()).numpy()
         z = (h - mean) / deviation
         slope = np.bincount(family, by_deviation, len(h))

@@ -8,23 +8,27 @@ others as its prior of the board.
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable, Sequence
-from typing import Literal, cast
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_orders import CLEAR, mode_turn, quarter_turns
-from kcal.calibrate.lensfit.board_prior import BoardMessage, BoardPrior, multiplied, printed_board
+from kcal.calibrate.lensfit.board_groups import compared, grouped, others_of
+from kcal.calibrate.lensfit.board_prior import BoardPrior, multiplied, printed_board, told_by_others
 from kcal.calibrate.lensfit.evidence import Hyperprior, typical_hyperprior
 from kcal.calibrate.lensfit.fleet import LEAST_CAMERAS, LensPrior, fleet_priors, typical_lens
+from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.calibrate.lensfit.turned_fit import CameraFit, Shape, fit_turned
-from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.lens.zernike import ZernikeModes
+
+# Calls a function for each of the numbered argument lists; numbers and results come in any order.
+Run = Callable[[Callable[..., CameraFit], dict[int, tuple[Any, ...]]], Iterable[tuple[int, CameraFit]]]
+# Of one fit: turns, shape, lens, a fit to begin with, a fit that is taken as it is.
+_Task = tuple[Tensor | None, Shape, LensPrior | None, HybridFit | None, HybridFit | None]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,6 +55,8 @@ def fit_cameras(
     board: Literal["printed", "exact"] | MeasuredBoard = "printed",
     one_type: bool = False,
     passes: int = 1,
+    first: Sequence[HybridFit] | None = None,
+    run: Run | None = None,
     advance: Callable[[str], None] | None = None,
 ) -> CamerasFit:
     """Fit cameras that saw one board, or several.
@@ -63,6 +69,8 @@ def fit_cameras(
         board: how boards differ from the ones that were ordered: as printers err, not at all, or as was measured.
         one_type: the cameras are of one type: from four cameras on, each learns from the others what its lens is like.
         passes: how often the cameras are fitted again, with what the others tell, after they were fitted alone.
+        first: fits of each camera alone with these weights and this board, if there are any.
+        run: makes the fits of one pass, for example on other processes; one after the other if not given.
         advance: called with a text after each fit.
 
     Raises:
@@ -83,45 +91,57 @@ def fit_cameras(
             known = board.prior_for(seen.board.points)
     each, alone = range(len(sets)), cast(Shape, "exact" if board == "exact" else "printed")
 
-    fitted: dict[int, Tensor] = {}
+    run = run or _one_by_one
 
-    def fit(i: int, shape: Shape, before: CameraFit | None = None, lens: LensPrior | None = None) -> CameraFit:
-        turns = None if before is None else before.turns
-        # Views that were turned since, and lenses of another form, have other unknowns.
-        same = before is not None and lens is None and torch.equal(before.turns, fitted[i])
-        start = before.fit if before is not None and same else None
-        found = fit_turned(sets[i], weights[i], modes, turns, shape, lens, start)
-        fitted[i] = found.turns
-        if advance is not None:
-            advance(names[i])
+    def fit(tasks: dict[int, _Task]) -> dict[int, CameraFit]:
+        """Fits of some cameras; each is told on as it ends."""
+        found = {}
+        for i, camera in run(fit_turned, {i: (sets[i], weights[i], modes, *task) for i, task in tasks.items()}):
+            found[i] = camera
+            if advance is not None:
+                advance(names[i])
         return found
 
-    cameras = [fit(i, alone) for i in each]
+    begun = fit({i: (None, alone, None, None, first[i] if first else None) for i in each})
+    cameras = [begun[i] for i in each]
+    fitted = [camera.turns for camera in cameras]
     if known is not None:
-        cameras = [_compared(camera, known, seen.board) for camera, seen in zip(cameras, sets, strict=True)]
+        cameras = [compared(camera, known, seen.board) for camera, seen in zip(cameras, sets, strict=True)]
     elif alone == "printed":
-        cameras = _grouped(cameras, [seen.board for seen in sets])
+        cameras = grouped(cameras, [seen.board for seen in sets])
     fleet = one_type and len(sets) >= LEAST_CAMERAS
     lens = _begun_fleet(cameras) if fleet else None
     lenses = [lens] * len(sets)
     for turn in range(max(passes, 2) if fleet else passes):
         if lens is not None and turn == 1:
             lens, lenses[:] = _learned_fleet(cameras, lens)
-        before = list(cameras)
-        for i in each:
-            same = [camera.message for j, camera in enumerate(before) if j != i and camera.board == before[i].board]
+        tasks: dict[int, _Task] = {}
+        others = [others_of(cameras, k) for k in range(1 + max(camera.board for camera in cameras))]
+        for i, camera in enumerate(cameras):
+            same = others[camera.board][i] if camera.board >= 0 else None
             shape = alone if known is None else known
-            if shape == "printed" and same:
-                base, _ = printed_board(before[i].fit.board_shapes, [before[i].message, *same])
-                shape = multiplied(base, same).board
+            if shape == "printed" and same is not None:
+                base, _ = printed_board(camera.fit.board_shapes, [camera.message, same])
+                shape = told_by_others(base, same)
             if fleet or shape is not alone:
-                again = fit(i, shape, before[i], lenses[i])
-                cameras[i] = dataclasses.replace(again, board=before[i].board, nats=before[i].nats)
+                # Views that were turned since, and lenses of another form, have other unknowns.
+                kept = lenses[i] is None and torch.equal(camera.turns, fitted[i])
+                tasks[i] = camera.turns, shape, lenses[i], camera.fit if kept else None, None
+        for i, again in fit(tasks).items():
+            fitted[i] = again.turns
+            cameras[i] = dataclasses.replace(again, board=cameras[i].board, nats=cameras[i].nats)
     if isinstance(board, MeasuredBoard):
         boards = [board]
     else:
         boards = [_measured(k, sets, names, cameras) for k in range(1 + max(camera.board for camera in cameras))]
     return CamerasFit(cameras=tuple(cameras), boards=tuple(boards), lens=lens)
+
+
+def _one_by_one(
+    function: Callable[..., CameraFit], tasks: dict[int, tuple[Any, ...]]
+) -> Iterator[tuple[int, CameraFit]]:
+    for i, arguments in tasks.items():
+        yield i, function(*arguments)
 
 
 def measure_board(
@@ -170,63 +190,6 @@ def _learned_fleet(cameras: Sequence[CameraFit], typical: LensPrior) -> tuple[Le
     """The lens of the next camera, and each camera's from all others: what a camera tells does not enter its prior."""
     following, each = fleet_priors([camera.lens for camera in cameras], Hyperprior(typical.mean, typical.sd))
     return typical._replace(**following._asdict()), [typical._replace(**prior._asdict()) for prior in each]
-
-
-def _evidence(messages: Sequence[BoardMessage], like: CameraFit) -> float:
-    """Log evidence of messages about one printed board."""
-    return printed_board(like.fit.board_shapes, messages)[1] if messages else 0.0
-
-
-def _gain(camera: CameraFit, others: Sequence[CameraFit]) -> float:
-    """Nats by which one board for all is better than one for the camera and one for the others."""
-    messages = [other.message for other in others]
-    alone = _evidence([camera.message], camera) + _evidence(messages, camera)
-    return _evidence([camera.message, *messages], camera) - alone
-
-
-def _turned(camera: CameraFit, turn: int) -> CameraFit:
-    """With all views read from another end."""
-    message = camera.message.turned(mode_turn(turn))
-    return dataclasses.replace(camera, turns=(camera.turns + turn) % 4, message=message)
-
-
-def _grouped(cameras: Sequence[CameraFit], kinds: Sequence[Board]) -> list[CameraFit]:
-    """Put each camera to the board, among those of its kind, that it shares with most evidence, or to a new one."""
-    out, groups = list(cameras), list[list[int]]()
-    # Those that know most begin: they have most to lose from another's board.
-    known = [float(camera.message.root.square().sum()) for camera in cameras]
-    for i in sorted(range(len(out)), key=lambda i: -known[i]):
-        best: tuple[float, CameraFit, list[int]] = (0.0, out[i], [])
-        for group in groups:
-            if kinds[group[0]] == kinds[i]:
-                for turn in quarter_turns(kinds[i]):
-                    camera = _turned(cameras[i], turn)
-                    # Read from another end only where that is clear.
-                    gain = _gain(camera, [out[j] for j in group]) - (CLEAR if turn else 0.0)
-                    best = max(best, (gain, camera, group), key=lambda found: found[0])
-        _, out[i], group = best
-        if not group:
-            groups.append(group)
-        group.append(i)
-    # Boards are numbered by their first cameras.
-    for k, group in enumerate(sorted(groups, key=min)):
-        for i in group:
-            rivals = [[j for j in group if j != i]] if len(group) > 1 else [g for g in groups if g is not group]
-            gains = [_gain(out[i], [out[j] for j in g]) for g in rivals if kinds[g[0]] == kinds[i]]
-            out[i] = dataclasses.replace(out[i], board=k, nats=max(gains, default=math.nan))
-    return out
-
-
-def _compared(camera: CameraFit, known: BoardPrior, kind: Board) -> CameraFit:
-    """With the evidence that the board is the measured one, and all views turned if it was read from another end."""
-
-    def nats(camera: CameraFit) -> float:
-        return multiplied(known, [camera.message]).log_evidence - _evidence([camera.message], camera)
-
-    best = camera
-    for turn in quarter_turns(kind)[1:]:
-        best = max(best, _turned(camera, turn), key=lambda found: nats(found) + CLEAR * (found is camera))
-    return dataclasses.replace(best, board=0, nats=nats(best))
 
 
 def _measured(

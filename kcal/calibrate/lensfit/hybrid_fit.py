@@ -58,6 +58,7 @@ class HybridFit:
         board_shapes: modes of the board.
         board_points: (N, 3) meters, the board as it was measured.
         residuals: (V, N, 2) projected minus observed, pixels, weights left out; NaN where a corner did not count.
+        weights: (V, N) by which the residuals were multiplied.
         weighted_rms: sqrt(mean w² ‖r‖²), pixels.
         iterations: trial steps of the solver.
         converged: whether the hyperparameters came to rest.
@@ -87,6 +88,7 @@ class HybridFit:
     board_shapes: BoardModes
     board_points: Tensor
     residuals: Tensor
+    weights: Tensor
     weighted_rms: float
     iterations: int
     converged: bool
@@ -104,6 +106,12 @@ class HybridFit:
         )
         return torch.where(valid[..., None], found, torch.inf) - pixels
 
+    def only(self, views: Sequence[int]) -> HybridFit:
+        """This fit with some of its views; the others were left out of it."""
+        at, state = list(views), self.state
+        state = state._replace(rotation=state.rotation[at], translation=state.translation[at])
+        return dataclasses.replace(self, state=state, residuals=self.residuals[at], weights=self.weights[at])
+
     def among(self, views: Sequence[int], count: int) -> HybridFit:
         """This fit of some views as one of `count` views: NaN for the others."""
 
@@ -113,7 +121,7 @@ class HybridFit:
             return out
 
         state = self.state._replace(rotation=of_all(self.state.rotation), translation=of_all(self.state.translation))
-        return dataclasses.replace(self, state=state, residuals=of_all(self.residuals))
+        return dataclasses.replace(self, state=state, residuals=of_all(self.residuals), weights=of_all(self.weights))
 
     @property
     def covariance(self) -> Tensor:
@@ -246,9 +254,8 @@ def fit_hybrid(
     half = inverse * deviation
     information = _from_rows(off, problem.shared(state), families.mean, deviation, variance, model)
     if isinstance(board, BoardPrior):
-        # Its modes are not the board's own: what is said of the camera, whatever the board is within its covariance.
-        information = information.without_board()
         state = state._replace(board=board.mean + state.board @ board.half)
+        information = board.in_modes(information, state.board)
         half = torch.cat([half[:, : -len(board.mean)], half[:, -len(board.mean) :] @ board.half], 1)
     return HybridFit(
         camera=Camera(state.params, size=size, model=model),
@@ -264,6 +271,7 @@ def fit_hybrid(
         board_shapes=own,
         board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),
         residuals=torch.where(seen[..., None], errors.transpose(-1, -2), torch.nan),
+        weights=weights,
         weighted_rms=math.sqrt(float((errors * problem.weights).square().sum()) / int(seen.sum())),
         iterations=spent + steps,
         converged=converged,

@@ -58,6 +58,7 @@ def fit_turned(
     shape: Shape,
     lens: LensPrior | None = None,
     start: HybridFit | None = None,
+    first: HybridFit | None = None,
 ) -> CameraFit:
     """Fit one camera, turn its views that were read from another end, and fit again until none is left.
 
@@ -69,13 +70,17 @@ def fit_turned(
         shape: of the board.
         lens: what is known of the lens.
         start: an earlier fit of the views with these turns, to begin with.
+        first: such a fit with these weights, board and lens, which is taken as it is.
     """
     board, pixels = seen.board, seen.pixels()
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     turns = torch.zeros(len(pixels), dtype=torch.long) if turns is None else turns
     for attempt in range(_MOST_FITS):
         ordered, weighted = (turned_corners(values, board, turns) for values in (pixels, weights))
-        fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, modes, shape, lens=lens, start=start)
+        if first is not None and attempt == 0:
+            fit = first
+        else:
+            fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, modes, shape, lens=lens, start=start)
         rows = _absolute_rows(fit, board.points, ordered, weighted)
         deviation = fit.families.deviation(fit.hyperparameters)[: -len(fit.state.board)]
         if shape == "exact" or attempt == _MOST_FITS - 1:

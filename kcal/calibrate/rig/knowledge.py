@@ -101,6 +101,7 @@ def _board_turned(known: CameraInformation, turn: Tensor) -> CameraInformation:
         rows=torch.cat([known.rows[:, :lens], known.rows[:, lens:] @ turn.T], 1),
         mean=torch.cat([known.mean[:lens], turn @ known.mean[lens:]]),
         sigma=torch.cat([known.sigma[:lens], turn.abs() @ known.sigma[lens:]]),
+        others=None if known.others is None else torch.cat([known.others[:, :-1] @ turn.T, known.others[:, -1:]], 1),
     )
 
 
@@ -157,6 +158,9 @@ def joint_unknowns(
         onto = torch.zeros(len(camera.names), total, dtype=torch.float64)
         if part is not None:
             own = torch.cat([part.data_rows(), part.prior_rows(board=False)])
+            if len(shared) == 1 and part.others is not None:
+                # What cameras told each other of their board counts once: of two in one rig, each brings its own rows.
+                own = torch.cat([own, torch.cat([own.new_zeros(len(part.others), size), part.others], 1)])
             wide = own.new_zeros(len(own), total + 1)
             wide[:, end : end + size], wide[:, -1] = own[:, :size], own[:, -1]
             if part.board_size:

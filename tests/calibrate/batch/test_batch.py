@@ -13,14 +13,15 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from kcal.calibrate.batch.jobs import BatchOptions, detect_image, read_jobs
+from kcal.calibrate.batch.jobs import BatchOptions, detect_image, pieces, read_jobs, sharing_jobs
 from kcal.calibrate.batch.results import Results, SummaryRow, write_summary
 from kcal.calibrate.batch.workers import Pool, Task, WorkerDiedError, pool, run_tasks
+from kcal.calibrate.camera.calibrate import calibrate_cameras
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError, KcalError
-from kcal.io.camera_file import CameraFile
+from kcal.io.camera_file import CameraFile, load_camera
 from kcal.lens.camera import Camera
 from kcal.sim.board import BoardSize
 from kcal.sim.poses import sample_board_poses
@@ -194,6 +195,41 @@ class TestResults:
             (folder / "east" / f"{i}.png").unlink()
         assert run(folder, tmp_path / "out")[0][0].status == "failed"
         assert not (tmp_path / "out" / "east.camera.json").exists()
+
+
+class TestSharing:
+    """Cameras with the hybrid lens that saw one board end as `calibrate_cameras` calibrates them."""
+
+    def batch(self, folder, output, crew):
+        results = Results(output, read_jobs(folder, BOARD, "hybrid"), BatchOptions())
+        done = []
+        run_tasks(results.tasks(done.append), results.done, crew)
+        (numbers,) = sharing_jobs(results.jobs)
+        results.share(numbers, crew)
+        assert len(done) == pieces(results.jobs) == 8 + 2 + 2
+        return results
+
+    def test_it_is_what_python_gives(self, folder, tmp_path):
+        crew = Here()
+        self.batch(folder, tmp_path, crew)
+        seen = [Observations.load(tmp_path / f"{name}.obs.json") for name in ("east", "west")]
+        for name, result in zip(("east", "west"), calibrate_cameras(seen), strict=True):
+            kept = load_camera(tmp_path / f"{name}.camera.json")
+            torch.testing.assert_close(kept.params, result.camera.params, rtol=1e-12, atol=0)
+        # Once more, nothing is left to do.
+        before = len(crew.tasks)
+        self.batch(folder, tmp_path, crew)
+        assert len(crew.tasks) == before
+
+    def test_a_worker_that_dies_leaves_cameras_as_they_are_alone(self, folder, tmp_path, monkeypatch):
+        def dies(*_):
+            raise WorkerDiedError("out of memory")
+
+        monkeypatch.setattr("kcal.calibrate.batch.results.calibrate_again", dies)
+        results = self.batch(folder, tmp_path, Here())
+        for row in results.rows():
+            assert "calibrated alone, without what other cameras tell of the board: out of memory" in row.warnings
+            assert row.rms is not None
 
 
 class TestJobs:

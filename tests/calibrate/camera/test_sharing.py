@@ -1,0 +1,215 @@
+"""Cameras calibrated together share the board that they saw, and only that."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import pytest
+import torch
+from calibrate_scenes import observe
+from printed_boards import printed_points, printed_views
+from torch import Tensor
+from typer.testing import CliRunner
+
+from kcal.calibrate.camera.calibrate import (
+    CalibrationOptions,
+    CameraCalibrationResult,
+    calibrate_camera,
+    calibrate_cameras,
+)
+from kcal.calibrate.camera.options import OutlierRejection
+from kcal.calibrate.lensfit.board_orders import turned_corners
+from kcal.calibrate.rig.knowledge import gathered, joint_unknowns
+from kcal.cli.main import app
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations
+from kcal.errors import DegenerateError, InputError, KcalError
+from kcal.io.camera_file import load_camera, save_camera
+from kcal.lens.camera import Camera
+
+BOARD = Board(columns=8, rows=6, square=0.03)
+SIZE = (1280, 960)
+PRINT = printed_points(BOARD, 3)
+# Half of the five views of the second camera, read from the other end.
+ENDS = torch.tensor([2, 0, 2, 0, 2])
+
+
+def camera(number: int) -> Camera:
+    return Camera.build(
+        focal=(800.0 + 7 * number,) * 2,
+        center=(640.0 - 5 * number, 484.0),
+        size=SIZE,
+        coefficients=[-0.12 - 0.01 * number, 0.03, 4e-4, -3e-4, 0.0],
+        model="opencv5",
+    )
+
+
+def seen_by(number: int, points: Tensor = PRINT, count: int = 5, turns: Tensor | None = None) -> Observations:
+    pixels = printed_views(camera(number), BOARD, points, count, 10 + number, noise=0.1, pupil=2e-3)
+    return observe(pixels if turns is None else turned_corners(pixels, BOARD, turns), board=BOARD, size=SIZE)
+
+
+def shape_error(points: Tensor) -> float:
+    """RMS distance in meters of a board from the print, at the best fit of one to the other."""
+    a, b = points - points.mean(0), PRINT - PRINT.mean(0)
+    u, s, vh = torch.linalg.svd(a.T @ b)
+    return float((s.sum() / a.square().sum() * a @ u @ vh - b).square().sum(-1).mean().sqrt())
+
+
+@functools.cache
+def alone(number: int) -> CameraCalibrationResult:
+    return calibrate_camera(seen_by(number))
+
+
+@functools.cache
+def pair() -> tuple[CameraCalibrationResult, ...]:
+    return tuple(map(result_of, calibrate_cameras([seen_by(1), seen_by(2)])))
+
+
+def result_of(outcome: object) -> CameraCalibrationResult:
+    assert isinstance(outcome, CameraCalibrationResult)
+    return outcome
+
+
+def test_a_shared_board_is_better_known() -> None:
+    """Five views each: errors of the board fall to less than 0.8, and σ of the camera tells."""
+    found = pair()
+    shared = sum(shape_error(result.board_points) ** 2 for result in found)
+    assert shared < 0.8**2 * sum(shape_error(alone(k).board_points) ** 2 for k in (1, 2))
+    for number, other, result in ((1, 1, found[0]), (2, 0, found[1])):
+        assert result.shared_board is not None
+        assert result.shared_board.others == (other,)
+        assert result.shared_board.evidence > 10
+        sigma = result.sigma["fx"], alone(number).sigma["fx"]
+        assert sigma[0] is not None
+        assert sigma[1] is not None
+        assert sigma[0] < sigma[1]
+    # Both boards are one, to what their σ say.
+    one, two = (result.measured_board for result in found)
+    assert one is not None
+    assert two is not None
+    spread = one.half.square().sum(0).sqrt()
+    assert float(((one.amplitudes - two.amplitudes) / spread).abs().max()) < 1.0
+
+
+def test_what_others_said_is_told_apart(tmp_path: Path) -> None:
+    """The file holds each camera's own rows beside those of others; together they are the covariance."""
+    for result, other in zip(pair(), reversed(pair()), strict=True):
+        known, said = result.information, other.information
+        assert known is not None
+        assert said is not None
+        assert known.others is not None
+        assert known.board_size == 28
+        # By its own modes, and by the variables of the fit: in units of σ.
+        sigma = result.covariance.diagonal().sqrt().clamp_min(1e-300)
+        unit = known.covariance() / sigma / sigma[:, None]
+        torch.testing.assert_close(unit, result.covariance / sigma / sigma[:, None], rtol=0, atol=1e-6)
+        # Where data and priors are largest together, nothing pulls any more.
+        rows = known.all_rows()
+        pull = known.half() @ (rows[:, :-1].T @ rows[:, -1])
+        assert float(pull.abs().max()) < 0.2
+        # Without others: the camera's own data and its prior.
+        own = dataclasses.replace(known, others=None)
+        assert float(own.covariance()[0, 0]) > float(known.covariance()[0, 0])
+        path = result.save(tmp_path / "camera.json")
+        again = load_camera(path)
+        kept = again.calibration
+        assert kept is not None
+        assert kept.information is not None
+        assert kept.information.others is not None
+        torch.testing.assert_close(kept.information.covariance() / sigma / sigma[:, None], unit, rtol=0, atol=1e-9)
+        assert save_camera(again, tmp_path / "again.json").read_bytes() == path.read_bytes()
+
+
+def test_a_rig_counts_each_camera_once() -> None:
+    """Cameras that told each other of their board bring a rig what they know alone: nothing is counted twice."""
+    shared = joint_half([result.camera for result in pair()])
+    single = joint_half([alone(1).camera, alone(2).camera])
+    assert shared.shape == single.shape
+    # The lenses are linearized elsewhere, and amplitudes of the board's prior are those that both found.
+    torch.testing.assert_close(shared.log(), single.log(), rtol=0, atol=0.15)
+
+
+def joint_half(cameras: list[Camera]) -> Tensor:
+    """σ of the leading parameters of both cameras in a rig."""
+    known = [None if camera.calibration is None else camera.calibration.information for camera in cameras]
+    knowledge = gathered(cameras, known, BOARD)
+    assert knowledge.board == (True, True)
+    unknowns, _ = joint_unknowns(cameras, knowledge, BOARD)
+    return torch.cat([onto.square().sum(1).sqrt()[[0, 2, 3]] for onto in unknowns.cameras])
+
+
+def test_cameras_with_nothing_in_common_stay_as_they_are() -> None:
+    """Another print, another kind of board, a set that fails, exact boards, a parametric lens."""
+    other = seen_by(2, printed_points(BOARD, 4))
+    larger = seen_by(2).model_copy(update={"board": Board(columns=8, rows=6, square=0.031)})
+    bad = seen_by(2).subset(["v00", "v01"])
+    for second in (other, larger, bad):
+        first, last = calibrate_cameras([seen_by(1), second])
+        assert torch.equal(result_of(first).camera.params, alone(1).camera.params)
+        assert result_of(first).shared_board is None
+        assert isinstance(last, DegenerateError) == (second is bad)
+    for options in (CalibrationOptions(board="exact"), CalibrationOptions(model="opencv5")):
+        both = calibrate_cameras([seen_by(1, count=4), seen_by(2, count=4)], options)
+        assert all(result_of(one).shared_board is None for one in both)
+
+
+def test_views_read_from_the_other_end_and_views_left_out() -> None:
+    """The result holds the views in one order, and what was left out of the camera alone stays out."""
+    wrong = seen_by(1, count=6)
+    swapped = [wrong.views[5].pixels[k] for k in torch.randperm(48, generator=torch.Generator().manual_seed(0))]
+    wrong = wrong.model_copy(
+        update={"views": (*wrong.views[:5], wrong.views[5].model_copy(update={"pixels": tuple(swapped)}))}
+    )
+    options = CalibrationOptions(reject=OutlierRejection(limit=0.3))
+    first, second = (result_of(one) for one in calibrate_cameras([wrong, seen_by(2, turns=ENDS)], options))
+    assert first.shared_board is not None
+    assert [view.view for view in first.rejected_views] == ["v05"]
+    assert bool(first.residuals[5].isnan().all())
+    read = seen_by(2, turns=ENDS).pixels()
+    back = second.observations.pixels()
+    changed = [not torch.equal(read[k], back[k]) for k in range(5)]
+    assert changed in ([True, False, True, False, True], [False, True, False, True, False])
+    assert second.rms < 0.16
+    projected, _ = second.camera.project(
+        second.board_points @ second.cam_from_board_rotation.mT + second.cam_from_board_translation[:, None]
+    )
+    used = second.residuals.isfinite().all(-1)
+    assert int(used.sum()) > 230
+    torch.testing.assert_close((projected - back)[used], second.residuals[used], rtol=0, atol=1e-9)
+
+
+def test_one_type_needs_the_hybrid_lens() -> None:
+    with pytest.raises(InputError, match="hybrid lens only"):
+        calibrate_cameras([seen_by(1)], CalibrationOptions(model="opencv5"), one_type=True)
+
+
+def test_command_line(tmp_path: Path) -> None:
+    for name, number in (("left", 1), ("right", 2)):
+        seen_by(number).save(tmp_path / f"{name}.obs.json")
+    files = [str(tmp_path / f"{name}.obs.json") for name in ("left", "right")]
+    run = CliRunner().invoke
+    done = run(app, ["calibrate", *files, "-o", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    text = " ".join(done.output.split())
+    assert "the board is that of right" in text
+    assert "the board is that of left" in text
+    for name, result in zip(("left", "right"), pair(), strict=True):
+        camera = load_camera(tmp_path / "out" / f"{name}.camera.json")
+        assert torch.equal(camera.params, result.camera.params)
+        assert camera.calibration is not None
+        assert camera.calibration.name == name
+    for arguments, complaint in (
+        ([*files, "-o", str(tmp_path / "out"), "--name", "west"], "names one camera"),
+        ([files[0], files[0], "-o", str(tmp_path / "out")], "would overwrite each other"),
+        ([*files, "-o", files[0]], "cannot make this folder"),
+    ):
+        refused = run(app, ["calibrate", *arguments])
+        assert isinstance(refused.exception, KcalError)
+        assert complaint in str(refused.exception)
+    seen_by(2).subset(["v00", "v01"]).save(tmp_path / "right.obs.json")
+    half = run(app, ["calibrate", *files, "-o", str(tmp_path / "half")])
+    assert "1 of 2 cameras failed: right" in str(half.exception)
+    assert [path.name for path in (tmp_path / "half").iterdir()] == ["left.camera.json"]
