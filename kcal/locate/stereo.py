@@ -144,7 +144,7 @@ def _epipolar(left: Tensor, right: Tensor, baseline: Tensor) -> tuple[Tensor, Te
     along, across = (right * axis).sum(-1), (right * side).sum(-1)
     right_ok = torch.linalg.vector_norm(torch.linalg.cross(axis, right), dim=-1) > EPIPOLE
     # The right ray in the plane: the rest of it, the epipolar error, says nothing about the range.
-    in_plane = left_ok & right_ok & (along * along + across * across > EPIPOLE**2)
+    in_plane = left_ok & right_ok & (torch.hypot(along, across) > EPIPOLE)
     parallax = torch.atan2(cosine * across - sine * along, cosine * along + sine * across)
     return torch.where(in_plane, parallax, 0.0), across <= 0, ~in_plane
 
