@@ -8,10 +8,8 @@ from __future__ import annotations
 import asyncio
 import math
 import secrets
-import socket
 import threading
 from collections.abc import AsyncIterator
-from importlib import resources
 from typing import Any
 
 import orjson
@@ -21,11 +19,11 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from kcal.errors import InputError
 from kcal.locate.columns import PositionColumns
 from kcal.locate.positions import Located
+from kcal.web.gate import new_token, page_files
+from kcal.web.listening import listening_socket
 
-_TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -53,25 +51,13 @@ class LiveMap:
             {"cameras": [{"name": f"{camera.name} camera", "place": camera.geodetic[:2]} for camera in run.cameras]}
         )
         self._news = (0, b"")
-        self._token = secrets.token_urlsafe(24)
-        self._socket = socket.socket()
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            self._socket.bind(("127.0.0.1", port))
-            self._socket.listen()
-        except OSError as error:
-            self._socket.close()
-            raise InputError(f"port {port} cannot be used: {error.strerror or error}; give another") from error
+        self._token, self._socket = new_token(), listening_socket(port, fallback=False)
         bound = self._socket.getsockname()[1]
         self._hosts = {f"127.0.0.1:{bound}", f"localhost:{bound}"}
         self.address = f"http://127.0.0.1:{bound}/#{self._token}"
         routes = [Route("/events", self._events)]
-        for package, folder in (("kcal.pipeline", "page"), ("kcal.report", "leaflet")):
-            for file in (resources.files(package) / folder).iterdir():
-                kind = _TYPES.get(file.name.rpartition(".")[2])
-                if kind:
-                    path = "/" if kind == "text/html" else f"/{folder}/{file.name}"
-                    routes.append(Route(path, self._file(file.read_bytes(), kind)))
+        pages = page_files(("kcal.pipeline", "page"), ("kcal.report", "leaflet"))
+        routes += [Route(path, self._file(content, kind)) for path, (content, kind) in pages.items()]
         config = uvicorn.Config(Starlette(routes=routes), log_level="warning", access_log=False, lifespan="off")
         self._server = uvicorn.Server(config)
         # Signals are those of the stream.
