@@ -8,7 +8,9 @@ inside which a pixel has several preimages), the region is shrunk until it does.
 
 A walk in steps misses narrow folds. So it is then proven that each direction has no fold before the end of the region
 or a single one (`kcal.lens.fold_proof`). Where this cannot be proven, narrow wedges are cut out of the region, or it is
-shrunk.
+shrunk. For a lens without prism terms that is all within a disc: its Jacobian is symmetric, and a disc where it is
+positive definite is one-to-one. With prism terms, and beyond the disc, samples of the edge, 1024 around, tell
+whether it goes once around.
 
 For a lens without tangential, prism and tilt terms the region is a disc. For others it is the union of the largest disc
 about the axis and the regular part of what a short Fourier series encloses. The series describes the reciprocal of the

@@ -311,7 +311,7 @@ def main() -> None:
     parser.add_argument("--lenses", type=int, default=10_000)
     parser.add_argument("--compared", type=int, default=1000, help="lenses that are also tried without the proof")
     parser.add_argument("--minutes", type=float, default=math.inf, help="most time for constructed lenses")
-    parser.add_argument("--ordinary", type=int, default=400)
+    parser.add_argument("--ordinary", type=int, default=400, help="drawn at random; 0 leaves all ordinary ones out")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
@@ -320,7 +320,9 @@ def main() -> None:
         ["# Folds", "", CONCLUSIONS["folds.md"], "", "`python -m scripts.check.folds` writes this page.", ""],
         ["## Constructed lenses", "", CONSTRUCTED, ""],
         constructed(arguments.lenses, arguments.seed, arguments.compared, arguments.minutes),
-        ["", "## Ordinary lenses", "", ORDINARY, "", *ordinary(arguments.ordinary, arguments.seed)],
+        ["", "## Ordinary lenses", "", ORDINARY, "", *ordinary(arguments.ordinary, arguments.seed)]
+        if arguments.ordinary
+        else [],
         ["", "## Time of a camera", "", TIMES, "", *build_times(15)],
     ]
     text = show([line for part in parts for line in part])

@@ -91,6 +91,21 @@ class TestOtherTerms:
         assert unproven >= 2
         assert found == 0
 
+    def test_behind_the_end_of_a_fold(self) -> None:
+        """Where a fold ends in the plane, points behind it are cut out, and points beside it stay."""
+        lens = torch.tensor(BENT, dtype=torch.float64)
+        region = valid_region(lens, "opencv14")
+        assert region.cuts.shape == (2, 4)
+        for cut in region.cuts:
+            angle, half = torch.atan2(cut[1], cut[0]), torch.acos(cut[2])
+            angle = angle + half * torch.tensor([0.0, 0.0, 0.99, -0.99, 1.01, -1.01], dtype=torch.float64)
+            reach = cut[3] * torch.tensor([0.999, *[1.001] * 5], dtype=torch.float64)
+            before, *cut_out, left, right = region.encloses(reach * torch.cos(angle), reach * torch.sin(angle)).tolist()
+            assert before
+            assert not any(cut_out)
+            # On one side, the edge of the region is nearer.
+            assert left or right
+
     def test_a_plane_that_is_wound_twice_around_the_axis(self) -> None:
         """In complex numbers the lens is z + z² / 2: regular but at z = -1, and the same at z and -2 - z."""
         lens = torch.zeros(12, dtype=torch.float64)
@@ -119,6 +134,8 @@ class TestOtherTerms:
             alone = valid_region(lens, "opencv14")
             assert torch.equal(alone.radius, own[0])
             assert torch.equal(alone.edge, own[1])
+            assert torch.equal(alone.cuts, own[2][: len(alone.cuts)])
+            assert bool(torch.isinf(own[2][len(alone.cuts) :, 3]).all())
 
 
 @pytest.mark.parametrize("name", [*MODELS, "pinhole", "fisheye4"])
