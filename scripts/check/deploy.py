@@ -1,4 +1,4 @@
-"""The whole localizer compiled, exported and as ONNX, with lenses of every kind, against eager results.
+"""The whole localizer compiled and exported, with lenses of every kind, against eager results.
 
     python -m scripts.check.deploy                     all kinds, some minutes each
     python -m scripts.check.deploy --lenses opencv5    one kind
@@ -9,16 +9,12 @@ Among the pixels are one that is not finite and one outside the image; the numbe
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
-import onnxruntime
 import torch
 from torch import Tensor
 
-from kcal.io.onnx_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
@@ -80,14 +76,8 @@ def checked(lens: str, ways: Sequence[str]) -> list[str]:
         start = time.process_time()
         if way == "compile":
             found = torch.compile(module, fullgraph=True, dynamic=True, backend="eager")(*many)
-        elif way == "export":
-            found = torch.export.export(module, few, dynamic_shapes=({0: count}, {0: count})).module()(*many)
         else:
-            with tempfile.TemporaryDirectory() as folder:
-                session = onnxruntime.InferenceSession(save_onnx(module, few, Path(folder, "localizer.onnx")))
-            names = [entry.name for entry in session.get_inputs()]
-            pixels = {name: value.numpy() for name, value in zip(names, many, strict=True)}
-            found = [torch.from_numpy(value) for value in session.run(None, pixels)]
+            found = torch.export.export(module, few, dynamic_shapes=({0: count}, {0: count})).module()(*many)
         cells.append(f"{difference(found, wanted):.0e} ({time.process_time() - start:.0f} s)")
     return cells
 
@@ -95,7 +85,7 @@ def checked(lens: str, ways: Sequence[str]) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lenses", nargs="+", default=LENSES)
-    parser.add_argument("--ways", nargs="+", default=("compile", "export", "onnx"))
+    parser.add_argument("--ways", nargs="+", default=("compile", "export"))
     options = parser.parse_args()
     show([row("lens", *options.ways), row(*["---"] * (1 + len(options.ways)))])
     for lens in options.lenses:

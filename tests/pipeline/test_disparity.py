@@ -158,6 +158,11 @@ class TestRefusals:
         noise = torch.rand(60, 40, generator=torch.Generator().manual_seed(1)).double()
         right[v - 30 : v + 30, u - 2 : u + 38] = 100 + 60 * noise
         self.check(match(scene, right=right), MatchStatus.OCCLUDED, MatchStatus.NO_MATCH)
+        # Flat and as bright as the object, so that the rest still correlates.
+        right = scene.right.clone()
+        right[v - 30 : v + 30, u + 2 : u + 38] = float(scene.right[v - 5 : v + 6, u - 5 : u + 6].mean())
+        strict = ObjectDisparity(scene.rig, DisparityOptions(min_score=0.3, min_share=0.85))
+        self.check(strict(scene.left, right, scene.boxes, scene.aims), MatchStatus.OCCLUDED)
 
     def test_a_corner_hidden_does_not_move_it(self) -> None:
         scene = case(0, size=24, amplitude=0.0, box_sigma=0.0)
@@ -203,7 +208,7 @@ class TestRefusals:
 def test_gradients_to_both_images(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against differences, in the direction of the gradient and in random ones, at a constant scale of residuals."""
     scene = case(4, noise=0.1, amplitude=0.0)
-    monkeypatch.setattr(shift_fit, "_scale", lambda residual, weight: residual.new_full((len(residual),), 1.5))
+    monkeypatch.setattr(shift_fit, "_scale", lambda residual, weight: residual.new_full((len(residual),), 0.25))
     images = [scene.left.clone().requires_grad_(), scene.right.clone().requires_grad_()]
     module = ObjectDisparity(scene.rig)
     found = module(*images, scene.boxes, scene.aims)

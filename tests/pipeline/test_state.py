@@ -58,4 +58,4 @@ def test_onnx_of_two_inputs(tmp_path: Path) -> None:
     session = onnxruntime.InferenceSession(save_onnx(Parallax(), (left[:2], left[:2]), tmp_path / "two.onnx"))
     names = [entry.name for entry in session.get_inputs()]
     (found,) = session.run(None, {names[0]: left.numpy(), names[1]: left.numpy() - 3.0})
-    assert torch.equal(torch.from_numpy(found), 6.0 - left)
+    assert torch.allclose(torch.from_numpy(found), 6.0 - left, rtol=0, atol=1e-14)
