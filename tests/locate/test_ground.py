@@ -36,8 +36,11 @@ def test_a_place_on_the_ellipsoid_is_found_again(distance: float) -> None:
     """Pyproj says where the ground is at that distance: the ellipsoid has fallen 1.96 m at 5 km."""
     lon, lat, _ = pyproj.Geod(ellps="WGS84").fwd(ORIGIN.lon, ORIGIN.lat, 40.0, distance)
     true = geodetic_to_enu(torch.tensor([[lat, lon, 12.0]], dtype=torch.float64), ORIGIN)
-    found = locate_on_ground(CAMERA, stands(), pixels_of(stands(), true), level_ground(12.0), pixel_sigma=0.1)
+    found = locate_on_ground(CAMERA, stands(), pixels_of(stands(), true), level_ground(12.0), pixel_sigma=0.02)
     torch.testing.assert_close(found.enu, true, rtol=0, atol=1e-6 * distance)
+    # A place on known ground errs along the ground only.
+    down = torch.cat([true[0, :2] / 6.35e6, torch.ones(1).double()])
+    assert float(down @ found.covariance[0] @ down) < 1e-6 * float(found.covariance[0].diagonal().sum())
     assert found.geodetic[0].tolist() == pytest.approx([lat, lon, 12.0], abs=1e-4)
 
 

@@ -137,7 +137,7 @@ def test_half_a_moment_is_cut_off(whole: tuple[Path, dict[str, bytes]], tmp_path
     stream.shown = lambda columns, tracks: stream.stop() if tracks.time > 1.7e9 + 2.05 else None
     stream.follow(lines_of(whole[0], read), waits=True, resumes=True)
     with open(tmp_path / "tracks.csv", "ab") as file:
-        file.write(b"track 1,ok,,19.07")
+        file.write(b"track 1,ok,,19.07" + 100_000 * b"0")
     with open(tmp_path / "journal", "ab") as file:
         file.write(b"[22,1700000002.1,45")
     assert new_stream(tmp_path).follow(lines_of(whole[0], read), waits=True, resumes=True).moments == 40 - 22

@@ -119,6 +119,28 @@ def test_frames_reduce_noise_but_never_the_systematic_part() -> None:
     assert noise[1] / noise[0] == pytest.approx(1 / 7, rel=1e-3)
 
 
+def test_the_effect_of_a_calibration_error_is_that_of_making_it() -> None:
+    """A focal length that is wrong by 1 px, which matters little ahead and much aside, and a target that sweeps by."""
+    rig = tracked_site().rig
+    covariance = torch.zeros(5, 5, dtype=torch.float64)
+    covariance[0, 0] = 1.0
+    localize = StereoLocalizer(rig, origin=ORIGIN, heading_deg=0.0, calibration=RigCovariance.of(rig, right=covariance))
+    found = []
+    for error in (0.0, 0.05):
+        tracker = Tracker(localize, TrackOptions(motions=(Motion(acceleration=3.0),), confirm_hits=1))
+        for frame in range(25):
+            left, right, _ = rig(torch.tensor([[-40.0 + 3.0 * frame, 0.0, 120.0]]).double())
+            # The true focal length is larger, and the marks are farther from the middle: it is believed too small.
+            right = right + error / 1600.0 * (right - rig.right.center) * torch.tensor([1.0, 0.0])
+            tracker(pairs_of(left, right, frame / 10.0))
+        found.append(tracker.beliefs.summary())
+    change = (found[1].mean - found[0].mean)[0] / 0.05
+    sign = torch.sign(localize.calibration_factor.sum())
+    unit = found[0].noise[0].diagonal().sqrt()
+    torch.testing.assert_close(change / unit, sign * found[0].effect[0, :, 0] / unit, rtol=0.03, atol=0.01)
+    assert float((change / unit).abs().max()) > 0.3
+
+
 def test_a_wide_sweep_turns_the_frame_and_stays_exact() -> None:
     localize = tracked_site()
     start, velocity = torch.tensor([[-56.0, 0.0, 100.0]]).double(), torch.tensor([[28.0, 0.0, 0.0]]).double()
