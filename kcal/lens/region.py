@@ -176,7 +176,7 @@ def valid_region(coefficients: Tensor, model: LensModel | str) -> Region:
     """Find where a lens is valid.
 
     The region of a hybrid lens is found by samples alone. So is that of every lens while Python must not branch on
-    values (compile, export, vmap); cameras bring theirs along.
+    values (compile, export, vmap); cameras bring theirs along. A pinhole is valid everywhere.
 
     Args:
         coefficients: (..., P).
@@ -195,7 +195,7 @@ def valid_region(coefficients: Tensor, model: LensModel | str) -> Region:
     coefficients = check_coefficients(coefficients, model)
     limits = direction_limits(coefficients, model, 1 if model.radial else DIRECTIONS)
     region = sampled_region(coefficients, model, limits)
-    if model.hybrid or not may_branch(coefficients):
+    if model.hybrid or not model.size or not may_branch(coefficients):
         return region
     reach = limits if model.radial else region.sector_reach()
     lenses = coefficients.expand(*limits.shape[:-1], model.size).reshape(limits[..., 0].numel(), model.size)

@@ -49,13 +49,14 @@ def rig_verdict(
         subject: its name.
 
     Example:
+        >>> import torch
         >>> from kcal.lens.rig import RigCovariance
         >>> from kcal.locate.budget import planned_rig
         >>> rig = planned_rig()
         >>> rig.covariance = RigCovariance.of(rig, pose=torch.diag(torch.tensor([0, 1e-8, 0, 0, 0, 0]).double()))
         >>> verdict = rig_verdict(rig, Requirement.parse("1km:5%, 5km:5%"), mark_sigma=0.1)
         >>> [answer.ok for answer in verdict.answers], verdict.reason
-        ([True, False], 'at 5 km the range is known to ±14 %; 5 % are required; most of it is from relative pose')
+        ([True, False], 'at 5 km the range is known to ±6.8 %; 5 % are required; most of it is from relative pose')
     """
     findings = [finding for verdict in cameras for finding in verdict.findings if finding.severity != "fine"]
     findings += _doubts(rig, result)

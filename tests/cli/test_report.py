@@ -108,7 +108,7 @@ def commands(app_or_group: Any, *path: str) -> list[tuple[str, ...]]:
     return found
 
 
-def test_every_command_has_json_but_the_one_that_serves_a_page() -> None:
+def test_every_command_has_json_but_those_that_serve_pages_or_streams() -> None:
     from typer.main import get_command
 
     group: Any = get_command(app)
@@ -117,7 +117,7 @@ def test_every_command_has_json_but_the_one_that_serves_a_page() -> None:
         for word in words:
             command = command.commands[word]
         options = {name for parameter in command.params for name in parameter.opts}
-        assert ("--json" in options) == (words != ("mark",)), words
+        assert ("--json" in options) == (words not in (("mark",), ("capture",), ("live",))), words
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

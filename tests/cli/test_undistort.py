@@ -97,7 +97,7 @@ def test_nothing_usable_writes_nothing(
         (["in", "left.camera.json", "-o", "in"], "in/a.png: an input image would be overwritten"),
         (["in", "b/a.jpg", "left.camera.json", "-o", "out"], "both in/a.png and b/a.jpg would become this file"),
         (["in", "nothing.json", "-o", "out"], "nothing.json: cannot read"),
-        (["in", "left.camera.json", "-o", "left.camera.json"], "cannot be made a folder"),
+        (["in", "left.camera.json", "-o", "left.camera.json"], "cannot make this folder"),
         (["no", "left.camera.json", "-o", "out"], "no: no such file or folder"),
     ],
 )

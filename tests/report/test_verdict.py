@@ -39,11 +39,11 @@ def seen_by(truth: Camera, points: Tensor, rotation: Tensor, translation: Tensor
 
 
 def observed(pixels: Tensor, names: list[str] | None = None, spread: float | None = None) -> Observations:
-    covariance = None if spread is None else ((spread**2, 0.0, spread**2),) * BOARD.corners
-    views = [
-        View(name=names[i] if names else f"{i:02}", pixels=[tuple(p) for p in view], covariance=covariance)
-        for i, view in enumerate(pixels.tolist())
-    ]
+    views = []
+    for i, view in enumerate(pixels.tolist()):
+        seen = [(u, v) if 0 <= u <= 639 and 0 <= v <= 479 else None for u, v in view]
+        known = None if spread is None else tuple(p and (spread**2, 0.0, spread**2) for p in seen)
+        views.append(View(name=names[i] if names else f"{i:02}", pixels=tuple(seen), covariance=known))
     return Observations(board=BOARD, image_size=(640, 480), views=tuple(views))
 
 

@@ -118,7 +118,7 @@ def compare_models(
         >>> for i in range(10):
         ...     tilt = 0.5 * torch.tensor([[math.cos(i), math.sin(i), 0.2]], dtype=torch.float64)
         ...     points = board.points @ rotation_from_vector(tilt)[0].T
-        ...     pixels, _ = truth.project(points + torch.tensor([-0.15, -0.12, 0.6], dtype=torch.float64))
+        ...     pixels, _ = truth.project(points + torch.tensor([-0.15, -0.14, 0.7], dtype=torch.float64))
         ...     pixels = pixels + 0.1 * torch.randn(pixels.shape, dtype=torch.float64, generator=noise)
         ...     views.append(View(name=str(i), pixels=pixels.tolist()))
         >>> seen = Observations(board=board, image_size=(640, 480), views=views)

@@ -125,7 +125,7 @@ def calibrate_views(
         >>> board = Board(columns=7, rows=6, square=0.05).points
         >>> truth = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)
-        >>> shift = torch.tensor([-0.15, -0.12, 0.6], dtype=torch.float64)
+        >>> shift = torch.tensor([-0.15, -0.14, 0.7], dtype=torch.float64)
         >>> pixels, _ = truth.project(board @ rotation_from_vector(tilts).transpose(-1, -2) + shift)
         >>> pixels = pixels.requires_grad_(True)
         >>> found = calibrate_views(pixels, board, (640, 480), CalibrationOptions(model="pinhole"))

@@ -53,7 +53,7 @@ def summarize(result: CameraCalibrationResult) -> CalibrationSummary:
         >>> truth = Camera.build(focal=(800, 800), center=(322, 238), size=(640, 480), model="pinhole")
         >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)
         >>> for i, rotation in enumerate(rotation_from_vector(tilts)):
-        ...     points = board.points @ rotation.T + torch.tensor([-0.15, -0.12, 0.6], dtype=torch.float64)
+        ...     points = board.points @ rotation.T + torch.tensor([-0.15, -0.14, 0.7], dtype=torch.float64)
         ...     views.append(View(name=str(i), pixels=truth.project(points)[0].tolist()))
         >>> result = calibrate_camera(Observations(board=board, image_size=(640, 480), views=views))
         >>> brief = summarize(result)

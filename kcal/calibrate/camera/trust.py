@@ -122,7 +122,7 @@ def examine(
         >>> truth = Camera.build(focal=(800, 800), center=(322, 238), size=(640, 480), model="pinhole")
         >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)
         >>> for i, rotation in enumerate(rotation_from_vector(tilts)):
-        ...     points = board.points @ rotation.T + torch.tensor([-0.15, -0.12, 0.6], dtype=torch.float64)
+        ...     points = board.points @ rotation.T + torch.tensor([-0.15, -0.14, 0.7], dtype=torch.float64)
         ...     views.append(View(name=str(i), pixels=truth.project(points)[0].tolist()))
         >>> options = CalibrationOptions()
         >>> result = calibrate_camera(Observations(board=board, image_size=(640, 480), views=views), options)
@@ -174,8 +174,9 @@ def stored_options(camera: Camera) -> CalibrationOptions:
     """The options that give a camera again from its views, as far as its file tells.
 
     Example:
-        >>> stored_options(Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="opencv4")).model
-        LensModel.named('opencv4')
+        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="opencv4")
+        >>> str(stored_options(camera).model)
+        'opencv4'
     """
     record = camera.calibration.record if camera.calibration else None
     reject = OutlierRejection() if record and record.excluded else None

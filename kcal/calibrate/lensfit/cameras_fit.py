@@ -163,6 +163,7 @@ def measure_board(
         InputError: no observations.
 
     Example:
+        >>> from kcal.corners.board import Board
         >>> from kcal.corners.observations import View
         >>> from kcal.lens.camera import Camera
         >>> from kcal.sim.captures import capture_corners

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import signal
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -145,8 +146,13 @@ def test_an_interrupt_while_a_calibration_runs_ends_all() -> None:
         solve(0)
         went_on.append(1)
 
-    with pytest.raises(KeyboardInterrupt):
-        together([interrupted, lambda: solve(0)], CPU, nothing)
+    # A shell ignores Ctrl+C in what it starts in the background.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            together([interrupted, lambda: solve(0)], CPU, nothing)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert not went_on
 
 
