@@ -21,6 +21,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 from kcal.report.camera_verdict import camera_verdict, stored_verdict
+from kcal.report.model_findings import model_findings
 from kcal.report.rig_verdict import rig_verdict
 from kcal.report.verdict import Finding, RangeAnswer, Requirement, Verdict
 from kcal.report.verdict_page import range_rows, verdict_page
@@ -183,6 +184,28 @@ def test_residuals_that_repeat_have_structure(clean: CameraCalibrationResult) ->
     assert residual_structure(noise + noise[:1], pixels, size, clean.observations).board > 5
     shifted = residual_structure(noise + 2 * noise[:, :1], pixels, size, clean.observations)
     assert shifted.neighbors > 0.5
+
+
+def test_real_corners_are_never_quite_independent(clean: CameraCalibrationResult, examination: Examination) -> None:
+    """A hybrid camera whose halves agree is doubted for neighbors that are alike, and stopped for more than that."""
+    result = calibrate_camera(clean.observations)
+    assert result.hybrid is not None
+    found = dataclasses.replace(examination, reference=None, model=None)
+    assert found.halves
+
+    def severity(tempering: float = 1.0, **changes: float) -> str:
+        assert result.hybrid is not None
+        fit = dataclasses.replace(result.hybrid, tempering=tempering)
+        structure = found.structure._replace(**{"neighbors": 0.25, "image": 1.0, **changes})
+        given = dataclasses.replace(found, structure=structure)
+        findings, beyond = model_findings(dataclasses.replace(result, hybrid=fit), CalibrationOptions(), given)
+        assert beyond == 0.0
+        return findings[0].severity
+
+    assert severity() == "doubt"
+    assert severity(neighbors=0.0) == "fine"
+    assert severity(image=3.0) == "stop"
+    assert severity(tempering=2.5) == "stop"
 
 
 def test_a_file_alone_is_believed_and_said_so(clean: CameraCalibrationResult) -> None:
