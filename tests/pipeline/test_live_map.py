@@ -83,7 +83,7 @@ def test_the_page_in_a_browser(page: LiveMap) -> None:
         tab.goto(page.address)
         show(page, "<img src=x onerror=alert(1)>")
         tab.wait_for_function("() => document.documentElement.dataset.sequence === '7'", timeout=60_000)
-        assert tab.locator("#status").inner_text() == "1 tracks, moment 7"
+        assert tab.locator("#status").inner_text() == "1 track, moment 7"
         assert "<img src=x onerror=alert(1)>, 500 m" in tab.locator(".leaflet-tooltip").first.inner_text()
         assert tab.locator("#map img").count() == 0
         assert errors == []

@@ -47,7 +47,7 @@
       Object.values(one).forEach((shape) => shape.remove());
       shown.delete(name);
     }
-    status.textContent = told.tracks.length + " tracks, moment " + told.sequence;
+    status.textContent = told.tracks.length + (told.tracks.length === 1 ? " track" : " tracks") + ", moment " + told.sequence;
     document.documentElement.dataset.sequence = told.sequence;
   });
 })();
