@@ -32,7 +32,8 @@ def live_command(
         list[Path], typer.Option("-o", "--output", help="File that grows: .geojsonl, .csv or .cot; may be repeated.")
     ],
     videos: Annotated[
-        list[str] | None, typer.Argument(metavar="[LEFT RIGHT]", help="Two video files, with --detector.")
+        list[str] | None,
+        typer.Argument(metavar="[LEFT RIGHT]", help="Two video files or addresses (rtsp://...), with --detector."),
     ] = None,
     detector: Annotated[
         str | None,
@@ -71,6 +72,10 @@ def live_command(
     ] = None,
     pixel_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of pairs that state none, each axis.")] = 0.3,
     box_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of the middle of a box, each axis.")] = 2.0,
+    match_sigma: Annotated[
+        float,
+        typer.Option(metavar="PX", help="Error of matched images that compression of the videos adds, each axis."),
+    ] = 0.05,
     clock_offset: Annotated[
         float, typer.Option(metavar="S", help="Seconds by which the right images are later than their times.")
     ] = 0.0,
@@ -135,7 +140,7 @@ def live_command(
     solved = locate.localize.rig
 
     tracker = Tracker(locate.localize, clock=clock)
-    pairs = _video_pairs(videos, detector, tracker, options) if videos and detector else None
+    pairs = _video_pairs(videos, detector, tracker, options, match_sigma) if videos and detector else None
     source = pairs or lines_of(lines, lambda line: read_moment(line, solved, options, pixel_sigma))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
     with steps("live", lines.stat().st_size if lines is not None and lines.is_file() else None) as advance:
@@ -149,7 +154,8 @@ def live_command(
             err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)
         before = {number: signal.signal(number, lambda *_: stream.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
-            counts = stream.follow(source, waits=True, resumes=bool(pairs or lines))
+            live = pairs is not None and pairs.live
+            counts = stream.follow(source, waits=not live, resumes=not live and detections != "-")
         finally:
             if pairs is not None:
                 pairs.close()
@@ -180,7 +186,9 @@ def summary(counts: StreamCounts) -> str:
     return "; ".join(parts)
 
 
-def _video_pairs(videos: list[str], detector: str, tracker: Tracker, options: AssociationOptions) -> VideoPairs:
+def _video_pairs(
+    videos: list[str], detector: str, tracker: Tracker, options: AssociationOptions, match_sigma: float
+) -> VideoPairs:
     try:
         from kcal.pipeline.video_source import VideoPairs
     except ImportError as error:
@@ -194,8 +202,13 @@ def _video_pairs(videos: list[str], detector: str, tracker: Tracker, options: As
         # Before the first moment the estimate is the prior.
         return tracker.clock_estimate().offset(max(tracker.time, tracker.shared.start or 0.0))[0]
 
-    left, right = (Path(video) for video in videos)
-    return VideoPairs(left, right, tracker.localize.rig, load_detector(detector), options, late=late)
+    def tell(text: str) -> None:
+        err.print(text, markup=False)
+
+    return VideoPairs(
+        videos[0], videos[1], tracker.localize.rig, load_detector(detector), options,
+        late=late, match_sigma=match_sigma, tell=tell,
+    )  # fmt: skip
 
 
 def _live_map(run: Located, port: int) -> LiveMap:

@@ -120,10 +120,19 @@ def open_video(address: str, name: str, **options: str) -> InputContainer:
     return container
 
 
-def decoded(container: InputContainer, undecoded: Callable[[], None]) -> Iterator[av.VideoFrame]:
-    """The frames of the first video stream; damaged ones are told and left out, with what was built on them."""
+def decoded(
+    container: InputContainer, undecoded: Callable[[], None], look: Callable[[av.Packet], None] = lambda _: None
+) -> Iterator[av.VideoFrame]:
+    """The frames of the first video stream; damaged ones are told and left out, with what was built on them.
+
+    Args:
+        container: that is read.
+        undecoded: called for each frame that is left out.
+        look: called with each packet before it is decoded.
+    """
     damaged = False
     for packet in container.demux(container.streams.video[0]):
+        look(packet)
         try:
             pictures = packet.decode()
         except av.InvalidDataError:

@@ -6,12 +6,14 @@ import csv
 import os
 import shutil
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("av", reason="the extra `video` is not installed")
+from rtsp_server import RtspCamera
 from typer.testing import CliRunner
 from video_scenes import VELOCITY, bright_spots, film, places, small_rig, write_video
 
@@ -174,3 +176,48 @@ def test_a_detector_that_does_not_work(folder: Path, detector: str, message: str
 def test_incomplete_commands(folder: Path, arguments: list[str]) -> None:
     done = CliRunner().invoke(app, ["live", str(folder / "rig.json"), *arguments, "-o", str(folder / "t.csv")])
     assert done.exit_code == 2
+
+
+def slow_spots(image: np.ndarray) -> np.ndarray:
+    time.sleep(0.15)
+    return bright_spots(image)
+
+
+def test_two_rtsp_streams_whose_newest_frames_are_taken(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = small_rig()
+    table = [film(rig, side, [number / 10 for number in range(30)]) for side in (0, 1)]
+    write = Stream._write
+
+    def terminated(self: Stream, *what: object) -> None:
+        write(self, *what)  # type: ignore[arg-type]
+        if self.counts.moments == 5:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Stream, "_write", terminated)
+    cameras = [RtspCamera(lambda when, side=side: table[side][round(10 * when) % 30], 10.0) for side in (0, 1)]
+    with cameras[0], cameras[1]:
+        videos = [camera.address for camera in cameras]
+        command = ["live", str(folder / "rig.json"), *videos, "--detector", f"{__name__}:slow_spots"]
+        done = CliRunner().invoke(app, [*command, "-o", str(folder / "tracks.csv")], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert "5 moments, " in done.output
+    assert "pairs dropped for lack of time" in done.output
+    assert "secret" not in done.output
+    with open(folder / "tracks.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert rows
+    for row in rows:
+        # The table begins again every three seconds.
+        true = places(float(row["time_s"]) % 3.0).numpy()
+        assert np.abs(true[:, 2] - float(row["north_m"])).min() < 5.0
+        assert abs(float(row["time_s"]) - time.time()) < 60.0
+
+
+def test_a_file_beside_a_stream(folder: Path) -> None:
+    with pytest.raises(InputError, match="two files or two live streams"):
+        CliRunner().invoke(
+            app,
+            ["live", str(folder / "rig.json"), str(folder / "left.mp4"), "rtsp://user:secret@127.0.0.1/main",
+             "--detector", "video_scenes:bright_spots", "-o", str(folder / "tracks.csv")],
+            catch_exceptions=False,
+        )  # fmt: skip
