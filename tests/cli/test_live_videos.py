@@ -27,13 +27,16 @@ FRAMES, LATE = 20, 0.03
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two videos: 15 frames a second, and some 25 at uneven times; the right camera is 30 ms later than it says."""
+    """Two videos: 15 frames a second, and some 25 at uneven times; the right camera is 30 ms later than it says.
+
+    They are compressed as cameras do it.
+    """
     folder, rig = tmp_path_factory.mktemp("scene"), small_rig()
     save_rig(rig, folder / "rig.json")
     times = [number / 15 for number in range(FRAMES)]
-    write_video(folder / "left.mp4", film(rig, 0, times), times)
+    write_video(folder / "left.mp4", film(rig, 0, times), times, crf=23)
     times = [round(0.013 + number / 25 + 0.008 * np.sin(number), 3) for number in range(34)]
-    write_video(folder / "right.mp4", film(rig, 1, times, LATE), times)
+    write_video(folder / "right.mp4", film(rig, 1, times, LATE), times, crf=23)
     return folder
 
 
@@ -55,7 +58,7 @@ def test_positions_and_clock_are_right_within_their_sigmas(folder: Path) -> None
     assert f"{FRAMES} moments, {2 * (FRAMES - 3)} positions" in told
     assert f"videos: {FRAMES} and " in told
     offset, sigma = (float(told.split(word)[1].split()[0]) for word in ("images are ", "± "))
-    assert abs(offset - 1e3 * LATE) < 3.5 * sigma < 5.0
+    assert abs(offset - 1e3 * LATE) < 3.5 * sigma < 25.0
     with open(folder / "tracks.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * (FRAMES - 3)
@@ -65,7 +68,7 @@ def test_positions_and_clock_are_right_within_their_sigmas(folder: Path) -> None
         target = int(np.abs(true - found).sum(1).argmin())
         sigma = np.sqrt([float(row[f"cov_{axis}_m2"]) for axis in ("ee", "uu", "nn")])
         # The images inside the boxes were matched: boxes alone leave some 10 m.
-        assert sigma[2] < 0.6
+        assert sigma[2] < 1.0
         assert (np.abs(found - true[target]) < 3.5 * sigma).all(), (found, true[target], sigma)
         pace = float(row["velocity_east_mps"]) - float(VELOCITY[target, 0])
         assert abs(pace) < 3.5 * float(row["velocity_east_sigma_mps"])

@@ -46,10 +46,12 @@ def drawn_image(rig: StereoRig, side: int, time: float, random: np.random.Genera
     return exposed(image, 1.0, random).round().clamp(0, 255).byte().numpy()
 
 
-def write_video(path: Path, images: Sequence[Image], times: Sequence[float], pixel_format: str = "yuvj420p") -> Path:
-    """A lossless video whose frames have the given times, to a millisecond."""
+def write_video(
+    path: Path, images: Sequence[Image], times: Sequence[float], pixel_format: str = "yuvj420p", crf: int = 0
+) -> Path:
+    """A video whose frames have the given times, to a millisecond; without losses if `crf` is 0."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=25, options={"qp": "0", "preset": "ultrafast", "g": "12"})
+        stream = container.add_stream("libx264", rate=25, options={"crf": str(crf), "preset": "fast", "g": "12"})
         stream.width, stream.height = images[0].shape[1], images[0].shape[0]
         stream.pix_fmt = pixel_format
         stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
