@@ -9,7 +9,6 @@ filter (the package `stonesoup`) get the same pairs.
 from __future__ import annotations
 
 import argparse
-import datetime
 import math
 from typing import Any, NamedTuple
 
@@ -26,6 +25,7 @@ from kcal.pipeline.consider import ClockPrior
 from kcal.pipeline.motion import Motion
 from kcal.pipeline.pairs import ObjectPairs
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
+from scripts.check.track_rivals import CartesianFilters, OfPixels, OfPositions
 from scripts.shared.page import table, write_section
 
 # Degrees: the relative yaw is known to this, 44 m at 5 km.
@@ -109,49 +109,6 @@ def owner(tracks: Tracks, site: Site, places: Tensor) -> Tensor:
     return torch.cdist(tracks.state.bearing, direction).argmin(-1)
 
 
-class StoneSoupFilter:
-    """Stone Soup's extended Kalman filter, Cartesian, one for each target, given who is who."""
-
-    def __init__(self) -> None:
-        from stonesoup.models.measurement.linear import LinearGaussian
-        from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
-        from stonesoup.predictor.kalman import KalmanPredictor
-        from stonesoup.types.detection import Detection
-        from stonesoup.types.hypothesis import SingleHypothesis
-        from stonesoup.types.state import GaussianState
-        from stonesoup.updater.kalman import KalmanUpdater
-
-        self._types: tuple[Any, ...] = (LinearGaussian, Detection, SingleHypothesis, GaussianState, KalmanUpdater)
-        model = CombinedLinearGaussianTransitionModel([ConstantVelocity(ACCELERATION**2)] * 3)
-        self._predictor = KalmanPredictor(model)
-        self.states: dict[int, Any] = {}
-
-    def take(self, targets: Tensor, enu: Tensor, covariance: Tensor, ok: Tensor, time: float) -> None:
-        """Take in positions with covariances."""
-        linear, detection, hypothesis, gaussian, updater = self._types
-        when = datetime.datetime(2026, 1, 1) + datetime.timedelta(seconds=time)
-        for i, target in enumerate(targets.tolist()):
-            if not bool(ok[i]):
-                continue
-            place, noise = enu[i].numpy()[:, None], covariance[i].numpy()
-            if target not in self.states:
-                mean, spread = np.zeros((6, 1)), np.zeros((6, 6))
-                mean[::2], spread[::2, ::2] = place, noise
-                spread[1::2, 1::2] = 20.0**2 * np.eye(3)
-                self.states[target] = gaussian(mean, spread, timestamp=when)
-                continue
-            prediction = self._predictor.predict(self.states[target], timestamp=when)
-            made = updater(linear(6, (0, 2, 4), noise)).update(hypothesis(prediction, detection(place, timestamp=when)))
-            self.states[target] = gaussian(made.state_vector, made.covar, timestamp=when)
-
-    def places(self, time: float) -> tuple[list[int], Tensor]:
-        """Targets and where they are believed to be."""
-        when = datetime.datetime(2026, 1, 1) + datetime.timedelta(seconds=time)
-        found = [self._predictor.predict(state, timestamp=when) for state in self.states.values()]
-        rows = [np.asarray(state.state_vector, float).ravel()[::2] for state in found]
-        return list(self.states), torch.from_numpy(np.array(rows))
-
-
 def gospa(found: Tensor, true: Tensor, cutoff: float, power: float = 2.0) -> float:
     """Generalized optimal sub-pattern assignment (Rahmathullah et al. 2017), alpha = 2.
 
@@ -200,7 +157,12 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
     tracker = Tracker(site.localize, options, clock=ClockPrior(offset_sigma_s=OFFSET_SIGMA), record=True)
     # The same without clock errors in the estimate of what is expected: knows the offset exactly.
     informed = Tracker(site.localize, options, clock=ClockPrior(offset_s=OFFSET))
-    rival = StoneSoupFilter() if oracle else None
+    # Filter against filter: both know the rig and the clock, and get the same pairs.
+    plain = StereoLocalizer(
+        site.true, origin=site.localize.origin, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0
+    )
+    equal = Tracker(plain, options, clock=ClockPrior(offset_s=OFFSET))
+    positions, pixels = OfPositions(ACCELERATION, options.speed_mps), OfPixels(ACCELERATION, options.speed_mps)
     for frame in range(frames):
         time = frame / 10.0
         pairs, which, places = seen_pairs(site, frame)
@@ -208,11 +170,14 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
         tracks, exact = tracker(pairs), informed(pairs)
         one = site.localize(pairs.left, pairs.right, pairs.covariance)
         mine = owner(tracks, site, places)
-        if rival is not None and frame >= 5:
-            # The rival is told the offset, and whose each sighting is: filter against filter.
+        if oracle:
+            same = equal(pairs)
+            pixels.take(which, pairs, plain(pairs.left, pairs.right, pairs.covariance).enu, plain, OFFSET)
+        if oracle and frame >= 5:
+            # This one is even told the velocities that bring the two times of a pair together.
             late = (pairs.time[:, 1:] - pairs.time[:, :1] + OFFSET) * pace[which, :1] / float(site.true.baseline)
             ahead = one.enu * (1.0 - late)
-            rival.take(which, ahead, one.covariance, one.status == 0, time)
+            positions.take(which, ahead, one.covariance, one.status == 0, time)
         far = which >= TARGETS - 6
         lost = torch.linalg.vector_norm(places, dim=-1)
         if frame == 9:
@@ -233,8 +198,9 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
             figures.add("position", error / sigma)
             floor = tracks.state.covariance[ok] - tracks.state.systematic[ok]
             figures.add("floor", torch.linalg.eigvalsh(floor)[:, 0] / floor.diagonal(dim1=-2, dim2=-1).sum(-1))
-            if rival is not None and frame >= 30:
-                compare(figures, rival, exact, owner(exact, site, places), enu, time)
+            if oracle and frame >= 30:
+                compare(figures, "positions", positions, exact, owner(exact, site, places), enu, time)
+                compare(figures, "pixels", pixels, same, owner(same, site, places), enu, time)
     offset, doubt = tracker.clock_estimate().offset(seconds / 2)
     figures.add("clock", torch.tensor([(offset - OFFSET) / doubt]))
     figures.add("clock ms", torch.tensor([1e3 * (offset - OFFSET)]))
@@ -248,18 +214,20 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
         figures.add("smoother", ratio / track.state.inverse_range_sigma[step])
 
 
-def compare(figures: Figures, rival: StoneSoupFilter, tracks: Tracks, owners: Tensor, enu: Tensor, time: float) -> None:
+def compare(
+    figures: Figures, kind: str, rival: CartesianFilters, tracks: Tracks, owners: Tensor, enu: Tensor, time: float
+) -> None:
     """Both filters on the targets that both follow; what kcal's tracker misses or doubles is counted apart."""
     names, guessed = rival.places(time)
     ours = {int(target): row for row, target in enumerate(owners.tolist()) if int(tracks.state.status[row]) == 0}
     both = [i for i, name in enumerate(names) if name in ours]
     there = torch.tensor([names[i] for i in both])
     mine = torch.stack([tracks.state.enu[ours[names[i]]] for i in both])
-    figures.add("gospa kcal", gospa(mine, enu[there], 300.0))
-    figures.add("gospa stonesoup", gospa(guessed[both], enu[there], 300.0))
-    figures.add("missed", float(len(names) - len(both)))
-    figures.add("doubled", float(len(owners) - len(set(owners.tolist()))))
-    figures.add("followed", float(len(names)))
+    figures.add(f"{kind}: kcal", gospa(mine, enu[there], 300.0))
+    figures.add(f"{kind}: stonesoup", gospa(guessed[both], enu[there], 300.0))
+    figures.add(f"{kind}: missed", float(len(names) - len(both)))
+    figures.add(f"{kind}: doubled", float(len(owners) - len(set(owners.tolist()))))
+    figures.add(f"{kind}: followed", float(len(names)))
 
 
 def main() -> None:
@@ -312,13 +280,30 @@ def report(figures: Figures, seeds: int, seconds: float) -> str:
         f"{_rms(figures.all('clock sigma ms')):.2f} ms. A target at 30 m/s that crosses at 5 km is wrong by "
         f"{lost[0]:.0f} m without and {lost[1]:.0f} m with it.",
     ]
-    if "gospa kcal" in figures.numbers:
-        ours, theirs = (float(np.mean(figures.numbers[f"gospa {name}"])) for name in ("kcal", "stonesoup"))
-        missed, doubled, followed = (sum(figures.numbers[name]) for name in ("missed", "doubled", "followed"))
+    if "pixels: kcal" in figures.numbers:
+        mean = {name: float(np.mean(values)) for name, values in figures.numbers.items()}
+        missed, doubled, followed = (
+            sum(figures.numbers[f"pixels: {name}"]) for name in ("missed", "doubled", "followed")
+        )
         lines += [
             "",
-            f"GOSPA (cutoff 300 m) of the targets that both follow: kcal {ours:.0f} m, Stone Soup's Kalman filter, "
-            f"which is told which sighting is whose, {theirs:.0f} m. Of {followed:,.0f} targets in all moments kcal's "
+            *table(
+                ["GOSPA (cutoff 300 m) of the targets that both follow", "kcal", "Stone Soup", "kcal over Stone Soup"],
+                [
+                    [
+                        what,
+                        f"{mean[f'{kind}: kcal']:.1f} m",
+                        f"{mean[f'{kind}: stonesoup']:.1f} m",
+                        f"{mean[f'{kind}: kcal'] / mean[f'{kind}: stonesoup']:.3f}",
+                    ]
+                    for what, kind in (
+                        ("equal information: the pairs, the true rig, the clock; unscented, Cartesian", "pixels"),
+                        ("positions as measurements, Kalman filter, Cartesian; the believed rig", "positions"),
+                    )
+                ],
+            ),
+            "",
+            f"Stone Soup's filters are told whose each sighting is. Of {followed:,.0f} targets in all moments kcal's "
             f"tracker has no position for {missed:,.0f} and two for {doubled:,.0f}.",
         ]
     return "\n".join(lines)
