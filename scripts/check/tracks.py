@@ -32,6 +32,8 @@ from scripts.shared.page import table, write_section
 YAW_SIGMA = 0.001
 # Seconds: the right clock is late by the first, and known to the second before.
 OFFSET, OFFSET_SIGMA = 0.040, 0.1
+# For the long runs: a crystal's drift in s/s, the right image's last row against its first in s, and what is known.
+DRIFT, SLOPE, DRIFT_SIGMA, SLOPE_SIGMA = 5e-5, 0.010, 1e-4, 0.02
 BEARING_PX, MATCH_PX = 0.5, 0.1
 ACCELERATION = 0.2
 TARGETS = 30
@@ -72,13 +74,14 @@ def drawn_site(seed: int, frames: int) -> Site:
     return Site(localize, true, path, pace, generator)
 
 
-def seen_pairs(site: Site, frame: int) -> tuple[ObjectPairs, Tensor, Tensor]:
+def seen_pairs(site: Site, frame: int, drift: float = 0.0, slope: float = 0.0) -> tuple[ObjectPairs, Tensor, Tensor]:
     """Pairs of a moment, the targets that they are of, and the true places when the left camera looked."""
     g, time = site.generator, frame / 10.0
     # The right camera runs at 25 frames a second; the nearest frame is taken, and its clock is late.
     stamp = round(25 * (time + 0.013)) / 25 - 0.013
     places = site.path[frame]
-    later = places + (stamp + OFFSET - time) * site.pace[frame]
+    row = site.true.right.project(site.true.right_from_left(places))[0][:, 1:] / site.true.right.size[1] - 0.5
+    later = places + (stamp + OFFSET + drift * time + slope * row - time) * site.pace[frame]
     left, fine = site.true.left.project(places)
     right, seen = site.true.right.project(site.true.right_from_left(later))
     # One target in 20 is hidden, for a second at a time.
@@ -214,6 +217,24 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
         figures.add("smoother", ratio / track.state.inverse_range_sigma[step])
 
 
+def run_clock(seed: int, seconds: float, figures: Figures) -> None:
+    """The clock alone, with drift and unlike rolling shutters; judged at the end."""
+    frames = round(seconds * 10)
+    site = drawn_site(seed, frames)
+    prior = ClockPrior(offset_sigma_s=OFFSET_SIGMA, drift_sigma=DRIFT_SIGMA, slope_sigma_s=SLOPE_SIGMA)
+    options = TrackOptions(motions=(Motion(acceleration=ACCELERATION),), speed_mps=15.0)
+    tracker = Tracker(site.localize, options, clock=prior)
+    for frame in range(frames):
+        tracker(seen_pairs(site, frame, DRIFT, SLOPE)[0], frame / 10.0)
+    estimate = tracker.clock_estimate()
+    offset, sigma = estimate.offset(tracker.time)
+    sigmas = estimate.covariance.diagonal().sqrt()
+    found = torch.stack([torch.tensor(offset), *estimate.values[1:]])
+    true = torch.tensor([OFFSET + DRIFT * tracker.time, DRIFT, SLOPE])
+    figures.add("long clock", (found - true)[None])
+    figures.add("long clock sigma", torch.stack([torch.tensor(sigma), *sigmas[1:]])[None])
+
+
 def compare(
     figures: Figures, kind: str, rival: CartesianFilters, tracks: Tracks, owners: Tensor, enu: Tensor, time: float
 ) -> None:
@@ -234,6 +255,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=12.0)
+    parser.add_argument("--clock-seconds", type=float, default=60.0, help="of the runs of the clock; 0: none")
+    parser.add_argument("--clock-seeds", type=int, default=4)
     parser.add_argument("--without-stonesoup", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
@@ -243,6 +266,11 @@ def main() -> None:
         run_seed(seed, options.seconds, figures, oracle=not options.without_stonesoup)
         text = report(figures, seed + 1, options.seconds)
         print(f"after {seed + 1} seeds\n{text}", flush=True)
+    for seed in range(options.clock_seeds if options.clock_seconds else 0):
+        run_clock(100 + seed, options.clock_seconds, figures)
+        print(f"clock, after {seed + 1} seeds\n{clock_report(figures, options.clock_seconds)}", flush=True)
+    if options.clock_seconds and options.clock_seeds:
+        text += "\n\n" + clock_report(figures, options.clock_seconds)
     if options.write:
         write_section("tracks.md", "tracks", text)
 
@@ -307,6 +335,23 @@ def report(figures: Figures, seeds: int, seconds: float) -> str:
             f"tracker has no position for {missed:,.0f} and two for {doubled:,.0f}.",
         ]
     return "\n".join(lines)
+
+
+def clock_report(figures: Figures, seconds: float) -> str:
+    error, sigma = (figures.all(name).reshape(-1, 3) for name in ("long clock", "long clock sigma"))
+    rows: list[list[object]] = []
+    for column, (what, true, unit, scale) in enumerate((
+        ("offset at the end", OFFSET + DRIFT * seconds, "ms", 1e3),
+        ("drift", DRIFT, "ppm", 1e6),
+        ("last row against first", SLOPE, "ms", 1e3),
+    )):  # fmt: skip
+        inside = int((error[:, column].abs() < 1.96 * sigma[:, column]).sum())
+        rows.append([
+            what, f"{scale * true:g} {unit}", f"{scale * _rms(error[:, column]):.2f} {unit}",
+            f"{scale * _rms(sigma[:, column]):.2f} {unit}", f"{inside} of {len(error)}",
+        ])  # fmt: skip
+    head = [f"clock after {seconds:g} s", "truth", "RMS of error", "stated sigma", "in the 95 % interval"]
+    return "\n".join(table(head, rows))
 
 
 def _rms(values: Tensor) -> float:
