@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from av.container import InputContainer
 from av.format import Flags
+from av.video.stream import VideoStream
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -19,6 +20,8 @@ from kcal.errors import FileError
 
 # Seconds before a wanted frame to which a file is wound: decoders are exact again after the next key frame.
 _RUN_UP = 1.0
+# No playlists and descriptions of sessions, which name other files and addresses.
+_CONTAINERS = "mov,matroska,avi,mpegts,mpeg,flv,asf,ogg,nut,mxf,h264,hevc,mjpeg,m4v"
 
 
 class TimedFrame(NamedTuple):
@@ -41,8 +44,8 @@ class TimedFrame(NamedTuple):
         return torch.from_numpy(self.picture.to_ndarray(format="gray"))
 
 
-def check_size(frame: av.VideoFrame, size: tuple[int, int], name: str) -> None:
-    """Raise unless a frame is as large as the camera's images.
+def check_size(frame: av.VideoFrame | VideoStream, size: tuple[int, int], name: str) -> None:
+    """Raise unless a frame or stream is as large as the camera's images.
 
     Raises:
         FileError: another size. Whether it was scaled or cropped cannot be seen, and the two differ by far.
@@ -82,13 +85,18 @@ def file_frames(
 
 
 def _wound(path: Path, size: tuple[int, int], since: float, undecoded: Callable[[], None]) -> Generator[TimedFrame]:
-    with open_video(str(path), str(path)) as container:
+    if not path.is_file():
+        raise FileError(f"{path}: no such file")
+    allowed = {"protocol_whitelist": "file", "format_whitelist": _CONTAINERS}
+    with open_video(f"file:{path}", str(path), **allowed) as container:
         if container.format.flags & cast(int, Flags.no_timestamps.value):
             raise FileError(f"{path}: a raw stream has no times; put it into a container with the times of the camera")
         stream = container.streams.video[0]
         base = stream.time_base
         if base is None:
             raise FileError(f"{path}: the video has no unit of time")
+        if stream.width and stream.height:
+            check_size(stream, size, str(path))
         if since > 0:
             container.seek(max(0, round((since - _RUN_UP) / base)), stream=stream)
         latest = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from collections import namedtuple
 from pathlib import Path
@@ -103,8 +104,16 @@ def test_files_that_are_no_videos(tmp_path: Path) -> None:
     garbage.write_bytes(b"no video at all" * 1000)
     with pytest.raises(FileError, match="cannot be opened as a video"):
         next(file_frames(garbage, SIZE))
-    with pytest.raises(FileError, match="No such file"):
+    with pytest.raises(FileError, match="no such file"):
         next(file_frames(tmp_path / "nowhere.mp4", SIZE))
+
+
+@pytest.mark.parametrize("kind", ["ffconcat version 1.0\nfile {name}\n", "#EXTM3U\n#EXTINF:1\n{name}\n"])
+def test_a_playlist_opens_nothing_else(video: Path, tmp_path: Path, kind: str) -> None:
+    shutil.copyfile(video, tmp_path / "video.mp4")
+    (tmp_path / "list.mp4").write_text(kind.format(name="video.mp4"), encoding="utf-8")
+    with pytest.raises(FileError, match="cannot be opened as a video"):
+        next(file_frames(tmp_path / "list.mp4", SIZE))
 
 
 def test_a_video_without_times_is_refused(tmp_path: Path) -> None:
