@@ -80,10 +80,12 @@ def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: p
     for path in folder.glob("tracks.csv*"):
         path.unlink()
     write = Stream._write
+    left_by_a_crash: dict[Path, bytes] = {}
 
     def terminated(self: Stream, *what: object) -> None:
         write(self, *what)  # type: ignore[arg-type]
         if self.counts.moments == 7:
+            left_by_a_crash.update((path, path.read_bytes()) for path in folder.glob("tracks.csv*"))
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(Stream, "_write", terminated)
@@ -95,6 +97,11 @@ def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: p
     assert f"{FRAMES - 8} moments" in told
     assert (folder / "tracks.csv").read_bytes() == whole
     assert "0 moments, 0 positions" in live(folder, "--clock-offset", str(LATE))
+    # After a crash there is no newer checkpoint: seven moments are detected again, and not written again.
+    for path, content in left_by_a_crash.items():
+        path.write_bytes(content)
+    assert f"{FRAMES - 8} moments" in live(folder, "--clock-offset", str(LATE))
+    assert (folder / "tracks.csv").read_bytes() == whole
 
 
 def test_a_shorter_video_ends_the_pairs(folder: Path) -> None:
