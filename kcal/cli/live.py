@@ -157,8 +157,6 @@ def live_command(
             live = pairs is not None and pairs.live
             counts = stream.follow(source, waits=not live, resumes=not live and detections != "-")
         finally:
-            if pairs is not None:
-                pairs.close()
             for number, handler in before.items():
                 signal.signal(number, handler)
             if page is not None:

@@ -114,7 +114,7 @@ class Stream:
         """Follow a source until it ends or `stop` is called.
 
         Args:
-            source: gives items from an offset on.
+            source: gives items from an offset on; if it can be closed, it is closed at the end.
             waits: whether the source waits when there is no time for more; else the oldest moments are dropped.
             resumes: whether it can begin at an offset; else it gives what comes now.
         """
@@ -164,6 +164,11 @@ class Stream:
             self.ledger.close()
             for sender in self.senders:
                 sender.close()
+            # The interpreter must not end while the reader computes; one that waits for input may be left alone.
+            close = getattr(source, "close", None)
+            if close is not None:
+                close()
+            reader.join(0.5 if close is None else 10.0)
         if self._error is not None:
             raise self._error
         return self.counts

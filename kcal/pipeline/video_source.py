@@ -124,7 +124,7 @@ class VideoPairs:
                 yield SourceItem(self._moment(one, other), one.place)
             if self._newest is not None:
                 self.counts.dropped = self._newest.dropped
-        if not self._met and not offset and not self.live:
+        if not (self._met or offset or self.live or self._ended.is_set()):
             raise FileError(
                 f"{self._videos[0]} and {self._videos[1]}: no frames within {self._apart:g} s of each other; if the "
                 "recordings began at different times, say so with --clock-offset"
