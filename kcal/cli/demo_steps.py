@@ -19,12 +19,8 @@ from kcal.cli.rig import app as rig
 SIDES = ("left", "right")
 
 
-def run(name: str, *arguments: object) -> int:
-    """Print a command as a user would type it, and run it: detect, calibrate, rig, locate or report.
-
-    Returns:
-        Its exit code: 0, or that of a no.
-    """
+def run(name: str, *arguments: object) -> None:
+    """Print a command as a user would type it, and run it: detect, calibrate, rig, locate or report."""
     words = [str(argument) for argument in arguments]
     out.print(f"\n[bold]kcal {escape(shlex.join([name, *words]))}[/]")
     app = rig
@@ -37,7 +33,7 @@ def run(name: str, *arguments: object) -> int:
             "report": report_command,
         }
         app.command()(commands[name])  # type: ignore[type-var]
-    return int(get_command(app).main(words, standalone_mode=False) or 0)
+    get_command(app).main(words, standalone_mode=False)
 
 
 def locate_again(output: Path, *options: object) -> str:
