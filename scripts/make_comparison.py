@@ -31,7 +31,7 @@ from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.rig.sources import Landmarks
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
-from kcal.report.figures import FAINT, GRAY, INK, WARN, new_figure, save_png
+from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save_picture
 from kcal.sim.board import PrintedBoard
 from kcal.sim.captures import capture_corners
 from kcal.sim.scene import FOCAL_MM, DemoScene, NamedPoints
@@ -48,12 +48,12 @@ NOISE, VIEWS = 0.05, 20
 FIRST = 400  # seed of the first draw; none below was looked at
 FLAGS = {f"OpenCV, {count} coefficients": flags for count, flags in ((5, 0), *CHAIN_FLAGS.items())}
 NAMES = ("kcal", *FLAGS)
-FAR_SHOWN = 7600.0  # meters
+FAR_SHOWN, ACROSS = 6900.0, 3900.0  # meters
 
 
 def scene_of(draw: int) -> DemoScene:
     """The site of the demonstration with other lenses and another board."""
-    places = tuple((f"{far:g} {at:g}", far, at, 0.0) for far in RANGES for at in BEARINGS)
+    places = tuple((f"{far:g} {at:g}", far, at, 0.0) for far in RANGES for at in BEARINGS[:: 2 if far < 5000 else 1])
     return DemoScene(
         seed=draw,
         rig=drawn_rig("surveillance", 1.0, draw, focal_mm=FOCAL_MM, wander=1.0),
@@ -145,43 +145,43 @@ def errors(records: list[dict[str, Any]], name: str, far: float) -> list[float]:
 
 def draw(records: list[dict[str, Any]], other: str) -> None:
     """Both results side by side, from above."""
-    figure = new_figure(8.0, 5.6, dpi=200)
+    figure = new_figure(8.0, 5.0, dpi=200)
     panels = figure.subplots(1, 2, sharey=True)
-    for axes, name in zip(panels, (other, "kcal"), strict=True):
-        _draw_panel(axes, records, name)
-    panels[0].plot([], [], "o", color=WARN, markersize=4, alpha=0.6, label="located")
-    panels[0].plot([], [], "+", color=INK, markersize=10, markeredgewidth=1.8, label="true")
-    figure.legend(loc="lower center", ncols=2, frameon=False, fontsize=12, bbox_to_anchor=(0.5, 0.0))
-    figure.subplots_adjust(left=0.01, right=0.99, top=0.84, bottom=0.09, wspace=0.02)
-    save_png(ASSETS / "opencv.png", figure)
+    for axes, name, color in zip(panels, (other, "kcal"), (WARN, ACCENT), strict=True):
+        _draw_panel(axes, records, name, color)
+    text = f"+ true   ● located, {len(records)} draws of lenses, board and noise   ±: median error of the range"
+    figure.text(0.5, 0.02, text, fontsize=11, color=GRAY, ha="center", va="bottom")
+    figure.subplots_adjust(left=0.01, right=0.99, top=0.81, bottom=0.09, wspace=0.03)
+    save_picture(ASSETS / "opencv.png", figure)
 
 
-def _draw_panel(axes: Axes, records: list[dict[str, Any]], name: str) -> None:
-    angles = torch.linspace(-math.radians(36.0), math.radians(36.0), 100)
+def _draw_panel(axes: Axes, records: list[dict[str, Any]], name: str, color: str) -> None:
+    edge = math.radians(36.0)
+    angles = np.linspace(-edge, edge, 100)
     for far in RANGES:
-        axes.plot(far * angles.sin(), far * angles.cos(), color=FAINT, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
-        end = float(angles[-1])
-        axes.text(far * math.sin(end) + 90, far * math.cos(end) - 60, f"{far / 1000:g} km", fontsize=12, color=GRAY,
-                  ha="left", va="top")  # fmt: skip
-    for edge in (-36.0, 36.0):
-        side = math.radians(edge)
-        axes.plot(
-            [0, FAR_SHOWN * math.sin(side)], [0, FAR_SHOWN * math.cos(side)], color=FAINT, linewidth=0.8, zorder=1
-        )
-    places = [place for record in records for place in record[name]]
-    near = [place for place in places if place is not None and place[1] < FAR_SHOWN]
-    axes.plot(*zip(*near, strict=True), "o", color=WARN, markersize=3.2, alpha=0.55, markeredgewidth=0, zorder=3)
-    truth = records[0]["truth"]
-    axes.plot(*zip(*truth, strict=True), "+", color=INK, markersize=9, markeredgewidth=1.6, zorder=4)
+        axes.plot(far * np.sin(angles), far * np.cos(angles), color=FAINT, linewidth=1.0, linestyle=(0, (4, 3)))
+        place = far * math.sin(edge) + 80, far * math.cos(edge) - 40
+        axes.text(*place, f"{far / 1000:g} km", fontsize=12, color=GRAY, ha="left", va="top")
+    for side in (-edge, edge):
+        axes.plot([0, FAR_SHOWN * math.sin(side)], [0, FAR_SHOWN * math.cos(side)], color=FAINT, linewidth=0.8)
+    beyond = count = 0
+    for record in records:
+        for true, place in zip(record["truth"], record[name], strict=True):
+            count += 1
+            if place is None or not (abs(place[0]) < ACROSS and 0 < place[1] < FAR_SHOWN):
+                beyond += 1
+                continue
+            axes.plot(*zip(true, place, strict=True), color=color, alpha=0.3, linewidth=0.8, zorder=2)
+            axes.plot(*place, "o", color=color, markersize=3.6, alpha=0.6, markeredgewidth=0, zorder=3)
+    axes.plot(*zip(*records[0]["truth"], strict=True), "+", color=INK, markersize=7, markeredgewidth=1.3, zorder=4)
     axes.plot(0, 0, "^", color=INK, markersize=9, zorder=4)
-    if beyond := len(places) - len(near):
-        axes.text(0, FAR_SHOWN + 60, f"{beyond} of {len(places)} beyond ▲", fontsize=11, color=WARN, ha="center",
-                  va="bottom")  # fmt: skip
+    if beyond:
+        axes.text(0, FAR_SHOWN, f"{beyond} of {count} lie beyond", fontsize=11, color=color, ha="center", va="top")
     typical = [median(errors(records, name, far)) for far in RANGES]
-    axes.set_title(name, fontsize=17, fontweight="bold", color=INK, pad=40)
-    text = ",  ".join(f"{far / 1000:g} km: ±{_meters(value)}" for far, value in zip(RANGES, typical, strict=True))
-    axes.text(0.5, 1.06, text, transform=axes.transAxes, fontsize=13, color=GRAY, ha="center", va="bottom")
-    axes.set(xlim=(-4700, 4700), ylim=(-200, FAR_SHOWN), aspect="equal")
+    axes.set_title(name, fontsize=18, fontweight="bold", color=INK, pad=34)
+    text = "    ".join(f"{far / 1000:g} km: ±{_meters(value)}" for far, value in zip(RANGES, typical, strict=True))
+    axes.text(0.5, 1.03, text, transform=axes.transAxes, fontsize=14, color=color, ha="center", va="bottom")
+    axes.set(xlim=(-ACROSS, ACROSS), ylim=(-150, FAR_SHOWN), aspect="equal")
     axes.axis("off")
 
 

@@ -14,7 +14,7 @@ from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.corners.observations import Observations
 from kcal.lens.uncertainty import image_sigma
-from kcal.report.figures import ACCENT, FAINT, INK, WARN, draw_arrows, frame_image, new_figure, save_png
+from kcal.report.figures import ACCENT, FAINT, INK, WARN, draw_arrows, frame_image, new_figure, save_picture
 
 
 def calibration_figure(result: CameraCalibrationResult) -> Figure:
@@ -40,8 +40,8 @@ def calibration_figure(result: CameraCalibrationResult) -> Figure:
 
 
 def save_calibration_picture(path: str | Path, result: CameraCalibrationResult) -> Path:
-    """Write the picture of `calibration_figure` as a PNG, atomically."""
-    return save_png(path, calibration_figure(result))
+    """Write the picture of `calibration_figure` as PNG or SVG, atomically."""
+    return save_picture(path, calibration_figure(result))
 
 
 def draw_coverage(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.locate.positions import Located, Position
 from kcal.locate.stereo import PositionStatus
-from kcal.report.figures import CAMERA_COLORS, FAINT, GRAY, HALO, INK, WARN, new_figure, range_text, save_png
+from kcal.report.figures import CAMERA_COLORS, FAINT, GRAY, HALO, INK, WARN, new_figure, range_text, save_picture
 
 Array = NDArray[np.float64]
 
@@ -65,13 +65,13 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
 
 
 def save_positions_picture(path: str | Path, located: Located, truth: Tensor | None = None) -> Path:
-    """Write the picture of `positions_figure` as a PNG, atomically.
+    """Write the picture of `positions_figure` as PNG or SVG, atomically.
 
     Raises:
-        InputError: a suffix other than .png, or a truth of the wrong shape.
+        InputError: a suffix other than .png and .svg, or a truth of the wrong shape.
         FileError: the file cannot be written.
     """
-    return save_png(path, positions_figure(located, truth))
+    return save_picture(path, positions_figure(located, truth))
 
 
 class _RangeScale:

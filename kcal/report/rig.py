@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from kcal.calibrate.rig.result import ItemResidual, RigResult
-from kcal.report.figures import new_figure, save_png
+from kcal.report.figures import new_figure, save_picture
 
 Array = NDArray[np.float64]
 
@@ -59,13 +59,13 @@ def rig_figure(result: RigResult) -> Figure:
 
 
 def save_rig_picture(path: str | Path, result: RigResult) -> Path:
-    """Write the picture of `rig_figure` as a PNG, atomically.
+    """Write the picture of `rig_figure` as PNG or SVG, atomically.
 
     Raises:
-        InputError: a suffix other than .png.
+        InputError: a suffix other than .png and .svg.
         FileError: the file cannot be written.
     """
-    return save_png(path, rig_figure(result))
+    return save_picture(path, rig_figure(result))
 
 
 def _flat(result: RigResult, points: Array) -> Array:
