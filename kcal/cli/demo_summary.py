@@ -56,8 +56,8 @@ def save_site_summary(
             text=(
                 f"A printed board was photographed {scene.near_views} times by each camera, and found in {found} of "
                 f"{2 * scene.near_views} pictures. The board is bent by 1 mm and stretched by 0.15 %; kcal measures "
-                f"that on the way. {_rms(file)} The truth is a lens traced ray by ray through seven pieces of glass "
-                "that are not quite centered.",
+                f"that on the way. {_residuals_text(file)} The truth is a lens traced ray by ray through seven "
+                "pieces of glass that are not quite centered.",
             ),
             pictures=(
                 (output / "images" / "left-near" / "near-02.png", "One of the pictures"),
@@ -105,7 +105,7 @@ def save_pairs_summary(output: Path, table: Sequence[Sequence[str]], command: st
         _map_part(output, "The located corners, and the interval of each range"),
         Part(
             heading="1. Each camera was calibrated",
-            text=(_rms(file),),
+            text=(_residuals_text(file),),
             pictures=tuple(
                 (output / f"{side}.png", f"{side.capitalize()} camera: where corners were, and their residuals")
                 for side in SIDES
@@ -121,7 +121,7 @@ def save_pairs_summary(output: Path, table: Sequence[Sequence[str]], command: st
     save_summary(output / "summary.html", f"Two cameras, {pairs} pairs of pictures", lead, parts)
 
 
-def _rms(file: RigFile) -> str:
+def _residuals_text(file: RigFile) -> str:
     cameras = zip(SIDES, (file.left.calibration, file.right.calibration), strict=True)
     rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
     return f"RMS of the residuals: {rms}."

@@ -38,10 +38,19 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
         truth: (N, 3) true east, north, up in meters, NaN where unknown; an arrow leads from each to its estimate.
 
     Returns:
-        A matplotlib figure that belongs to no window and no global state.
+        A matplotlib figure that belongs to no window and no global state: the map, then the intervals.
 
     Raises:
         InputError: a truth of the wrong shape.
+
+    Example:
+        >>> from kcal import Camera, Origin, StereoRig, locate_points
+        >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> left, right, _ = rig(torch.tensor([[50.0, 0.0, 900.0]]))
+        >>> located = locate_points(rig, left, right, origin=Origin(lat=19.0, lon=72.9, height=0.0), heading_deg=35.0)
+        >>> len(positions_figure(located).axes)
+        2
     """
     true_enu = None if truth is None else truth.detach().cpu().double().numpy()
     if true_enu is not None and true_enu.shape != (len(located.positions), 3):

@@ -24,6 +24,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from kcal.files import make_folder
 from scripts.shared.page import CONCLUSIONS, DOCS, table
 from scripts.shared.timing import show
 
@@ -111,7 +112,10 @@ def cell(folder: Path, python: str, package: Path, pins: list[str]) -> dict[str,
     try:
         call(python, "-m", "venv", place)
         pip = place / "bin" / "pip"
-        call(pip, "install", "--quiet", package, *pins)
+        # Kept from one cell to the next: torch brings gigabytes that all interpreters share.
+        wheels = "--find-links", folder / "wheels"
+        call(pip, "download", "--quiet", *wheels, "--dest", wheels[1], package, *pins)
+        call(pip, "install", "--quiet", "--no-compile", *wheels, package, *pins)
         installed = time.perf_counter() - start
         found = json.loads(call(place / "bin" / "python", "-c", SMOKE, cwd=folder).splitlines()[-1])
         call(place / "bin" / "kcal", "--help", cwd=folder)
@@ -153,6 +157,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="kcal-versions-") as name:
         folder = Path(name)
         packages = built(folder)
+        make_folder(folder / "wheels")
         for version in arguments.pythons:
             python = interpreter(version)
             if python is None:
