@@ -34,15 +34,17 @@ def calibration_figure(result: CameraCalibrationResult) -> Figure:
 
     Example:
         >>> import torch
-        >>> from kcal import Board, Camera, Observations, View, calibrate_camera, rotation_from_vector
+        >>> from kcal import Board, CalibrationOptions, Camera, Observations, View, calibrate_camera
+        >>> from kcal.lens.pose import rotation_from_vector
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.2, 0.05])
         >>> board, views = Board(columns=7, rows=6, square=0.05), []
         >>> for turn in ((0.5, 0, 0), (-0.5, 0, 0.2), (0, 0.5, 0), (0, -0.5, 0.1), (0.3, 0.3, 1.5)):
         ...     rotation = rotation_from_vector(torch.tensor(turn).double())
-        ...     pixels, _ = camera.project((board.points - board.points.mean(0)) @ rotation.T + torch.eye(3)[2] * 0.5)
+        ...     pixels, _ = camera.project((board.points - board.points.mean(0)) @ rotation.T + torch.eye(3)[2] * 0.7)
         ...     pixels = pixels + 0.1 * torch.sin(1e3 * pixels)  # noise, of a kind
-        ...     views.append(View(name=str(turn), pixels=tuple(map(tuple, pixels.tolist()))))
-        >>> result = calibrate_camera(Observations(board=board, image_size=camera.size, views=tuple(views)))
+        ...     views.append(View(name=f"{len(views)}.png", pixels=tuple(map(tuple, pixels.tolist()))))
+        >>> seen = Observations(board=board, image_size=camera.size, views=tuple(views))
+        >>> result = calibrate_camera(seen, CalibrationOptions(model="opencv4"))
         >>> figure = calibration_figure(result)
         >>> figure.savefig("camera.svg")  # doctest: +SKIP
         >>> len(figure.axes)

@@ -44,6 +44,7 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
         InputError: a truth of the wrong shape.
 
     Example:
+        >>> import torch
         >>> from kcal import Camera, Origin, StereoRig, locate_points
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))

@@ -68,6 +68,7 @@ def lowest(requirement: str) -> str:
     if match is None:
         raise SystemExit(f"{requirement}: a lower bound is needed")
     name, version = match.groups()
+    version = version if "." in version else f"{version}.0"
     return f"{name}=={version}.*" if version.count(".") < 2 else f"{name}=={version}"
 
 
