@@ -348,7 +348,7 @@ class Camera(ConvertibleCamera):
 def pixels_to_plane(
     pixels: Tensor, values: Tensor, model: LensModel, ready: PreparedInverse
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Map pixels (..., N, 2) to x, y on the plane of a lens with parameters (..., 5 + P), and valid; each is (..., N)."""
+    """Map pixels (..., N, 2) to x, y on the plane of a lens with `values` (..., 5 + P), and valid; each is (..., N)."""
     cx, cy = values[..., 2, None], values[..., 3, None]
     u, v = split_coordinates(pixels)
     u, v, finite = finite_or(u, v, cx, cy)

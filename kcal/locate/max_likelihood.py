@@ -25,7 +25,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.camera_stack import project_each
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection
-from kcal.lens.tracing import known_true
+from kcal.lens.tracing import is_traced, known_true
 
 _MOST_STEPS = 5
 # The derivative of the optimum comes from this many steps with a fixed matrix; each leaves a share of about the
@@ -135,12 +135,15 @@ def most_likely(
     columns = torch.cat([turned_sides, shift[:, None, :, None].expand_as(turned_sides[..., :1, :, :])], -3)
     turned_base = rotation @ base[..., None, :, :]
     fixed = _Fixed(lenses, scale, turned_base, columns, pixels, usable, weight, tuple(() for _ in cameras))
+    whole = fixed._replace(wanted=wanted)
+    # After a step, the evaluation that finds nothing left to move is also the last one.
+    later = fixed if differentiated or is_traced() else whole
     zero = torch.zeros_like(start[1])
     with torch.no_grad():
         theta = torch.stack([zero, zero, torch.where(usable, start[1], 0.0)], -2)
         best, step, cost, at = theta, torch.zeros_like(theta), torch.full_like(zero, torch.inf), None
-        for _ in range(_MOST_STEPS):
-            at = _evaluate(fixed, theta)
+        for number in range(_MOST_STEPS):
+            at = _evaluate(later if number else fixed, theta)
             better = at.cost <= cost
             every = known_true(better)
             newton = _newton(at, usable)
@@ -155,7 +158,7 @@ def most_likely(
                 break
             theta = best + step
         theta = best
-    if not differentiated and not by_camera and every and at is not None:
+    if not differentiated and every and at is not None and (number or not by_camera):
         return _with_covariance(at, theta, sides, usable)
     if differentiated:
         inverse = _inverse_of_six(_normal_matrix(_evaluate(fixed, theta), usable))
@@ -163,7 +166,7 @@ def most_likely(
         for _ in range(_CHORDS):
             at = _evaluate(fixed, theta)
             theta = theta - torch.where(usable[..., None, :], _product(inverse, _cost_slope(at)), 0.0)
-    return _with_covariance(_evaluate(fixed._replace(wanted=wanted), theta), theta, sides, usable)
+    return _with_covariance(_evaluate(whole, theta), theta, sides, usable)
 
 
 def _least_noise(weight: Tensor | None) -> Tensor | float:
