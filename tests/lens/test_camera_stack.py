@@ -51,7 +51,8 @@ def test_gradients_reach_each_camera() -> None:
     pixels = some_pixels(2, 20)
     weight = torch.rand(2, 20, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     slopes = []
-    for rays in (unproject_each(cameras, pixels)[0], torch.stack([c.unproject(p)[0] for c, p in zip(cameras, pixels)])):
+    alone = [camera.unproject(some)[0] for camera, some in zip(cameras, pixels, strict=True)]
+    for rays in (unproject_each(cameras, pixels)[0], torch.stack(alone)):
         slopes.append(torch.autograd.grad((weight * rays).sum(), [camera.params for camera in cameras]))
     for one, other in zip(*slopes, strict=True):
         assert float(one.abs().max()) > 0
