@@ -36,9 +36,9 @@ def near_epipolar_lines(rig: StereoRig, left: Tensor, right: Tensor, sigma: floa
         [[True, False]]
     """
     rotation, shift = rig.right_from_left_rotation, rig.right_from_left_translation
-    halves = None if rig.covariance is None else rig.covariance.half.T
     sizes = (rig.left.values.shape[-1], rig.right.values.shape[-1], 3, 3)
-    own = [None] * 4 if halves is None else list(halves.split(sizes))
+    known = shift.new_zeros(0, sum(sizes)) if rig.covariance is None else rig.covariance.half
+    own = known.T.split(sizes)
     rays_left, by_left, effect_left = _turns(rig.left, left, own[0])
     rays_right, by_right, effect_right = _turns(rig.right, right, own[1])
     turned = (rays_left @ rotation.T)[:, None]
@@ -48,24 +48,21 @@ def near_epipolar_lines(rig: StereoRig, left: Tensor, right: Tensor, sigma: floa
     by_turn = torch.linalg.cross(*torch.broadcast_tensors(turned, across))
     normal = torch.linalg.cross(shift.expand_as(turned), turned)
     by_other = torch.linalg.cross(*torch.broadcast_tensors(rays_right[None], normal))
-    by_left = rotation @ by_left
-    marks = torch.cat([by_turn @ by_left, (by_other.movedim(1, 0) @ by_right).movedim(0, 1)], -1)
-    variance = sigma**2 * marks.square().sum(-1)
-    if effect_left is not None and effect_right is not None:
-        moved = (by_turn @ (own[2] - rotation @ effect_left)) - (by_other.movedim(1, 0) @ effect_right).movedim(0, 1)
-        moved = moved + torch.linalg.cross(*torch.broadcast_tensors(turned, rays_right[None])) @ own[3]
-        variance = variance + moved.square().sum(-1)
+    shifted = torch.linalg.cross(*torch.broadcast_tensors(turned, rays_right[None]))
+    by_left, by_other = rotation @ by_left, by_other.movedim(1, 0)
+    marks = torch.cat([by_turn @ by_left, (by_other @ by_right).movedim(0, 1)], -1)
+    moved = by_turn @ (own[2] - rotation @ effect_left) - (by_other @ effect_right).movedim(0, 1) + shifted @ own[3]
+    variance = sigma**2 * marks.square().sum(-1) + moved.square().sum(-1)
     # What products of two turns add at most.
     reach = (_SLACK * gate * sigma) ** 2
     second = by_left.square().sum((1, 2))[:, None] + by_right.square().sum((1, 2))
     return ~(error.abs() > _SLACK * gate * variance.sqrt() + reach * rig.baseline * second)
 
 
-def _turns(camera: Camera, pixels: Tensor, half: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+def _turns(camera: Camera, pixels: Tensor, half: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Rays (N, 3), turns of them (N, 3, 2) by a pixel and (N, 3, K) by the K errors of the camera's parameters."""
-    wanted = [] if half is None else list(range(len(half)))
     rays, _ = camera.unproject(pixels)
-    by_camera, by_motion, _ = pixel_slopes(camera, rays, torch.inf, wanted)
+    by_camera, by_motion, _ = pixel_slopes(camera, rays, torch.inf, list(range(len(half))))
     by_turn = by_motion[..., :3]
     turns = by_turn.mT @ torch.linalg.inv_ex(by_turn @ by_turn.mT)[0]
-    return rays, turns, None if half is None else turns @ (by_camera @ half)
+    return rays, turns, turns @ (by_camera @ half)
