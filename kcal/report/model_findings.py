@@ -8,6 +8,7 @@ from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.summary import summarize
 from kcal.calibrate.camera.trust import Examination, HalvesDifference, unexplained
+from kcal.calibrate.camera.warnings import REPEATING
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.verdict import Finding
 
@@ -20,10 +21,6 @@ _CHANCE = 1e-6
 _NEIGHBORS = 0.12
 # Averages of residuals over parts of the image, mean squares over what noise leaves: below 1.2 in clean captures.
 _IMAGE = 2.5
-# Tempering, above which residuals repeat so much within views that the calibration itself warns of it. OpenCV's stereo
-# images have less, with a correlation of 0.25, and predict held-out views to 0.1 px; two boards in one file
-# had more.
-_REPEATED = 2.0
 # Standard deviations by which a board bends, or a pupil moves, before it is named.
 _SURE = 5.0
 # RMS of halves over that of all views, below which these are not of one camera: 0.93 and more in captures of one.
@@ -57,7 +54,9 @@ def model_findings(
         against = against or named
     elif structured and against is None:
         # Real corners are never quite independent: with halves that agree, and the same in all views, they do little.
-        tempered = result.hybrid is not None and result.hybrid.tempering <= _REPEATED
+        # OpenCV's stereo images have a correlation of 0.25 and predict held-out views to 0.1 px; their tempering is
+        # below that of which the calibration itself warns, that of two boards in one file above it.
+        tempered = result.hybrid is not None and result.hybrid.tempering <= REPEATING
         slight = tempered and not beyond and found.structure.image <= _IMAGE
         against = Finding(
             name="model",

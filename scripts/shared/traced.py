@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -46,16 +47,33 @@ def capture(
     fill: tuple[float, float] = (0.25, 0.8),
 ) -> Observations:
     """Views of a board, whose corners truly are at `points`, by a lens, as an observations file."""
+    return captures(lens, views, [sigma], seed, points, fill)[0]
+
+
+def captures(
+    lens: TruthLens,
+    views: int,
+    sigmas: Sequence[float],
+    seed: int,
+    points: Tensor = BOARD.points,
+    fill: tuple[float, float] = (0.25, 0.8),
+) -> list[Observations]:
+    """The same views with noise of several sizes, each drawn by itself."""
     found = capture_corners(lens, views, sigma=1.0, seed=seed, fill=fill)
     seen, valid = lens.project(points @ found.rotation.transpose(-1, -2) + found.translation[:, None])
-    noisy = torch.where(valid[..., None], seen + sigma * (found.pixels - found.true_pixels), torch.nan)
-    corners = [tuple(None if u != u else (u, v) for u, v in view) for view in noisy.tolist()]
-    names = [f"{i:03d}" for i in range(views)]
-    return Observations(
-        board=BOARD,
-        image_size=lens.size,
-        views=tuple(View(name=name, pixels=view) for name, view in zip(names, corners, strict=True)),
-    )
+    out = []
+    for k, sigma in enumerate(sigmas):
+        # Noise of other corners is other noise.
+        noise = (found.pixels - found.true_pixels).roll(k, 1)
+        out.append(as_observations(torch.where(valid[..., None], seen + sigma * noise, torch.nan), lens.size))
+    return out
+
+
+def as_observations(pixels: Tensor, size: tuple[int, int]) -> Observations:
+    """Corners (V, N, 2) of the board, NaN where not seen, as an observations file."""
+    corners = [tuple(None if u != u else (u, v) for u, v in view) for view in pixels.tolist()]
+    views = tuple(View(name=f"{i:03d}", pixels=view) for i, view in enumerate(corners))
+    return Observations(board=BOARD, image_size=size, views=views)
 
 
 def pupil_of(lens: TruthLens) -> float:
