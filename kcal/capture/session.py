@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.calibrate.camera.advice import board_rolls
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.next_view import NextView, far_sigma, next_view, possible_views
 from kcal.corners.board import Board
@@ -246,6 +247,5 @@ def _seen_pixels(pixels: Tensor | None) -> list[list[float]]:
 def _holds(rotation: Tensor) -> list[list[float]]:
     """Of each view: where the board's normal leans (x, y), as the sine of its tilt, and its roll in degrees."""
     rotation = rotation[rotation.isfinite().all(-1).all(-1)]
-    roll = torch.rad2deg(torch.atan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1]))
-    leaning: list[list[float]] = torch.cat([rotation[:, :2, 2], roll[:, None]], 1).tolist()
+    leaning: list[list[float]] = torch.cat([rotation[:, :2, 2], board_rolls(rotation)[:, None]], 1).tolist()
     return leaning

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kcal.cli.board_options import Refine, RefineMethod
 from kcal.cli.console import err, out, print_table, print_wrote, steps
-from kcal.cli.detect import Refine
 from kcal.errors import DegenerateError, InputError
 
 if TYPE_CHECKING:
@@ -33,9 +33,7 @@ def batch_command(
         typer.Option("--square", metavar="LENGTH", help="Side of a square with its unit: 25mm.", show_default=False),
     ] = None,
     model: Annotated[str, typer.Option(metavar="NAME", help="Lens model, see `kcal calibrate`.")] = "hybrid",
-    refine: Annotated[
-        Refine, typer.Option("--refine", metavar="METHOD", help="erf (most accurate), saddle, opencv, skimage or none.")
-    ] = Refine.erf,
+    refine: RefineMethod = Refine.erf,
     board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how each board bends.")] = False,
     one_type: Annotated[
         bool,

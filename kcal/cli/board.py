@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from kcal.cli.board_options import BoardSize, SquareSide
 from kcal.cli.console import out, print_wrote, steps, warn, with_json
 from kcal.cli.groups import group_with_default
 from kcal.errors import InputError
@@ -21,17 +22,8 @@ app = typer.Typer(
 @app.command("print")
 @with_json
 def print_command(
-    size: Annotated[
-        str,
-        typer.Option(
-            "--board",
-            metavar="CxR",
-            help="Inner corners, columns by rows: 9x6 has 10x7 squares; charuco:9x6[:DICTIONARY[:MARKER]].",
-        ),
-    ],
-    square: Annotated[
-        str, typer.Option("--square", metavar="LENGTH", help="Side of a square with its unit: 25mm, 2.5cm, 1in.")
-    ],
+    size: BoardSize,
+    square: SquareSide,
     output: Annotated[Path, typer.Option("-o", "--output", help="File to write, .svg or .pdf.")],
     page: Annotated[
         str,

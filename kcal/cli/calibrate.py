@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from kcal.cli.calibrate_result import calibration_numbers, print_calibration
 from kcal.cli.console import out, print_wrote, steps, tell, warn
-from kcal.cli.report import NO, REQUIRE_HELP, judged, told_usable
+from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_writable, make_folder
 
@@ -177,9 +177,8 @@ def calibrate_command(
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14`: for exchange with OpenCV.
     """
     from kcal.lens.model import LensModel
-    from kcal.report.verdict import Requirement
 
-    needs = Requirement.parse(require) if require else ()
+    needs = required(require)
     places = _camera_files(observations, output, picture, report, name)
     if model != "hybrid":
         LensModel.named(model)

@@ -12,8 +12,7 @@ if TYPE_CHECKING:
 
 def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose: bool) -> None:
     """Print what a person reads: noise, uncertainty, parameters, board, warnings, what to photograph next."""
-    from kcal.calibrate.camera.summary import summarize
-    from kcal.report.view_findings import distances_text
+    from kcal.calibrate.camera.summary import distances_text, summarize
 
     assert result.camera.calibration is not None
     record = result.camera.calibration.record

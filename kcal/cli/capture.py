@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kcal.cli.board_options import BoardSize, Refine, RefineMethod, SquareSide
 from kcal.cli.console import err, out
-from kcal.cli.detect import Refine
 from kcal.errors import InputError, KcalError
 from kcal.files import check_writable
 
@@ -26,26 +26,15 @@ def capture_command(
     source: Annotated[
         str, typer.Argument(help="camera:0, a stream (rtsp://...), a video, or a folder into which images come.")
     ],
-    size: Annotated[
-        str,
-        typer.Option(
-            "--board",
-            metavar="CxR",
-            help="Inner corners, columns by rows: 9x6 has 10x7 squares; charuco:9x6[:DICTIONARY[:MARKER]].",
-        ),
-    ],
-    square: Annotated[
-        str, typer.Option("--square", metavar="LENGTH", help="Side of a square with its unit: 25mm, 2.5cm, 1in.")
-    ],
+    size: BoardSize,
+    square: SquareSide,
     output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write, or to continue.")],
     until: Annotated[
         float,
         typer.Option(metavar="PX", help="Stop when far directions are known to this σ, on average over the image."),
     ] = 0.1,
     most: Annotated[int, typer.Option(metavar="N", help="Stop at this number of views.", min=4)] = 60,
-    refine: Annotated[
-        Refine, typer.Option("--refine", metavar="METHOD", help="erf (most accurate), saddle, opencv, skimage or none.")
-    ] = Refine.erf,
+    refine: RefineMethod = Refine.erf,
     page: Annotated[
         bool, typer.Option("--page/--no-page", help="Show it on a local page; without, only in this terminal.")
     ] = True,

@@ -3,26 +3,16 @@
 from __future__ import annotations
 
 import os
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 
+from kcal.cli.board_options import BoardSize, Refine, RefineMethod, SquareSide
 from kcal.cli.console import err, out, steps, tell
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable
-
-
-class Refine(StrEnum):
-    """Names of the refinements, for the command line."""
-
-    erf = "erf"
-    saddle = "saddle"
-    opencv = "opencv"
-    skimage = "skimage"
-    none = "none"
 
 
 def detect_command(
@@ -35,21 +25,10 @@ def detect_command(
             show_default=False,
         ),
     ],
-    size: Annotated[
-        str,
-        typer.Option(
-            "--board",
-            metavar="CxR",
-            help="Inner corners, columns by rows: 9x6 has 10x7 squares; charuco:9x6[:DICTIONARY[:MARKER]].",
-        ),
-    ],
-    square: Annotated[
-        str, typer.Option("--square", metavar="LENGTH", help="Side of a square with its unit: 25mm, 2.5cm, 1in.")
-    ],
+    size: BoardSize,
+    square: SquareSide,
     output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write.")],
-    refine: Annotated[
-        Refine, typer.Option("--refine", metavar="METHOD", help="erf (most accurate), saddle, opencv, skimage or none.")
-    ] = Refine.erf,
+    refine: RefineMethod = Refine.erf,
     gallery: Annotated[
         Path | None, typer.Option(help="PNG file to write: the views with their corners, worst first.")
     ] = None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
@@ -12,7 +11,8 @@ import typer
 from kcal.cli.camera_sources import single_camera
 from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.errors import InputError
-from kcal.files import check_writable
+from kcal.files import check_writable, read_bytes
+from kcal.strict_json import MOST_BYTES, read_json
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.options import CalibrationOptions
@@ -60,9 +60,7 @@ def report_command(
 
     `kcal report rig.json --require 800m:2%,5km:10% --mark-sigma 0.1 -o report.html`
     """
-    from kcal.report.verdict import Requirement
-
-    needs = Requirement.parse(require) if require else ()
+    needs = required(require)
     given = observations or []
     if output is not None:
         check_writable(output, subject, *given)
@@ -76,10 +74,22 @@ def report_command(
         raise typer.Exit(NO)
 
 
+def required(text: str) -> tuple[Requirement, ...]:
+    """What was asked for with --require."""
+    if not text:
+        return ()
+    from kcal.report.verdict import Requirement
+
+    return Requirement.parse(text)
+
+
 def _is_rig(path: Path) -> bool:
     from kcal.io.formats import recognized
 
-    return recognized(path) == "kcal" and json.loads(path.read_text(encoding="utf-8"))["kcal"] == "rig"
+    if recognized(path) != "kcal":
+        return False
+    content = read_json(read_bytes(path, MOST_BYTES), str(path))
+    return isinstance(content, dict) and content.get("kcal") == "rig"
 
 
 def told_usable(

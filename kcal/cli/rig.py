@@ -10,7 +10,7 @@ import typer
 
 from kcal.cli.console import with_json
 from kcal.cli.groups import group_with_default
-from kcal.cli.report import NO, REQUIRE_HELP, told_usable
+from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
 from kcal.cli.rig_check import check
 from kcal.errors import InputError
 
@@ -92,7 +92,7 @@ def solve_command(
     ] = 0.1,
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Leave nothing out; only warn.")] = False,
     board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
-    picture: Annotated[Path | None, typer.Option(help="A .png file: residuals by source and a plan.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="A .png or .svg file: a plan, and residuals.")] = None,
 ) -> None:
     """Solve a stereo rig: where the right camera stands from the left, and where both stand on the Earth.
 
@@ -122,23 +122,19 @@ def solve_command(
     from kcal.io.rig_file import save_rig
     from kcal.locate.mounting import placed_rig
     from kcal.locate.range_sigmas import range_sigmas
-    from kcal.report.figures import check_picture
-    from kcal.report.rig import rig_figure, save_rig_picture
-    from kcal.report.rig_verdict import rig_verdict
     from kcal.report.tables import range_sigma_rows
-    from kcal.report.verdict import Requirement
-    from kcal.report.verdict_page import camera_tables
-    from kcal.report.verdict_pictures import png_bytes
 
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=mark_sigma, survey_sigma=survey_sigma, geoid=geoid,
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
-    needs = Requirement.parse(require) if require else ()
+    needs = required(require)
     if report is not None:
         check_writable(report, left, right, *sources.files)
     if picture is not None:
+        from kcal.report.figures import check_picture
+
         check_picture(picture)
     if not any((pairs, landmarks, marks, features, positions, baseline)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
@@ -163,6 +159,8 @@ def solve_command(
     )
     save_rig(rig, output)
     if picture is not None:
+        from kcal.report.rig import save_rig_picture
+
         save_rig_picture(picture, result)
     print_rig(result, lines)
     try:
@@ -171,6 +169,11 @@ def solve_command(
         warn(f"range errors are not split: {error}")
     print_wrote(output, picture)
     if needs or report is not None:
+        from kcal.report.rig import rig_figure
+        from kcal.report.rig_verdict import rig_verdict
+        from kcal.report.verdict_page import camera_tables
+        from kcal.report.verdict_pictures import png_bytes
+
         verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, result=result, subject=output.name.split(".")[0])
         tables = [*camera_tables(rig.left), *camera_tables(rig.right)]
         tell(verdict=verdict.to_dict())

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import board_tilts, roll_span, unreached_share
+from kcal.calibrate.camera.advice import ROLL_SPAN, board_tilts, reached, roll_span, unreached_share
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.trust import seen_pixels
 from kcal.corners.observations import Observations
@@ -15,8 +13,6 @@ from kcal.report.verdict import Finding
 
 # Degrees beyond which a view tells the focal length, and how many views must.
 _TILTED, _FEWEST_TILTED = 15.0, 3
-# Degrees within which rolls leave principal point and print of the board entangled (`kcal.calibrate.camera.advice`).
-_ROLLS = 60.0
 # Farthest over nearest board.
 _DEPTH = 1.3
 # Share of the image, and of its border ring, that no board reached.
@@ -113,7 +109,7 @@ def _pose_findings(rotation: Tensor, translation: Tensor) -> list[Finding]:
                 picture="poses",
             )
         )
-    if (span := roll_span(rotation)) < _ROLLS:
+    if (span := roll_span(rotation)) < ROLL_SPAN:
         found.append(
             Finding(
                 name="roll",
@@ -150,8 +146,6 @@ def _pose_findings(rotation: Tensor, translation: Tensor) -> list[Finding]:
 
 
 def _coverage_finding(observations: Observations) -> Finding:
-    from kcal.calibrate.camera.advice import reached
-
     share = unreached_share(observations)
     seen = reached(observations, 96, 64)
     ring = torch.ones_like(seen)
@@ -199,24 +193,3 @@ def _repetition_finding(result: CameraCalibrationResult) -> Finding | None:
         action="use one stiff board, held still, and take the views again",
         picture="views",
     )
-
-
-def distances_text(result: CameraCalibrationResult) -> str:
-    """The board's size and how far away it was, so that centimeters in place of millimeters are noticed.
-
-    The board in millimeters from outer corner to outer corner, and distances in meters.
-    """
-    board = result.observations.board
-    far = result.cam_from_board_translation
-    middle = (result.cam_from_board_rotation @ board.points.mean(0)) + far
-    distance = middle.norm(dim=-1)
-    distance = distance[distance.isfinite()]
-    width, height = (1e3 * board.square * (count - 1) for count in (board.columns, board.rows))
-    return (
-        f"board {board.columns} x {board.rows} corners, {1e3 * board.square:g} mm squares: {width:g} x {height:g} mm; "
-        f"nearest view {_distance_text(float(distance.min()))}, farthest {_distance_text(float(distance.max()))}"
-    )
-
-
-def _distance_text(value: float) -> str:
-    return f"{value:.{max(0, 1 - math.floor(math.log10(value)))}f} m" if value > 0 else "0 m"

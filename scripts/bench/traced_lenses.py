@@ -2,13 +2,16 @@
 
     python -m scripts.bench.traced_lenses --out cells.jsonl --lens webcam  # cells that the file holds are kept
     python -m scripts.bench.traced_lenses --out *.jsonl --write            # the tables in docs/measured
+    python -m scripts.bench.traced_lenses --out sigmas.jsonl --models hybrid --views 60 30 --noise .03 .1 .2 \
+        --seeds $(seq 200 211)                                             # error bars alone; --write-sigmas
 
 Truth: three lenses of `kcal.sim.prescription`, decentered by their tolerances, whose entrance pupil moves as in life
 (`wander` 1); views of the paper's board (6 x 7 corners, 5 cm), exact or printed (stretch 0.15 %, shear 0.02 %,
 bent along an oblique axis by 0.7 mm, smooth errors of 0.03 mm), with Gaussian corner noise. Measure: how far from the
 truth each camera sees infinitely distant points, all over the image, after the best turn; RMS in pixels. Coverage: how
-often the truth lies in the hybrid's 95 % ellipses, on a grid of the image, where boards reached and beyond. Parametric
-models are fitted as `calibrate_camera` does by default, with the board's warp.
+often the truth lies in the hybrid's 95 % ellipses, on a grid of the image, where boards reached and beyond; and the RMS
+error that its covariance predicts, over the true one. Parametric models are fitted as `calibrate_camera` does by
+default, with the board's warp.
 
 Seeds below 100 were used for tuning the hybrid; the tables use those given by --seeds.
 """
@@ -21,6 +24,7 @@ import json
 import math
 import statistics
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +32,15 @@ import torch
 
 from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.uncertainty import pixel_covariance
 from kcal.sim.captures import drawn_lens
 from kcal.sim.infinity import error_at_infinity
+from kcal.sim.truth import TruthLens
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
-from scripts.shared.traced import BOARD, capture, printed
+from scripts.shared.traced import BOARD, captures, printed
 
 LENSES = ("webcam", "machine-vision", "surveillance")
 SIGMAS = (0.02, 0.05, 0.1, 0.3)
@@ -51,38 +57,42 @@ PAGE = "one-camera.md"
 CHI2 = -2.0 * math.log(0.05)
 
 
-def cell(name: str, board: str, views: int, sigma: float, seed: int) -> list[dict[str, Any]]:
-    """All models on one capture."""
+def cells(
+    name: str, board: str, views: int, sigmas: list[float], seed: int, models: list[str]
+) -> Iterator[dict[str, Any]]:
+    """Models on captures that differ in their noise alone."""
     lens = drawn_lens(name, 1.0, seed, wander=1.0)
     points = BOARD.points if board == "exact" else printed(BOARD.points, seed)
-    seen = capture(lens, views, sigma, 1000 + seed, points)
-    head = {"lens": name, "board": board, "views": views, "sigma": sigma, "seed": seed}
-    out = []
-    for model, options in MODELS.items():
-        start = time.process_time()
-        record: dict[str, Any] = {**head, "model": model, "rms": math.inf}
-        try:
-            result = calibrate_camera(seen, options)
-            record["cpu_s"] = time.process_time() - start
-            error = error_at_infinity(result.camera, lens)
-            record |= {"rms": error.rms, "valid": error.valid, "noise": result.noise}
-            if result.hybrid is not None:
-                covariance = pixel_covariance(result.camera, error.pixels.reshape(-1, 2))
-                e = error.errors.reshape(-1, 2)
-                good = e.isfinite().all(-1) & covariance.isfinite().all(-1).all(-1)
-                distance = (e * torch.linalg.solve(covariance, e[..., None])[..., 0]).sum(-1)
-                rows, columns = error.pixels.shape[:2]
-                within = reached(seen, columns, rows).reshape(-1)
-                record |= {
-                    "tempering": result.hybrid.tempering,
-                    "inside": float((distance < CHI2)[good & within].double().mean()),
-                    "beyond": float((distance < CHI2)[good & ~within].double().mean()),
-                }
-        except KcalError as error:
-            record["failed"] = str(error)
-        out.append(record)
-        print(json.dumps(record)[:200], flush=True)
-    return out
+    for sigma, seen in zip(sigmas, captures(lens, views, sigmas, 1000 + seed, points), strict=True):
+        for model in models:
+            head = {"lens": name, "board": board, "views": views, "sigma": sigma, "seed": seed, "model": model}
+            yield head | measured(lens, seen, MODELS[model])
+
+
+def measured(lens: TruthLens, seen: Observations, options: CalibrationOptions) -> dict[str, Any]:
+    """One calibration against the truth."""
+    start = time.process_time()
+    try:
+        result = calibrate_camera(seen, options)
+        spent = time.process_time() - start
+        error = error_at_infinity(result.camera, lens)
+    except KcalError as refusal:
+        return {"rms": math.inf, "failed": str(refusal)}
+    record: dict[str, Any] = {"rms": error.rms, "cpu_s": spent, "valid": error.valid, "noise": result.noise}
+    if result.hybrid is None:
+        return record
+    covariance = pixel_covariance(result.camera, error.pixels.reshape(-1, 2))
+    e = error.errors.reshape(-1, 2)
+    good = e.isfinite().all(-1) & covariance.isfinite().all(-1).all(-1)
+    distance = (e * torch.linalg.solve(covariance, e[..., None])[..., 0]).sum(-1)
+    rows, columns = error.pixels.shape[:2]
+    within = reached(seen, columns, rows).reshape(-1)
+    return record | {
+        "tempering": result.hybrid.tempering,
+        "inside": float((distance < CHI2)[good & within].double().mean()),
+        "beyond": float((distance < CHI2)[good & ~within].double().mean()),
+        "predicted": float(covariance[good].diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt()),
+    }
 
 
 def tables(records: list[dict[str, Any]]) -> list[str]:
@@ -112,14 +122,44 @@ def tables(records: list[dict[str, Any]]) -> list[str]:
             *table(["lens", "views", "noise", *MODELS, "ratio"], rows),
             "",
         ]
+    return [*lines, *coverage_table(records)]
+
+
+def coverage_table(records: list[dict[str, Any]]) -> list[str]:
+    """How often the truth is inside the hybrid's ellipses."""
     rows = []
     for board, name in itertools.product(BOARDS, LENSES):
         own = [r for r in records if (r["board"], r["lens"], r["model"]) == (board, name, "hybrid") and "inside" in r]
         if own:
             shares = [statistics.fmean(v) for k in ("inside", "beyond") if (v := [r[k] for r in own if r[k] == r[k]])]
             rows.append([board, name, *(f"{100 * share:.1f} %" for share in shares), len(own)])
-    return [*lines, "Truth inside the 95 % ellipses of the hybrid:", "", *table(
-        ["board", "lens", "where boards reached", "beyond", "captures"], rows)]  # fmt: skip
+    header = ["board", "lens", "where boards reached", "beyond", "captures"]
+    return ["Truth inside the 95 % ellipses of the hybrid:", "", *table(header, rows)]
+
+
+def sigma_tables(records: list[dict[str, Any]]) -> list[str]:
+    """Predicted errors of the hybrid over true ones, and its coverage."""
+    cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for r in records:
+        if "predicted" in r:
+            cells.setdefault((r["lens"], r["board"], r["views"], r["sigma"]), []).append(r)
+    rows, ratios = [], []
+    for (name, board, views, sigma), own in sorted(cells.items()):
+        predicted, true = (math.sqrt(statistics.fmean(r[key] ** 2 for r in own)) for key in ("predicted", "rms"))
+        ratios.append(predicted / true)
+        shares = [statistics.fmean(v) for k in ("inside", "beyond") if (v := [r[k] for r in own if r[k] == r[k]])]
+        shown = [f"{100 * share:.1f} %" for share in shares]
+        rows.append([name, board, views, f"{sigma:g}", f"{true:.3f}", f"{predicted:.3f}", f"{ratios[-1]:.2f}", *shown])
+    mean = math.exp(statistics.fmean(map(math.log, ratios)))
+    header = ["lens", "board", "views", "noise", "true RMS", "predicted", "ratio", "in 95 %, reached", "beyond"]
+    return [
+        f"Predicted over true RMS error at infinity: geometric mean {mean:.2f}, from {min(ratios):.2f} to "
+        f"{max(ratios):.2f}, each from {len(next(iter(cells.values())))} captures.",
+        "",
+        *table(header, rows),
+        "",
+        *coverage_table(records),
+    ]
 
 
 def main() -> None:
@@ -127,21 +167,28 @@ def main() -> None:
     parser.add_argument("--out", nargs="+", type=Path, required=True, help="JSON lines; the first is written to")
     parser.add_argument("--lens", choices=LENSES, help="only this one")
     parser.add_argument("--seeds", nargs="+", type=int, default=[200, 201, 202])
+    parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
+    parser.add_argument("--views", nargs="+", type=int, default=list(VIEWS))
+    parser.add_argument("--noise", nargs="+", type=float, default=list(SIGMAS), help="px")
     parser.add_argument("--write", action="store_true", help="write the tables into the page")
+    parser.add_argument("--write-sigmas", action="store_true", help="write those of the error bars alone")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     records = [json.loads(line) for path in arguments.out if path.exists() for line in path.read_text().splitlines()]
-    if arguments.write:
+    if arguments.write or arguments.write_sigmas:
         seeds = ", ".join(map(str, sorted({r["seed"] for r in records})))
-        write_section(PAGE, "traced", "\n".join([f"Seeds {seeds}.", "", *tables(records)]))
+        section, lines = ("traced", tables(records)) if arguments.write else ("sigmas", sigma_tables(records))
+        write_section(PAGE, section, "\n".join([f"Seeds {seeds}.", "", *lines]))
         return
     done = {(r["lens"], r["board"], r["views"], r["sigma"], r["seed"]) for r in records}
     names = (arguments.lens,) if arguments.lens else LENSES
-    for seed, name, board, views, sigma in itertools.product(arguments.seeds, names, BOARDS, VIEWS, SIGMAS):
-        if (name, board, views, sigma, seed) not in done:
+    for seed, name, board, views in itertools.product(arguments.seeds, names, BOARDS, arguments.views):
+        left = [sigma for sigma in arguments.noise if (name, board, views, sigma, seed) not in done]
+        for record in cells(name, board, views, left, seed, arguments.models) if left else ():
+            print(json.dumps(record)[:200], flush=True)
             with arguments.out[0].open("a") as file:
-                file.writelines(json.dumps(r) + "\n" for r in cell(name, board, views, sigma, seed))
-    show(tables([json.loads(line) for line in arguments.out[0].read_text().splitlines()]))
+                file.write(json.dumps(record) + "\n")
+    show(sigma_tables([json.loads(line) for line in arguments.out[0].read_text().splitlines()]))
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import ZernikeModes
+from kcal.sim.board import PrintedBoard
 from kcal.sim.captures import capture_corners
 from kcal.sim.truth import TruthLens
 
@@ -23,18 +25,7 @@ BOARD = Board(columns=7, rows=6, square=0.05)
 
 def printed(points: Tensor, seed: int) -> Tensor:
     """The board as a printer and a wall leave it."""
-    generator = torch.Generator().manual_seed(5000 + seed)
-    middle, half = points.mean(0), 0.5 * (points.amax(0) - points.amin(0))[:2]
-    a, b = ((points[:, :2] - middle[:2]) / half).unbind(-1)
-    angle, phase = (math.pi * torch.rand(2, generator=generator, dtype=torch.float64)).tolist()
-    across = a * math.cos(angle) + b * math.sin(angle)
-    out = points.clone()
-    out[:, 0] += 1.5e-3 * (points[:, 0] - middle[0]) + 2e-4 * (points[:, 1] - middle[1])
-    out[:, 2] += 0.7e-3 * (1.0 - across**2)
-    waves = 3e-5 * torch.randn(3, 2, generator=generator, dtype=torch.float64)
-    shapes = torch.stack([torch.sin(2 * a + phase), torch.sin(2 * b + phase), torch.cos(2 * (a + b))])
-    out[:, :2] += shapes.T @ waves / math.sqrt(1.5)
-    return out
+    return points + PrintedBoard(BOARD.columns, BOARD.rows, BOARD.square, seed).errors(points)
 
 
 def capture(
@@ -46,16 +37,33 @@ def capture(
     fill: tuple[float, float] = (0.25, 0.8),
 ) -> Observations:
     """Views of a board, whose corners truly are at `points`, by a lens, as an observations file."""
+    return captures(lens, views, [sigma], seed, points, fill)[0]
+
+
+def captures(
+    lens: TruthLens,
+    views: int,
+    sigmas: Sequence[float],
+    seed: int,
+    points: Tensor = BOARD.points,
+    fill: tuple[float, float] = (0.25, 0.8),
+) -> list[Observations]:
+    """The same views with noise of several sizes, each drawn by itself."""
     found = capture_corners(lens, views, sigma=1.0, seed=seed, fill=fill)
     seen, valid = lens.project(points @ found.rotation.transpose(-1, -2) + found.translation[:, None])
-    noisy = torch.where(valid[..., None], seen + sigma * (found.pixels - found.true_pixels), torch.nan)
-    corners = [tuple(None if u != u else (u, v) for u, v in view) for view in noisy.tolist()]
-    names = [f"{i:03d}" for i in range(views)]
-    return Observations(
-        board=BOARD,
-        image_size=lens.size,
-        views=tuple(View(name=name, pixels=view) for name, view in zip(names, corners, strict=True)),
-    )
+    out = []
+    for k, sigma in enumerate(sigmas):
+        # Noise of other corners is other noise.
+        noise = (found.pixels - found.true_pixels).roll(k, 1)
+        out.append(as_observations(torch.where(valid[..., None], seen + sigma * noise, torch.nan), lens.size))
+    return out
+
+
+def as_observations(pixels: Tensor, size: tuple[int, int]) -> Observations:
+    """Corners (V, N, 2) of the board, NaN where not seen, as an observations file."""
+    corners = [tuple(None if u != u else (u, v) for u, v in view) for view in pixels.tolist()]
+    views = tuple(View(name=f"{i:03d}", pixels=view) for i, view in enumerate(corners))
+    return Observations(board=BOARD, image_size=size, views=views)
 
 
 def pupil_of(lens: TruthLens) -> float:

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from kcal.cli.main import app
 from kcal.corners.observations import Observations, View
+from kcal.errors import KcalError
 from kcal.io.rig_file import save_rig
 from kcal.lens.rig import RigCovariance
 
@@ -75,6 +76,13 @@ def test_calibration_ends_with_3_where_what_is_required_is_not_met(folder: Path)
     assert (folder / "again.json").exists()
     code, _ = kcal(*words, "--require", "200m")
     assert code == 1
+
+
+def test_a_file_that_nests_too_deeply_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "deep.json").write_text('{"kcal": "rig", "a": ' + "[" * 100_000 + "]" * 100_000 + "}")
+    found = CliRunner().invoke(app, ["report", str(tmp_path / "deep.json")])
+    assert found.exit_code == 1
+    assert isinstance(found.exception, KcalError | SystemExit)
 
 
 def test_a_rig_is_judged_by_its_covariance(tmp_path: Path) -> None:

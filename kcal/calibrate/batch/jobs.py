@@ -218,13 +218,10 @@ def calibration_options(model: str, options: BatchOptions) -> CalibrationOptions
     return CalibrationOptions(model=model, board_warp=options.board_warp)
 
 
-def calibrate_again(seen: Observations, options: BatchOptions) -> CameraCalibrationResult | KcalError:
-    """One camera with the hybrid lens, with all that its calibration tells, or why there is none."""
+def calibrate_again(seen: Observations, options: BatchOptions) -> CameraCalibrationResult:
+    """One camera with the hybrid lens, with all that its calibration tells."""
     with _time_limit(options.time_limit):
-        try:
-            return calibrate_camera(seen, calibration_options(HYBRID, options))
-        except KcalError as error:
-            return error
+        return calibrate_camera(seen, calibration_options(HYBRID, options))
 
 
 def calibrated(result: CameraCalibrationResult, name: str) -> Calibrated:

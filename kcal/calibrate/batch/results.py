@@ -27,7 +27,7 @@ from kcal.calibrate.batch.jobs import (
 from kcal.calibrate.batch.workers import Pool, Task, WorkerDiedError, pool, run_tasks
 from kcal.calibrate.camera.options import HYBRID
 from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.calibrate.camera.sharing import sharing
+from kcal.calibrate.camera.sharing import ALONE, sharing
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, KcalError
 from kcal.files import NativeFile, dump_json, make_folder, read_bytes, write_atomic
@@ -218,12 +218,11 @@ class Results:
                     one_type=self.options.one_type,
                     run=lambda function, tasks: self._each(function, tasks, crew).items(),
                 )
-            except WorkerDiedError as error:
-                # What is there is good: cameras that know their own views only.
-                note = f"calibrated alone, without what other cameras tell of the board: {error}"
+            except KcalError as error:
+                # What is there is good: cameras that know their own views only. It is not kept as a finished piece.
                 for i in good:
                     before = self._calibrated[i]
-                    kept[i] = before.model_copy(update={"warnings": (*before.warnings, note)})
+                    kept[i] = before.model_copy(update={"warnings": (*before.warnings, f"{ALONE}: {error}")})
                 found = []
             for i, result in zip(good, found, strict=False):
                 if isinstance(result, CameraCalibrationResult):
@@ -238,9 +237,7 @@ class Results:
         found: dict[int, Any] = {}
 
         def done(task: Task, outcome: Any) -> list[Task]:
-            if isinstance(outcome, Exception) and not isinstance(outcome, KcalError):
-                raise outcome
-            if isinstance(outcome, WorkerDiedError):
+            if isinstance(outcome, Exception):
                 raise outcome
             found[task.tag] = outcome
             return []

@@ -27,6 +27,18 @@ _DIRECTIONS, _SIDE, _STEPS = 16, 8, 250
 _SHARES = (0.5, 0.8, 1.0)
 
 
+def among(values: Tensor, views: Sequence[int], count: int) -> Tensor:
+    """(count, ...) values of some views put among all of them: NaN for the others.
+
+    Example:
+        >>> among(torch.tensor([2.0]), [1], 3).tolist()
+        [nan, 2.0, nan]
+    """
+    out = values.new_full((count, *values.shape[1:]), torch.nan)
+    out[list(views)] = values
+    return out
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Views:
     """Views of a board by one camera.

@@ -17,7 +17,7 @@ _FEW_VIEWS = 10
 # In a share of the image that is larger than this no board was seen: worth a picture.
 _LARGE_SHARE = 0.1
 # Rolls within ±25° more than double σ of the principal point; rolls up to 90° are nearly as good as any.
-_ROLL_SPAN = 60.0
+ROLL_SPAN = 60.0
 _STEEP = 20.0
 
 
@@ -63,7 +63,7 @@ def what_to_photograph(observations: Observations, camera: Camera, rotation: Ten
     advice = []
     if int((board_tilts(rotation) > _STEEP).sum()) < 4:
         advice.append("tilt the board by 30 to 45 degrees in different directions: tilts determine the focal length")
-    if (span := roll_span(rotation)) < _ROLL_SPAN:
+    if (span := roll_span(rotation)) < ROLL_SPAN:
         advice.append(
             f"roll the board by 90 degrees in some views (so far within {span:.0f} degrees): otherwise the principal "
             "point and the print of the board cannot be told apart"
@@ -92,10 +92,19 @@ def board_tilts(rotation: Tensor) -> Tensor:
     return torch.rad2deg(torch.acos(rotation[:, 2, 2].abs().clamp(max=1.0)))
 
 
+def board_rolls(rotation: Tensor) -> Tensor:
+    """(V,) degrees by which boards are turned about the optical axis, of cam_from_board rotations (V, 3, 3).
+
+    Example:
+        >>> board_rolls(torch.eye(3)[None]).tolist()
+        [0.0]
+    """
+    return torch.rad2deg(torch.atan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1]))
+
+
 def roll_span(rotation: Tensor) -> float:
     """Degrees within which the rolls of all views lie; a half turn of a board counts as a roll."""
-    roll = torch.rad2deg(torch.atan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1]))
-    ordered = roll.sort().values
+    ordered = board_rolls(rotation).sort().values
     gaps = torch.cat([ordered.diff(), (ordered[:1] + 360.0 - ordered[-1:])])
     return 360.0 - float(gaps.max()) if len(gaps) else 0.0
 

@@ -15,11 +15,11 @@ from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.outliers import solve_without_outliers
 from kcal.calibrate.camera.repeats import copied_views, copy_warnings, pose_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedView
-from kcal.calibrate.camera.sharing import sharing
+from kcal.calibrate.camera.sharing import ALONE, sharing
 from kcal.calibrate.camera.solve import solve
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
-from kcal.errors import KcalError
+from kcal.errors import InputError, KcalError
 
 __all__ = ["CalibrationOptions", "CameraCalibrationResult", "calibrate_camera", "calibrate_cameras"]
 
@@ -167,10 +167,23 @@ def calibrate_cameras(
         [DegenerateError('1 view(s) of the board: at least 3 at different tilts are needed, 10 to 40 are good')]
     """
     options = options or CalibrationOptions()
+    if one_type and not options.hybrid:
+        raise InputError("cameras of one type learn from each other with the hybrid lens only; leave the model out")
+    if one_type and len({seen.image_size for seen in observations}) > 1:
+        raise InputError("cameras of one type have images of one size; these have several")
     count = len(observations)
     alone = together(
         [functools.partial(calibrate_camera, seen, options) for seen in observations],
         torch.device(device),
         lambda done: progress(f"{done} of {count} cameras"),
     )
-    return sharing(alone, options, one_type=one_type, advance=lambda name: progress(f"camera {name} with the others"))
+    try:
+        return sharing(
+            alone, options, one_type=one_type, advance=lambda name: progress(f"camera {name} with the others")
+        )
+    except KcalError as error:
+        note = f"{ALONE}: {error}"
+        return [
+            found if isinstance(found, KcalError) else dataclasses.replace(found, warnings=(*found.warnings, note))
+            for found in alone
+        ]

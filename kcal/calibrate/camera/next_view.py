@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -17,10 +18,11 @@ from torch import Tensor
 from kcal.calibrate.lensfit.board_modes import board_modes
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
-from kcal.lens.information import CameraInformation
 from kcal.lens.pose import rotation_from_vector, step_rows
 from kcal.lens.projection import project_components
-from kcal.lens.uncertainty import pixel_slopes
+from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
+
+T = TypeVar("T")
 
 # Grid of the image over which variances are averaged.
 _GRID = (13, 9)
@@ -87,30 +89,27 @@ def possible_views(camera: Camera, board: Board) -> BoardViews:
     middle = 0.5 * (points.amin(0) + points.amax(0))
     extent = float((points.amax(0) - points.amin(0)).max())
     rotations, translations, words = [], [], []
-    for fill, roll in itertools.product(_FILLS, _ROLLS):
+    for fill in _FILLS:
         margin = (0.5 * fill + 0.06) * side
         rows = {"top": margin, "": 0.5 * height, "bottom": height - margin}
         columns = {"left": margin, "": 0.5 * width, "right": width - margin}
-        for (up, v), (across, u) in itertools.product(rows.items(), columns.items()):
-            rays, valid = camera.unproject(torch.tensor([[u, v]], dtype=torch.float64))
-            if not bool(valid):
-                continue
-            ray = rays[0]
-            distance = extent * float(camera.focal.min()) / (fill * side)
+        places = list(itertools.product(rows.items(), columns.items()))
+        rays, valid = camera.unproject(torch.tensor([[u, v] for (_, v), (_, u) in places], dtype=torch.float64))
+        distance = extent * float(camera.focal.min()) / (fill * side)
+        size = "near" if fill == _FILLS[-1] else "far"
+        for ((up, _), (across, _)), ray in zip(_kept(places, valid), rays[valid], strict=True):
             place = " ".join(filter(None, (up, across))) or "middle"
-            for tilt, leaning in _TILTS.items():
+            for roll, (tilt, leaning) in itertools.product(_ROLLS, _TILTS.items()):
                 turn = _facing(ray) @ _rotation(*tilt, 0.0) @ _rotation(0.0, 0.0, roll)
                 rotations.append(turn)
                 translations.append(distance * ray - turn @ middle)
-                size = "near" if fill == _FILLS[-1] else "far"
                 rolled = ", rolled by a quarter" if roll else ""
                 words.append(f"{size}, in the {place} of the image, {leaning}{rolled}")
     rotation, translation = torch.stack(rotations), torch.stack(translations)
     pixels, valid = camera.project(points @ rotation.mT + translation[:, None])
     inside = ((pixels >= 0) & (pixels <= torch.tensor([width - 1, height - 1], dtype=pixels.dtype))).all(-1)
     good = (inside & valid).all(-1)
-    kept = tuple(text for text, fits in zip(words, good.tolist(), strict=True) if fits)
-    return BoardViews(rotation[good], translation[good], pixels[good], kept)
+    return BoardViews(rotation[good], translation[good], pixels[good], tuple(_kept(words, good)))
 
 
 def far_sigma(camera: Camera) -> float:
@@ -118,10 +117,10 @@ def far_sigma(camera: Camera) -> float:
 
     After the best turn of the camera, as `kcal.lens.uncertainty.projection_sigma`. NaN for a camera without error bars.
     """
-    known = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
-    if known is None:
+    if camera.calibration is None or camera.calibration.known(camera.params.detach()) is None:
         return math.nan
-    return _root_mean(_image_slopes(camera, known) @ known.half().T)
+    variances = pixel_covariance(camera, camera.grid(*_GRID).reshape(-1, 2), grid=_GRID).diagonal(dim1=-2, dim2=-1)
+    return math.sqrt(float(variances.nanmean()))
 
 
 def next_view(camera: Camera, board: Board, noise: float) -> NextView | None:
@@ -140,43 +139,47 @@ def next_view(camera: Camera, board: Board, noise: float) -> NextView | None:
     if known is None or not views.words:
         return None
     half = known.half()
-    slopes = _image_slopes(camera, known) @ half.T
-    rest = []
+    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
+    onto = known.selection()[wanted]
+    slopes = _image_slopes(camera, wanted) @ onto @ half.T
+    shapes = board_modes(board.points).shapes if known.board_size else None
+    gains = []
     for rotation, translation in zip(views.rotation, views.translation, strict=True):
-        rows = _view_rows(camera, known, board, rotation, translation) @ half.T / noise
+        by_camera, by_board, by_pose = _view_slopes(camera, wanted, board.points, shapes, rotation, translation)
+        rows = by_camera @ onto
+        if by_board is not None:
+            rows[:, known.lens_size :] = by_board
+        rows = torch.linalg.qr(by_pose, mode="complete").Q[:, by_pose.shape[1] :].T @ rows @ half.T / noise
         # Variance that this view takes away: G Aᵀ (1 + A Aᵀ)⁻¹ A Gᵀ.
         lower = torch.linalg.cholesky(torch.eye(len(rows), dtype=rows.dtype) + rows @ rows.T)
-        rest.append(float(torch.linalg.solve_triangular(lower, rows @ slopes.T, upper=False).square().sum()))
-    best = max(range(len(rest)), key=rest.__getitem__)
-    sigma = math.sqrt(max(float(slopes.square().sum()) - rest[best], 0.0) / len(slopes))
+        gains.append(float(torch.linalg.solve_triangular(lower, rows @ slopes.T, upper=False).square().sum()))
+    best = max(range(len(gains)), key=gains.__getitem__)
+    sigma = math.sqrt(max(float(slopes.square().sum()) - gains[best], 0.0) / len(slopes))
     return NextView(views.rotation[best], views.translation[best], views.pixels[best], views.words[best], sigma)
 
 
-def _root_mean(slopes: Tensor) -> float:
-    return math.sqrt(float(slopes.square().sum()) / len(slopes))
+def _kept(items: Sequence[T], good: Tensor) -> list[T]:
+    return [item for item, fits in zip(items, good.tolist(), strict=True) if fits]
 
 
-def _image_slopes(camera: Camera, known: CameraInformation) -> Tensor:
-    """(2 G, U) derivatives of the image's grid by the unknowns, far away, after the best turn."""
-    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
+def _image_slopes(camera: Camera, wanted: list[int]) -> Tensor:
+    """(2 G, C) derivatives of the image's grid by parameters, far away, after the best turn."""
     by_camera, by_motion, good = pixel_slopes(camera, camera.grid(*_GRID).reshape(-1, 2), math.inf, wanted)
     flat, by_turn = by_camera[good].flatten(0, 1), by_motion[good][..., :3].flatten(0, 1)
-    flat = flat - by_turn @ torch.linalg.lstsq(by_turn, flat).solution
-    return flat @ known.selection()[wanted]
+    return flat - by_turn @ torch.linalg.lstsq(by_turn, flat).solution
 
 
-def _view_rows(camera: Camera, known: CameraInformation, board: Board, rotation: Tensor, translation: Tensor) -> Tensor:
-    """(2 N - 6, U) derivatives of a view's corners by the unknowns, off the view's pose."""
-    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
-    points = board.points @ rotation.T + translation
-    seen = project_components(points.T, camera.params.detach(), camera.model, wanted)
-    rows = seen.by_camera.flatten(1).T @ known.selection()[wanted]
-    if known.board_size:
+def _view_slopes(
+    camera: Camera, wanted: list[int], points: Tensor, shapes: Tensor | None, rotation: Tensor, translation: Tensor
+) -> tuple[Tensor, Tensor | None, Tensor]:
+    """Derivatives of a view's corners (2 N, ...) by parameters, by modes of the board, and by the view's pose."""
+    placed = points @ rotation.T + translation
+    seen = project_components(placed.T, camera.params.detach(), camera.model, wanted)
+    by_board = None
+    if shapes is not None:
         by_point = torch.einsum("pcn,pk->kcn", seen.by_point, rotation)
-        by_board = torch.einsum("kcn,bkn->cnb", by_point, board_modes(board.points).shapes).flatten(0, 1)
-        rows[:, known.lens_size :] = by_board
-    by_pose = step_rows(seen.by_point, points.T).flatten(1).T
-    return torch.linalg.qr(by_pose, mode="complete").Q[:, by_pose.shape[1] :].T @ rows
+        by_board = torch.einsum("kcn,bkn->cnb", by_point, shapes).flatten(0, 1)
+    return seen.by_camera.flatten(1).T, by_board, step_rows(seen.by_point, placed.T).flatten(1).T
 
 
 def _rotation(x: float, y: float, z: float) -> Tensor:

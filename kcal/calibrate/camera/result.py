@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.board_problem import warp_shape
+from kcal.calibrate.bundle.views import among
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.corners.observations import Observations
@@ -136,20 +137,15 @@ class CameraCalibrationResult:
 
     def among(self, views: Sequence[int], observations: Observations) -> CameraCalibrationResult:
         """This result of some views as one of all `observations`: NaN for the others."""
-
-        def of_all(values: Tensor) -> Tensor:
-            out = values.new_full((len(observations.views), *values.shape[1:]), torch.nan)
-            out[list(views)] = values
-            return out
-
+        count = len(observations.views)
         return dataclasses.replace(
             self,
             observations=observations,
-            per_view_rms=of_all(self.per_view_rms),
-            residuals=of_all(self.residuals),
-            cam_from_board_rotation=of_all(self.cam_from_board_rotation),
-            cam_from_board_translation=of_all(self.cam_from_board_translation),
-            hybrid=None if self.hybrid is None else self.hybrid.among(views, len(observations.views)),
+            per_view_rms=among(self.per_view_rms, views, count),
+            residuals=among(self.residuals, views, count),
+            cam_from_board_rotation=among(self.cam_from_board_rotation, views, count),
+            cam_from_board_translation=among(self.cam_from_board_translation, views, count),
+            hybrid=None if self.hybrid is None else self.hybrid.among(views, count),
         )
 
     def _record(self) -> CalibrationRecord:

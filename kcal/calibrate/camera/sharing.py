@@ -21,9 +21,11 @@ from kcal.calibrate.lensfit.cameras_fit import Run, fit_cameras
 from kcal.calibrate.lensfit.fleet import LEAST_CAMERAS
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.corners.observations import Observations
-from kcal.errors import InputError, KcalError
+from kcal.errors import KcalError
 
 Outcome = CameraCalibrationResult | KcalError
+# Said of each camera when all of them together could not be fitted.
+ALONE = "calibrated alone, without what other cameras tell of the board"
 
 
 def sharing(
@@ -44,10 +46,8 @@ def sharing(
         advance: called after each fit.
 
     Raises:
-        InputError: `one_type` with another lens than the hybrid one, or with images of several sizes.
+        KcalError: the cameras cannot be fitted together.
     """
-    if one_type and not options.hybrid:
-        raise InputError("cameras of one type learn from each other with the hybrid lens only; leave the model out")
     found = list(outcomes)
     known = {i: outcome for i, outcome in enumerate(outcomes) if isinstance(outcome, CameraCalibrationResult)}
     boards = [result.observations.board for result in known.values()]

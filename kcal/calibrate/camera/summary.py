@@ -90,3 +90,24 @@ def _pupil(result: CameraCalibrationResult) -> tuple[float | None, float | None]
     depth = pupil_depth(angle[None] ** 2, camera.params.detach()[5:])
     variance = slope @ result.covariance[place][:, place] @ slope
     return float(depth[0]), math.sqrt(float(variance))
+
+
+def distances_text(result: CameraCalibrationResult) -> str:
+    """The board's size and how far away it was, so that centimeters in place of millimeters are noticed.
+
+    The board in millimeters from outer corner to outer corner, and distances in meters.
+    """
+    board = result.observations.board
+    far = result.cam_from_board_translation
+    middle = (result.cam_from_board_rotation @ board.points.mean(0)) + far
+    distance = middle.norm(dim=-1)
+    distance = distance[distance.isfinite()]
+    width, height = (1e3 * board.square * (count - 1) for count in (board.columns, board.rows))
+    return (
+        f"board {board.columns} x {board.rows} corners, {1e3 * board.square:g} mm squares: {width:g} x {height:g} mm; "
+        f"nearest view {_distance_text(float(distance.min()))}, farthest {_distance_text(float(distance.max()))}"
+    )
+
+
+def _distance_text(value: float) -> str:
+    return f"{value:.{max(0, 1 - math.floor(math.log10(value)))}f} m" if value > 0 else "0 m"

@@ -26,7 +26,7 @@ _CONTRADICTION = 3.0
 # A corner is reported if it is this many times farther off than noise explains.
 _GROSS = 2.0
 # Tempering that chance and rounding do not explain: it is 1 on simulated captures, 2.2 on the wide lens's.
-_REPEATING = 2.0
+REPEATING = 2.0
 # Of the principal point, in standard deviations of its prior.
 _FAR_CENTER = 3.0
 NO_ERROR_BARS = (
@@ -99,7 +99,7 @@ def rival_warnings(
 def hybrid_warnings(fit: HybridFit) -> list[str]:
     """Warnings about the evidence: residuals that repeat within views, a principal point far from the middle."""
     found = []
-    if fit.tempering > _REPEATING:
+    if fit.tempering > REPEATING:
         found.append(
             f"residuals repeat within views (tempering {fit.tempering:.1f}): blur, motion or a board that flexes; "
             "error bars are widened for it"

@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from kcal.calibrate.bundle.views import among
 from kcal.calibrate.lensfit.base_fit import Estimate, cauchy_weights, fit_base
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
 from kcal.calibrate.lensfit.board_prior import BoardPrior
@@ -114,14 +115,12 @@ class HybridFit:
 
     def among(self, views: Sequence[int], count: int) -> HybridFit:
         """This fit of some views as one of `count` views: NaN for the others."""
-
-        def of_all(values: Tensor) -> Tensor:
-            out = values.new_full((count, *values.shape[1:]), torch.nan)
-            out[list(views)] = values
-            return out
-
-        state = self.state._replace(rotation=of_all(self.state.rotation), translation=of_all(self.state.translation))
-        return dataclasses.replace(self, state=state, residuals=of_all(self.residuals), weights=of_all(self.weights))
+        rotation, translation, residuals, weights = (
+            among(values, views, count)
+            for values in (self.state.rotation, self.state.translation, self.residuals, self.weights)
+        )
+        state = self.state._replace(rotation=rotation, translation=translation)
+        return dataclasses.replace(self, state=state, residuals=residuals, weights=weights)
 
     @property
     def covariance(self) -> Tensor:

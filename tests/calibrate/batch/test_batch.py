@@ -20,7 +20,7 @@ from kcal.calibrate.camera.calibrate import calibrate_cameras
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
-from kcal.errors import FileError, InputError, KcalError
+from kcal.errors import DegenerateError, FileError, InputError, KcalError
 from kcal.io.camera_file import CameraFile, load_camera
 from kcal.lens.camera import Camera
 from kcal.sim.board import BoardSize
@@ -221,9 +221,10 @@ class TestSharing:
         self.batch(folder, tmp_path, crew)
         assert len(crew.tasks) == before
 
-    def test_a_worker_that_dies_leaves_cameras_as_they_are_alone(self, folder, tmp_path, monkeypatch):
+    @pytest.mark.parametrize("kind", [WorkerDiedError, DegenerateError])
+    def test_a_worker_that_fails_leaves_cameras_as_they_are_alone(self, folder, tmp_path, monkeypatch, kind):
         def dies(*_):
-            raise WorkerDiedError("out of memory")
+            raise kind("out of memory")
 
         monkeypatch.setattr("kcal.calibrate.batch.results.calibrate_again", dies)
         results = self.batch(folder, tmp_path, Here())

@@ -185,9 +185,28 @@ def test_views_read_from_the_other_end_and_views_left_out() -> None:
     torch.testing.assert_close((projected - back)[used], second.residuals[used], rtol=0, atol=1e-9)
 
 
-def test_one_type_needs_the_hybrid_lens() -> None:
+def test_one_type_is_refused_before_anything_is_calibrated(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError("calibrated")
+
+    monkeypatch.setattr("kcal.calibrate.camera.calibrate.calibrate_camera", never)
     with pytest.raises(InputError, match="hybrid lens only"):
         calibrate_cameras([seen_by(1)], CalibrationOptions(model="opencv5"), one_type=True)
+    other = seen_by(2).model_copy(update={"image_size": (1280, 961)})
+    with pytest.raises(InputError, match="images of one size"):
+        calibrate_cameras([seen_by(1), other], one_type=True)
+
+
+def test_cameras_that_cannot_be_fitted_together_stay_as_they_are_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise DegenerateError("nothing fits")
+
+    monkeypatch.setattr("kcal.calibrate.camera.sharing.fit_cameras", fails)
+    found = calibrate_cameras([seen_by(1), seen_by(2)])
+    alone = calibrate_camera(seen_by(1))
+    assert isinstance(found[0], CameraCalibrationResult)
+    assert torch.equal(found[0].camera.params, alone.camera.params)
+    assert found[0].warnings[-1].endswith("what other cameras tell of the board: nothing fits")
 
 
 def test_command_line(tmp_path: Path) -> None:

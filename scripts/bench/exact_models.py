@@ -1,0 +1,104 @@
+"""The default camera where a parametric model is exactly right: error at infinity over that model's.
+
+    python -m scripts.bench.exact_models [--seeds 200 201 202 203] [--write]    # into docs/measured/one-camera.md
+
+Truth: lenses with OpenCV's 5 or 14 coefficients, drawn at random about those of a surveillance camera, f 1600 px,
+1920 x 1080 px, without a moving pupil; views of an exact board with Gaussian noise. This is the worst case for a camera
+that knows no model. Both ways to take the board: unknown (the default; the right model with `board_warp`), and exact
+(`board="exact"`; the right model as `kcal calibrate --model` fits it).
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import statistics
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.lens.camera import Camera
+from kcal.sim.board import board_points
+from kcal.sim.captures import PAPER_BOARD, capture_corners
+from kcal.sim.infinity import error_at_infinity
+from scripts.shared.page import table, write_section
+from scripts.shared.timing import show
+from scripts.shared.traced import BOARD, as_observations
+from scripts.shared.views import TRUTH
+
+MODELS = ("opencv5", "opencv14")
+VIEWS = (60, 30, 8)
+NOISE = (0.05, 0.2)
+# Relative scatter of the coefficients between lenses.
+SCATTER = 0.3
+
+
+def drawn(model: str, seed: int) -> Camera:
+    """A lens of this model that is regular all over its image."""
+    generator = torch.Generator().manual_seed(seed)
+    count = int(model.removeprefix("opencv"))
+    while True:
+        factors = 1.0 + SCATTER * torch.randn(count, generator=generator, dtype=torch.float64)
+        shift = 8.0 * torch.randn(2, generator=generator, dtype=torch.float64)
+        camera = Camera.build(
+            focal=(1600, 1600),
+            center=tuple((torch.tensor([959.5, 539.5], dtype=torch.float64) + shift).tolist()),
+            size=(1920, 1080),
+            coefficients=(factors * torch.tensor(TRUTH[:count], dtype=torch.float64)).tolist(),
+            model=model,
+        )
+        if bool(camera.unproject(camera.grid(33, 25).reshape(-1, 2))[1].all()):
+            return camera
+
+
+def errors(camera: Camera, views: int, noise: float, seed: int, model: str) -> list[float]:
+    """Error at infinity on one capture, px RMS: default and right model with the board unknown, and both with it."""
+    assert torch.equal(board_points(PAPER_BOARD), BOARD.points)
+    pixels: Tensor = capture_corners(camera, views, sigma=noise, seed=seed).pixels
+    seen = as_observations(pixels, camera.size)
+    options = (
+        CalibrationOptions(),
+        CalibrationOptions(model=model, board_warp=True),
+        CalibrationOptions(board="exact"),
+        CalibrationOptions(model=model),
+    )
+    with torch.no_grad():
+        return [error_at_infinity(calibrate_camera(seen, one).camera, camera).rms for one in options]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[200, 201, 202, 203])
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    rows, ratios = [], []
+    for model, views, noise in itertools.product(MODELS, VIEWS, NOISE):
+        found = [errors(drawn(model, seed), views, noise, 1000 + seed, model) for seed in arguments.seeds]
+        typical = [math.exp(statistics.fmean(map(math.log, column))) for column in zip(*found, strict=True)]
+        ratios.append((typical[0] / typical[1], typical[2] / typical[3]))
+        shown = [f"{value:.3f}" for value in typical]
+        rows.append(
+            [model, views, f"{noise:g}", *shown[:2], f"{ratios[-1][0]:.2f}", *shown[2:], f"{ratios[-1][1]:.2f}"]
+        )
+        show([" | ".join(map(str, rows[-1]))])
+    unknown, exact = (
+        f"geometric mean {math.exp(statistics.fmean(map(math.log, column))):.2f}, worst {max(column):.2f}"
+        for column in zip(*ratios, strict=True)
+    )
+    header = ["the lens is", "views", "noise", "default camera", "right model, warp", "ratio"]
+    lines = [
+        f"Error at infinity, px RMS over the image, geometric mean of {len(arguments.seeds)} lenses in each row. "
+        f"Default camera over the right model: {unknown}; both with the board taken as exact: {exact}.",
+        "",
+        *table([*header, "default, board exact", "right model, board exact", "ratio"], rows),
+    ]
+    show(lines)
+    if arguments.write:
+        write_section("one-camera.md", "exact-models", "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,152 @@
+"""Processor time and memory of the default camera, beside 14 coefficients, Ceres and mrcal's splines.
+
+    python -m scripts.bench.hybrid_time --write                          6 to 800 views; docs/measured/one-camera.md
+    KCAL_PEERS=/path/to/env/bin/python python -m scripts.bench.hybrid_time      Ceres too, from one with pyceres
+    KCAL_MRCAL=/usr/bin/python3 python -m scripts.bench.hybrid_time             mrcal too
+    python -m scripts.bench.hybrid_time --cameras 64 --views 30          many cameras: one call against single ones
+
+Views as in `scripts.bench.solver`: 6 x 7 corners, 0.2 px of noise. Each run is a process of its own, warmed up on eight
+views; runs alternate. Ceres begins at a good start that is not timed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scripts.bench import solver
+from scripts.shared.memory import peak_megabytes
+from scripts.shared.page import table, write_section
+from scripts.shared.timing import show
+from scripts.shared.views import COLUMNS, ROWS, SIZE, SQUARE, observed, simulate
+
+SPLINE = "SPLINED13x9"
+DEFAULT, MANY, SINGLE = "default camera", "one call", "single calls"
+
+
+def work(way: str, views: int, cameras: int) -> None:
+    """In a process of its own: calibrate, and print processor seconds and peak memory."""
+    import torch
+
+    from kcal.calibrate.camera.calibrate import calibrate_camera, calibrate_cameras
+
+    torch.set_num_threads(1)
+    sets = [observed(simulate(views, seed=50_000 + i)["pixels"].tolist()) for i in range(cameras)]
+    calibrate_camera(observed(simulate(8)["pixels"].tolist()))
+    before, start = peak_megabytes(), time.process_time()
+    if way == MANY:
+        calibrate_cameras(sets)
+    else:
+        for seen in sets:
+            calibrate_camera(seen)
+    print(json.dumps({"seconds": time.process_time() - start, "megabytes": peak_megabytes(), "before": before}))
+
+
+def own(way: str, views: int, cameras: int = 1) -> dict[str, Any]:
+    command = [sys.executable, "-m", "scripts.bench.hybrid_time", "--work", way, str(views), str(cameras)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return found
+
+
+def spline(data: dict[str, np.ndarray], timeout: float) -> dict[str, Any]:
+    """Mrcal's splined lens by `scripts/bench/peer_mrcal.py`, with no view held out."""
+    count = len(data["pixels"])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "problem.npz")
+        np.savez(
+            path,
+            corners=data["pixels"],
+            weight=np.ones((count, ROWS * COLUMNS)),
+            train=np.arange(count),
+            held=np.arange(0),
+            image_size=np.array(SIZE),
+            board_size=np.array([COLUMNS, ROWS]),
+            square_m=SQUARE,
+            focal=1500.0,
+        )
+        try:
+            done = subprocess.run(
+                [os.environ["KCAL_MRCAL"], "scripts/bench/peer_mrcal.py", str(path), SPLINE],
+                capture_output=True, text=True, timeout=timeout, check=True,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            return {"failed": f"> {timeout:.0f} s"}
+        except subprocess.CalledProcessError as error:
+            return {"failed": error.stderr.strip().splitlines()[-1][:60]}
+    return {"seconds": json.loads(done.stdout.strip().splitlines()[-1])["cpu_s"]}
+
+
+def compare(views: int, repeats: int, timeout: float) -> list[Any]:
+    """A row of the table."""
+    others = ["kcal, weak prior", *(["Ceres"] if os.environ.get("KCAL_PEERS") else [])]
+    runs: dict[str, list[dict[str, Any]]] = {}
+    data = simulate(views)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "views.npz"
+        np.savez(path, **data)  # type: ignore[arg-type]
+        for _ in range(repeats):
+            runs.setdefault(DEFAULT, []).append(own(DEFAULT, views))
+            for name in others:
+                runs.setdefault(name, []).append(solver.run(name, path, 14, timeout))
+            if os.environ.get("KCAL_MRCAL"):
+                runs.setdefault(SPLINE, []).append(spline(data, timeout))
+    cells: list[Any] = [views]
+    first = [run["seconds"] for run in runs[DEFAULT]]
+    for found in runs.values():
+        if "failed" in found[-1]:
+            cells.append(found[-1]["failed"])
+            continue
+        seconds = [run["seconds"] for run in found]
+        ratios = [b / a for a, b in zip(first, seconds, strict=True)]
+        spread = "" if found is runs[DEFAULT] else f" ({statistics.median(ratios):.2f} times)"
+        cells.append(f"{statistics.median(seconds):.2f} s{spread}")
+    return [*cells, f"{runs[DEFAULT][-1]['megabytes']:.0f} MB"]
+
+
+def main() -> None:
+    if sys.argv[1:2] == ["--work"]:
+        work(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
+        return
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--views", type=int, nargs="+", default=[6, 15, 30, 60, 200, 800])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--timeout", type=float, default=120.0)
+    parser.add_argument("--cameras", type=int, help="only many cameras in one call, and in calls of their own")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
+    arguments = parser.parse_args()
+    os.environ["OMP_NUM_THREADS"] = "1"
+    if arguments.cameras:
+        rows = []
+        for way in (MANY, SINGLE):
+            found = own(way, arguments.views[0], arguments.cameras)
+            rows.append([way, f"{found['seconds']:.1f} s", f"{found['megabytes'] - found['before']:.0f} MB"])
+        lines = [f"{arguments.cameras} cameras of {arguments.views[0]} views each. One call also finds which of them "
+                 "saw one board.", "", *table(["way", "processor time", "memory, more than before"], rows)]  # fmt: skip
+        section = "many"
+    else:
+        header = ["views", DEFAULT, "14 coefficients, weak prior"]
+        header += ["Ceres, 14 coefficients"] if os.environ.get("KCAL_PEERS") else []
+        header += [f"mrcal, {SPLINE}"] if os.environ.get("KCAL_MRCAL") else []
+        rows = []
+        for views in arguments.views:
+            rows.append([str(cell) for cell in compare(views, arguments.repeats, arguments.timeout)])
+            show([" | ".join(rows[-1])])
+        lines, section = table([*header, "peak memory of the default"], rows), "time"
+    show(lines)
+    if arguments.write:
+        write_section("one-camera.md", section, "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
