@@ -75,7 +75,7 @@ def live_command(
     match_sigma: Annotated[
         float,
         typer.Option(metavar="PX", help="Error of matched images that compression of the videos adds, each axis."),
-    ] = 0.05,
+    ] = 0.06,
     clock_offset: Annotated[
         float, typer.Option(metavar="S", help="Seconds by which the right images are later than their times.")
     ] = 0.0,

@@ -25,8 +25,6 @@ from kcal.pipeline.pairing import pair_objects
 from kcal.pipeline.stream import SourceItem
 from kcal.pipeline.video_frames import TimedFrame, file_frames
 
-# Of matches in H.264 videos of usual quality (x264 at CRF 23), besides what they state; it falls to half at CRF 17.
-MATCH_SIGMA = 0.05
 # Decoded frames that wait for their partners: a third of a second of video.
 _FRAMES = 8
 # Frames of one live stream after which a lack of partners is told: some seconds.
@@ -74,7 +72,8 @@ class VideoPairs:
         detector: see `detect_in`.
         options: of the pairing of boxes.
         late: seconds by which the right images are later than their times say, as known at present.
-        match_sigma: pixels, error of a match along each axis besides what its pixels tell: compression makes it.
+        match_sigma: pixels, error of a match along each axis besides what its pixels tell; compression makes it: 0.06
+            in H.264 of usual quality (CRF 23 of x264, `scripts/check/compression.py`).
         apart_s: frames that are farther apart in time are not paired.
         tell: called with what happens to live streams, from another thread.
 
@@ -91,7 +90,7 @@ class VideoPairs:
         options: AssociationOptions,
         *,
         late: Callable[[], float],
-        match_sigma: float = MATCH_SIGMA,
+        match_sigma: float,
         apart_s: float = 0.5,
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
