@@ -177,6 +177,7 @@ from kcal.pipeline.tracks import TrackOptions as TrackOptions
 from kcal.pipeline.tracks import Tracks as Tracks
 from kcal.report.board import save_board_picture as save_board_picture
 from kcal.report.budget import save_budget_picture as save_budget_picture
+from kcal.report.calibration import calibration_figure as calibration_figure
 from kcal.report.calibration import save_calibration_picture as save_calibration_picture
 from kcal.report.camera_verdict import camera_verdict as camera_verdict
 from kcal.report.camera_verdict import stored_verdict as stored_verdict
@@ -184,7 +185,9 @@ from kcal.report.difference import save_difference_picture as save_difference_pi
 from kcal.report.gallery import save_coverage as save_coverage
 from kcal.report.gallery import save_gallery as save_gallery
 from kcal.report.map_page import save_map as save_map
+from kcal.report.positions import positions_figure as positions_figure
 from kcal.report.positions import save_positions_picture as save_positions_picture
+from kcal.report.rig import rig_figure as rig_figure
 from kcal.report.rig import save_rig_picture as save_rig_picture
 from kcal.report.rig_verdict import rig_verdict as rig_verdict
 from kcal.report.verdict import Finding as Finding

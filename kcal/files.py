@@ -93,6 +93,20 @@ def make_folder(path: str | Path) -> Path:
     return path
 
 
+# Lists to which the paths of files are added as they are written.
+_watching: list[list[Path]] = []
+
+
+@contextmanager
+def written_files() -> Iterator[list[Path]]:
+    """Collect the paths of all files that are written meanwhile, for messages after an interruption."""
+    _watching.append([])
+    try:
+        yield _watching[-1]
+    finally:
+        _watching.pop()
+
+
 @contextmanager
 def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
     """Open a file beside `path` for writing, and move it into place when the block ends.
@@ -128,6 +142,8 @@ def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
             if mode is not None:
                 os.chmod(temporary, mode)
             os.replace(temporary, target)
+            for paths in _watching:
+                paths.append(path)
         except BaseException:
             temporary.unlink()
             raise

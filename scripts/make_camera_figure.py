@@ -14,7 +14,7 @@ from kcal.calibrate.lensfit.cameras_fit import measure_board
 from kcal.lens.pupil import pupil_depth
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.board import save_board_picture
-from kcal.report.figures import ACCENT, frame_image, new_figure, save_png
+from kcal.report.figures import ACCENT, frame_image, new_figure, save_picture
 from scripts.bench.one_camera import stereo_images
 from scripts.shared.wide_lens import load
 
@@ -49,7 +49,7 @@ def main() -> None:
     frame_image(right, camera.size)
     right.set_title("σ of far directions, pixels", fontsize=10, loc="left")
     figure.colorbar(shown, ax=right, fraction=0.035, pad=0.02)
-    print(f"wrote {save_png(FOLDER / 'camera.png', figure)}")
+    print(f"wrote {save_picture(FOLDER / 'camera.png', figure)}")
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ def real_pairs(
     output: Path, folder: Path, size: str, square: str, board: Board, origin: Origin | None, heading: float
 ) -> None:
     """Calibrate from a folder of pairs, and locate two opposite corners of each board, whose distance is known."""
+    from kcal.cli.demo_summary import save_pairs_summary
     from kcal.io.rig_file import load_rig
     from kcal.lens.mounting import Origin
     from kcal.locate.marks import read_marks, write_marks
@@ -42,7 +43,9 @@ def real_pairs(
     rig = load_rig(output / "rig.json")
     located = locate_points(rig, marks.left, marks.right, origin=where, heading_deg=heading, names=marks.names)
     out.print("\nThe board's diagonal, true against estimated", markup=False)
-    print_table(diagonal_rows(located, board))
+    rows = diagonal_rows(located, board)
+    print_table(rows)
+    save_pairs_summary(output, rows, command)
     if origin is None:
         err.print("[yellow]note:[/] no --origin was given: positions are placed at latitude 0, longitude 0")
     print_results(output, command)

@@ -13,19 +13,25 @@ from kcal.cli.calibrate import calibrate_command
 from kcal.cli.console import out
 from kcal.cli.detect import detect_command
 from kcal.cli.locate import locate_command
+from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
 
 SIDES = ("left", "right")
 
 
 def run(name: str, *arguments: object) -> None:
-    """Print a command as a user would type it, and run it: detect, calibrate, rig or locate."""
+    """Print a command as a user would type it, and run it: detect, calibrate, rig, locate or report."""
     words = [str(argument) for argument in arguments]
     out.print(f"\n[bold]kcal {escape(shlex.join([name, *words]))}[/]")
     app = rig
     if name != "rig":
         app = typer.Typer()
-        commands = {"detect": detect_command, "calibrate": calibrate_command, "locate": locate_command}
+        commands = {
+            "detect": detect_command,
+            "calibrate": calibrate_command,
+            "locate": locate_command,
+            "report": report_command,
+        }
         app.command()(commands[name])  # type: ignore[type-var]
     get_command(app).main(words, standalone_mode=False)
 
@@ -38,11 +44,11 @@ def locate_again(output: Path, *options: object) -> str:
     return shlex.join(map(str, ["kcal", "locate", *words, "-o", "again.geojson"]))
 
 
-def print_results(output: Path, command: str, *, summary: bool = False) -> None:
+def print_results(output: Path, command: str) -> None:
     """Print where the results are, what they are, and the command that locates the points once more."""
     out.print(f"\nResults are in {output.resolve()}:", markup=False)
     for name, what in (
-        *((("summary.html", "what was done and what came out, on one page"),) if summary else ()),
+        ("summary.html", "what was done and what came out, on one page"),
         ("map.png", "the map"),
         ("map.html", "the map, interactive, for any browser"),
         ("points.geojson", "positions for a GIS"),

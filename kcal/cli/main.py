@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -32,6 +33,7 @@ from kcal.cli.rig import app as rig
 from kcal.cli.show import show_command
 from kcal.cli.undistort import undistort_command
 from kcal.errors import KcalError
+from kcal.files import written_files
 from kcal.texts import visible
 
 
@@ -53,8 +55,22 @@ class _Commands(TyperGroup):
             return super().make_context(*arguments, **options)
 
     def invoke(self, ctx: Any) -> Any:
-        with usage_errors_shown():
-            return super().invoke(ctx)
+        # Typer ends an interrupted command without a word.
+        with usage_errors_shown(), written_files() as written:
+            try:
+                return super().invoke(ctx)
+            except KeyboardInterrupt:
+                err.print(kept_text(written), markup=False)
+                raise typer.Exit(130) from None
+
+
+def kept_text(written: Sequence[Path]) -> str:
+    """What is said after an interruption: the last files that were written, and how many others."""
+    names = list(dict.fromkeys(map(str, written)))
+    if not names:
+        return "interrupted; nothing was written"
+    more = f"{len(names) - 3} other files, " if len(names) > 3 else ""
+    return f"interrupted; written and kept: {more}{', '.join(names[-3:])}"
 
 
 app = typer.Typer(

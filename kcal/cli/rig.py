@@ -92,7 +92,7 @@ def solve_command(
     ] = 0.1,
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Leave nothing out; only warn.")] = False,
     board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
-    picture: Annotated[Path | None, typer.Option(help="A .png file: residuals by source and a plan.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="A .png or .svg file: a plan, and residuals.")] = None,
 ) -> None:
     """Solve a stereo rig: where the right camera stands from the left, and where both stand on the Earth.
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from kcal.calibrate.lensfit.measured_board import Measured, MeasuredBoard
-from kcal.report.figures import GRAY, INK, draw_arrows, new_figure, save_png
+from kcal.report.figures import GRAY, INK, draw_arrows, new_figure, save_picture
 
 _ACROSS = 160
 # What is below this (mm) is not worth full colors and long arrows.
@@ -63,5 +63,5 @@ def board_figure(board: MeasuredBoard) -> Figure:
 
 
 def save_board_picture(path: str | Path, board: MeasuredBoard) -> Path:
-    """Write the picture of `board_figure` as a PNG, atomically."""
-    return save_png(path, board_figure(board))
+    """Write the picture of `board_figure` as PNG or SVG, atomically."""
+    return save_picture(path, board_figure(board))

@@ -9,7 +9,7 @@ from matplotlib.ticker import NullFormatter
 from torch import Tensor
 
 from kcal.locate.budget import RangeError
-from kcal.report.figures import new_figure, plain_number, save_png
+from kcal.report.figures import new_figure, plain_number, save_picture
 
 _SOURCE_COLORS = {"disparity": "#2b6cb0", "yaw": "#c02a6b", "baseline": "#4b5563", "timing": "#dd7a1f"}
 
@@ -55,5 +55,5 @@ def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[
 def save_budget_picture(
     path: str | Path, distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]
 ) -> Path:
-    """Write the picture of `budget_figure` as a PNG, atomically."""
-    return save_png(path, budget_figure(distances, found, labels))
+    """Write the picture of `budget_figure` as PNG or SVG, atomically."""
+    return save_picture(path, budget_figure(distances, found, labels))

@@ -14,34 +14,73 @@ from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.corners.observations import Observations
 from kcal.lens.uncertainty import image_sigma
-from kcal.report.figures import ACCENT, FAINT, INK, WARN, draw_arrows, frame_image, new_figure, save_png
+from kcal.report.figures import ACCENT, FAINT, HALO, INK, WARN, draw_arrows, frame_image, new_figure, save_picture
+
+# Of the width of axes: their color bar and the gap before it.
+COLORBAR_SHARE = 0.055
 
 
 def calibration_figure(result: CameraCalibrationResult) -> Figure:
-    """Draw coverage (the paper's Fig. 1) with magnified residuals, and where the camera is uncertain.
-
-    Below them are residuals against noise and the RMS of each view.
+    """Draw a calibration: coverage with magnified residuals, uncertainty over the image, residuals, RMS of each view.
 
     Args:
         result: from `calibrate_camera`.
+
+    Returns:
+        A matplotlib figure that belongs to no window and no global state; its four axes may be changed.
+
+    Source:
+        Coverage is Fig. 1 of the paper.
+
+    Example:
+        >>> import torch
+        >>> from kcal import Board, CalibrationOptions, Camera, Observations, View, calibrate_camera
+        >>> from kcal.lens.pose import rotation_from_vector
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.2, 0.05])
+        >>> board, views = Board(columns=7, rows=6, square=0.05), []
+        >>> for turn in ((0.5, 0, 0), (-0.5, 0, 0.2), (0, 0.5, 0), (0, -0.5, 0.1), (0.3, 0.3, 1.5)):
+        ...     rotation = rotation_from_vector(torch.tensor(turn).double())
+        ...     pixels, _ = camera.project((board.points - board.points.mean(0)) @ rotation.T + torch.eye(3)[2] * 0.7)
+        ...     pixels = pixels + 0.1 * torch.sin(1e3 * pixels)  # noise, of a kind
+        ...     views.append(View(name=f"{len(views)}.png", pixels=tuple(map(tuple, pixels.tolist()))))
+        >>> seen = Observations(board=board, image_size=camera.size, views=tuple(views))
+        >>> result = calibrate_camera(seen, CalibrationOptions(model="opencv4"))
+        >>> figure = calibration_figure(result)
+        >>> figure.savefig("camera.svg")  # doctest: +SKIP
+        >>> len(figure.axes)
+        5
     """
     observations = result.observations
-    figure = new_figure(13.0, 9.2)
-    grid = figure.add_gridspec(
-        2, 2, height_ratios=[1.35, 1.0], left=0.05, right=0.94, top=0.92, bottom=0.07, hspace=0.22, wspace=0.12
-    )
-    draw_coverage(figure.add_subplot(grid[0, 0]), observations, result)
-    draw_uncertainty(figure.add_subplot(grid[0, 1]), observations, result)
-    draw_residuals(figure.add_subplot(grid[1, 0]), result)
-    draw_view_rms(figure.add_subplot(grid[1, 1]), observations, result)
+    wide = 5.9  # inches, as all of the following
+    tall = wide * observations.image_size[1] / observations.image_size[0]
+    size = 13.5, 4.75 + tall
+    figure = new_figure(*size)
+
+    def axes(left: float, bottom: float, across: float, up: float) -> Axes:
+        return figure.add_axes((left / size[0], bottom / size[1], across / size[0], up / size[1]))
+
+    images = axes(0.3, 3.85, wide, tall), axes(6.55, 3.85, wide / (1.0 - COLORBAR_SHARE), tall)
+    draw_coverage(images[0], observations, result)
+    draw_uncertainty(images[1], observations, result)
+    for drawn in images:
+        frame_image(drawn, observations.image_size, margin=0.005)
+        drawn.set(xticks=[], yticks=[], xlabel="", ylabel="")
+        drawn.spines[:].set_visible(False)
+    draw_residuals(axes(0.95, 0.75, 2.5, 2.5), result)
+    draw_view_rms(axes(4.75, 0.75, 7.7, 2.5), observations, result)
+    for drawn in figure.axes:
+        drawn.set_title(drawn.get_title(loc="left") or drawn.get_title(), fontsize=12, loc="left")
+        drawn.set_title("", loc="center")
     model = "" if result.hybrid is not None else f", model {result.camera.model}"
-    figure.suptitle(f"{len(observations.views)} views{model}: RMS {result.rms:.3f} px", x=0.05, ha="left", fontsize=14)
+    text = f"{len(observations.views)} views{model}: RMS {result.rms:.3f} px"
+    place = 0.3 / size[0], 1.0 - 0.2 / size[1]
+    figure.text(*place, text, ha="left", va="top", fontsize=17, fontweight="bold", color=INK)
     return figure
 
 
 def save_calibration_picture(path: str | Path, result: CameraCalibrationResult) -> Path:
-    """Write the picture of `calibration_figure` as a PNG, atomically."""
-    return save_png(path, calibration_figure(result))
+    """Write the picture of `calibration_figure` as PNG or SVG, atomically."""
+    return save_picture(path, calibration_figure(result))
 
 
 def draw_coverage(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
@@ -92,7 +131,7 @@ def draw_uncertainty(axes: Axes, observations: Observations, result: CameraCalib
         x, y = (np.linspace(-0.5, size - 0.5, count) for size, count in ((width, 4 * columns), (height, 4 * rows)))
         axes.contour(x, y, seen, levels=[0.5], colors=INK, linewidths=1.0, linestyles="dashed")
     axes.set_title("σ of far directions, pixels; dashed: what boards reached", fontsize=10, loc="left")
-    axes.figure.colorbar(shown, ax=axes, fraction=0.035, pad=0.02, format="%g")
+    axes.figure.colorbar(shown, ax=axes, fraction=COLORBAR_SHARE - 0.02, pad=0.02, format="%g")
 
 
 def _round_levels(low: float, high: float) -> list[float]:
@@ -117,7 +156,10 @@ def draw_residuals(axes: Axes, result: CameraCalibrationResult) -> None:
     axes.axhline(0, color=FAINT, linewidth=0.6)
     axes.axvline(0, color=FAINT, linewidth=0.6)
     axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="u, pixels", ylabel="v, pixels")
-    axes.set_title(f"Residuals; σ {sigma:.3f} px per axis, {100 * outside:.1f} % outside the 95 % circle", fontsize=10)
+    axes.locator_params(nbins=5)
+    axes.set_title(f"Residuals: σ {sigma:.3f} px per axis", fontsize=10, loc="left")
+    text = f"{100 * outside:.1f} % outside the 95 % circle"
+    axes.text(0.03, 0.97, text, transform=axes.transAxes, fontsize=9, color=INK, va="top", path_effects=HALO)
 
 
 def draw_view_rms(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:

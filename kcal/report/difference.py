@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera.export import Misfit
 from kcal.lens.difference import CameraDifference
-from kcal.report.figures import INK, draw_arrows, frame_image, new_figure, save_png
+from kcal.report.figures import INK, draw_arrows, frame_image, new_figure, save_picture
 
 # Arrows per row of the picture, at most.
 _ARROWS = 17
@@ -79,10 +79,10 @@ def _colors(axes, places: np.ndarray, values: Tensor, figure: Figure, label: str
 def save_difference_picture(
     path: str | Path, found: CameraDifference | Misfit, title: str = "", lines: list[str] | None = None
 ) -> Path:
-    """Write the picture of a comparison, or of the misfit of an exported lens, as a PNG, atomically.
+    """Write the picture of a comparison, or of the misfit of an exported lens, as PNG or SVG, atomically.
 
     Raises:
-        InputError: a suffix other than .png.
+        InputError: a suffix other than .png and .svg.
         FileError: the file cannot be written.
     """
     if lines is None:
@@ -91,4 +91,4 @@ def save_difference_picture(
             if isinstance(found, CameraDifference)
             else [f"{found.model}: RMS {found.rms:.4g} px, largest {found.largest:.4g} px, at infinity"]
         )
-    return save_png(path, difference_figure(found, title, lines))
+    return save_picture(path, difference_figure(found, title, lines))

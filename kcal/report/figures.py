@@ -1,4 +1,4 @@
-"""Shared parts of all pictures: colors, axes of an image, magnified arrows, and PNG files that are written whole."""
+"""Shared parts of all pictures: colors, axes of an image, magnified arrows, and PNG or SVG files written whole."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import patheffects
+from matplotlib import patheffects, rc_context
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -108,22 +108,25 @@ def check_picture(path: str | Path) -> None:
     """Raise an error now if `path` could not be written as a picture later.
 
     Raises:
-        InputError: a suffix other than .png.
+        InputError: a suffix other than .png and .svg.
         FileError: the file cannot be written.
     """
-    if Path(path).suffix.lower() != ".png":
-        raise InputError(f"{path}: the picture is a PNG; the file name must end with .png")
+    if Path(path).suffix.lower() not in (".png", ".svg"):
+        raise InputError(f"{path}: the name of a picture must end with .png or .svg")
     check_writable(path)
 
 
-def save_png(path: str | Path, figure: Figure) -> Path:
-    """Write a figure as PNG, atomically.
+def save_picture(path: str | Path, figure: Figure) -> Path:
+    """Write a figure as PNG or SVG, as the suffix says, atomically.
 
     Raises:
-        InputError: a suffix other than .png.
+        InputError: a suffix other than .png and .svg.
         FileError: the file cannot be written.
     """
     check_picture(path)
     data = io.BytesIO()
-    figure.savefig(data, format="png")
+    # The same figure makes the same bytes: an SVG has neither a date nor random names.
+    with rc_context({"svg.hashsalt": "kcal"}):
+        kind = Path(path).suffix.lower()[1:]
+        figure.savefig(data, format=kind, metadata={"Date": None} if kind == "svg" else None)
     return write_atomic(path, data.getvalue())

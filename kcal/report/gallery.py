@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError
-from kcal.report.figures import ACCENT, INK, WARN, frame_image, new_figure, save_png
+from kcal.report.figures import ACCENT, INK, WARN, frame_image, new_figure, save_picture
 
 _MOST_VIEWS = 24  # views in a gallery
 _ACROSS = 4
@@ -106,13 +106,13 @@ def coverage_figure(observations: Observations) -> Figure:
 
 
 def save_gallery(path: str | Path, observations: Observations) -> Path:
-    """Write the picture of `gallery_figure` as a PNG, atomically."""
-    return save_png(path, gallery_figure(observations))
+    """Write the picture of `gallery_figure` as PNG or SVG, atomically."""
+    return save_picture(path, gallery_figure(observations))
 
 
 def save_coverage(path: str | Path, observations: Observations) -> Path:
-    """Write the picture of `coverage_figure` as a PNG, atomically."""
-    return save_png(path, coverage_figure(observations))
+    """Write the picture of `coverage_figure` as PNG or SVG, atomically."""
+    return save_picture(path, coverage_figure(observations))
 
 
 def _badness(view: View) -> tuple[int, float]:

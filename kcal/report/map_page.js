@@ -7,12 +7,20 @@
   const text = (value) => document.createTextNode(value);
   // Leaflet takes attributions as HTML: this is the HTML that shows a text.
   const attribution = (value) => { const s = document.createElement("span"); s.append(text(value)); return s.innerHTML; };
+  const node = (parent, name, attributes) => {
+    const made = parent.appendChild(document.createElementNS("http://www.w3.org/2000/svg", name));
+    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+    return made;
+  };
+  const North = L.Control.extend({onAdd: () => {
+    const box = L.DomUtil.create("div", "north");
+    const drawn = node(box, "svg", {viewBox: "0 0 20 40", width: 20, height: 40});
+    node(drawn, "polygon", {points: "10,0 16,20 10,16 4,20", fill: "#374151"});
+    node(drawn, "text", {x: 10, y: 36, "text-anchor": "middle"}).append(text("N"));
+    return box;
+  }});
+  new North({position: "topleft"}).addTo(map);
   const head = (azimuth) => {
-    const node = (parent, name, attributes) => {
-      const made = parent.appendChild(document.createElementNS("http://www.w3.org/2000/svg", name));
-      for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-      return made;
-    };
     const box = document.createElement("div");
     node(node(box, "svg", {viewBox: "-6 -6 12 12"}), "path",
       {d: "M0,0 L-4,6 L4,6 Z", fill: "#c02a6b", transform: "rotate(" + Number(azimuth) + ")"});
@@ -20,8 +28,12 @@
   };
   const overlays = {};
   const layer = (name) => overlays[name] || (overlays[name] = L.layerGroup().addTo(map));
-  const label = (shape, name, side) => shape.bindTooltip(() => { const s = document.createElement("span"); s.append(text(name)); return s; },
-    {permanent: true, direction: side || "right", className: "name", offset: side ? [0, 0] : [6, 0]});
+  const named = [];
+  const label = (shape, name, side) => {
+    named.push(shape);
+    return shape.bindTooltip(() => { const s = document.createElement("span"); s.append(text(name)); return s; },
+      {permanent: true, direction: side || "right", className: "name", offset: side ? [0, 0] : [6, 0]});
+  };
 
   if (data.image) {
     L.imageOverlay(data.image.uri, data.image.bounds, {attribution: attribution(data.image.name)}).addTo(map);
@@ -47,6 +59,25 @@
       if (element) element.style.display = far ? "" : "none";
       const tip = shape.getTooltip();
       if (tip && tip.getElement()) tip.getElement().style.display = far ? "" : "none";
+    }
+  };
+  // A name that would cover another one goes to the other side of its point, or waits until the map is zoomed in.
+  const spread = () => {
+    const placed = [];
+    for (const shape of named.slice(0, 300)) {
+      const tip = shape.getTooltip(), element = tip.getElement();
+      if (!element || !map.hasLayer(shape) || element.style.display === "none") continue;
+      const fits = (direction) => {
+        tip.options.direction = direction;
+        tip.options.offset = L.point(direction === "right" ? 6 : -6, 0);
+        tip.update();
+        const box = element.getBoundingClientRect();
+        const free = placed.every((b) => box.right < b.left || b.right < box.left || box.bottom - 2 < b.top || b.bottom - 2 < box.top);
+        if (free) placed.push(box);
+        return free;
+      };
+      const first = tip.options.first || (tip.options.first = tip.options.direction);
+      element.style.visibility = fits(first) || fits(first === "right" ? "left" : "right") ? "" : "hidden";
     }
   };
   for (const view of data.cameras) {
@@ -85,8 +116,10 @@
     }
     shape.bindPopup(rows);
   }
-  L.control.layers(null, overlays, {collapsed: false}).addTo(map);
-  map.on("zoomend moveend overlayadd", tidy);
+  // Targets keep their names, those of cameras and arcs give way.
+  named.sort((a, b) => Number(Boolean(b.getPopup())) - Number(Boolean(a.getPopup())));
+  L.control.layers(null, overlays, {collapsed: map.getSize().x < 600}).addTo(map);
+  map.on("zoomend moveend overlayadd", () => { tidy(); spread(); });
   map.fitBounds(data.bounds, {padding: [30, 30]});
-  map.whenReady(() => { tidy(); document.documentElement.dataset.drawn = data.points.length + "/" + document.querySelectorAll("#map path").length; });
+  map.whenReady(() => { tidy(); spread(); document.documentElement.dataset.drawn = data.points.length + "/" + document.querySelectorAll("#map path").length; });
 })();

@@ -37,6 +37,10 @@ header { padding: 8px 14px; border-bottom: 1px solid #d1d5db; }
 header b { font-size: 16px; }
 header p { margin: 2px 0 0; color: #4b5563; font-size: 12px; }
 #map { flex: 1; background: #f3f1ea; }
+.north { pointer-events: none; font: 700 14px system-ui, sans-serif; margin-left: 17px !important; }
+.leaflet-control-layers-toggle::after { content: "\\2630"; display: block; text-align: center; line-height: 36px;
+  color: #374151; font-size: 20px; }
+.leaflet-control-layers-toggle { text-decoration: none; }
 .leaflet-tooltip.name { background: none; border: 0; box-shadow: none; padding: 0; font: 600 12px system-ui, sans-serif;
   color: #111827; text-shadow: 0 0 3px #fff, 0 0 3px #fff, 0 0 3px #fff, 0 0 3px #fff; }
 .leaflet-tooltip.name::before { display: none; }

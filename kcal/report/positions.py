@@ -15,7 +15,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.locate.positions import Located, Position
 from kcal.locate.stereo import PositionStatus
-from kcal.report.figures import CAMERA_COLORS, FAINT, GRAY, HALO, INK, WARN, new_figure, range_text, save_png
+from kcal.report.figures import CAMERA_COLORS, FAINT, GRAY, HALO, INK, WARN, new_figure, range_text, save_picture
 
 Array = NDArray[np.float64]
 
@@ -38,10 +38,20 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
         truth: (N, 3) true east, north, up in meters, NaN where unknown; an arrow leads from each to its estimate.
 
     Returns:
-        A matplotlib figure that belongs to no window and no global state.
+        A matplotlib figure that belongs to no window and no global state: the map, then the intervals.
 
     Raises:
         InputError: a truth of the wrong shape.
+
+    Example:
+        >>> import torch
+        >>> from kcal import Camera, Origin, StereoRig, locate_points
+        >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> left, right, _ = rig(torch.tensor([[50.0, 0.0, 900.0]]))
+        >>> located = locate_points(rig, left, right, origin=Origin(lat=19.0, lon=72.9, height=0.0), heading_deg=35.0)
+        >>> len(positions_figure(located).axes)
+        2
     """
     true_enu = None if truth is None else truth.detach().cpu().double().numpy()
     if true_enu is not None and true_enu.shape != (len(located.positions), 3):
@@ -65,13 +75,13 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
 
 
 def save_positions_picture(path: str | Path, located: Located, truth: Tensor | None = None) -> Path:
-    """Write the picture of `positions_figure` as a PNG, atomically.
+    """Write the picture of `positions_figure` as PNG or SVG, atomically.
 
     Raises:
-        InputError: a suffix other than .png, or a truth of the wrong shape.
+        InputError: a suffix other than .png and .svg, or a truth of the wrong shape.
         FileError: the file cannot be written.
     """
-    return save_png(path, positions_figure(located, truth))
+    return save_picture(path, positions_figure(located, truth))
 
 
 class _RangeScale:

@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from kcal.calibrate.rig.result import ItemResidual, RigResult
-from kcal.report.figures import new_figure, save_png
+from kcal.lens.camera import Camera
+from kcal.report.figures import new_figure, save_picture
 
 Array = NDArray[np.float64]
 
@@ -32,15 +33,30 @@ _ROWS = 45
 
 
 def rig_figure(result: RigResult) -> Figure:
-    """Draw a plan of the site, residuals by source, and each item's residual in sigmas; what was left out in magenta.
+    """Draw a rig on the map, with what it was solved from, and each item's residual in sigmas.
 
-    In the plan distances from the rig are drawn as log(1 + range / r0), directions as they are.
+    Distances from the rig are drawn as log(1 + range / r0), directions as they are. What was left out is magenta.
 
     Args:
-        result: from `kcal.calibrate.rig.solve.solve_rig`.
+        result: from `solve_rig` or `calibrate_rig`.
 
     Returns:
-        A matplotlib figure that belongs to no window and no global state.
+        A matplotlib figure that belongs to no window and no global state: the map, then the bars.
+
+    Example:
+        >>> import torch
+        >>> from kcal import Camera, Landmarks, RigData, RigOptions, StereoRig, solve_rig
+        >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        >>> ahead = 80.0 * (1.0 + torch.arange(8).double())
+        >>> places = torch.stack([ahead * torch.sin(ahead), ahead * torch.cos(ahead), 10 * ahead], -1) * 0.4
+        >>> left, right, _ = rig(places)
+        >>> seen = Landmarks(names=tuple("abcdefgh"), points=places, sigma=torch.full_like(places, 0.02),
+        ...                  pixels=torch.stack([left, right], 1), pixel_sigma=0.1)
+        >>> data = RigData(cameras=(camera, camera), names=("left", "right"), landmarks=seen)
+        >>> figure = rig_figure(solve_rig(data, RigOptions(refraction=0.0, refraction_sigma=0.0)))
+        >>> len(figure.axes)
+        2
     """
     figure = new_figure(13.0, 7.6)
     plan, bars = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
@@ -59,13 +75,13 @@ def rig_figure(result: RigResult) -> Figure:
 
 
 def save_rig_picture(path: str | Path, result: RigResult) -> Path:
-    """Write the picture of `rig_figure` as a PNG, atomically.
+    """Write the picture of `rig_figure` as PNG or SVG, atomically.
 
     Raises:
-        InputError: a suffix other than .png.
+        InputError: a suffix other than .png and .svg.
         FileError: the file cannot be written.
     """
-    return save_png(path, rig_figure(result))
+    return save_picture(path, rig_figure(result))
 
 
 def _flat(result: RigResult, points: Array) -> Array:
@@ -99,6 +115,19 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
         distance = np.maximum(np.hypot(offset[..., 0], offset[..., 1]), 1e-9)[..., None]
         return np.asarray(offset / distance * np.log1p(distance / unit) / math.log1p(reach / unit))
 
+    extent = []
+    for c, camera in enumerate(result.cameras):
+        color, edges = _CAMERAS[c % len(_CAMERAS)], _edges(result, c, camera)
+        if edges is not None:
+            first, last = edges
+            fan = np.linspace(first, first + (last - first) % (2.0 * math.pi), 100)
+            rim = centers[c] + 1.1 * reach * np.stack([np.sin(fan), np.cos(fan)], -1)
+            # Straight lines from a camera beside the middle are curved on a logarithmic plan.
+            steps = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 60)])[:, None]
+            sides = [centers[c] + steps * (end - centers[c]) for end in (rim[0], rim[-1])]
+            extent.append(place(np.concatenate([sides[0], rim, sides[1][::-1]])))
+            axes.fill(*extent[-1].T, facecolor=color, alpha=0.07, edgecolor="none", zorder=0)
+            axes.plot(*extent[-1].T, color=color, alpha=0.5, linewidth=0.9, zorder=1)
     circle = np.linspace(0.0, 2.0 * math.pi, 200)
     for radius in (step * 10.0**power for power in range(-1, 7) for step in (1.0, 5.0)):
         if nearest / 4 <= radius <= reach:
@@ -130,13 +159,29 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
             arrowprops={"arrowstyle": "-|>", "color": "#111827", "linewidth": 1.2},
         )  # fmt: skip
         axes.plot(*here, "o", color=_CAMERAS[c % len(_CAMERAS)], markersize=6, zorder=5, label=f"{name} camera")
-    seen = np.concatenate([place(centers), *(place(points) for points, _, _ in places.values())])
+    seen = np.concatenate([place(centers), *extent, *(place(points) for points, _, _ in places.values())])
     low, high = seen.min(0) - 0.1, seen.max(0) + 0.15
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axes.axis("off")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.005), ncols=4, fontsize=9, frameon=False)
+    if result.absolute:
+        arrow = {"arrowstyle": "-|>", "color": "#374151", "linewidth": 1.4}
+        axes.annotate("", (0.04, 1.0), (0.04, 0.89), xycoords="axes fraction", arrowprops=arrow)
+        axes.text(0.04, 0.88, "N", transform=axes.transAxes, ha="center", va="top", fontsize=11, color="#374151")
     where = "north up" if result.absolute else "first camera's axis up"
     axes.set_title(f"From above, {where}, ranges on a logarithmic scale", fontsize=10.5, color="#374151")
+
+
+def _edges(result: RigResult, c: int, camera: Camera) -> tuple[float, float] | None:
+    """Azimuths on the plan of the left and right ends of the image's middle row; None without rays there."""
+    width, height = camera.size
+    ends = torch.tensor([[-0.5, 0.5 * height], [width - 0.5, 0.5 * height]], dtype=torch.float64)
+    with torch.no_grad():
+        rays, valid = camera.unproject(ends)
+    flat = _flat(result, (rays @ result.rotation[c]).numpy())
+    if not bool(valid.all()) or float(np.linalg.norm(flat, axis=-1).min()) < 1e-6:
+        return None
+    return float(np.arctan2(*flat[0])), float(np.arctan2(*flat[1]))
 
 
 def _draw_items(axes: Axes, result: RigResult) -> None:

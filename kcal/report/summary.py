@@ -21,15 +21,17 @@ section { background: #fff; border: 1px solid #e5e7eb; border-radius: 8px; paddi
 p { margin: .3rem 0 .8rem; max-width: 52rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .92rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .3rem .8rem; text-align: right; border-bottom: 1px solid #e5e7eb; white-space: nowrap; }
+th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid #e5e7eb; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
 th { color: #4b5563; font-weight: 600; }
 figure { margin: .6rem 0; }
 figcaption { color: #4b5563; font-size: .88rem; }
 img { max-width: 100%; height: auto; }
-pre { background: #f3f4f6; padding: .7rem .9rem; overflow-x: auto; font-size: .85rem; }
+pre { background: #f3f4f6; padding: .7rem .9rem; white-space: pre-wrap; overflow-wrap: anywhere; font-size: .85rem; }
 .row { display: flex; gap: 1rem; flex-wrap: wrap; }
-.row figure { flex: 1 1 20rem; }
+.row figure { flex: 1 1 100%; }
+@media (max-width: 44rem) { main { padding: 1rem .6rem; } section { padding: 1rem .8rem; } th, td { padding: .3rem; }
+  figure { overflow-x: auto; } figure img { max-width: none; width: 40rem; } }
 """
 
 

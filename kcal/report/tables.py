@@ -9,6 +9,9 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.locate.positions import Located, Position
 from kcal.locate.range_sigmas import RangeSigmas
+from kcal.locate.truth import position_errors
+
+_WORDS = {1: "one", 2: "two", 3: "three", 4: "four"}
 
 
 def position_rows(located: Located, off: list[tuple[float, float, bool] | None] | None = None) -> list[list[str]]:
@@ -45,7 +48,7 @@ def _meters(value: float) -> str:
 
 
 def truth_rows(located: Located, noiseless: Located, truth: Tensor) -> list[list[str]]:
-    """Range, interval and error of each point, along and across the true line of sight.
+    """Range, interval and error of each point, along and across the true line of sight, and whether it is in between.
 
     Args:
         located: the points.
@@ -53,19 +56,55 @@ def truth_rows(located: Located, noiseless: Located, truth: Tensor) -> list[list
             calibration alone has caused.
         truth: (N, 3) true east, north, up, meters.
     """
-    rows = [["target", "true m", "estimate m", "95 % interval m", "error m", "%", "across m", "calibration m"]]
-    for position, exact, true in zip(located.positions, noiseless.positions, truth, strict=True):
+    rows = [
+        ["target", "true m", "estimate m", "95 % interval m", "truth is", "error m", "%", "across m", "calibration m"]
+    ]
+    for position, exact, true, miss in zip(
+        located.positions, noiseless.positions, truth, position_errors(located, truth), strict=True
+    ):
         distance = float(true.norm())
-        if position.enu is None or position.range_m is None:
-            rows.append([position.name, f"{distance:.1f}", "-", "-", "-", "-", "-", position.reason])
+        if position.enu is None or position.range_m is None or miss is None:
+            rows.append([position.name, f"{distance:.1f}", "-", "-", "-", "-", "-", "-", position.reason])
             continue
         along, across = _along_and_across(position, true)
         low, high = position.range_low_m or 0.0, position.range_high_m or 0.0
         estimate, interval = f"{position.range_m:.1f}", f"{low:.1f} – {high:.1f}"
         error = [f"{along:+.2f}", f"{100 * along / distance:+.2f}", f"{across:.2f}"]
         share = "-" if exact.enu is None else f"{_along_and_across(exact, true)[0]:+.2f}"
-        rows.append([position.name, f"{distance:.1f}", estimate, interval, *error, share])
+        where = "inside" if miss[2] else "outside"
+        rows.append([position.name, f"{distance:.1f}", estimate, interval, where, *error, share])
     return rows
+
+
+def chance_text(located: Located, truth: Tensor) -> str:
+    """How many 95 % intervals contain the true range, and how many misses chance explains.
+
+    Example:
+        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.locate.positions import locate_points
+        >>> from kcal.lens.mounting import Origin
+        >>> import torch
+        >>> points = torch.tensor([[0.0, 0.0, 1000.0]] * 7, dtype=torch.float64)
+        >>> left, right, _ = planned_rig()(points)
+        >>> found = locate_points(planned_rig(), left, right, origin=Origin(lat=19.0, lon=72.9, height=0.0),
+        ...                       heading_deg=0.0)
+        >>> chance_text(found, points[:, [0, 2, 1]])
+        'The true range is inside 7 of 7 intervals. Of 7 intervals of 95 %, one or more miss in 30 % of all runs.'
+    """
+    found = [miss[2] for miss in position_errors(located, truth) if miss is not None]
+    count, outside = len(found), found.count(False)
+    text = f"The true range is inside {count - outside} of {count} intervals."
+    most = max(outside, 1)
+    if not count:
+        return text
+    fewer = sum(math.comb(count, k) * 0.05**k * 0.95 ** (count - k) for k in range(most))
+    share = f"{100 * (1 - fewer):.2g} %"
+    text += f" Of {count} intervals of 95 %, {_WORDS.get(most, most)} or more miss in {share} of all runs."
+    if outside and 1 - fewer < 0.01:
+        text += (
+            " Chance hardly explains that, but all targets share the errors of the rig, so several can miss together."
+        )
+    return text
 
 
 def _along_and_across(position: Position, true: Tensor) -> tuple[float, float]:

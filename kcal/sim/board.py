@@ -1,8 +1,9 @@
-"""The simulator's checkerboard: size, pose, true corners, and colors averaged over small areas."""
+"""The simulator's checkerboard: size, errors of its print, pose, true corners, and colors averaged over small areas."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import torch
@@ -85,6 +86,45 @@ class BoardSize(NamedTuple):
     square: float
 
 
+@dataclass(frozen=True)
+class PrintedBoard:
+    """A checkerboard as a printer and a wall leave it; poses and sizes are those of the board as it should be.
+
+    It is stretched by 0.15 % along x, sheared by 0.02 %, bent by 0.7 mm about an oblique axis, and off by smooth errors
+    of 0.03 mm.
+
+    Args:
+        columns: inner corners in a row.
+        rows: inner corners in a column.
+        square: side of a square in meters.
+        seed: of the axis of the bend and of the smooth errors.
+
+    Example:
+        >>> board = PrintedBoard(9, 6, 0.06, seed=1)
+        >>> points = board_points(board)
+        >>> [round(1e3 * float(value), 1) for value in board.errors(points).abs().amax(0)]  # millimeters
+        [0.4, 0.1, 0.7]
+    """
+
+    columns: int
+    rows: int
+    square: float
+    seed: int
+
+    def errors(self, points: Tensor) -> Tensor:
+        """Return how far points (..., 3) of the board are from where they should be, meters."""
+        generator = torch.Generator().manual_seed(5000 + self.seed)
+        half = 0.5 * self.square * torch.tensor([self.columns - 1, self.rows - 1], dtype=torch.float64)
+        off = points[..., :2] - half
+        a, b = (off / half).unbind(-1)
+        angle, phase = (math.pi * torch.rand(2, generator=generator, dtype=torch.float64)).tolist()
+        across = a * math.cos(angle) + b * math.sin(angle)
+        waves = 3e-5 * torch.randn(3, 2, generator=generator, dtype=torch.float64)
+        shapes = torch.stack([torch.sin(2 * a + phase), torch.sin(2 * b + phase), torch.cos(2 * (a + b))], -1)
+        x, y = (shapes @ waves / math.sqrt(1.5)).unbind(-1)
+        return torch.stack([x + 1.5e-3 * off[..., 0] + 2e-4 * off[..., 1], y, 0.7e-3 * (1.0 - across**2)], -1)
+
+
 class BoardPose(NamedTuple):
     """cam_from_board: `points_cam = rotation @ points_board + translation`; (3, 3) and (3,) float64 meters."""
 
@@ -142,6 +182,12 @@ def board_points(board: BoardLike, border: int = 0) -> Tensor:
     return torch.stack([x.reshape(-1), y.reshape(-1), torch.zeros(x.numel(), dtype=torch.float64)], -1) * board.square
 
 
+def true_corners(board: BoardLike) -> Tensor:
+    """Return where the inner corners truly are, in the order of `board_points`: (N, 3) meters."""
+    points = board_points(board)
+    return points + board.errors(points) if isinstance(board, PrintedBoard) else points
+
+
 def project_board(camera: LensLike, cam_from_board: tuple[Tensor, Tensor], board: BoardLike) -> tuple[Tensor, Tensor]:
     """Project the inner corners to their true pixels.
 
@@ -165,7 +211,7 @@ def project_board(camera: LensLike, cam_from_board: tuple[Tensor, Tensor], board
         ([339.5, 239.5], True)
     """
     rotation, translation = check_pose(cam_from_board)
-    pixels, valid = camera.project(board_points(board) @ rotation.T + translation)
+    pixels, valid = camera.project(true_corners(board) @ rotation.T + translation)
     return pixels, valid & camera.inside(pixels)
 
 

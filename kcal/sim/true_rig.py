@@ -44,7 +44,7 @@ class TrueRig:
         return pixels_left, pixels_right, valid_left & valid_right
 
 
-def drawn_rig(lens: str, strength: float, seed: int) -> TrueRig:
+def drawn_rig(lens: str, strength: float, seed: int, *, focal_mm: float = 2.8, wander: float = 0.1) -> TrueRig:
     """Draw two cameras 10 m apart whose lenses have one design and separate errors of assembly.
 
     The right camera is toed in by 0.34 degrees, and turned by 0.17 degrees in pitch and 0.46 in roll.
@@ -53,6 +53,8 @@ def drawn_rig(lens: str, strength: float, seed: int) -> TrueRig:
         lens: name of a prescription.
         strength: of the misalignment, see `kcal.sim.captures.drawn_lens`.
         seed: of both draws.
+        focal_mm: see `TruthLens`.
+        wander: see `TruthLens`.
 
     Example:
         >>> rig = drawn_rig("surveillance", 1.0, 3)
@@ -61,9 +63,10 @@ def drawn_rig(lens: str, strength: float, seed: int) -> TrueRig:
     """
     rotation = rotation_from_vector(torch.tensor([0.003, 0.006, -0.008], dtype=torch.float64))
     center = torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64)
+    left, right = (drawn_lens(lens, strength, 2 * seed + side, focal_mm=focal_mm, wander=wander) for side in (0, 1))
     return TrueRig(
-        left=drawn_lens(lens, strength, 2 * seed),
-        right=drawn_lens(lens, strength, 2 * seed + 1),
+        left=left,
+        right=right,
         right_from_left_rotation=rotation,
         right_from_left_translation=-rotation @ center,
     )

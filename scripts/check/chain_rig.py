@@ -15,12 +15,10 @@ from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Landmarks, RigData
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import placed_rig
-from kcal.sim.captures import drawn_lens
-from kcal.sim.true_rig import TrueRig
+from kcal.sim.true_rig import TrueRig, drawn_rig
 from scripts.shared.long_range import ORIGIN, RANGES, range_sigma
 
 How = Literal["held", "prior"]
@@ -58,18 +56,7 @@ def true_rig(draw: int, pupil: float) -> TrueRig:
         draw: seed of the lenses.
         pupil: movement of the entrance pupil, mm/rad².
     """
-    rotation = rotation_from_vector(torch.tensor([0.003, 0.006, -0.008], dtype=torch.float64))
-    center = torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64)
-    left, right = (
-        drawn_lens("surveillance", 1.0, 2 * draw + side, focal_mm=FOCAL_MM, wander=pupil / FULL_PUPIL)
-        for side in (0, 1)
-    )
-    return TrueRig(
-        left=left,
-        right=right,
-        right_from_left_rotation=rotation,
-        right_from_left_translation=-rotation @ center,
-    )
+    return drawn_rig("surveillance", 1.0, draw, focal_mm=FOCAL_MM, wander=pupil / FULL_PUPIL)
 
 
 def targets(rig: TrueRig) -> Targets:

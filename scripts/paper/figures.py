@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from kcal.corners.observations import Observations
-from kcal.report.figures import new_figure, save_png
+from kcal.report.figures import new_figure, save_picture
 from scripts.paper.aims import LIMIT
 from scripts.paper.numbers import (
     DISTANCES,
@@ -75,7 +75,7 @@ def _split(results: Results) -> None:
     # All share it: its limits must count every bar.
     _logarithmic(axes)
     _legend_below(figure, axes)
-    save_png(DOCS / "paper-split.png", figure)
+    save_picture(DOCS / "paper-split.png", figure)
 
 
 def _shown(values: Iterable[float]) -> list[float]:
@@ -118,7 +118,7 @@ def _coverage(work: Path, name: str, views: int) -> None:
     axes.set_xlabel("u, pixels")
     axes.set_ylabel("v, pixels")
     figure.tight_layout()
-    save_png(DOCS / "paper-coverage.png", figure)
+    save_picture(DOCS / "paper-coverage.png", figure)
 
 
 def _turbo(share: float) -> tuple[float, float, float, float]:
@@ -151,7 +151,7 @@ def _models(results: Results) -> None:
             axes.set_title(f"{name}: {title}", fontsize=10, loc="left")
     axes.set_xlabel("coefficients; gray: each draw, blue: median", fontsize=9)
     figure.tight_layout()
-    save_png(DOCS / "paper-models.png", figure)
+    save_picture(DOCS / "paper-models.png", figure)
 
 
 def _distance(results: Results) -> None:
@@ -179,7 +179,7 @@ def _distance(results: Results) -> None:
             axes.set_title(f"{name}: {title}", fontsize=10, loc="left")
             axes.grid(axis="y", color=GRID, linewidth=0.6)
     _legend_below(figure, right)
-    save_png(DOCS / "paper-distance.png", figure)
+    save_picture(DOCS / "paper-distance.png", figure)
 
 
 def _edges(results: Results) -> None:
@@ -195,7 +195,7 @@ def _edges(results: Results) -> None:
         axes.tick_params(labelsize=8)
         axes.set_title(f"{name}: mean reprojection error, pixels", fontsize=10, loc="left")
     _legend_below(figure, axes)
-    save_png(DOCS / "paper-edges.png", figure)
+    save_picture(DOCS / "paper-edges.png", figure)
 
 
 def _where(axes: Axes, pixels: list[list[float]]) -> None:
@@ -224,7 +224,7 @@ def _map(results: Results) -> None:
         _plan(axes, run["targets"], run["located"][label][kind])
         axes.set_title(f"{name}: {label}, {title}", fontsize=10)
     figure.tight_layout()
-    save_png(DOCS / "paper-map.png", figure)
+    save_picture(DOCS / "paper-map.png", figure)
 
 
 def _plan(axes: Axes, true: list, found: list) -> None:

@@ -16,6 +16,7 @@ from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import ZernikeModes
+from kcal.sim.board import PrintedBoard
 from kcal.sim.captures import capture_corners
 from kcal.sim.truth import TruthLens
 
@@ -24,18 +25,7 @@ BOARD = Board(columns=7, rows=6, square=0.05)
 
 def printed(points: Tensor, seed: int) -> Tensor:
     """The board as a printer and a wall leave it."""
-    generator = torch.Generator().manual_seed(5000 + seed)
-    middle, half = points.mean(0), 0.5 * (points.amax(0) - points.amin(0))[:2]
-    a, b = ((points[:, :2] - middle[:2]) / half).unbind(-1)
-    angle, phase = (math.pi * torch.rand(2, generator=generator, dtype=torch.float64)).tolist()
-    across = a * math.cos(angle) + b * math.sin(angle)
-    out = points.clone()
-    out[:, 0] += 1.5e-3 * (points[:, 0] - middle[0]) + 2e-4 * (points[:, 1] - middle[1])
-    out[:, 2] += 0.7e-3 * (1.0 - across**2)
-    waves = 3e-5 * torch.randn(3, 2, generator=generator, dtype=torch.float64)
-    shapes = torch.stack([torch.sin(2 * a + phase), torch.sin(2 * b + phase), torch.cos(2 * (a + b))])
-    out[:, :2] += shapes.T @ waves / math.sqrt(1.5)
-    return out
+    return points + PrintedBoard(BOARD.columns, BOARD.rows, BOARD.square, seed).errors(points)
 
 
 def capture(

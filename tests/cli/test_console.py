@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
-from kcal.cli.main import main, usage_errors_shown
+from kcal.cli.main import app, main, usage_errors_shown
+from kcal.files import write_atomic
 
 ESCAPE = "a\x1b]0;title\x07\x1b[2J\x9b31m\x85:bomb:"
 
@@ -121,3 +123,22 @@ def test_a_pipe_is_an_error_at_once(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "not a regular file" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [(0, "interrupted; nothing was written"), (2, "written and kept: 0.png, 1.png"), (5, "kept: 2 other files, 2.png")],
+)
+def test_an_interruption_says_what_was_kept(
+    count: int, words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def detect(*_: object, **__: object) -> None:
+        for number in range(count):
+            write_atomic(f"{number}.png", b"")
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("kcal.corners.images.expand_images", detect)
+    found = CliRunner().invoke(app, ["detect", "a.png", "--board", "9x6", "--square", "25mm", "-o", "a.obs.json"])
+    assert found.exit_code == 130
+    assert words in found.stderr.replace("\n", "")

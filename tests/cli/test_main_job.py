@@ -6,6 +6,7 @@ import csv
 import functools
 import json
 import math
+import re
 import shlex
 import sys
 from collections.abc import Callable
@@ -131,17 +132,22 @@ class TestRealImages:
         assert "13 of 13 pairs" in text
         for name in ("map.png", "points.geojson", "positions.csv", "left.png", "right.png", "rig.json", "points.csv"):
             assert Path("out", name).stat().st_size > 100
+        page = Path("out", "summary.html").read_text()
+        assert page.count("data:image/png;base64,") == 3
+        assert "left01" in page
         assert_the_printed_command_gives_the_same(run, text)
 
 
 class TestDemo:
     def test_simulated_site(self, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         # A third of the images, so that the test takes seconds.
-        small = functools.partial(kcal.sim.scene.DemoScene, near_views=7, pair_views=3)
+        small = functools.partial(kcal.sim.scene.DemoScene, near_views=7)
         monkeypatch.setattr(kcal.sim.scene, "DemoScene", small)
         code, shown, _ = run("demo", "-o", "out", "--seed", "3")
         assert code == 0
         assert "True against estimated positions" in shown
+        assert "of 7 intervals. Of 7 intervals of 95 %, " in shown
+        assert re.search("^(YES|NO): at 5 km the range is known to ", shown, re.MULTILINE)
         scene = small(seed=3)
         text = Path("out", "positions.csv").read_text()
         rows = {row["name"]: row for row in csv.DictReader(text.splitlines())}

@@ -7,7 +7,7 @@ import torch
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.sim.board import BoardPose, BoardSize, board_points, project_board
+from kcal.sim.board import BoardPose, BoardSize, PrintedBoard, board_points, project_board
 from kcal.sim.rectangle import PixelRectangle, pixel_axes
 from kcal.sim.render import RenderOptions, render_board, render_light
 from kcal.sim.truth import TruthLens
@@ -97,6 +97,19 @@ def test_corners_are_where_the_true_lens_sees_them(gamma):
     assert float((project_board(central, pose, BOARD)[0] - pixels).abs().max()) > 0.3
     some = pixels[::7]
     error = torch.stack([cubic_saddle((image / 255) ** gamma, pixel) for pixel in some]) - some
+    assert float(error.square().mean().sqrt()) < 0.0015
+
+
+def test_corners_of_a_print_are_where_its_errors_put_them():
+    lens = TruthLens("surveillance", size=(960, 600), focal=700.0, wander=1.0, focal_mm=8.0)
+    pose, board = pose_of((0.3, -0.2, 0.1), (-0.02, 0.01, 0.45)), PrintedBoard(9, 6, 0.06, seed=3)
+    image = render_light(lens, pose, board, RenderOptions(noise=0, vignetting=0, blur=1.0))
+    pixels, visible = project_board(lens, pose, board)
+    assert visible.all()
+    off = pixels - project_board(lens, pose, BOARD)[0]
+    assert 0.3 < float(off.norm(dim=-1).max()) < 3.0
+    some = pixels[::7]
+    error = torch.stack([cubic_saddle(image, pixel) for pixel in some]) - some
     assert float(error.square().mean().sqrt()) < 0.0015
 
 

@@ -68,7 +68,7 @@ def test_unseen_points_are_refused():
 
 def test_squares_are_large_enough_to_be_found():
     """15 px and more, also far away, tilted and pressed together by the distortion at the image's edge."""
-    scene = DemoScene(seed=5)
+    scene = DemoScene(seed=5, pair_views=12)
     smallest = {"near": math.inf, "pair": math.inf}
     for view in _scene_views(scene):
         board = scene.near_board if view.kind == "near" else scene.pair_board
