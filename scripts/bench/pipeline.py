@@ -91,7 +91,13 @@ def main() -> None:
         calls.append(lambda a=seen, b=aims: match(left, right, a, b))  # type: ignore[misc]
         rows.append([count, *(milliseconds(call, options.calls) for call in calls)])
         print(*rows[-1], sep=" | ", flush=True)
-    heads = ["objects", "localize, eager", *(["localize, compiled"] if compiled else []), "associate", "match"]
+    heads = [
+        "objects",
+        "localize, eager",
+        *(["localize, compiled"] if compiled is not None else []),
+        "associate",
+        "match",
+    ]
     text = (
         "Milliseconds a call: median / 99th percentile (processor time, mean). Made by `scripts/bench/pipeline.py`.\n\n"
         + "\n".join(table(heads, rows))
