@@ -94,13 +94,18 @@ def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
         given = signature.bind(*arguments, **options).arguments
+        outputs = given.get("output") or []
+        outputs = outputs if isinstance(outputs, list) else [outputs]
+        # Where nothing can be written, the command says so first.
+        if not all(Path(path).parent.is_dir() for path in outputs):
+            return command(*arguments, **options)
         for name, checked in names.items():
             value = given.get(name)
             for path in value if isinstance(value, list | tuple) else [value]:
                 if checked and path is not None and not _is_there(str(path)):
                     what = "no such file or folder" if name == "images" else "cannot read: No such file or directory"
                     raise FileError(f"{path}: {what}")
-        command(*arguments, **options)
+        return command(*arguments, **options)
 
     run.__signature__ = signature  # type: ignore[attr-defined]
     return run

@@ -151,10 +151,13 @@ def main() -> None:
     parser.add_argument("--only", choices=("oldest", "newest"), help="only these dependencies")
     parser.add_argument("--pythons", nargs="+", default=list(PYTHONS), metavar="X.Y")
     parser.add_argument("--newest-torch", default="", metavar="REQUIREMENT", help="in place of what pip chooses")
+    parser.add_argument("--out", type=Path, help="JSON lines of rows; those in it are kept and shown")
     parser.add_argument("--no-page", action="store_true")
     arguments = parser.parse_args()
     lower = [lowest(line) for line in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]]
-    rows, missing = [], []
+    kept = arguments.out.read_text().splitlines() if arguments.out and arguments.out.exists() else []
+    rows: list[list[str]] = [json.loads(line) for line in kept]
+    missing: list[str] = []
     with tempfile.TemporaryDirectory(prefix="kcal-versions-") as name:
         folder = Path(name)
         packages = built(folder)
@@ -165,13 +168,17 @@ def main() -> None:
                 missing.append(version)
                 continue
             for kind, age in (("wheel", "oldest"), ("sdist", "newest")):
-                if arguments.only in (None, age):
+                done = [version, kind, age] in [row[:3] for row in rows]
+                if arguments.only in (None, age) and not done:
                     newest = [arguments.newest_torch] if arguments.newest_torch else []
                     found = cell(folder, python, packages[kind], lower if age == "oldest" else newest)
                     seen = found.get("versions", {})
                     names = ("torch", "numpy", "scipy")
                     rows.append([version, kind, age, *(seen.get(name, "") for name in names), found["outcome"]])
                     show([" | ".join(rows[-1])])
+                    if arguments.out:
+                        with arguments.out.open("a") as file:
+                            file.write(json.dumps(rows[-1]) + "\n")
         if not arguments.no_page:
             (DOCS / "versions.md").write_text(page(rows, packages, missing), encoding="utf-8")
     if not rows or any(row[-1] != "passed" for row in rows):
