@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import datetime
+import os
 import signal
+import sys
 import time as clocks
 from collections.abc import Callable
 from pathlib import Path
@@ -17,19 +19,35 @@ from kcal.errors import InputError
 if TYPE_CHECKING:
     from kcal.locate.columns import PositionColumns
     from kcal.locate.positions import Located
+    from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.live_map import LiveMap
     from kcal.pipeline.stream import StreamCounts
-    from kcal.pipeline.tracks import Tracks
+    from kcal.pipeline.tracks import Tracker, Tracks
+    from kcal.pipeline.video_source import VideoPairs
 
 
 def live_command(
     rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
-    detections: Annotated[
-        str, typer.Option(metavar="JSONL", help="Lines of JSON, one for each moment; - for the standard input.")
-    ],
     output: Annotated[
         list[Path], typer.Option("-o", "--output", help="File that grows: .geojsonl, .csv or .cot; may be repeated.")
     ],
+    videos: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[LEFT RIGHT]", help="Two video files or addresses (rtsp://...), with --detector."),
+    ] = None,
+    detector: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODULE:CALLABLE",
+            help="Called with each image, uint8 (H, W, 3) in the order red, green, blue; returns boxes in pixels.",
+        ),
+    ] = None,
+    detections: Annotated[
+        str | None,
+        typer.Option(
+            metavar="JSONL", help="In place of videos: lines of JSON, one for each moment; - for the standard input."
+        ),
+    ] = None,
     to: Annotated[
         list[str] | None,
         typer.Option(
@@ -54,6 +72,10 @@ def live_command(
     ] = None,
     pixel_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of pairs that state none, each axis.")] = 0.3,
     box_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of the middle of a box, each axis.")] = 2.0,
+    match_sigma: Annotated[
+        float,
+        typer.Option(metavar="PX", help="Error of matched images that compression of the videos adds, each axis."),
+    ] = 0.05,
     clock_offset: Annotated[
         float, typer.Option(metavar="S", help="Seconds by which the right images are later than their times.")
     ] = 0.0,
@@ -70,8 +92,12 @@ def live_command(
 ) -> None:
     """Follow what two cameras see: tracks with latitude, longitude, velocity and honest errors, written as they come.
 
-    A line of the input is one moment: `{"left": {"time": T, "boxes": [[x1,y1,x2,y2], ...]}, "right": {...}}`, or pairs
-    that are matched already: `{"time": T, "left": [[u,v], ...], "right": [[u,v], ...], "sigma": PX}`.
+    Of two videos, frames belong together by their own times, and the images inside the boxes are matched to a fraction
+    of a pixel. The detector returns what `kcal.Detections.read` takes: an array of x1, y1, x2, y2, score, class, or
+    results of supervision, torchvision, ultralytics or kornia.
+
+    A line of `--detections` is one moment: `{"left": {"time": T, "boxes": [[x1,y1,x2,y2], ...]}, "right": {...}}`, or
+    pairs that are matched already: `{"time": T, "left": [[u,v], ...], "right": [[u,v], ...], "sigma": PX}`.
 
     Frames reduce the noise of the marks, never what calibration, mounting and clocks contribute. With `--clock-sigma`
     the offset between the cameras' clocks is estimated from targets that move.
@@ -81,7 +107,7 @@ def live_command(
 
     **Examples**
 
-    `kcal live rig.json --detections boxes.jsonl -o tracks.geojsonl`
+    `kcal live rig.json left.mp4 right.mp4 --detector mydetector:find -o tracks.geojsonl`
 
     `detector | kcal live rig.json --detections - -o tracks.csv --to udp://239.2.3.1:6969`
     """
@@ -92,16 +118,20 @@ def live_command(
     from kcal.locate.positions import located_by
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.consider import ClockPrior
-    from kcal.pipeline.lines import Moment, read_moment
+    from kcal.pipeline.lines import read_moment
     from kcal.pipeline.senders import sender_to
     from kcal.pipeline.stream import Stream, lines_of
     from kcal.pipeline.tracks import Tracker
 
     if (origin is None) != (heading is None):
         raise typer.BadParameter("--origin and --heading belong together")
-    source = None if detections == "-" else Path(detections)
+    if (detections is None) == (not videos):
+        raise typer.BadParameter("give two videos and --detector, or --detections")
+    if videos and (len(videos) != 2 or detector is None):
+        raise typer.BadParameter("two videos, of the left and the right camera, and --detector are needed")
+    lines = Path(detections) if detections not in (None, "-") else None
     for path in output:
-        check_writable(path, rig, *([source] if source else []))
+        check_writable(path, rig, *([lines] if lines else []), *(videos or []))
     moment_zero = None if start is None else _calendar_time(start)
     clock = ClockPrior(offset_s=clock_offset, offset_sigma_s=clock_sigma, drift_sigma=clock_sigma / 3600.0)
     options = AssociationOptions(box_sigma=box_sigma)
@@ -109,14 +139,13 @@ def live_command(
     locate = Locator(load_rig(rig), origin=place, heading_deg=heading, pixel_sigma=pixel_sigma)
     solved = locate.localize.rig
 
-    def read(line: bytes) -> Moment:
-        return read_moment(line, solved, options, pixel_sigma)
-
+    tracker = Tracker(locate.localize, clock=clock)
+    pairs = _video_pairs(videos, detector, tracker, options, match_sigma) if videos and detector else None
+    source = pairs or lines_of(lines, lambda line: read_moment(line, solved, options, pixel_sigma))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
-    size = source.stat().st_size if source is not None and source.is_file() else None
-    with steps("live", size) as advance:
+    with steps("live", lines.stat().st_size if lines is not None and lines.is_file() else None) as advance:
         stream = Stream(
-            Tracker(locate.localize, clock=clock), located_by(locate), output, log,
+            tracker, located_by(locate), output, log,
             senders=[sender_to(address) for address in to or []], start=moment_zero, shown=None,
         )  # fmt: skip
         page = None if port is None else _live_map(stream.run, port)
@@ -125,13 +154,18 @@ def live_command(
             err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)
         before = {number: signal.signal(number, lambda *_: stream.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
-            counts = stream.follow(lines_of(source, read), waits=True, resumes=source is not None)
+            live = pairs is not None and pairs.live
+            counts = stream.follow(source, waits=not live, resumes=not live and detections != "-")
         finally:
+            if pairs is not None:
+                pairs.close()
             for number, handler in before.items():
                 signal.signal(number, handler)
             if page is not None:
                 page.close()
     err.print(summary(counts), markup=False)
+    if pairs is not None:
+        err.print(str(pairs.counts), markup=False)
     if counts.malformed:
         err.print(f"last malformed line: {counts.last_error}", markup=False)
     if clock_sigma:
@@ -150,6 +184,31 @@ def summary(counts: StreamCounts) -> str:
     ):
         parts += [f"{count:,} {what}"] if count else []
     return "; ".join(parts)
+
+
+def _video_pairs(
+    videos: list[str], detector: str, tracker: Tracker, options: AssociationOptions, match_sigma: float
+) -> VideoPairs:
+    try:
+        from kcal.pipeline.video_source import VideoPairs
+    except ImportError as error:
+        raise InputError(f"videos need {error.name}; install it with: pip install 'kcal[video]'") from error
+    from kcal.pipeline.detector_call import load_detector
+
+    # As `python -m` does: a detector beside which the command is run is found.
+    sys.path.insert(0, os.getcwd())
+
+    def late() -> float:
+        # Before the first moment the estimate is the prior.
+        return tracker.clock_estimate().offset(max(tracker.time, tracker.shared.start or 0.0))[0]
+
+    def tell(text: str) -> None:
+        err.print(text, markup=False)
+
+    return VideoPairs(
+        videos[0], videos[1], tracker.localize.rig, load_detector(detector), options,
+        late=late, match_sigma=match_sigma, tell=tell,
+    )  # fmt: skip
 
 
 def _live_map(run: Located, port: int) -> LiveMap:

@@ -8,6 +8,7 @@ import tempfile
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -68,6 +69,7 @@ def save_onnx(module: nn.Module, example: Tensor | Sequence[Tensor], path: str |
                     external_data=False,
                     optimize=False,
                     verbose=False,
+                    custom_translation_table={torch.ops.aten.scalar_tensor.default: _scalar_tensor},
                 )
             os.replace(written, path)
     except OSError as error:
@@ -75,3 +77,14 @@ def save_onnx(module: nn.Module, example: Tensor | Sequence[Tensor], path: str |
     finally:
         module.train(training)
     return path
+
+
+def _scalar_tensor(s: Any, dtype: int = -1, layout: str = "", device: str = "", pin_memory: bool = False) -> Any:
+    """A number of the graph in its own precision; by default onnxscript 0.7 rounds every plain number to float32."""
+    from onnx import TensorProto, helper
+    from onnxscript import opset18
+
+    kind = TensorProto.FLOAT if dtype == -1 else dtype
+    if isinstance(s, bool | int | float):
+        return opset18.Constant(value=helper.make_tensor("number", kind, [], [s]))
+    return opset18.Cast(s, to=kind)

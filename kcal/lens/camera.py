@@ -250,13 +250,8 @@ class Camera(ConvertibleCamera):
 
     def _to_plane(self, pixels: Tensor, start: InverseStart | None) -> tuple[Tensor, Tensor, Tensor]:
         """Map pixels (..., N, 2) to x, y on the plane of the lens, and valid; each is (..., N)."""
-        values = self.values
-        cx, cy = values[..., 2, None], values[..., 3, None]
-        u, v = split_coordinates(pixels)
-        u, v, finite = finite_or(u, v, cx, cy)
-        x, y = from_pixels(u, v, values)
         ready = PreparedInverse(self.valid_region, self.inverse_start, start)
-        return undistort_components(x, y, finite, values[..., 5:], self.model, ready)
+        return pixels_to_plane(pixels, self.values, self.model, ready)
 
     def normalize(self, pixels: Tensor, *, start: InverseStart | None = None) -> tuple[Tensor, Tensor]:
         """Map pixels (..., N, 2) to undistorted coordinates (..., N, 2) on the plane z = 1, and valid (..., N).
@@ -348,3 +343,14 @@ class Camera(ConvertibleCamera):
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
         self.update_valid_region()
+
+
+def pixels_to_plane(
+    pixels: Tensor, values: Tensor, model: LensModel, ready: PreparedInverse
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Map pixels (..., N, 2) to x, y on the plane of a lens with `values` (..., 5 + P), and valid; each is (..., N)."""
+    cx, cy = values[..., 2, None], values[..., 3, None]
+    u, v = split_coordinates(pixels)
+    u, v, finite = finite_or(u, v, cx, cy)
+    x, y = from_pixels(u, v, values)
+    return undistort_components(x, y, finite, values[..., 5:], model, ready)

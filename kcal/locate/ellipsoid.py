@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from kcal.checks import as_points
+from kcal.lens.plane import angle_over_distance
 
 # Semi-major axis in meters and flattening of WGS84 (NIMA TR8350.2).
 SEMI_MAJOR = 6378137.0
@@ -25,6 +26,7 @@ _E2_SECOND = _E2 / (1.0 - _E2)
 _PASSES = 2
 # Meters from the Earth's axis: closer points are at a pole, where a longitude has no gradient.
 _AT_POLE = 1e-6
+_DEGREES = 180.0 / math.pi
 
 
 def geodetic_to_ecef(geodetic: Tensor) -> Tensor:
@@ -66,7 +68,7 @@ def geodetic_components(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor
     squared = x * x + y * y
     off_axis = squared > _AT_POLE**2
     distance = torch.sqrt(torch.where(off_axis, squared, _AT_POLE**2))
-    lon = torch.atan2(torch.where(off_axis, y, 0.0), torch.where(off_axis, x, 1.0))
+    lon = arc_tangent(torch.where(off_axis, y, 0.0), torch.where(off_axis, x, 1.0))
     # As sine and cosine of the parametric latitude: tangents are infinite at the poles.
     up, out = z * SEMI_MAJOR, distance * SEMI_MINOR
     for _ in range(_PASSES):
@@ -75,11 +77,30 @@ def geodetic_components(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor
         above = z + _E2_SECOND * SEMI_MINOR * sine**3
         beside = distance - _E2 * SEMI_MAJOR * cosine**3
         up, out = above * SEMI_MINOR, beside * SEMI_MAJOR
-    lat = torch.atan2(above, beside)
+    lat = arc_tangent(above, beside)
     sine, cosine = torch.sin(lat), torch.cos(lat)
     # p cos φ + z sin φ - a √(1 - e² sin² φ) needs no division by a cosine that is zero at the poles.
     height = distance * cosine + z * sine - SEMI_MAJOR * torch.sqrt(1.0 - _E2 * sine * sine)
-    return torch.rad2deg(lat), torch.rad2deg(lon), height
+    # Not `rad2deg`, whose factor ONNX files have in float32.
+    return lat * _DEGREES, lon * _DEGREES, height
+
+
+def arc_tangent(y: Tensor, x: Tensor) -> Tensor:
+    """`torch.atan2` of float64; in exported graphs by square roots and a series, exact to rounding.
+
+    Runtimes of ONNX have no arc tangent in float64.
+
+    Example:
+        >>> one = torch.ones(1, dtype=torch.float64)
+        >>> torch.rad2deg(arc_tangent(one, -one)).tolist()
+        [135.0]
+    """
+    if not torch.compiler.is_exporting():
+        return torch.atan2(y, x)
+    # Of the half-plane x > 0, so that nothing cancels; the other one is its mirror image.
+    ahead = y * angle_over_distance(torch.zeros_like(y), y, x.abs())
+    half_turn = y.new_tensor(math.pi)
+    return torch.where(x < 0, torch.where(y < 0, -half_turn, half_turn) - ahead, ahead)
 
 
 def ecef_from_enu_rotation(lat_deg: float, lon_deg: float) -> Tensor:

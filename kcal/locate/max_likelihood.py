@@ -22,9 +22,10 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
+from kcal.lens.camera_stack import project_each
 from kcal.lens.pose import side_axes, step_rows
-from kcal.lens.projection import Projection, project_components
-from kcal.lens.tracing import known_true
+from kcal.lens.projection import Projection
+from kcal.lens.tracing import is_traced, known_true
 
 _MOST_STEPS = 5
 # The derivative of the optimum comes from this many steps with a fixed matrix; each leaves a share of about the
@@ -73,19 +74,28 @@ class _Evaluated(NamedTuple):
     jacobian: Tensor
     weighted: Tensor
     residual: Tensor
-    direction: Tensor
+    turned: Tensor
     projections: tuple[Projection, ...]
-    turned: tuple[Tensor, ...]
 
 
 class _Fixed(NamedTuple):
-    """What stays fixed while (a, b, ρ) moves."""
+    """What stays fixed while (a, b, ρ) moves.
 
-    cameras: Sequence[RelativeCamera]
+    Attributes:
+        cameras: C of them.
+        scale: meters.
+        base: (..., C, 3, N) the first guess of the direction in the axes of each camera.
+        columns: (..., C, 3, 3, N) what a, b and ρ add to it.
+        pixels: (..., 2 C, N).
+        usable: (..., N).
+        weight: (..., 2 C, 2 C, N) or None.
+        wanted: for each camera the parameters by which derivatives are formed.
+    """
+
+    cameras: Sequence[Camera]
     scale: Tensor
     base: Tensor
-    sides: Tensor
-    shifts: list[Tensor]
+    columns: Tensor
     pixels: Tensor
     usable: Tensor
     weight: Tensor | None
@@ -117,38 +127,46 @@ def most_likely(
     """
     base = start[0].detach().mT
     sides = torch.stack([side.mT for side in side_axes(start[0].detach())], -3)
-    wanted = tuple(tuple(range(s.camera.values.shape[-1])) if by_camera else () for s in cameras)
-    shifts = [camera.translation / scale for camera in cameras]
-    fixed = _Fixed(cameras, scale, base, sides, shifts, pixels, usable, weight, tuple(() for _ in cameras))
+    lenses = [each.camera for each in cameras]
+    wanted = tuple(tuple(range(lens.values.shape[-1])) if by_camera else () for lens in lenses)
+    rotation = torch.stack([each.rotation for each in cameras])
+    shift = torch.stack([each.translation for each in cameras]) / scale
+    turned_sides = rotation[:, None] @ sides[..., None, :, :, :]
+    columns = torch.cat([turned_sides, shift[:, None, :, None].expand_as(turned_sides[..., :1, :, :])], -3)
+    turned_base = rotation @ base[..., None, :, :]
+    fixed = _Fixed(lenses, scale, turned_base, columns, pixels, usable, weight, tuple(() for _ in cameras))
+    whole = fixed._replace(wanted=wanted)
+    # After a step, the evaluation that finds nothing left to move is also the last one.
+    later = fixed if differentiated or is_traced() else whole
     zero = torch.zeros_like(start[1])
     with torch.no_grad():
         theta = torch.stack([zero, zero, torch.where(usable, start[1], 0.0)], -2)
         best, step, cost, at = theta, torch.zeros_like(theta), torch.full_like(zero, torch.inf), None
-        for _ in range(_MOST_STEPS):
-            at = _evaluate(fixed, theta)
+        for number in range(_MOST_STEPS):
+            at = _evaluate(later if number else fixed, theta)
             better = at.cost <= cost
             every = known_true(better)
             newton = _newton(at, usable)
-            moved = (at.jacobian * newton[..., None, :]).sum(-3).abs().amax(-2)
             if every:
                 best, step, cost = theta, newton, at.cost
             else:
                 best = torch.where(better[..., None, :], theta, best)
                 step = torch.where(better[..., None, :], newton, 0.25 * step)
                 cost = torch.where(better, at.cost, cost)
+            moved = (at.jacobian * newton[..., None, :]).sum(-3).abs().amax(-2)
             if every and known_true(moved <= _SMALLEST_STEP * _least_noise(weight)):
                 break
             theta = best + step
         theta = best
-    if not differentiated and not by_camera and every and at is not None:
-        return _with_covariance(at, theta, fixed, usable)
+    if not differentiated and every and at is not None and (number or not by_camera):
+        return _with_covariance(at, theta, sides, usable)
     if differentiated:
         inverse = _inverse_of_six(_normal_matrix(_evaluate(fixed, theta), usable))
         inverse = tuple(value.detach() for value in inverse)  # type: ignore[assignment]
         for _ in range(_CHORDS):
             at = _evaluate(fixed, theta)
             theta = theta - torch.where(usable[..., None, :], _product(inverse, _cost_slope(at)), 0.0)
-    return _with_covariance(_evaluate(fixed._replace(wanted=wanted), theta), theta, fixed, usable)
+    return _with_covariance(_evaluate(whole, theta), theta, sides, usable)
 
 
 def _least_noise(weight: Tensor | None) -> Tensor | float:
@@ -157,51 +175,49 @@ def _least_noise(weight: Tensor | None) -> Tensor | float:
 
 
 def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
-    a, b, inverse = (value[..., None, :] for value in theta.unbind(-2))
-    e1, e2 = fixed.sides[..., 0, :, :], fixed.sides[..., 1, :, :]
-    direction = fixed.base + a * e1 + b * e2
-    rows, predicted, projections, turned = [], [], [], []
-    for number, (camera, shift) in enumerate(zip(fixed.cameras, fixed.shifts, strict=True)):
-        ahead, along, across = direction, e1, e2
-        if number:
-            ahead, along, across = camera.rotation @ direction, camera.rotation @ e1, camera.rotation @ e2
-        seen = ahead + inverse * shift[:, None]
-        with torch.no_grad():
-            good = fixed.usable if camera.camera.model.wide else fixed.usable & (seen[..., 2, :] > 1e-6)
-        if not known_true(good):
-            # The axis is a harmless stand-in: no NaN in values or gradients.
-            seen = torch.where(good[..., None, :], seen, seen.new_tensor([[0.0], [0.0], [1.0]]))
-        # `seen` is the point times ρ / scale, so small that an entrance pupil seems to move too far.
-        meter = inverse[..., 0, :] / fixed.scale
-        projection = project_components(seen, camera.camera.values, camera.camera.model, fixed.wanted[number], meter)
-        columns = torch.stack([along, across, shift[:, None].expand_as(along)], -3)
-        # (..., 3 unknowns, 3 of the point, 2, N) summed over the point.
-        slopes = (columns[..., None, :] * projection.by_point[..., None, :, :, :]).sum(-3)
-        if projection.by_meter is not None:
-            last = slopes[..., 2:, :, :] + projection.by_meter[..., None, :, :] / fixed.scale
-            slopes = torch.cat([slopes[..., :2, :, :], last], -3)
-        rows.append(slopes)
-        predicted.append(projection.pixels)
-        projections.append(projection)
-        turned.append(ahead)
-    jacobian = torch.cat(rows, -2)
-    residual = torch.where(fixed.usable[..., None, :], torch.cat(predicted, -2) - fixed.pixels, 0.0)
+    a, b, inverse = (value[..., None, None, :] for value in theta.unbind(-2))
+    e1, e2, shift = fixed.columns.unbind(-3)
+    turned = fixed.base + a * e1 + b * e2
+    seen = turned + inverse * shift
+    with torch.no_grad():
+        good = fixed.usable[..., None, :].expand(seen[..., 2, :].shape)
+        wide = [camera.model.wide for camera in fixed.cameras]
+        if not all(wide):
+            # A perspective lens sees nothing beside and behind the camera.
+            good = good & ((seen[..., 2, :] > 1e-6) | torch.tensor(wide, device=seen.device)[:, None])
+    if not known_true(good):
+        # The axis is a harmless stand-in: no NaN in values or gradients.
+        seen = torch.where(good[..., None, :], seen, seen.new_tensor([[0.0], [0.0], [1.0]]))
+    # `seen` is the point times ρ / scale, so small that an entrance pupil seems to move too far.
+    meter = inverse[..., 0, 0, :] / fixed.scale
+    projections = project_each(fixed.cameras, seen, fixed.wanted, meter)
+    by_point = torch.stack([projection.by_point for projection in projections], -4)
+    # (..., C, 3 unknowns, 3 of the point, 2, N) summed over the point.
+    slopes = (fixed.columns[..., None, :] * by_point[..., None, :, :, :]).sum(-3)
+    rates = [projection.by_meter for projection in projections]
+    if any(rate is not None for rate in rates):
+        zero = torch.zeros_like(slopes[..., 0, 2, :, :])
+        moved = torch.stack([zero if rate is None else rate / fixed.scale for rate in rates], -3)
+        slopes = torch.cat([slopes[..., :2, :, :], (slopes[..., 2, :, :] + moved)[..., None, :, :]], -3)
+    jacobian = slopes.movedim(-4, -3).flatten(-3, -2)
+    predicted = torch.cat([projection.pixels for projection in projections], -2)
+    residual = torch.where(fixed.usable[..., None, :], predicted - fixed.pixels, 0.0)
     weighted = jacobian
     if fixed.weight is None:
         cost = (residual * residual).sum(-2)
     else:
         weighted = (fixed.weight[..., None, :, :, :] * jacobian[..., None, :, :]).sum(-2)
         cost = (fixed.weight * residual[..., None, :, :] * residual[..., None, :]).sum((-3, -2))
-    return _Evaluated(cost, jacobian, weighted, residual, direction, tuple(projections), tuple(turned))
+    return _Evaluated(cost, jacobian, weighted, residual, turned, tuple(projections))
 
 
 def _normal_matrix(at: _Evaluated, usable: Tensor) -> Six:
     """Jᵀ W J by its six entries 11, 12, 13, 22, 23, 33; the identity where a point is not usable."""
     j, w = at.jacobian.unbind(-3), at.weighted.unbind(-3)
-    entries = []
-    for row, column in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
-        entries.append(torch.where(usable, (j[row] * w[column]).sum(-2), 1.0 if row == column else 0.0))
-    return tuple(entries)  # type: ignore[return-value]
+    places = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    entries = torch.stack([j[row] * w[column] for row, column in places], -3).sum(-2)
+    still = entries.new_tensor([[float(row == column)] for row, column in places])
+    return torch.where(usable[..., None, :], entries, still).unbind(-2)  # type: ignore[return-value]
 
 
 def _cost_slope(at: _Evaluated) -> Tensor:
@@ -228,13 +244,12 @@ def _product(m: Six, v: Tensor) -> Tensor:
     return torch.stack([a * x + b * y + c * z, b * x + d * y + e * z, c * x + e * y + f * z], -2)
 
 
-def _with_covariance(at: _Evaluated, theta: Tensor, fixed: _Fixed, usable: Tensor) -> PointFit:
+def _with_covariance(at: _Evaluated, theta: Tensor, sides: Tensor, usable: Tensor) -> PointFit:
     covariance = _inverse_of_six(_normal_matrix(at, usable))
-    weighted = at.weighted.movedim(-3, -2)  # (..., M, 3, N)
-    gain = torch.stack([_product(covariance, row) for row in weighted.unbind(-3)], -2)
-    return PointFit(
-        at.direction, theta[..., 2, :], fixed.sides, covariance, gain, at.residual, at.projections, at.turned
-    )
+    spread = [entry[..., None, :] for entry in covariance]
+    gain = _product(spread, at.weighted.movedim(-3, -2)).movedim(-2, -3)  # type: ignore[arg-type]
+    turned = at.turned.unbind(-3)
+    return PointFit(turned[0], theta[..., 2, :], sides, covariance, gain, at.residual, at.projections, turned)
 
 
 def by_pose(fit: PointFit, number: int) -> Tensor:

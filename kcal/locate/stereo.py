@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
+from kcal.lens.camera_stack import unproject_each
 from kcal.lens.rig import StereoRig
 from kcal.lens.tracing import CHUNK, is_traced, known_true
 from kcal.locate.angular import EPIPOLE, triangulate_pairs
@@ -109,17 +110,17 @@ class SightLines(NamedTuple):
 def sight_lines(rig: StereoRig, pixels_left: Tensor, pixels_right: Tensor) -> SightLines:
     """Rays, closed-form points and statuses of float64 pixels, both (..., N, 2)."""
     rotation, translation = rig.right_from_left_rotation, rig.right_from_left_translation
-    rays_left, seen_left = rig.left.unproject(pixels_left)
-    rays_right, seen_right = rig.right.unproject(pixels_right)
+    rays, seen = unproject_each((rig.left, rig.right), torch.stack([pixels_left, pixels_right], -3))
+    rays_left, rays_right = rays.unbind(-3)
     inside = rig.left.inside(pixels_left) & rig.right.inside(pixels_right)
     finite = (torch.isfinite(pixels_left) & torch.isfinite(pixels_right)).all(-1)
-    parallax, opposite, along_baseline = _epipolar(rays_left, rays_right @ rotation, -translation @ rotation)
+    parallel, opposite, along_baseline = _epipolar(rays_left, rays_right @ rotation, -translation @ rotation)
     points, solved = triangulate_pairs(rays_left, rays_right, (rotation, translation))
     code = torch.full(rays_left.shape[:-1], int(PositionStatus.OK), dtype=torch.int8, device=rays_left.device)
     for condition, status in (
-        ((parallax <= _PARALLEL) | along_baseline, PositionStatus.PARALLEL),
-        ((opposite | (~solved & (parallax > _PARALLEL))) & ~along_baseline, PositionStatus.BEHIND),
-        (~(seen_left & seen_right), PositionStatus.OUTSIDE_LENS),
+        (parallel | along_baseline, PositionStatus.PARALLEL),
+        ((opposite | ~(solved | parallel)) & ~along_baseline, PositionStatus.BEHIND),
+        (~seen.all(-2), PositionStatus.OUTSIDE_LENS),
         (~inside, PositionStatus.OUTSIDE_IMAGE),
         (~finite, PositionStatus.NOT_FINITE),
     ):
@@ -132,8 +133,8 @@ def _epipolar(left: Tensor, right: Tensor, baseline: Tensor) -> tuple[Tensor, Te
     """Of unit rays (..., N, 3) in the rig frame, in the plane of the left one and the baseline (left to right camera).
 
     Returns:
-        parallax (..., N), radians, negative where the rays diverge; whether the right ray points to the other side of
-        the baseline; and whether either runs along it.
+        (..., N) whether the rays are parallel or diverge; whether the right ray points to the other side of the
+        baseline; and whether either runs along it.
     """
     axis = (baseline / torch.linalg.vector_norm(baseline)).expand_as(left)
     normal = torch.linalg.cross(axis, left)
@@ -144,9 +145,11 @@ def _epipolar(left: Tensor, right: Tensor, baseline: Tensor) -> tuple[Tensor, Te
     along, across = (right * axis).sum(-1), (right * side).sum(-1)
     right_ok = torch.linalg.vector_norm(torch.linalg.cross(axis, right), dim=-1) > EPIPOLE
     # The right ray in the plane: the rest of it, the epipolar error, says nothing about the range.
-    in_plane = left_ok & right_ok & (torch.hypot(along, across) > EPIPOLE)
-    parallax = torch.atan2(cosine * across - sine * along, cosine * along + sine * across)
-    return torch.where(in_plane, parallax, 0.0), across <= 0, ~in_plane
+    in_plane = left_ok & right_ok & (along * along + across * across > EPIPOLE**2)
+    # Sine and cosine of the parallax, times the length of the right ray in the plane.
+    upward, level = cosine * across - sine * along, cosine * along + sine * across
+    parallel = (upward <= _PARALLEL * level) & ((level > 0) | (upward < 0))
+    return parallel | ~in_plane, across <= 0, ~in_plane
 
 
 class PairFit(NamedTuple):

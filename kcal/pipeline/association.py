@@ -1,8 +1,9 @@
 """Which detection of the left image is which of the right one: geometry, size, category and looks, one to one.
 
-Every pair of detections gets its most likely point, at once on tensors. What no point explains is the epipolar error;
-it is judged by the noise of the boxes and by what is not known of the rig. The assignment with the least sum of costs
-is exact (Crouse, "On implementing 2D rectangular assignment algorithms", 2016, by SciPy); a detection may stay alone.
+Pairs near one epipolar line (`kcal.pipeline.epipolar_band`) get their most likely point, at once on tensors. What no
+point explains is the epipolar error; it is judged by the noise of the boxes and by what is not known of the rig. The
+assignment with the least sum of costs is exact (Crouse, "On implementing 2D rectangular assignment algorithms", 2016,
+by SciPy); a detection may stay alone.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse.csgraph
 import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
@@ -22,6 +24,7 @@ from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.max_likelihood import by_pose, calibration_effect
 from kcal.locate.stereo import PairFit, PositionStatus, fit_pairs, inverse_range
 from kcal.pipeline.detections import Anchor, Detections
+from kcal.pipeline.epipolar_band import near_epipolar_lines
 from kcal.pipeline.looks import appearance
 
 # Spread of the logarithm of an object's size between two views, besides what boxes err: it is seen from two sides.
@@ -116,44 +119,53 @@ def associate(
     for word, camera, seen in (("left", rig.left, left), ("right", rig.right, right)):
         if seen.size != camera.size:
             raise InputError(f"the {word} detections are of an image {seen.size}, the camera has {camera.size}")
-    cost = pair_costs(rig, left, right, options)
+    near = torch.ones(len(left), len(right), dtype=torch.bool)
+    if options.same_category:
+        names = {name: number for number, name in enumerate({*left.category, *right.category})}
+        kinds = [torch.tensor([names[name] for name in seen.category]).reshape(-1) for seen in (left, right)]
+        near = kinds[0][:, None] == kinds[1]
+    anchors = left.anchors(options.anchor), right.anchors(options.anchor)
+    near &= near_epipolar_lines(rig, *anchors, options.box_sigma, options.gate)
+    cost = pair_costs(rig, left, right, options, near)
     if images is not None:
         gray = [as_gray(f"{word} image", image) for word, image in zip(("left", "right"), images, strict=True)]
         if [image.shape[::-1] for image in gray] != [rig.left.size, rig.right.size]:
             raise InputError("association: images of the cameras' sizes are needed")
         cost = cost + ((1.0 - appearance(gray[0], left.boxes, gray[1], right.boxes)) / _LOOKS_SPREAD).square()
     possible = cost < options.gate**2
-    if options.same_category:
-        names = {name: number for number, name in enumerate({*left.category, *right.category})}
-        kinds = [torch.tensor([names[name] for name in seen.category]).reshape(-1) for seen in (left, right)]
-        possible &= kinds[0][:, None] == kinds[1]
     chosen, ambiguous = _assigned(torch.where(possible, cost, _FORBIDDEN).numpy(), options)
     rows = torch.from_numpy(np.flatnonzero(chosen >= 0))
     columns = torch.from_numpy(chosen[chosen >= 0])
     return Association(rows, columns, cost[rows, columns], torch.from_numpy(ambiguous)[rows], possible)
 
 
-def pair_costs(rig: StereoRig, left: Detections, right: Detections, options: AssociationOptions) -> Tensor:
-    """(N, M) squared standard deviations of epipolar error, range and size of all pairs; infinite where impossible."""
-    rows, columns = len(left), len(right)
-    if not rows * columns:
-        return torch.zeros(rows, columns, dtype=torch.float64)
-    first = left.anchors(options.anchor)[:, None].expand(rows, columns, 2).reshape(-1, 2)
-    second = right.anchors(options.anchor)[None].expand(rows, columns, 2).reshape(-1, 2)
-    noise = (options.box_sigma**2 * torch.eye(4, dtype=torch.float64)).expand(len(first), 4, 4)
-    found = fit_pairs(rig, first, second, noise, by_camera=rig.covariance is not None)
-    cost = epipolar_cost(found, options.box_sigma**2, rig.covariance)
-    variance = found.fit.covariance[5]
+def pair_costs(
+    rig: StereoRig, left: Detections, right: Detections, options: AssociationOptions, among: Tensor | None = None
+) -> Tensor:
+    """(N, M) squared standard deviations of epipolar error, range and size of pairs; infinite where impossible.
+
+    `among` (N, M) bool: the pairs that are compared; all of them if left out. Others are infinite.
+    """
+    cost = torch.full((len(left), len(right)), torch.inf, dtype=torch.float64)
+    rows, columns = (torch.ones_like(cost, dtype=torch.bool) if among is None else among).nonzero(as_tuple=True)
+    if not len(rows):
+        return cost
+    variance = options.box_sigma**2
+    first, second = left.anchors(options.anchor)[rows], right.anchors(options.anchor)[columns]
+    # Every coordinate has the same noise: the point does not depend on how large it is.
+    found = fit_pairs(rig, first, second, by_camera=rig.covariance is not None)
+    spread = variance * found.fit.covariance[5]
     if rig.covariance is not None:
         moved = calibration_effect(found.fit, found.scale)[..., 2, :] @ rig.covariance.half.T
-        variance = variance + moved.square().sum(-1)
-    reach = inverse_range(found, variance, PositionStatus.BEARING_ONLY)
+        spread = spread + moved.square().sum(-1)
+    reach = inverse_range(found, spread, PositionStatus.BEARING_ONLY)
     nearest = options.nearest if options.nearest is not None else 10.0 * float(rig.baseline)
     beyond = (1.0 / options.farthest - reach.value).clamp_min(0.0)
     before = (reach.value - 1.0 / nearest).clamp_min(0.0)
-    cost = cost + (torch.maximum(beyond, before) / reach.sigma).square()
-    cost = cost + _size_cost(found, left, right, options.box_sigma)
-    return torch.where(found.usable & (reach.sigma > 0), cost, torch.inf).reshape(rows, columns)
+    total = epipolar_cost(found, variance, rig.covariance) + (torch.maximum(beyond, before) / reach.sigma).square()
+    total = total + _size_cost(found, left.boxes[rows], right.boxes[columns], options.box_sigma)
+    cost[rows, columns] = torch.where(found.usable & (reach.sigma > 0), total, torch.inf)
+    return cost
 
 
 def epipolar_cost(found: PairFit, variance: float, covariance: RigCovariance | None) -> Tensor:
@@ -180,32 +192,43 @@ def epipolar_cost(found: PairFit, variance: float, covariance: RigCovariance | N
     return error.square() / spread
 
 
-def _size_cost(found: PairFit, left: Detections, right: Detections, box_sigma: float) -> Tensor:
-    """(N * M,) squared standard deviations between the sizes, given how much each lens magnifies there."""
-    sizes = [seen.boxes[:, 2:] - seen.boxes[:, :2] for seen in (left, right)]
-    ratio = sizes[0].log()[:, None] - sizes[1].log()
+def _size_cost(found: PairFit, left: Tensor, right: Tensor, box_sigma: float) -> Tensor:
+    """(L,) squared standard deviations between the sizes of boxes, given how much each lens magnifies there."""
+    sizes = [boxes[:, 2:] - boxes[:, :2] for boxes in (left, right)]
     near, far = (torch.linalg.vector_norm(p.by_point, dim=(-3, -2)).log() for p in found.fit.projections)
-    ratio = ratio - (near - far).reshape(len(left), len(right), 1)
+    ratio = (sizes[0] / sizes[1]).log() - (near - far)[:, None]
     # Middles of boxes err by box_sigma, so edges by √2 and sizes by twice as much.
-    relative = [2.0 * box_sigma / size for size in sizes]
-    spread = relative[0].square()[:, None] + relative[1].square() + _SIZE_SPREAD**2
-    return (ratio.square() / spread).sum(-1).reshape(-1)
+    spread = sum((2.0 * box_sigma / size).square() for size in sizes) + _SIZE_SPREAD**2
+    return (ratio.square() / spread).sum(-1)
 
 
 def _assigned(cost: np.ndarray, options: AssociationOptions) -> tuple[np.ndarray, np.ndarray]:
-    """For each row its column or -1, and whether another pairing of the two is nearly as good."""
-    chosen, least = _best_assignment(cost, options.gate**2)
-    ambiguous = np.zeros(len(cost), dtype=bool)
-    for i in np.flatnonzero(chosen >= 0):
-        j = chosen[i]
-        rivals = np.count_nonzero(cost[i] < _FORBIDDEN) + np.count_nonzero(cost[:, j] < _FORBIDDEN)
-        if rivals == 2:
+    """For each row its column or -1, and whether another pairing of the two is nearly as good.
+
+    Detections that no chain of possible pairs connects do not bear on each other, so each group is solved on its own.
+    """
+    chosen, ambiguous = np.full(len(cost), -1), np.zeros(len(cost), dtype=bool)
+    ends = np.nonzero(cost < _FORBIDDEN)
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(ends[0])), (ends[0], len(cost) + ends[1])), shape=(sum(cost.shape),) * 2
+    )
+    _, groups = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    for group in np.unique(groups[ends[0]]):
+        rows = np.flatnonzero(groups[: len(cost)] == group)
+        columns = np.flatnonzero(groups[len(cost) :] == group)
+        if len(rows) == len(columns) == 1:
+            # Cheaper than two that stay alone, and without a rival.
+            chosen[rows] = columns
             continue
-        without = cost.copy()
-        without[i, j] = _FORBIDDEN
-        other, more = _best_assignment(without, options.gate**2)
-        elsewhere = other[i] >= 0 or j in other
-        ambiguous[i] = elsewhere and more - least < 2.0 * math.log(options.odds)
+        part = cost[np.ix_(rows, columns)]
+        best, least = _best_assignment(part, options.gate**2)
+        chosen[rows] = np.where(best >= 0, columns[best], -1)
+        for i in np.flatnonzero(best >= 0):
+            without = part.copy()
+            without[i, best[i]] = _FORBIDDEN
+            other, more = _best_assignment(without, options.gate**2)
+            elsewhere = other[i] >= 0 or best[i] in other
+            ambiguous[rows[i]] = elsewhere and more - least < 2.0 * math.log(options.odds)
     return chosen, ambiguous
 
 

@@ -56,10 +56,14 @@ class Beliefs(NamedTuple):
         """The tracks at some places."""
         return type(self)(*(value[which] for value in self))
 
+    @property
+    def middle(self) -> Tensor:
+        """(T, 1, 6) the mean over the models."""
+        return (self.weight[..., None] * self.mean).sum(1, keepdim=True)
+
     def merged(self) -> Self:
         """One model with the same mean and covariance."""
-        weight = self.weight[..., None]
-        mean = (weight * self.mean).sum(1, keepdim=True)
+        weight, mean = self.weight[..., None], self.middle
         apart = self.mean - mean
         noise = (weight[..., None] * (self.noise + apart[..., :, None] * apart[..., None, :])).sum(1, keepdim=True)
         shared = (weight[..., None] * self.shared).sum(1, keepdim=True)
@@ -106,8 +110,7 @@ def predicted(beliefs: Beliefs, step: Transition, turn: Tensor | None = None) ->
     late = (slope @ beliefs.late.flatten(-2)).unflatten(-1, (-1, 3)) @ (share * turned.mT[..., None, :, :])
     new = Beliefs(mean, slope @ beliefs.noise @ slope.mT + noise, slope @ beliefs.shared, late, beliefs.weight)
     weight = beliefs.weight[..., None, None]
-    before, after = beliefs.merged().mean, new.merged().mean
-    apart = (beliefs.mean - before)[..., :, None] * (mean - after)[..., None, :]
+    apart = (beliefs.mean - beliefs.middle)[..., :, None] * (mean - new.middle)[..., None, :]
     return Predicted(new, (weight * (beliefs.noise @ slope.mT + apart)).sum(1))
 
 

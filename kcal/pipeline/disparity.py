@@ -9,14 +9,14 @@ what stands in front, lose their weight (J. W. Tukey's biweight).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from kcal.checks import as_points, keep_float64
-from kcal.corners.filters import as_gray
+from kcal.checks import as_points, keep_float64, require_finite
 from kcal.corners.match import RIVAL_DISTANCE, MatchStatus
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
@@ -29,7 +29,7 @@ from kcal.pipeline.patches import (
     plane_places,
     sample,
 )
-from kcal.pipeline.shift_fit import ShiftFit, fit_shifts, weighted_correlation
+from kcal.pipeline.shift_fit import fit_shifts, is_textured, weighted_correlation
 
 # Steps of a patch from its middle at most; larger objects get steps of powers of two pixels.
 _LARGEST_HALF = 24
@@ -148,8 +148,7 @@ class ObjectDisparity(nn.Module):
                 f"{tuple(starts.shape)}"
             )
         for word, image, camera in (("left", left, self.rig.left), ("right", right, self.rig.right)):
-            if image.dtype.is_floating_point:
-                as_gray(f"{word} image", image.detach())
+            require_finite(f"{word} image", image.detach())
             if tuple(image.shape) != camera.size[::-1]:
                 raise InputError(
                     f"{word} image {tuple(image.shape)}: the {word} camera needs (H, W) = {camera.size[::-1]}"
@@ -221,9 +220,22 @@ class ObjectDisparity(nn.Module):
             )
             saturated |= (sample(second, moved, saturated=True) > 0.02) & (base > 0)
             weight = torch.where(saturated | ~has_samples(second, moved), 0.0, base)
-        fit = fit_shifts(template, second, moved, slopes, weight)
+            wanted, named = plane_places(rig.left, planes, objects.anchors)
+            bright = (base * saturated).sum((1, 2)) / base.sum((1, 2)).clamp_min(1e-12)
+            searched = (scores > -1.0).flatten(1).any(1)
+            textured = is_textured(template, weight)
+            # What is named last counts first.
+            status = _flagged(torch.full_like(score, int(MatchStatus.GOOD), dtype=torch.int64), (
+                (rival > options.max_rival * score, MatchStatus.AMBIGUOUS),
+                (edge | (score < options.min_score), MatchStatus.NO_MATCH),
+                (~textured, MatchStatus.FLAT),
+                (bright > 1.0 - options.min_share, MatchStatus.SATURATED),
+                (outside | ~searched & textured, MatchStatus.OUTSIDE),
+                (~(planes.valid & named), MatchStatus.NO_RAY),
+            ))  # fmt: skip
+            found = status == int(MatchStatus.GOOD)
+        fit = fit_shifts(template, second, moved, slopes, weight, found)
         column = start + planes.step[:, None] * fit.shift
-        wanted, named = plane_places(rig.left, planes, objects.anchors)
         pixels, _ = plane_pixels(rig.right, planes, (wanted + column - planes.left)[:, None], rotation)
         with torch.no_grad():
             at = objects.half
@@ -234,12 +246,13 @@ class ObjectDisparity(nn.Module):
             )
             by_anchor = middle @ torch.linalg.inv_ex(own)[0]
             off_line = (column[:, 1] / planes.step).abs() * 2**level
-            whole = base.sum((1, 2)).clamp_min(1e-12)
-            bright = (base * saturated).sum((1, 2)) / whole
-            searched = (scores > -1.0).flatten(1).any(1)
-            status = self._status(
-                planes.valid & named, outside, bright, fit, searched, score, rival, edge, covariance, off_line
-            )  # fmt: skip
+            sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+            status = _flagged(status, (
+                (found & (off_line > options.max_off_line), MatchStatus.OFF_LINE),
+                (found & ~(sigma < options.max_sigma), MatchStatus.FLAT),
+                (found & (fit.share < options.min_share), MatchStatus.OCCLUDED),
+                (found & ~fit.converged, MatchStatus.NOT_CONVERGED),
+            ))  # fmt: skip
             good = status == int(MatchStatus.GOOD)
             score = torch.where(score > -1.0, score, 0.0)
             infinite = torch.diag(covariance.new_full((2,), math.inf))
@@ -248,38 +261,6 @@ class ObjectDisparity(nn.Module):
             torch.where(good[:, None], pixels[:, 0], objects.right), covariance, status, score,
             torch.where(good, off_line, 0.0), torch.where(good[:, None, None], by_anchor, torch.eye(2).to(by_anchor)),
         )  # fmt: skip
-
-    def _status(
-        self,
-        valid: Tensor,
-        outside: Tensor,
-        bright: Tensor,
-        fit: ShiftFit,
-        searched: Tensor,
-        score: Tensor,
-        rival: Tensor,
-        edge: Tensor,
-        covariance: Tensor,
-        off_line: Tensor,
-    ) -> Tensor:
-        """(N,) of `MatchStatus`; what is named last counts first."""
-        options = self.options
-        sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-        status = torch.full_like(score, int(MatchStatus.GOOD), dtype=torch.int64)
-        for condition, code in (
-            (off_line > options.max_off_line, MatchStatus.OFF_LINE),
-            (~(sigma < options.max_sigma), MatchStatus.FLAT),
-            (fit.share < options.min_share, MatchStatus.OCCLUDED),
-            (~fit.converged, MatchStatus.NOT_CONVERGED),
-            (rival > options.max_rival * score, MatchStatus.AMBIGUOUS),
-            (edge | (score < options.min_score), MatchStatus.NO_MATCH),
-            (~fit.textured, MatchStatus.FLAT),
-            (bright > 1.0 - options.min_share, MatchStatus.SATURATED),
-            (outside | ~searched & fit.textured, MatchStatus.OUTSIDE),
-            (~valid, MatchStatus.NO_RAY),
-        ):
-            status = torch.where(condition, int(code), status)
-        return status
 
     def _apply(self, fn, recurse: bool = True):  # type: ignore[no-untyped-def]
         return super()._apply(keep_float64(fn), recurse)
@@ -308,6 +289,13 @@ class _Objects(NamedTuple):
         half = 0.5 * (self.boxes[:, 2:] - self.boxes[:, :2])[:, None, None]
         radius = torch.linalg.vector_norm((pixels - middle) / half, dim=-1)
         return ((_NONE - radius) / (_NONE - _FULL)).clamp(0.0, 1.0)
+
+
+def _flagged(status: Tensor, conditions: Sequence[tuple[Tensor, MatchStatus]]) -> Tensor:
+    """(N,) the status with the code of each condition (N,) in turn where it is true."""
+    for condition, code in conditions:
+        status = torch.where(condition, int(code), status)
+    return status
 
 
 def _brightest(image: Tensor, options: DisparityOptions) -> float:

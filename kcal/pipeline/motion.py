@@ -76,20 +76,24 @@ def transition(motions: tuple[Motion, ...], dt: float, up: Tensor) -> Transition
     x, y, z = up.unbind(-1)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
     still = torch.eye(3, dtype=up.dtype, device=up.device)
-    reach, keep, noise = [], [], []
+    along = up[:, :, None] * up[:, None, :]
+    # Of what is level, of its turn to the left, and of what is upright.
+    parts = torch.stack([still - along, cross, along], 1)[:, None, None]
+    steps, blocks = [], []
     for motion in motions:
         # Velocity decays and turns at once: v(t) = e^(-t / memory) exp(t rate [up]x) v, integrated for the position.
         decay, rate = 1.0 / motion.memory_s, motion.turn_rate
-        kept, turned = complex(math.exp(-decay * dt)), complex(-decay, rate)
+        left = math.exp(-decay * dt)
+        kept, turned = complex(left), complex(-decay, rate)
         kept *= complex(math.cos(rate * dt), math.sin(rate * dt))
         moved = (kept - 1.0) / turned if abs(turned) * dt > 1e-9 else complex(dt)
-        upright = (1.0 - math.exp(-decay * dt)) / decay if decay * dt > 1e-9 else dt
-        along = up[:, :, None] * up[:, None, :]
-        keep.append(kept.real * (still - along) + kept.imag * cross + math.exp(-decay * dt) * along)
-        reach.append(moved.real * (still - along) + moved.imag * cross + upright * along)
-        blocks = up.new_tensor([_noise_entries(motion, dt)[i] for i in (0, 1, 1, 2)]).reshape(2, 2)
-        noise.append(torch.kron(blocks, still).expand(len(up), 6, 6))
-    return Transition(torch.stack(reach, 1), torch.stack(keep, 1), torch.stack(noise, 1))
+        upright = (1.0 - left) / decay if decay * dt > 1e-9 else dt
+        steps.append([[moved.real, moved.imag, upright], [kept.real, kept.imag, left]])
+        place, both, velocity = _noise_entries(motion, dt)
+        blocks.append([[place, both], [both, velocity]])
+    reach, keep = (up.new_tensor(steps)[..., None, None] * parts).sum(3).unbind(2)
+    noise = torch.kron(up.new_tensor(blocks), still).expand(len(up), -1, 6, 6)
+    return Transition(reach, keep, noise)
 
 
 def _noise_entries(motion: Motion, dt: float) -> tuple[float, float, float]:

@@ -7,7 +7,8 @@ and however they are turned; only its column differs. One step of the plane is a
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -109,6 +110,12 @@ class ImageWindows(NamedTuple):
     size: tuple[int, int]
     level: int
 
+    def at(self, which: Tensor) -> Self:
+        """Those of the objects at some places."""
+        return self._replace(
+            values=self.values[which], saturated=self.saturated[which], corner=self.corner[which]
+        )  # fmt: skip
+
 
 def image_windows(image: Tensor, pixels: Tensor, level: int, brightest: float) -> ImageWindows:
     """Windows that cover pixels (N, ..., 2) of an image (H, W) with room for blur and slopes; edges repeat."""
@@ -122,10 +129,11 @@ def image_windows(image: Tensor, pixels: Tensor, level: int, brightest: float) -
     steps = torch.arange(min(count, 3 * max(width, height)), device=image.device)
     columns, rows = ((low[:, i : i + 1] + steps).clamp(0, side - 1) for i, side in enumerate((width, height)))
     raw = image[rows[:, :, None], columns[:, None, :]].to(torch.float64)
-    both = torch.cat([raw, (raw.detach() >= brightest).double()])[:, None]
-    blurred = torch.nn.functional.conv2d(both, kernel.reshape(1, 1, 1, -1))
+    # Without a brightest level nothing is saturated.
+    parts = [raw] if math.isinf(brightest) else [raw, (raw.detach() >= brightest).double()]
+    blurred = torch.nn.functional.conv2d(torch.cat(parts)[:, None], kernel.reshape(1, 1, 1, -1))
     blurred = torch.nn.functional.conv2d(blurred, kernel.reshape(1, 1, -1, 1))[:, 0]
-    values, saturated = blurred.chunk(2)
+    values, saturated = blurred.chunk(2) if len(parts) == 2 else (blurred, torch.zeros_like(blurred))
     return ImageWindows(values, saturated, low + float(reach), (width, height), level)
 
 
@@ -134,7 +142,8 @@ def sample(windows: ImageWindows, pixels: Tensor, *, saturated: bool = False) ->
     values = windows.saturated if saturated else windows.values
     last = pixels.new_tensor([values.shape[2] - 1, values.shape[1] - 1])
     lead = (len(pixels), *[1] * (pixels.ndim - 2), 2)
-    place = 2.0 * (pixels - windows.corner.reshape(lead)) / last - 1.0
+    scale = 2.0 / last
+    place = torch.addcmul(-scale * windows.corner.reshape(lead) - 1.0, pixels, scale)
     found = torch.nn.functional.grid_sample(
         values[:, None], place.reshape(len(pixels), 1, -1, 2), padding_mode="border", align_corners=True
     )

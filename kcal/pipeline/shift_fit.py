@@ -30,15 +30,22 @@ class ShiftFit(NamedTuple):
         shift: (N, 2) steps of the plane.
         covariance: (N, 2, 2) of the shift.
         converged: (N,).
-        textured: (N,) whether the template is not flat.
         share: (N,) share of the weight that robust weights left.
     """
 
     shift: Tensor
     covariance: Tensor
     converged: Tensor
-    textured: Tensor
     share: Tensor
+
+
+@torch.no_grad()
+def is_textured(template: Tensor, weight: Tensor) -> Tensor:
+    """(N,) whether templates (N, h, w) are not flat where they count."""
+    full = weight.sum((1, 2)).clamp_min(1e-12)
+    level = (weight * template).sum((1, 2)) / full
+    contrast = (weight * (template - level[:, None, None]).square()).sum((1, 2)) / full
+    return contrast.sqrt() > 1e-6 * (1.0 + level.abs())
 
 
 def weighted_correlation(template: Tensor, weight: Tensor, wide: Tensor, usable: Tensor) -> Tensor:
@@ -74,13 +81,22 @@ class _Patches(NamedTuple):
     slopes: Tensor
     weight: Tensor
 
+    def at(self, which: Tensor) -> _Patches:
+        """The objects at some places."""
+        right = self.right.at(which)
+        return _Patches(self.template[which], right, self.moved[which], self.slopes[which], self.weight[which])
+
 
 def _residual(patches: _Patches, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Residual (N, K), slopes (N, K, 2) and design (N, K, 4) at theta (N, 4): shift, gain, offset."""
-    at = patches.moved + (patches.slopes @ theta[:, None, None, :2, None])[..., 0]
-    steps = patches.slopes.unbind(-1)
-    slope = torch.stack([0.5 * (sample(patches.right, at + d) - sample(patches.right, at - d)) for d in steps], -1)
-    values, slope, template = sample(patches.right, at).flatten(1), slope.flatten(1, 2), patches.template.flatten(1)
+    across, down = patches.slopes.unbind(-1)
+    shift = theta[:, None, None, :2]
+    at = torch.addcmul(torch.addcmul(patches.moved, across, shift[..., :1]), down, shift[..., 1:])
+    # The value and, for the slopes, a step to each side along both axes.
+    places = torch.stack([at, at + across, at - across, at + down, at - down], 1)
+    values, *sides = sample(patches.right, places).flatten(2).unbind(1)
+    slope = torch.stack([0.5 * (sides[0] - sides[1]), 0.5 * (sides[2] - sides[3])], -1)
+    template = patches.template.flatten(1)
     residual = values - theta[:, 2:3] * template - theta[:, 3:]
     design = torch.cat([slope, -template[..., None], -torch.ones_like(template)[..., None]], -1)
     return residual, slope, design
@@ -112,7 +128,9 @@ def _balance(patches: _Patches, theta: Tensor, scale: Tensor) -> Tensor:
     return ((weight * residual)[..., None] * design).sum(1)
 
 
-def fit_shifts(template: Tensor, right: ImageWindows, moved: Tensor, slopes: Tensor, weight: Tensor) -> ShiftFit:
+def fit_shifts(
+    template: Tensor, right: ImageWindows, moved: Tensor, slopes: Tensor, weight: Tensor, wanted: Tensor
+) -> ShiftFit:
     """Fit right(moved + slopes shift) = gain template + offset.
 
     Args:
@@ -121,56 +139,62 @@ def fit_shifts(template: Tensor, right: ImageWindows, moved: Tensor, slopes: Ten
         moved: (N, h, w, 2) pixels of the right image at zero shift.
         slopes: (N, h, w, 2, 2) their derivatives by a step along the plane's axes (last axis).
         weight: (N, h, w) of the pixels.
+        wanted: (N,) bool: objects to fit. Others have not converged, and zeros.
     """
-    patches = _Patches(template, right, moved, slopes, weight)
+    which = wanted.nonzero()[:, 0]
+    nothing = torch.zeros_like(moved[:, 0, 0])
+    if not len(which):
+        return ShiftFit(nothing, torch.zeros_like(slopes[:, 0, 0]), torch.zeros_like(wanted), nothing[:, 0])
+    patches = _Patches(template, right, moved, slopes, weight).at(which)
     with torch.no_grad():
-        still = _Patches(template.detach(), right._replace(values=right.values.detach()), moved, slopes, weight)
+        values = patches.right.values.detach()
+        still = patches._replace(template=patches.template.detach(), right=patches.right._replace(values=values))
         theta, scale, step = _fitted_shifts(still)
         residual, slope, _ = _residual(still, theta)
-        robust = weight.flatten(1) * _biweight(residual, scale, still)
+        weight = still.weight.flatten(1)
+        robust = weight * _biweight(residual, scale, still)
         covariance, sound = _covariance(still, theta, residual, slope, robust)
-        full = weight.sum((1, 2))
         # In a perfect fit a biweight takes a few percent.
-        share = robust.sum(1) / full.clamp_min(1e-12)
-        level = (weight * template.detach()).sum((1, 2)) / full.clamp_min(1e-12)
-        contrast = (weight * (template.detach() - level[:, None, None]).square()).sum((1, 2)) / full.clamp_min(1e-12)
-        textured = contrast.sqrt() > 1e-6 * (1.0 + level.abs())
+        share = robust.sum(1) / weight.sum(1).clamp_min(1e-12)
         converged = (step < 10 * _CONVERGED) & sound & theta.isfinite().all(1)
         theta = torch.where(converged[:, None], theta, 0.0)
     shift = theta[:, :2]
     if torch.is_grad_enabled() and (template.requires_grad or right.values.requires_grad):
         shift = _implicit(patches, theta, scale, converged)[:, :2]
-    return ShiftFit(shift, covariance, converged, textured, share)
+    found = ShiftFit(shift, covariance, converged, share)
+    return ShiftFit(*(part.new_zeros(len(wanted), *part.shape[1:]).index_copy(0, which, part) for part in found))
 
 
 def _fitted_shifts(patches: _Patches) -> tuple[Tensor, Tensor, Tensor]:
-    """Theta, scale of the residuals and length of the last step."""
-    weight = patches.weight.flatten(1)
-    count = len(weight)
+    """Theta, scale of the residuals and length of the last step; each object stops when it has converged."""
+    count = len(patches.weight)
     theta = patches.template.new_zeros(count, 4)
     theta[:, 2] = 1.0
     eye = torch.eye(4, dtype=theta.dtype, device=theta.device)
-    step = theta.new_full((count,), torch.inf)
-    scale = theta.new_ones(count)
+    step, scale = theta.new_full((count,), torch.inf), theta.new_ones(count)
+    going = torch.arange(count, device=theta.device)
     for number in range(_MOST_STEPS):
-        residual, _, design = _residual(patches, theta)
-        if number == 0:
-            robust = weight  # contrast and brightness are not known yet
-        else:
+        residual, _, design = _residual(patches, theta[going])
+        weight = robust = patches.weight.flatten(1)
+        if number:  # contrast and brightness are not known before
             # The scale settles, so that the weights do.
-            scale = _scale(residual, weight) if number < 6 else scale
-            robust = weight * _biweight(residual, scale, patches)
+            if number < 6:
+                scale[going] = _scale(residual, weight)
+            robust = weight * _biweight(residual, scale[going], patches)
         weighted = robust[..., None] * design
         normal = weighted.mT @ design
         size = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).sqrt()
         normal = normal / (size[:, :, None] * size[:, None, :]) + 1e-9 * eye
         change = -torch.linalg.solve_ex(normal, (weighted * residual[..., None]).sum(1) / size)[0] / size
         length = torch.linalg.vector_norm(change[:, :2], dim=1)
-        change = torch.nan_to_num(change * (1.0 / length.clamp_min(1.0))[:, None])
-        theta = theta + change
-        step = length
-        if number > 6 and bool((step < _CONVERGED).all()):
-            break
+        theta[going] += torch.nan_to_num(change * (1.0 / length.clamp_min(1.0))[:, None])
+        step[going] = length
+        if number > 6:
+            moving = (~(length < _CONVERGED)).nonzero()[:, 0]
+            if not len(moving):
+                break
+            if len(moving) < len(going):
+                going, patches = going[moving], patches.at(moving)
     return theta, scale, step
 
 

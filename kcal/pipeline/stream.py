@@ -122,11 +122,10 @@ class Stream:
         items: queue.Queue[SourceItem | None] = queue.Queue(_WAITING)
         begin = checkpoint.offset if resumes else 0
         reader = threading.Thread(target=self._read, args=(source, begin, items, waits), daemon=True)
-        since = place.sequence - checkpoint.sequence
-        if self.ledger.state is None or not since or not resumes:
+        # Moments after the checkpoint that are in the outputs already bring only the tracker to where it was.
+        behind = resumes and self.ledger.state is not None and checkpoint.sequence < place.sequence
+        if not behind:
             self.ledger.checkpoint(snapshot(self.tracker))
-            since = 0
-        again = place.sequence - since
         latest = place.time if place.time is not None and not resumes else -math.inf
         reader.start()
         try:
@@ -144,20 +143,23 @@ class Stream:
                         self.counts.last_error = str(item.moment)
                     continue
                 if item.moment.time <= max(self.tracker.time, latest):
-                    self.counts.repeated += 1
+                    self.counts.repeated += not behind
                     continue
-                again += 1
-                if again <= place.sequence:
-                    self.tracker(item.moment.pairs, item.moment.time)
-                    if again == place.sequence:
+                if behind:
+                    written, behind = item.offset <= place.offset, item.offset < place.offset
+                    if written:
+                        self.tracker(item.moment.pairs, item.moment.time)
+                    if not behind:
                         self.ledger.checkpoint(snapshot(self.tracker))
-                    continue
-                self._write(item.moment, item.offset, again)
-                if again % _CHECKPOINT == 0:
+                    if written:
+                        continue
+                sequence = self.ledger.place.sequence + 1
+                self._write(item.moment, item.offset, sequence)
+                if sequence % _CHECKPOINT == 0:
                     self.ledger.checkpoint(snapshot(self.tracker))
         finally:
             self._stop.set()
-            if again >= self.ledger.place.sequence:
+            if not behind:
                 self.ledger.checkpoint(snapshot(self.tracker))
             self.ledger.close()
             for sender in self.senders:

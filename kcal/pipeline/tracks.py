@@ -220,7 +220,7 @@ class Tracker:
             return
         beliefs = self.beliefs.mixed(math.exp(-dt / self.options.switch_s))
         up, turn = self.frame @ self.localize.enu_from_rig[2], None
-        aim = beliefs.merged().mean[:, 0, :2]
+        aim = beliefs.middle[:, 0, :2]
         if bool((aim.abs().amax(-1) > _TURN).any()):
             turn = _toward(aim)
             self.frame = turn @ self.frame
@@ -274,13 +274,13 @@ class Tracker:
         found = innovations(beliefs, seen, timing.at(pair))
         new = updated(beliefs, found, fit_of(found, self.shared.root))
         self.beliefs = Beliefs(*(old.index_copy(0, track, value) for old, value in zip(self.beliefs, new, strict=True)))
-        densities = possible.log_density[rows].tolist()
+        densities, scores = possible.log_density[rows].tolist(), pairs.score.tolist()
         for t, p, density in zip(track.tolist(), pair.tolist(), densities, strict=True):
             record = self.records[t]
             record.last, record.hits = self.time, record.hits + 1
             record.evidence += density
             name = pairs.category[p]
-            record.categories[name] = record.categories.get(name, 0.0) + float(pairs.score[p])
+            record.categories[name] = record.categories.get(name, 0.0) + scores[p]
 
     def _begin(self, which: Tensor, pairs: ObjectPairs, seen: Sightings, timing: Timing) -> None:
         seen = seen.at(which)

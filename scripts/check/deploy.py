@@ -1,20 +1,26 @@
-"""The whole localizer compiled and exported, with lenses of every kind, against eager results.
+"""The whole localizer compiled, exported and in onnxruntime, with lenses of every kind, against eager results.
 
-    python -m scripts.check.deploy                     all kinds, some minutes each
+    python -m scripts.check.deploy --write             all kinds, some minutes each; docs/measured/deploy.md
     python -m scripts.check.deploy --lenses opencv5    one kind
 
 Among the pixels are one that is not finite and one outside the image; the number of pairs differs from the traced one.
+It ends with an error if a field of the result differs by more than 1e-9 of one plus its size: 1e-9 px, 1e-5 m at 5 km.
+`trace` is one graph by `torch.compile` that runs as it is; `inductor` also translates it to C++.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
+import onnxruntime
 import torch
 from torch import Tensor
 
+from kcal.io.onnx_file import save_onnx
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
@@ -22,9 +28,12 @@ from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import StereoLocalizer
+from scripts.shared.page import table, write_section
 from scripts.shared.timing import row, show
 
 LENSES = ("pinhole", "opencv5", "opencv14", "ext24", "fisheye4", "hybrid")
+WAYS = ("trace", "inductor", "export", "onnx")
+ALLOWED = 1e-9
 
 
 def localizer(lens: str) -> StereoLocalizer:
@@ -64,32 +73,52 @@ def difference(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> float:
 
 
 @torch.no_grad()
-def checked(lens: str, ways: Sequence[str]) -> list[str]:
-    """The largest difference for each way, with the seconds that it took."""
+def result(way: str, module: StereoLocalizer, few: tuple[Tensor, Tensor], many: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """What a way of deployment that has seen `few` pairs gives for `many`."""
+    if way in {"trace", "inductor"}:
+        compiled = torch.compile(module, fullgraph=True, dynamic=True, backend="eager" if way == "trace" else way)
+        compiled(*few)
+        return list(compiled(*many))
+    if way == "export":
+        count = torch.export.Dim("count", min=2)
+        return list(torch.export.export(module, few, dynamic_shapes=({0: count}, {0: count})).module()(*many))
+    with tempfile.TemporaryDirectory() as folder:
+        session = onnxruntime.InferenceSession(save_onnx(module, few, Path(folder, "localizer.onnx")))
+        inputs = {place.name: pixels.numpy() for place, pixels in zip(session.get_inputs(), many, strict=True)}
+        return [torch.from_numpy(values) for values in session.run(None, inputs)]
+
+
+def checked(lens: str, ways: Sequence[str]) -> list[tuple[float, float]]:
+    """The largest difference for each way, and the seconds of processor time that it took."""
     module = localizer(lens)
     few, many = marks(module, 1), marks(module, 3)
     wanted = module(*many)
-    count = torch.export.Dim("count", min=2)
-    cells = []
+    found = []
     for way in ways:
         torch.compiler.reset()
         start = time.process_time()
-        if way == "compile":
-            found = torch.compile(module, fullgraph=True, dynamic=True, backend="eager")(*many)
-        else:
-            found = torch.export.export(module, few, dynamic_shapes=({0: count}, {0: count})).module()(*many)
-        cells.append(f"{difference(found, wanted):.0e} ({time.process_time() - start:.0f} s)")
-    return cells
+        apart = difference(result(way, module, few, many), wanted)
+        found.append((apart, time.process_time() - start))
+    return found
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lenses", nargs="+", default=LENSES)
-    parser.add_argument("--ways", nargs="+", default=("compile", "export"))
+    parser.add_argument("--lenses", nargs="+", choices=LENSES, default=LENSES)
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
+    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    show([row("lens", *options.ways), row(*["---"] * (1 + len(options.ways)))])
+    torch.set_num_threads(1)
+    rows, worst = [], 0.0
     for lens in options.lenses:
-        show([row(lens, *checked(lens, options.ways))])
+        found = checked(lens, options.ways)
+        worst = max(worst, *(apart for apart, _ in found))
+        rows.append([lens, *(f"{apart:.0e} ({seconds:.0f} s)" for apart, seconds in found)])
+        show([row(*rows[-1])])
+    if options.write:
+        write_section("deploy.md", "deploy", "\n".join(table(["lens", *options.ways], rows)))
+    if not worst < ALLOWED:
+        raise SystemExit(f"largest difference {worst:.1e}: more than {ALLOWED:.0e}")
 
 
 if __name__ == "__main__":

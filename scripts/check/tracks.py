@@ -9,7 +9,6 @@ filter (the package `stonesoup`) get the same pairs.
 from __future__ import annotations
 
 import argparse
-import datetime
 import math
 from typing import Any, NamedTuple
 
@@ -26,12 +25,15 @@ from kcal.pipeline.consider import ClockPrior
 from kcal.pipeline.motion import Motion
 from kcal.pipeline.pairs import ObjectPairs
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
+from scripts.check.track_rivals import CartesianFilters, OfPixels, OfPositions
 from scripts.shared.page import table, write_section
 
 # Degrees: the relative yaw is known to this, 44 m at 5 km.
 YAW_SIGMA = 0.001
 # Seconds: the right clock is late by the first, and known to the second before.
 OFFSET, OFFSET_SIGMA = 0.040, 0.1
+# For the long runs: a crystal's drift in s/s, the right image's last row against its first in s, and what is known.
+DRIFT, SLOPE, DRIFT_SIGMA, SLOPE_SIGMA = 5e-5, 0.010, 1e-4, 0.02
 BEARING_PX, MATCH_PX = 0.5, 0.1
 ACCELERATION = 0.2
 TARGETS = 30
@@ -72,13 +74,14 @@ def drawn_site(seed: int, frames: int) -> Site:
     return Site(localize, true, path, pace, generator)
 
 
-def seen_pairs(site: Site, frame: int) -> tuple[ObjectPairs, Tensor, Tensor]:
+def seen_pairs(site: Site, frame: int, drift: float = 0.0, slope: float = 0.0) -> tuple[ObjectPairs, Tensor, Tensor]:
     """Pairs of a moment, the targets that they are of, and the true places when the left camera looked."""
     g, time = site.generator, frame / 10.0
     # The right camera runs at 25 frames a second; the nearest frame is taken, and its clock is late.
     stamp = round(25 * (time + 0.013)) / 25 - 0.013
     places = site.path[frame]
-    later = places + (stamp + OFFSET - time) * site.pace[frame]
+    row = site.true.right.project(site.true.right_from_left(places))[0][:, 1:] / site.true.right.size[1] - 0.5
+    later = places + (stamp + OFFSET + drift * time + slope * row - time) * site.pace[frame]
     left, fine = site.true.left.project(places)
     right, seen = site.true.right.project(site.true.right_from_left(later))
     # One target in 20 is hidden, for a second at a time.
@@ -107,49 +110,6 @@ def owner(tracks: Tracks, site: Site, places: Tensor) -> Tensor:
     """The target nearest in direction to each track."""
     direction = torch.nn.functional.normalize(places @ site.localize.enu_from_rig.T, dim=-1)
     return torch.cdist(tracks.state.bearing, direction).argmin(-1)
-
-
-class StoneSoupFilter:
-    """Stone Soup's extended Kalman filter, Cartesian, one for each target, given who is who."""
-
-    def __init__(self) -> None:
-        from stonesoup.models.measurement.linear import LinearGaussian
-        from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
-        from stonesoup.predictor.kalman import KalmanPredictor
-        from stonesoup.types.detection import Detection
-        from stonesoup.types.hypothesis import SingleHypothesis
-        from stonesoup.types.state import GaussianState
-        from stonesoup.updater.kalman import KalmanUpdater
-
-        self._types: tuple[Any, ...] = (LinearGaussian, Detection, SingleHypothesis, GaussianState, KalmanUpdater)
-        model = CombinedLinearGaussianTransitionModel([ConstantVelocity(ACCELERATION**2)] * 3)
-        self._predictor = KalmanPredictor(model)
-        self.states: dict[int, Any] = {}
-
-    def take(self, targets: Tensor, enu: Tensor, covariance: Tensor, ok: Tensor, time: float) -> None:
-        """Take in positions with covariances."""
-        linear, detection, hypothesis, gaussian, updater = self._types
-        when = datetime.datetime(2026, 1, 1) + datetime.timedelta(seconds=time)
-        for i, target in enumerate(targets.tolist()):
-            if not bool(ok[i]):
-                continue
-            place, noise = enu[i].numpy()[:, None], covariance[i].numpy()
-            if target not in self.states:
-                mean, spread = np.zeros((6, 1)), np.zeros((6, 6))
-                mean[::2], spread[::2, ::2] = place, noise
-                spread[1::2, 1::2] = 20.0**2 * np.eye(3)
-                self.states[target] = gaussian(mean, spread, timestamp=when)
-                continue
-            prediction = self._predictor.predict(self.states[target], timestamp=when)
-            made = updater(linear(6, (0, 2, 4), noise)).update(hypothesis(prediction, detection(place, timestamp=when)))
-            self.states[target] = gaussian(made.state_vector, made.covar, timestamp=when)
-
-    def places(self, time: float) -> tuple[list[int], Tensor]:
-        """Targets and where they are believed to be."""
-        when = datetime.datetime(2026, 1, 1) + datetime.timedelta(seconds=time)
-        found = [self._predictor.predict(state, timestamp=when) for state in self.states.values()]
-        rows = [np.asarray(state.state_vector, float).ravel()[::2] for state in found]
-        return list(self.states), torch.from_numpy(np.array(rows))
 
 
 def gospa(found: Tensor, true: Tensor, cutoff: float, power: float = 2.0) -> float:
@@ -200,7 +160,12 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
     tracker = Tracker(site.localize, options, clock=ClockPrior(offset_sigma_s=OFFSET_SIGMA), record=True)
     # The same without clock errors in the estimate of what is expected: knows the offset exactly.
     informed = Tracker(site.localize, options, clock=ClockPrior(offset_s=OFFSET))
-    rival = StoneSoupFilter() if oracle else None
+    # Filter against filter: both know the rig and the clock, and get the same pairs.
+    plain = StereoLocalizer(
+        site.true, origin=site.localize.origin, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0
+    )
+    equal = Tracker(plain, options, clock=ClockPrior(offset_s=OFFSET))
+    positions, pixels = OfPositions(ACCELERATION, options.speed_mps), OfPixels(ACCELERATION, options.speed_mps)
     for frame in range(frames):
         time = frame / 10.0
         pairs, which, places = seen_pairs(site, frame)
@@ -208,11 +173,14 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
         tracks, exact = tracker(pairs), informed(pairs)
         one = site.localize(pairs.left, pairs.right, pairs.covariance)
         mine = owner(tracks, site, places)
-        if rival is not None and frame >= 5:
-            # The rival is told the offset, and whose each sighting is: filter against filter.
+        if oracle:
+            same = equal(pairs)
+            pixels.take(which, pairs, plain(pairs.left, pairs.right, pairs.covariance).enu, plain, OFFSET)
+        if oracle and frame >= 5:
+            # This one is even told the velocities that bring the two times of a pair together.
             late = (pairs.time[:, 1:] - pairs.time[:, :1] + OFFSET) * pace[which, :1] / float(site.true.baseline)
             ahead = one.enu * (1.0 - late)
-            rival.take(which, ahead, one.covariance, one.status == 0, time)
+            positions.take(which, ahead, one.covariance, one.status == 0, time)
         far = which >= TARGETS - 6
         lost = torch.linalg.vector_norm(places, dim=-1)
         if frame == 9:
@@ -233,8 +201,9 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
             figures.add("position", error / sigma)
             floor = tracks.state.covariance[ok] - tracks.state.systematic[ok]
             figures.add("floor", torch.linalg.eigvalsh(floor)[:, 0] / floor.diagonal(dim1=-2, dim2=-1).sum(-1))
-            if rival is not None and frame >= 30:
-                compare(figures, rival, exact, owner(exact, site, places), enu, time)
+            if oracle and frame >= 30:
+                compare(figures, "positions", positions, exact, owner(exact, site, places), enu, time)
+                compare(figures, "pixels", pixels, same, owner(same, site, places), enu, time)
     offset, doubt = tracker.clock_estimate().offset(seconds / 2)
     figures.add("clock", torch.tensor([(offset - OFFSET) / doubt]))
     figures.add("clock ms", torch.tensor([1e3 * (offset - OFFSET)]))
@@ -248,24 +217,46 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
         figures.add("smoother", ratio / track.state.inverse_range_sigma[step])
 
 
-def compare(figures: Figures, rival: StoneSoupFilter, tracks: Tracks, owners: Tensor, enu: Tensor, time: float) -> None:
+def run_clock(seed: int, seconds: float, figures: Figures) -> None:
+    """The clock alone, with drift and unlike rolling shutters; judged at the end."""
+    frames = round(seconds * 10)
+    site = drawn_site(seed, frames)
+    prior = ClockPrior(offset_sigma_s=OFFSET_SIGMA, drift_sigma=DRIFT_SIGMA, slope_sigma_s=SLOPE_SIGMA)
+    options = TrackOptions(motions=(Motion(acceleration=ACCELERATION),), speed_mps=15.0)
+    tracker = Tracker(site.localize, options, clock=prior)
+    for frame in range(frames):
+        tracker(seen_pairs(site, frame, DRIFT, SLOPE)[0], frame / 10.0)
+    estimate = tracker.clock_estimate()
+    offset, sigma = estimate.offset(tracker.time)
+    sigmas = estimate.covariance.diagonal().sqrt()
+    found = torch.stack([torch.tensor(offset), *estimate.values[1:]])
+    true = torch.tensor([OFFSET + DRIFT * tracker.time, DRIFT, SLOPE])
+    figures.add("long clock", (found - true)[None])
+    figures.add("long clock sigma", torch.stack([torch.tensor(sigma), *sigmas[1:]])[None])
+
+
+def compare(
+    figures: Figures, kind: str, rival: CartesianFilters, tracks: Tracks, owners: Tensor, enu: Tensor, time: float
+) -> None:
     """Both filters on the targets that both follow; what kcal's tracker misses or doubles is counted apart."""
     names, guessed = rival.places(time)
     ours = {int(target): row for row, target in enumerate(owners.tolist()) if int(tracks.state.status[row]) == 0}
     both = [i for i, name in enumerate(names) if name in ours]
     there = torch.tensor([names[i] for i in both])
     mine = torch.stack([tracks.state.enu[ours[names[i]]] for i in both])
-    figures.add("gospa kcal", gospa(mine, enu[there], 300.0))
-    figures.add("gospa stonesoup", gospa(guessed[both], enu[there], 300.0))
-    figures.add("missed", float(len(names) - len(both)))
-    figures.add("doubled", float(len(owners) - len(set(owners.tolist()))))
-    figures.add("followed", float(len(names)))
+    figures.add(f"{kind}: kcal", gospa(mine, enu[there], 300.0))
+    figures.add(f"{kind}: stonesoup", gospa(guessed[both], enu[there], 300.0))
+    figures.add(f"{kind}: missed", float(len(names) - len(both)))
+    figures.add(f"{kind}: doubled", float(len(owners) - len(set(owners.tolist()))))
+    figures.add(f"{kind}: followed", float(len(names)))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=12.0)
+    parser.add_argument("--clock-seconds", type=float, default=60.0, help="of the runs of the clock; 0: none")
+    parser.add_argument("--clock-seeds", type=int, default=4)
     parser.add_argument("--without-stonesoup", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
@@ -275,6 +266,11 @@ def main() -> None:
         run_seed(seed, options.seconds, figures, oracle=not options.without_stonesoup)
         text = report(figures, seed + 1, options.seconds)
         print(f"after {seed + 1} seeds\n{text}", flush=True)
+    for seed in range(options.clock_seeds if options.clock_seconds else 0):
+        run_clock(100 + seed, options.clock_seconds, figures)
+        print(f"clock, after {seed + 1} seeds\n{clock_report(figures, options.clock_seconds)}", flush=True)
+    if options.clock_seconds and options.clock_seeds:
+        text += "\n\n" + clock_report(figures, options.clock_seconds)
     if options.write:
         write_section("tracks.md", "tracks", text)
 
@@ -312,16 +308,50 @@ def report(figures: Figures, seeds: int, seconds: float) -> str:
         f"{_rms(figures.all('clock sigma ms')):.2f} ms. A target at 30 m/s that crosses at 5 km is wrong by "
         f"{lost[0]:.0f} m without and {lost[1]:.0f} m with it.",
     ]
-    if "gospa kcal" in figures.numbers:
-        ours, theirs = (float(np.mean(figures.numbers[f"gospa {name}"])) for name in ("kcal", "stonesoup"))
-        missed, doubled, followed = (sum(figures.numbers[name]) for name in ("missed", "doubled", "followed"))
+    if "pixels: kcal" in figures.numbers:
+        mean = {name: float(np.mean(values)) for name, values in figures.numbers.items()}
+        missed, doubled, followed = (
+            sum(figures.numbers[f"pixels: {name}"]) for name in ("missed", "doubled", "followed")
+        )
         lines += [
             "",
-            f"GOSPA (cutoff 300 m) of the targets that both follow: kcal {ours:.0f} m, Stone Soup's Kalman filter, "
-            f"which is told which sighting is whose, {theirs:.0f} m. Of {followed:,.0f} targets in all moments kcal's "
+            *table(
+                ["GOSPA (cutoff 300 m) of the targets that both follow", "kcal", "Stone Soup", "kcal over Stone Soup"],
+                [
+                    [
+                        what,
+                        f"{mean[f'{kind}: kcal']:.1f} m",
+                        f"{mean[f'{kind}: stonesoup']:.1f} m",
+                        f"{mean[f'{kind}: kcal'] / mean[f'{kind}: stonesoup']:.3f}",
+                    ]
+                    for what, kind in (
+                        ("equal information: the pairs, the true rig, the clock; unscented, Cartesian", "pixels"),
+                        ("positions as measurements, Kalman filter, Cartesian; the believed rig", "positions"),
+                    )
+                ],
+            ),
+            "",
+            f"Stone Soup's filters are told whose each sighting is. Of {followed:,.0f} targets in all moments kcal's "
             f"tracker has no position for {missed:,.0f} and two for {doubled:,.0f}.",
         ]
     return "\n".join(lines)
+
+
+def clock_report(figures: Figures, seconds: float) -> str:
+    error, sigma = (figures.all(name).reshape(-1, 3) for name in ("long clock", "long clock sigma"))
+    rows: list[list[object]] = []
+    for column, (what, true, unit, scale) in enumerate((
+        ("offset at the end", OFFSET + DRIFT * seconds, "ms", 1e3),
+        ("drift", DRIFT, "ppm", 1e6),
+        ("last row against first", SLOPE, "ms", 1e3),
+    )):  # fmt: skip
+        inside = int((error[:, column].abs() < 1.96 * sigma[:, column]).sum())
+        rows.append([
+            what, f"{scale * true:g} {unit}", f"{scale * _rms(error[:, column]):.2f} {unit}",
+            f"{scale * _rms(sigma[:, column]):.2f} {unit}", f"{inside} of {len(error)}",
+        ])  # fmt: skip
+    head = [f"clock after {seconds:g} s", "truth", "RMS of error", "stated sigma", "in the 95 % interval"]
+    return "\n".join(table(head, rows))
 
 
 def _rms(values: Tensor) -> float:

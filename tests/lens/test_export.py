@@ -101,6 +101,20 @@ def test_onnx_keeps_factors_that_are_almost_one(tmp_path: Path) -> None:
     assert_same((torch.from_numpy(values), torch.from_numpy(valid)), camera.project(points))
 
 
+class Numbers(nn.Module):
+    """Numbers that float32 rounds, where the exporter makes tensors of them."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.where(x > 0.1, 6356752.314245179 - 1.959963984540054 * x, 1e-9 / 3.0)
+
+
+def test_onnx_keeps_numbers_in_float64(tmp_path: Path) -> None:
+    x = torch.tensor([[0.05, 0.3], [0.1000000001, 1e6]], dtype=torch.float64)
+    session = onnxruntime.InferenceSession(save_onnx(Numbers(), x, tmp_path / "numbers.onnx"))
+    (found,) = session.run(None, {session.get_inputs()[0].name: x.numpy()})
+    assert torch.equal(torch.from_numpy(found), Numbers()(x))
+
+
 def test_onnx_refuses_what_it_cannot_write(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="folder"):
         save_onnx(make_camera("opencv5"), POINTS, tmp_path / "none" / "camera.onnx")

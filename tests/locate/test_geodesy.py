@@ -12,7 +12,7 @@ from locate_rigs import tensor
 
 from kcal.errors import InputError
 from kcal.lens.mounting import Origin
-from kcal.locate.ellipsoid import ecef_to_geodetic, geodetic_to_ecef
+from kcal.locate.ellipsoid import arc_tangent, ecef_to_geodetic, geodetic_to_ecef
 from kcal.locate.geodesy import azimuth_elevation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
 
 ORIGINS = [
@@ -215,3 +215,14 @@ def test_origin_keeps_every_digit() -> None:
     assert Origin.parse(" -33.856784123456, 151.2152961234 ,-1e1") == Origin(
         lat=-33.856784123456, lon=151.2152961234, height=-10.0
     )
+
+
+def test_the_arc_tangent_of_exported_graphs_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    angle = torch.cat([torch.linspace(-math.pi, math.pi, 4001), torch.tensor([1e-12, -1e-12, math.pi - 1e-9])]).double()
+    length = torch.tensor([1e-3, 1.0, 6e6], dtype=torch.float64)[:, None]
+    y, x = length * angle.sin(), length * angle.cos()
+    y, x = (torch.cat([a.flatten(), torch.tensor(b).double()]) for a, b in ((y, [0, 1, -1, 0]), (x, [-1, 0, 0, 2])))
+    wanted = torch.atan2(y, x)
+    monkeypatch.setattr(torch.compiler, "is_exporting", lambda: True)
+    found = arc_tangent(y, x)
+    assert torch.allclose(found, wanted, rtol=1e-15, atol=1e-300)

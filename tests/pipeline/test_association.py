@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -11,8 +12,18 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.stereo import fit_pairs
-from kcal.pipeline.association import Association, AssociationOptions, associate, epipolar_cost, pair_costs
+from kcal.pipeline.association import (
+    _FORBIDDEN,
+    Association,
+    AssociationOptions,
+    _assigned,
+    _best_assignment,
+    associate,
+    epipolar_cost,
+    pair_costs,
+)
 from kcal.pipeline.detections import Detections
+from kcal.pipeline.epipolar_band import near_epipolar_lines
 
 SIZE = (1920, 1080)
 
@@ -82,6 +93,67 @@ def test_the_assignment_is_the_best_one() -> None:
         found = associate(rig, left, right, options)
         cost = torch.where(found.possible, pair_costs(rig, left, right, options), torch.inf)
         assert total(found, (4, 3), 16.0) == pytest.approx(brute(cost, 16.0))
+
+
+def fisheye_rig(offset: float) -> StereoRig:
+    """Two fisheyes 2 m apart that look past each other, with errors of lenses and pose."""
+    camera = Camera.build(
+        focal=(600, 600), center=(959.5, 539.5), size=SIZE, coefficients=[0.02, -0.01], model="fisheye4"
+    )
+    turn = rotation_from_vector(torch.tensor([0.02, -0.3, 0.1], dtype=torch.float64))
+    rig = StereoRig(camera, camera, turn, torch.tensor([-2.0, 0.2, offset]))
+    lens = torch.diag(torch.tensor([1.0, 1.0, 2.0, 2.0, 0.0, 1e-3, 1e-3, 0, 0], dtype=torch.float64) ** 2)
+    pose = torch.diag(torch.tensor([1e-3, 2e-3, 1e-3, 0.01, 0.01, 0.01], dtype=torch.float64) ** 2)
+    rig.covariance = RigCovariance.of(rig, left=lens, right=lens, pose=pose)
+    return rig
+
+
+@pytest.mark.parametrize(("kind", "share"), [("ordinary", 0.05), ("errors", 0.1), ("fisheye", 0.5), ("ahead", 0.7)])
+def test_the_band_leaves_out_no_pair_that_is_possible(kind: str, share: float) -> None:
+    """Gated and exhaustive comparison agree, also near the epipoles, which are in both images of the last rig."""
+    random = torch.Generator().manual_seed(3)
+    rig = rig_of() if kind in {"ordinary", "errors"} else fisheye_rig(0.0 if kind == "fisheye" else 2.0)
+    if kind == "errors":
+        sigma = torch.tensor([5e-4, 5e-4, 1e-3, 1e-2, 1e-2, 1e-2], dtype=torch.float64)
+        rig.covariance = RigCovariance.of(rig, pose=torch.diag(sigma**2))
+    options = AssociationOptions(box_sigma=2.0, nearest=5.0)
+    size = torch.tensor(SIZE, dtype=torch.float64)
+    left, right = (seen(torch.rand(120, 2, generator=random, dtype=torch.float64) * size) for _ in range(2))
+    near = near_epipolar_lines(rig, left.anchors(), right.anchors(), options.box_sigma, options.gate)
+    every = pair_costs(rig, left, right, options)
+    possible = every < options.gate**2
+    for i, j in (possible & ~near).nonzero().tolist():
+        # A false optimum: far from both marks, of rays that diverge.
+        found = fit_pairs(rig, left.anchors()[i : i + 1], right.anchors()[j : j + 1])
+        assert kind in {"fisheye", "ahead"}
+        assert float(found.fit.residual.abs().max()) > 30 * options.box_sigma
+        assert float(found.fit.inverse) < 0
+    possible &= near
+    assert int(possible.sum()) > 30
+    assert float(near.double().mean()) < share
+    gated = pair_costs(rig, left, right, options, near)
+    assert torch.allclose(gated[possible], every[possible], rtol=1e-9, atol=1e-9)
+    assert bool(gated[~near].isinf().all())
+
+
+def test_groups_are_assigned_as_the_whole_is() -> None:
+    """Costs of three groups in one matrix: columns, ambiguity and sum are those of one large problem."""
+    random = np.random.default_rng(0)
+    options = AssociationOptions()
+    for _ in range(20):
+        cost = np.full((9, 8), _FORBIDDEN)
+        for rows, columns in ((slice(0, 4), slice(0, 3)), (slice(4, 7), slice(3, 7)), (slice(8, 9), slice(7, 8))):
+            part = random.uniform(0.0, 16.0, cost[rows, columns].shape)
+            cost[rows, columns] = np.where(random.random(part.shape) < 0.7, part, _FORBIDDEN)
+        chosen, ambiguous = _assigned(cost, options)
+        whole, least = _best_assignment(cost, 16.0)
+        assert chosen.tolist() == whole.tolist()
+        for i in np.flatnonzero(chosen >= 0):
+            without = cost.copy()
+            without[i, chosen[i]] = _FORBIDDEN
+            other, more = _best_assignment(without, 16.0)
+            rival = other[i] >= 0 or chosen[i] in other
+            assert ambiguous[i] == (rival and more - least < 2.0 * np.log(20.0))
 
 
 def test_two_that_could_be_swapped_are_ambiguous() -> None:

@@ -110,6 +110,22 @@ def test_many_objects_at_once_are_as_one_by_one() -> None:
         assert torch.allclose(alone.pixels[0], together.pixels[number], atol=2e-3)
 
 
+def test_an_object_does_not_depend_on_its_neighbors() -> None:
+    """Each stops when it has converged itself, whatever the others still do."""
+    scene = case(0)
+    shifts = torch.tensor([[0.0, 0.0], [-7.0, 3.0], [9.0, -5.0], [2.0, 11.0]], dtype=torch.float64)
+    boxes, aims = scene.boxes[:1] + shifts.repeat(1, 2), scene.aims[:1] + shifts.flip(0)
+    match = ObjectDisparity(scene.rig)
+    together = match(scene.left, scene.right, boxes, aims)
+    statuses = set()
+    for number in range(4):
+        alone = match(scene.left, scene.right, boxes[number : number + 1], aims[number : number + 1])
+        statuses.add(int(alone.status[0]))
+        assert int(alone.status[0]) == int(together.status[number])
+        assert torch.allclose(alone.pixels[0], together.pixels[number], rtol=0, atol=1e-8)
+    assert len(statuses) > 1
+
+
 def test_a_mask_replaces_the_ellipse() -> None:
     scene = case(2, amplitude=1.6, box_sigma=0.5)
     mask = torch.zeros(1, *SIZE[::-1], dtype=torch.bool)

@@ -80,9 +80,20 @@ def test_a_clean_capture_is_allowed_and_has_no_fault(clean: CameraCalibrationRes
     assert not names(verdict, "stop")
     assert names(verdict, "doubt") <= {"coverage", "depth", "roll"}
     assert {"halves", "poses"} & names(verdict, "fine")
+    assert "prediction" in names(verdict, "fine")
     for half in examination.halves:
         # Held-out corners are predicted almost as well as those that were fitted.
         assert half.own < half.held_out < 1.3 * half.own
+
+
+def test_halves_that_do_not_predict_each_other_are_doubted(
+    clean: CameraCalibrationResult, examination: Examination
+) -> None:
+    halves = tuple(dataclasses.replace(half, held_out=1.5 * half.own) for half in examination.halves)
+    given = dataclasses.replace(examination, halves=halves)
+    verdict = camera_verdict(clean, OPTIONS, Requirement.parse("100m:10%"), mark_sigma=0.1, examination=given)
+    assert "prediction" in names(verdict, "doubt")
+    assert any("1.50 times" in finding.text for finding in verdict.findings)
 
 
 def test_the_range_asked_for_decides(clean: CameraCalibrationResult, examination: Examination) -> None:

@@ -1,0 +1,175 @@
+"""`VideoPairs`: two videos and a detector as the source of a stream."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import torch
+
+from kcal.corners.video import is_stream, source_name
+from kcal.errors import FileError, InputError
+from kcal.lens.rig import StereoRig
+from kcal.pipeline.association import AssociationOptions
+from kcal.pipeline.detector_call import Detector, detect_in
+from kcal.pipeline.disparity import ObjectDisparity
+from kcal.pipeline.frame_pairs import paired_by_time
+from kcal.pipeline.handover import Handover
+from kcal.pipeline.lines import Moment
+from kcal.pipeline.live_frames import live_frames
+from kcal.pipeline.pairing import pair_objects
+from kcal.pipeline.stream import SourceItem
+from kcal.pipeline.video_frames import TimedFrame, file_frames
+
+# Of matches in H.264 videos of usual quality (x264 at CRF 23), besides what they state; it falls to half at CRF 17.
+MATCH_SIGMA = 0.05
+# Decoded frames that wait for their partners: a third of a second of video.
+_FRAMES = 8
+# Frames of one live stream after which a lack of partners is told: some seconds.
+_ALONE = 100
+
+
+@dataclasses.dataclass(kw_only=True)
+class VideoCounts:
+    """What became of frames so far.
+
+    Attributes:
+        left: decoded frames of the left video.
+        right: of the right one.
+        paired: pairs of frames that the detector saw.
+        undecoded: frames that were damaged or out of order.
+        dropped: pairs of a live source for which there was no time.
+    """
+
+    left: int = 0
+    right: int = 0
+    paired: int = 0
+    undecoded: int = 0
+    dropped: int = 0
+
+    def __str__(self) -> str:
+        parts = [f"videos: {self.left:,} and {self.right:,} frames, {self.paired:,} pairs"]
+        for count, what in (
+            (self.undecoded, "damaged or out of order, left out"),
+            (self.dropped, "pairs dropped for lack of time"),
+        ):
+            parts += [f"{count:,} {what}"] if count else []
+        return "; ".join(parts)
+
+
+class VideoPairs:
+    """Detect in the frames of two videos that belong together, and match the images inside the boxes.
+
+    Call it with the offset of the last moment that is not wanted any more: it is a source for `Stream.follow`. Files
+    wait until there is time for the next frames; of live streams the newest ones are taken, the others counted.
+
+    Args:
+        left: file or address of the left camera.
+        right: the same of the right camera.
+        rig: the cameras; frames must have their sizes.
+        detector: see `detect_in`.
+        options: of the pairing of boxes.
+        late: seconds by which the right images are later than their times say, as known at present.
+        match_sigma: pixels, error of a match along each axis besides what its pixels tell: compression makes it.
+        apart_s: frames that are farther apart in time are not paired.
+        tell: called with what happens to live streams, from another thread.
+
+    Raises:
+        InputError: a `match_sigma` that is negative or not finite, or a file beside a live stream.
+    """
+
+    def __init__(
+        self,
+        left: str,
+        right: str,
+        rig: StereoRig,
+        detector: Detector,
+        options: AssociationOptions,
+        *,
+        late: Callable[[], float],
+        match_sigma: float = MATCH_SIGMA,
+        apart_s: float = 0.5,
+        tell: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        if not 0 <= match_sigma < math.inf:
+            raise InputError(f"match_sigma: pixels, not negative, are needed, got {match_sigma}")
+        self._compression = match_sigma**2 * torch.diag(torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64))
+        self.counts = VideoCounts()
+        self.live = is_stream(left)
+        if self.live != is_stream(right):
+            raise InputError(f"{source_name(left)} and {source_name(right)}: two files or two live streams are needed")
+        self._videos, self._rig, self._detector, self._options = (left, right), rig, detector, options
+        self._late, self._apart, self._tell = late, apart_s, tell
+        self._match = ObjectDisparity(rig)
+        self._ended, self._met = threading.Event(), False
+        self._running: list[Handover[TimedFrame]] = []
+        self._newest: Handover[tuple[TimedFrame, TimedFrame]] | None = None
+
+    def __call__(self, offset: int) -> Iterator[SourceItem]:
+        """The moments after an offset: microseconds of the left frame, from 1."""
+        # Somewhat earlier frames decide which frames belong together.
+        left = self._frames(0, 1e-6 * offset - self._apart)
+        right = self._frames(1, 1e-6 * offset - 2 * self._apart - self._late())
+        pairs: Iterable[tuple[TimedFrame, TimedFrame]] = self._noted(
+            paired_by_time(left, right, self._late, self._apart)
+        )
+        if self.live:
+            pairs = self._newest = Handover(pairs, 1, waits=False)
+        for one, other in pairs:
+            if one.place > offset:
+                yield SourceItem(self._moment(one, other), one.place)
+            if self._newest is not None:
+                self.counts.dropped = self._newest.dropped
+        if not self._met and not offset and not self.live:
+            raise FileError(
+                f"{self._videos[0]} and {self._videos[1]}: no frames within {self._apart:g} s of each other; if the "
+                "recordings began at different times, say so with --clock-offset"
+            )
+
+    def _noted(self, pairs: Iterator[tuple[TimedFrame, TimedFrame]]) -> Iterator[tuple[TimedFrame, TimedFrame]]:
+        for pair in pairs:
+            self._met = True
+            yield pair
+
+    def close(self) -> None:
+        """End the threads that decode."""
+        self._ended.set()
+        for running in self._running:
+            running.close()
+        if self._newest is not None:
+            self._newest.close()
+
+    def _frames(self, side: int, since: float) -> Iterator[TimedFrame]:
+        size, name = ((self._rig.left, self._rig.right)[side].size, ("left", "right")[side])
+        video, undecoded = self._videos[side], functools.partial(self._count, "undecoded")
+        if self.live:
+            frames = live_frames(video, size, self._ended, self._tell, undecoded)
+        else:
+            frames = file_frames(Path(video), size, since, undecoded)
+        running = Handover(frames, _FRAMES, waits=not self.live)
+        self._running.append(running)
+        for frame in running:
+            self._count(name)
+            if self.live and getattr(self.counts, name) == _ALONE and not self._met:
+                self._tell(
+                    f"{_ALONE} frames of the {name} camera came, none within {self._apart:g} s of one of the other: do "
+                    " the clocks of both cameras agree? --clock-offset corrects a known difference"
+                )
+            yield frame
+
+    def _count(self, name: str) -> None:
+        setattr(self.counts, name, getattr(self.counts, name) + 1)
+
+    def _moment(self, one: TimedFrame, other: TimedFrame) -> Moment:
+        left, right = (
+            detect_in(self._detector, frame.colors(), frame.time, f"{word} image")
+            for word, frame in (("left", one), ("right", other))
+        )
+        images = one.gray(), other.gray()
+        pairs = pair_objects(self._rig, left, right, images, options=self._options, disparity=self._match)
+        self._count("paired")
+        return Moment(one.time, dataclasses.replace(pairs, covariance=pairs.covariance + self._compression))

@@ -1,0 +1,233 @@
+"""`kcal live` on two videos: positions within their intervals, restarts, and one line for whatever is wrong."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("av", reason="the extra `video` is not installed")
+from rtsp_server import RtspCamera
+from typer.testing import CliRunner
+from video_scenes import VELOCITY, bright_spots, film, places, small_rig, write_video
+
+from kcal.cli.main import app
+from kcal.errors import FileError, InputError
+from kcal.io.rig_file import save_rig
+from kcal.pipeline.stream import Stream
+
+FRAMES, LATE = 20, 0.03
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two videos: 15 frames a second, and some 25 at uneven times; the right camera is 30 ms later than it says.
+
+    They are compressed as cameras do it.
+    """
+    folder, rig = tmp_path_factory.mktemp("scene"), small_rig()
+    save_rig(rig, folder / "rig.json")
+    times = [number / 15 for number in range(FRAMES)]
+    write_video(folder / "left.mp4", film(rig, 0, times), times, crf=23)
+    times = [round(0.013 + number / 25 + 0.008 * np.sin(number), 3) for number in range(34)]
+    write_video(folder / "right.mp4", film(rig, 1, times, LATE), times, crf=23)
+    return folder
+
+
+@pytest.fixture
+def folder(scene: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(scene, tmp_path, dirs_exist_ok=True))
+
+
+def live(folder: Path, *options: str, detector: str = "video_scenes:bright_spots") -> str:
+    videos = [str(folder / "left.mp4"), str(folder / "right.mp4")]
+    command = ["live", str(folder / "rig.json"), *videos, "--detector", detector, "-o", str(folder / "tracks.csv")]
+    done = CliRunner().invoke(app, [*command, *options], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_positions_and_clock_are_right_within_their_sigmas(folder: Path) -> None:
+    told = live(folder, "--clock-sigma", "0.1")
+    assert f"{FRAMES} moments, {2 * (FRAMES - 3)} positions" in told
+    assert f"videos: {FRAMES} and " in told
+    offset, sigma = (float(told.split(word)[1].split()[0]) for word in ("images are ", "± "))
+    assert abs(offset - 1e3 * LATE) < 3.5 * sigma < 25.0
+    with open(folder / "tracks.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * (FRAMES - 3)
+    for row in rows[-10:]:
+        found = np.array([float(row[f"{axis}_m"]) for axis in ("east", "up", "north")]) * [1, -1, 1]
+        true = places(float(row["time_s"])).numpy()
+        target = int(np.abs(true - found).sum(1).argmin())
+        sigma = np.sqrt([float(row[f"cov_{axis}_m2"]) for axis in ("ee", "uu", "nn")])
+        # The images inside the boxes were matched: boxes alone leave some 10 m.
+        assert sigma[2] < 1.0
+        assert (np.abs(found - true[target]) < 3.5 * sigma).all(), (found, true[target], sigma)
+        pace = float(row["velocity_east_mps"]) - float(VELOCITY[target, 0])
+        assert abs(pace) < 3.5 * float(row["velocity_east_sigma_mps"])
+
+
+def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    live(folder, "--clock-offset", str(LATE))
+    whole = (folder / "tracks.csv").read_bytes()
+    for path in folder.glob("tracks.csv*"):
+        path.unlink()
+    write = Stream._write
+    left_by_a_crash: dict[Path, bytes] = {}
+
+    def terminated(self: Stream, *what: object) -> None:
+        write(self, *what)  # type: ignore[arg-type]
+        if self.counts.moments == 7:
+            left_by_a_crash.update((path, path.read_bytes()) for path in folder.glob("tracks.csv*"))
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Stream, "_write", terminated)
+    assert "7 moments, 8 positions" in live(folder, "--clock-offset", str(LATE))
+    monkeypatch.setattr(Stream, "_write", write)
+    told = live(folder, "--clock-offset", str(LATE))
+    assert "continuing after 7 moments" in told
+    # The first left frame is earlier than all right ones.
+    assert f"{FRAMES - 8} moments" in told
+    assert (folder / "tracks.csv").read_bytes() == whole
+    assert "0 moments, 0 positions" in live(folder, "--clock-offset", str(LATE))
+    # After a crash there is no newer checkpoint: seven moments are detected again, and not written again.
+    for path, content in left_by_a_crash.items():
+        path.write_bytes(content)
+    assert f"{FRAMES - 8} moments" in live(folder, "--clock-offset", str(LATE))
+    assert (folder / "tracks.csv").read_bytes() == whole
+
+
+def test_a_shorter_video_ends_the_pairs(folder: Path) -> None:
+    times = [number / 15 for number in range(5)]
+    write_video(folder / "right.mp4", film(small_rig(), 1, times), times)
+    assert "5 moments, 4 positions" in live(folder)
+
+
+def test_recordings_that_do_not_overlap(folder: Path) -> None:
+    times = [7.0 + number / 15 for number in range(5)]
+    write_video(folder / "right.mp4", film(small_rig(), 1, times, -7.0), times)
+    with pytest.raises(FileError, match=r"no frames within 0.5 s of each other.*--clock-offset"):
+        live(folder)
+    # Seven seconds too late by its own clock.
+    (folder / "tracks.csv.journal").unlink()
+    assert "5 moments, 4 positions" in live(folder, "--clock-offset", "-7")
+
+
+def test_a_color_video_of_another_size_is_refused(folder: Path) -> None:
+    image = np.zeros((120, 160), np.uint8)
+    write_video(folder / "right.mp4", [image], [0.0], "yuv420p")
+    with pytest.raises(FileError, match=r"right.mp4: frames of 160x120 px, but the camera has 320x240"):
+        live(folder)
+
+
+class Box:
+    """What a detector of batches returns for one image."""
+
+    def __init__(self, boxes: np.ndarray) -> None:
+        self.xyxy, self.conf, self.cls, self.orig_shape, self.names = boxes, None, None, (240, 320), {}
+        self.boxes = self
+
+
+def of_batches(image: np.ndarray) -> list[Box]:
+    assert image.shape == (240, 320, 3)
+    assert image.dtype == np.uint8
+    return [Box(bright_spots(image))]
+
+
+def returns_text(image: np.ndarray) -> object:
+    return object()
+
+
+def raises(image: np.ndarray) -> None:
+    raise ValueError("no weights\nwere loaded")
+
+
+not_callable = 3
+
+
+def test_a_detector_of_batches(folder: Path) -> None:
+    told = live(folder, "--clock-offset", str(LATE), detector=f"{__name__}:of_batches")
+    assert f"{FRAMES - 1} moments, {2 * (FRAMES - 4)} positions" in told
+
+
+@pytest.mark.parametrize(
+    ("detector", "message"),
+    [
+        ("nomodule:find", "detector nomodule:find: no module 'nomodule'"),
+        ("video_scenes:find", "the module video_scenes has no 'find'"),
+        ("video_scenes", "write package.module:callable"),
+        (f"{__name__}:not_callable", "of type int, cannot be called"),
+        (f"{__name__}:returns_text", "returned for the left image at 0.000 s: detections: object is not known"),
+        (f"{__name__}:raises", "failed on the left image at 0.000 s: ValueError: no weights were loaded"),
+    ],
+)
+def test_a_detector_that_does_not_work(folder: Path, detector: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        live(folder, detector=detector)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["a.mp4", "--detector", "a:b"],
+        ["a.mp4", "b.mp4"],
+        [],
+        ["a.mp4", "b.mp4", "--detector", "a:b", "--detections", "-"],
+    ],
+)
+def test_incomplete_commands(folder: Path, arguments: list[str]) -> None:
+    done = CliRunner().invoke(app, ["live", str(folder / "rig.json"), *arguments, "-o", str(folder / "t.csv")])
+    assert done.exit_code == 2
+
+
+def slow_spots(image: np.ndarray) -> np.ndarray:
+    time.sleep(0.15)
+    return bright_spots(image)
+
+
+def test_two_rtsp_streams_whose_newest_frames_are_taken(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = small_rig()
+    table = [film(rig, side, [number / 10 for number in range(30)]) for side in (0, 1)]
+    write = Stream._write
+
+    def terminated(self: Stream, *what: object) -> None:
+        write(self, *what)  # type: ignore[arg-type]
+        if self.counts.moments == 5:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Stream, "_write", terminated)
+    cameras = [RtspCamera(lambda when, side=side: table[side][round(10 * when) % 30], 10.0) for side in (0, 1)]
+    with cameras[0], cameras[1]:
+        videos = [camera.address for camera in cameras]
+        command = ["live", str(folder / "rig.json"), *videos, "--detector", f"{__name__}:slow_spots"]
+        done = CliRunner().invoke(app, [*command, "-o", str(folder / "tracks.csv")], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert "5 moments, " in done.output
+    assert "pairs dropped for lack of time" in done.output
+    assert "secret" not in done.output
+    with open(folder / "tracks.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert rows
+    for row in rows:
+        # The table begins again every three seconds.
+        true = places(float(row["time_s"]) % 3.0).numpy()
+        assert np.abs(true[:, 2] - float(row["north_m"])).min() < 5.0
+        assert abs(float(row["time_s"]) - time.time()) < 60.0
+
+
+def test_a_file_beside_a_stream(folder: Path) -> None:
+    with pytest.raises(InputError, match="two files or two live streams"):
+        CliRunner().invoke(
+            app,
+            ["live", str(folder / "rig.json"), str(folder / "left.mp4"), "rtsp://user:secret@127.0.0.1/main",
+             "--detector", "video_scenes:bright_spots", "-o", str(folder / "tracks.csv")],
+            catch_exceptions=False,
+        )  # fmt: skip
