@@ -30,6 +30,7 @@ from scripts.shared.timing import show
 
 ROOT = DOCS.parents[1]
 PYTHONS = ("3.11", "3.12", "3.13")
+CELLS = (("wheel", "oldest"), ("sdist", "newest"))
 SMOKE = """
 import importlib.metadata, json, math, os, sys, time
 import torch, numpy
@@ -128,7 +129,10 @@ def cell(folder: Path, python: str, package: Path, pins: list[str]) -> dict[str,
 
 
 def page(rows: list[list[str]], packages: dict[str, Path], missing: list[str]) -> str:
-    """The Markdown page."""
+    """The Markdown page; cells that were left out are shown as not run."""
+    cells = [(version, *cell) for version in PYTHONS for cell in CELLS if version not in missing]
+    there = {(row[0], row[1], row[2]): row for row in rows}
+    rows = [there.get(head, [*head, "", "", "", "not run"]) for head in cells]
     sizes = ", ".join(f"{kind} {path.stat().st_size / 1024:.0f} KB" for kind, path in packages.items())
     none = f"Not to be had on this machine: Python {', '.join(missing)}." if missing else ""
     return "\n".join(
@@ -167,7 +171,7 @@ def main() -> None:
             if python is None:
                 missing.append(version)
                 continue
-            for kind, age in (("wheel", "oldest"), ("sdist", "newest")):
+            for kind, age in CELLS:
                 done = [version, kind, age] in [row[:3] for row in rows]
                 if arguments.only in (None, age) and not done:
                     newest = [arguments.newest_torch] if arguments.newest_torch else []
