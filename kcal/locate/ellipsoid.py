@@ -26,7 +26,8 @@ _E2_SECOND = _E2 / (1.0 - _E2)
 _PASSES = 2
 # Meters from the Earth's axis: closer points are at a pole, where a longitude has no gradient.
 _AT_POLE = 1e-6
-_DEGREES = 180.0 / math.pi
+# Not `rad2deg` and `deg2rad`, whose factors ONNX files have in float32.
+_DEGREES, _RADIANS = 180.0 / math.pi, math.pi / 180.0
 
 
 def geodetic_to_ecef(geodetic: Tensor) -> Tensor:
@@ -39,7 +40,7 @@ def geodetic_to_ecef(geodetic: Tensor) -> Tensor:
         [0.0, 6378147.0, 0.0]
     """
     lat, lon, height = as_points("geodetic", geodetic, 3).unbind(-1)
-    lat, lon = torch.deg2rad(lat), torch.deg2rad(lon)
+    lat, lon = lat * _RADIANS, lon * _RADIANS
     sine, cosine = torch.sin(lat), torch.cos(lat)
     normal = SEMI_MAJOR / torch.sqrt(1.0 - _E2 * sine * sine)
     level = (normal + height) * cosine
@@ -81,7 +82,6 @@ def geodetic_components(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor
     sine, cosine = torch.sin(lat), torch.cos(lat)
     # p cos φ + z sin φ - a √(1 - e² sin² φ) needs no division by a cosine that is zero at the poles.
     height = distance * cosine + z * sine - SEMI_MAJOR * torch.sqrt(1.0 - _E2 * sine * sine)
-    # Not `rad2deg`, whose factor ONNX files have in float32.
     return lat * _DEGREES, lon * _DEGREES, height
 
 

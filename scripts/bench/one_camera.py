@@ -5,6 +5,7 @@
     KCAL_DATA=DATA python -m scripts.bench.one_camera --views 8               # fitted to 8 of its views, three draws
     KCAL_DATA=DATA python -m scripts.bench.one_camera --stereo                # OpenCV's images, one view left out
     KCAL_DATA=DATA python -m scripts.bench.one_camera --epipolar              # the same, 9 pairs fitted and 4 held out
+    KCAL_MRCAL=/usr/bin/python3 ... --models mrcal                            # mrcal's spline too, of the wide lens
 
 With --write the table goes into docs/measured/one-camera.md.
 
@@ -16,8 +17,11 @@ Sampson's distance of held-out corners in pixels, which needs no board.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
+import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -40,6 +44,8 @@ from scripts.shared.page import write_section
 from scripts.shared.timing import row, show
 from scripts.shared.wide_lens import folds, held_out, load, warped
 
+# The spline of mrcal that predicts held-out views of the wide lens best, and about its focal length, pixels.
+SPLINE, FOCAL = "SPLINED11x8", 1900.0
 # A camera and the corners of its board (N, 3), from views and their weights (V, N).
 Fitter = Callable[[Observations, Tensor], tuple[Camera, Tensor]]
 
@@ -70,7 +76,33 @@ MODELS: dict[str, Fitter] = {
 }
 
 
+def with_mrcal(seen: Observations, weight: Tensor, parts: list[np.ndarray]) -> str:
+    """Mrcal's splined lens with a warped board, by `scripts/bench/peer_mrcal.py`."""
+    total, seconds, count = 0.0, 0.0, 0
+    with tempfile.TemporaryDirectory() as folder:
+        for out in parts:
+            path = Path(folder, "problem.npz")
+            np.savez(
+                path,
+                corners=seen.pixels().numpy(),
+                weight=weight.numpy(),
+                train=np.setdiff1d(np.arange(len(seen.views)), out),
+                held=out,
+                image_size=np.array(seen.image_size),
+                board_size=np.array([seen.board.columns, seen.board.rows]),
+                square_m=seen.board.square,
+                focal=FOCAL,
+            )
+            command = [os.environ["KCAL_MRCAL"], "scripts/bench/peer_mrcal.py", str(path), SPLINE]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            found = json.loads(done.stdout.strip().splitlines()[-1])
+            total, seconds, count = total + found["sum"], seconds + found["cpu_s"], count + found["count"]
+    return row(f"mrcal, {SPLINE}", f"{math.sqrt(total / count):.4f}", f"{seconds / len(parts):.1f}")
+
+
 def measure(name: str, seen: Observations, weight: Tensor, parts: list[np.ndarray]) -> str:
+    if name == "mrcal":
+        return with_mrcal(seen, weight, parts)
     total, seconds, count = 0.0, 0.0, 0
     for out in parts:
         train = np.setdiff1d(np.arange(len(seen.views)), out)
@@ -129,7 +161,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, help="fitted of the wide lens, all others held out")
     parser.add_argument("--stereo", action="store_true", help="OpenCV's stereo images, both cameras")
     parser.add_argument("--epipolar", action="store_true", help="OpenCV's stereo images, pairs")
-    parser.add_argument("--models", nargs="*", default=list(MODELS), choices=list(MODELS))
+    parser.add_argument("--models", nargs="*", default=list(MODELS), choices=[*MODELS, "mrcal"])
     parser.add_argument("--write", action="store_true", help="write the tables into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)

@@ -64,7 +64,7 @@ def main() -> None:
     texture = torch.rand(1, 1, SIZE[1] // 4, SIZE[0] // 4, generator=random)
     left = 255 * torch.nn.functional.interpolate(texture, scale_factor=4.0, mode="bicubic")[0, 0]
     right = left.roll(-SHIFT, 1)
-    rows = []
+    rows: list[list[object]] = []
     for count in COUNTS:
         depth = 10 ** torch.empty(count, dtype=torch.float64).uniform_(2.3, 3.7, generator=random)
         place = torch.stack([torch.empty(count).uniform_(-s, s, generator=random) for s in (0.45, 0.25)], -1)
@@ -91,7 +91,13 @@ def main() -> None:
         calls.append(lambda a=seen, b=aims: match(left, right, a, b))  # type: ignore[misc]
         rows.append([count, *(milliseconds(call, options.calls) for call in calls)])
         print(*rows[-1], sep=" | ", flush=True)
-    heads = ["objects", "localize, eager", *(["localize, compiled"] if compiled else []), "associate", "match"]
+    heads = [
+        "objects",
+        "localize, eager",
+        *(["localize, compiled"] if compiled is not None else []),
+        "associate",
+        "match",
+    ]
     text = (
         "Milliseconds a call: median / 99th percentile (processor time, mean). Made by `scripts/bench/pipeline.py`.\n\n"
         + "\n".join(table(heads, rows))

@@ -27,7 +27,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.lens.zernike import ZernikeModes
-from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.localizer import Localization, StereoLocalizer
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import row, show
 
@@ -60,11 +60,16 @@ def marks(module: StereoLocalizer, repeats: int) -> tuple[Tensor, Tensor]:
     return torch.cat([left, bad]).repeat(repeats, 1), torch.cat([right, fine]).repeat(repeats, 1)
 
 
-def difference(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> float:
-    """Largest relative difference of all fields; what is infinite must be so in both."""
-    largest = 0.0
-    for some, other in zip(found, wanted, strict=True):
+def difference(found: Sequence[Tensor], wanted: Localization, origin: Tensor) -> float:
+    """Largest difference of all fields, of one plus their size; what is infinite must be so in both.
+
+    Latitude and longitude count in meters from the origin.
+    """
+    largest, meters = 0.0, torch.tensor([111_320.0, 111_320.0, 1.0], dtype=torch.float64)
+    for name, some, other in zip(wanted._fields, found, wanted, strict=True):
         one, two = some.double(), other.double()
+        if name == "geodetic":
+            one, two = ((each - origin) * meters for each in (one, two))
         if not torch.equal(one.isfinite(), two.isfinite()):
             return float("inf")
         apart = torch.nan_to_num(one - two, 0.0, 0.0, 0.0).abs() / (1.0 + torch.nan_to_num(two, 0.0, 0.0, 0.0).abs())
@@ -97,7 +102,7 @@ def checked(lens: str, ways: Sequence[str]) -> list[tuple[float, float]]:
     for way in ways:
         torch.compiler.reset()
         start = time.process_time()
-        apart = difference(result(way, module, few, many), wanted)
+        apart = difference(result(way, module, few, many), wanted, module.geodetic_of_origin)
         found.append((apart, time.process_time() - start))
     return found
 

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
+import onnxruntime
 import pyproj
 import pytest
 import torch
@@ -11,9 +13,10 @@ from hypothesis import strategies as st
 from locate_rigs import tensor
 
 from kcal.errors import InputError
+from kcal.io.onnx_file import save_onnx
 from kcal.lens.mounting import Origin
 from kcal.locate.ellipsoid import arc_tangent, ecef_to_geodetic, geodetic_to_ecef
-from kcal.locate.geodesy import azimuth_elevation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
+from kcal.locate.geodesy import anchor, azimuth_elevation, enu_from_cam, enu_to_geodetic, geodetic_to_enu, place_enu
 
 ORIGINS = [
     Origin(lat=0.0, lon=0.0, height=0.0),
@@ -226,3 +229,18 @@ def test_the_arc_tangent_of_exported_graphs_is_the_same(monkeypatch: pytest.Monk
     monkeypatch.setattr(torch.compiler, "is_exporting", lambda: True)
     found = arc_tangent(y, x)
     assert torch.allclose(found, wanted, rtol=1e-15, atol=1e-300)
+
+
+class Places(torch.nn.Module):
+    def forward(self, enu: torch.Tensor) -> torch.Tensor:
+        return place_enu(enu, *anchor(ORIGINS[1]))
+
+
+def test_places_in_onnxruntime(tmp_path: Path) -> None:
+    """It has no arc tangent in float64; and float32 constants would be off by half a meter."""
+    enu = 5000.0 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    # The anchor is part of the graph.
+    session = onnxruntime.InferenceSession(save_onnx(Places(), enu[:5], tmp_path / "places.onnx"))
+    (found,) = session.run(None, {session.get_inputs()[0].name: enu.numpy()})
+    apart = geodetic_to_enu(torch.from_numpy(found), ORIGINS[1]) - enu
+    assert float(apart.abs().max()) < 1e-8
