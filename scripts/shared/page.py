@@ -13,7 +13,7 @@ CONCLUSIONS = {
     "first-contact.md": (
         "**Conclusion.** Fewer than 1,500 words lead to the first position, no how-to is longer than a screen, and "
         "tests run every Python example. Every command refuses a missing file before it loads torch. `kcal "
-        "--help` takes 0.6 s on a busy machine, twice what is aimed at."
+        "--help` takes 0.5 s on a busy machine; 0.3 s is the aim."
     ),
     "versions.md": (
         "**Conclusion.** The lowest versions that `pyproject.toml` allows work on Python 3.11, from the wheel: torch "
