@@ -14,8 +14,9 @@ import pydantic
 import pytest
 
 from kcal.errors import FileError, InputError
-from kcal.files import NativeFile, check_writable, dump_json, read_bytes, write_atomic
+from kcal.files import check_writable, dump_json, read_bytes, write_atomic
 from kcal.lens.calibration import Exclusion
+from kcal.native_file import NativeFile
 from kcal.strict_json import read_json
 
 

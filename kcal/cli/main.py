@@ -20,7 +20,7 @@ from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
 from kcal.cli.compare import compare_command
-from kcal.cli.console import err, with_json
+from kcal.cli.console import err, with_inputs, with_json
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.diff import diff_command
@@ -101,22 +101,22 @@ def _global_options(
 app.command("demo")(with_json(demo_command))
 app.add_typer(board, name="board")
 app.command("capture")(capture_command)
-app.command("detect")(with_json(detect_command))
-app.command("calibrate")(with_json(calibrate_command))
-app.command("compare")(with_json(compare_command))
-app.command("batch")(with_json(batch_command))
-app.command("mark")(mark_command)
+app.command("detect")(with_json(with_inputs(detect_command)))
+app.command("calibrate")(with_json(with_inputs(calibrate_command)))
+app.command("compare")(with_json(with_inputs(compare_command)))
+app.command("batch")(with_json(with_inputs(batch_command)))
+app.command("mark")(with_inputs(mark_command))
 app.add_typer(rig, name="rig")
-app.command("locate")(locate_command)
-app.command("live")(live_command)
+app.command("locate")(with_inputs(locate_command))
+app.command("live")(with_inputs(live_command))
 app.command("budget")(with_json(budget_command))
-app.command("undistort")(with_json(undistort_command))
-app.command("bake")(with_json(bake_command))
-app.command("export")(with_json(export_command))
-app.command("import")(with_json(import_command))
-app.command("show")(with_json(show_command))
-app.command("diff")(with_json(diff_command))
-app.command("report")(with_json(report_command))
+app.command("undistort")(with_json(with_inputs(undistort_command)))
+app.command("bake")(with_json(with_inputs(bake_command)))
+app.command("export")(with_json(with_inputs(export_command)))
+app.command("import")(with_json(with_inputs(import_command)))
+app.command("show")(with_json(with_inputs(show_command)))
+app.command("diff")(with_json(with_inputs(diff_command)))
+app.command("report")(with_json(with_inputs(report_command)))
 
 
 def main() -> None:

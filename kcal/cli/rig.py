@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from kcal.cli.console import with_json
+from kcal.cli.console import with_inputs, with_json
 from kcal.cli.groups import group_with_default
 from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
 from kcal.cli.rig_check import check
@@ -239,5 +239,5 @@ def print_rig(result: RigResult, lines: list[str]) -> None:
         err.print("[yellow]warning:[/]", text)
 
 
-app.command("solve", hidden=True)(with_json(solve_command))
-app.command("check")(with_json(check))
+app.command("solve", hidden=True)(with_json(with_inputs(solve_command)))
+app.command("check")(with_json(with_inputs(check)))

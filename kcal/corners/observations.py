@@ -11,7 +11,7 @@ from torch import Tensor
 from kcal.checks import ImageSize
 from kcal.corners.board import Board
 from kcal.errors import InputError
-from kcal.files import NativeFile
+from kcal.native_file import NativeFile
 
 # Sides of images have at most 65535 pixels in most formats; far beyond, squares and products overflow.
 Coordinate = Annotated[float, pydantic.Field(ge=-1e6, le=1e6)]

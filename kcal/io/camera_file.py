@@ -17,13 +17,13 @@ import torch
 import kcal
 from kcal.checks import ImageSize
 from kcal.errors import InputError
-from kcal.files import NativeFile
 from kcal.io.information_record import InformationRecord
 from kcal.io.lens_record import LensOrders
 from kcal.io.record import CovarianceRecord, Record
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.projection import INTRINSICS
+from kcal.native_file import NativeFile
 
 
 class IntrinsicsRecord(Record):

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from kcal.checks import as_covariance
 from kcal.errors import InputError
-from kcal.files import NativeFile
 from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, camera_to_file
 from kcal.io.record import Packed, Record
 from kcal.lens.calibration import RigCalibration
@@ -27,6 +26,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.rig import RigCovariance, StereoRig, half_of_covariance
+from kcal.native_file import NativeFile
 
 Triple = tuple[float, float, float]
 

@@ -30,6 +30,7 @@ from scripts.shared.timing import show
 
 ROOT = DOCS.parents[1]
 PYTHONS = ("3.11", "3.12", "3.13")
+CELLS = (("wheel", "oldest"), ("sdist", "newest"))
 SMOKE = """
 import importlib.metadata, json, math, os, sys, time
 import torch, numpy
@@ -128,7 +129,10 @@ def cell(folder: Path, python: str, package: Path, pins: list[str]) -> dict[str,
 
 
 def page(rows: list[list[str]], packages: dict[str, Path], missing: list[str]) -> str:
-    """The Markdown page."""
+    """The Markdown page; cells that were left out are shown as not run."""
+    cells = [(version, *cell) for version in PYTHONS for cell in CELLS if version not in missing]
+    there = {(row[0], row[1], row[2]): row for row in rows}
+    rows = [there.get(head, [*head, "", "", "", "not run"]) for head in cells]
     sizes = ", ".join(f"{kind} {path.stat().st_size / 1024:.0f} KB" for kind, path in packages.items())
     none = f"Not to be had on this machine: Python {', '.join(missing)}." if missing else ""
     return "\n".join(
@@ -151,10 +155,13 @@ def main() -> None:
     parser.add_argument("--only", choices=("oldest", "newest"), help="only these dependencies")
     parser.add_argument("--pythons", nargs="+", default=list(PYTHONS), metavar="X.Y")
     parser.add_argument("--newest-torch", default="", metavar="REQUIREMENT", help="in place of what pip chooses")
+    parser.add_argument("--out", type=Path, help="JSON lines of rows; those in it are kept and shown")
     parser.add_argument("--no-page", action="store_true")
     arguments = parser.parse_args()
     lower = [lowest(line) for line in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]]
-    rows, missing = [], []
+    kept = arguments.out.read_text().splitlines() if arguments.out and arguments.out.exists() else []
+    rows: list[list[str]] = [json.loads(line) for line in kept]
+    missing: list[str] = []
     with tempfile.TemporaryDirectory(prefix="kcal-versions-") as name:
         folder = Path(name)
         packages = built(folder)
@@ -164,14 +171,18 @@ def main() -> None:
             if python is None:
                 missing.append(version)
                 continue
-            for kind, age in (("wheel", "oldest"), ("sdist", "newest")):
-                if arguments.only in (None, age):
+            for kind, age in CELLS:
+                done = [version, kind, age] in [row[:3] for row in rows]
+                if arguments.only in (None, age) and not done:
                     newest = [arguments.newest_torch] if arguments.newest_torch else []
                     found = cell(folder, python, packages[kind], lower if age == "oldest" else newest)
                     seen = found.get("versions", {})
                     names = ("torch", "numpy", "scipy")
                     rows.append([version, kind, age, *(seen.get(name, "") for name in names), found["outcome"]])
                     show([" | ".join(rows[-1])])
+                    if arguments.out:
+                        with arguments.out.open("a") as file:
+                            file.write(json.dumps(rows[-1]) + "\n")
         if not arguments.no_page:
             (DOCS / "versions.md").write_text(page(rows, packages, missing), encoding="utf-8")
     if not rows or any(row[-1] != "passed" for row in rows):

@@ -138,7 +138,17 @@ def test_an_interruption_says_what_was_kept(
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
+    Path("a.png").touch()
     monkeypatch.setattr("kcal.corners.images.expand_images", detect)
     found = CliRunner().invoke(app, ["detect", "a.png", "--board", "9x6", "--square", "25mm", "-o", "a.obs.json"])
     assert found.exit_code == 130
     assert words in found.stderr.replace("\n", "")
+
+
+@pytest.mark.parametrize("command", ["show none.json", "calibrate none.obs.json -o a.camera.json", "report none.json"])
+def test_a_missing_file_is_refused_before_torch_is_loaded(command: str, tmp_path: Path) -> None:
+    code = "import sys; from kcal.cli.main import main\ntry: main()\nfinally: print('torch' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code, *command.split()], cwd=tmp_path, capture_output=True, text=True)
+    assert found.returncode == 1
+    assert "cannot read: No such file" in found.stderr
+    assert found.stdout.strip() == "False"

@@ -27,8 +27,9 @@ from kcal.corners.images import decode_gray, expand_images, unique_names
 from kcal.corners.observations import Failure, Observations, PackedCovariance, Pixel, View
 from kcal.corners.refine import Refinement
 from kcal.errors import FileError, InputError, KcalError
-from kcal.files import NativeFile, read_bytes
+from kcal.files import read_bytes
 from kcal.io.camera_file import CameraFile
+from kcal.native_file import NativeFile
 
 _COLUMNS = ("camera", "images", "board", "square", "model")
 

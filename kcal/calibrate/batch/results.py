@@ -30,7 +30,8 @@ from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.sharing import ALONE, sharing
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, KcalError
-from kcal.files import NativeFile, dump_json, make_folder, read_bytes, write_atomic
+from kcal.files import dump_json, make_folder, read_bytes, write_atomic
+from kcal.native_file import NativeFile
 from kcal.strict_json import MOST_BYTES, read_json
 from kcal.texts import csv_line
 

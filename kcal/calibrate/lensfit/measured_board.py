@@ -15,7 +15,7 @@ from kcal.calibrate.lensfit.board_modes import board_modes, undetermined_modes
 from kcal.calibrate.lensfit.board_prior import BoardPrior
 from kcal.corners.board import Board
 from kcal.errors import InputError
-from kcal.files import NativeFile
+from kcal.native_file import NativeFile
 
 
 class Measured(NamedTuple):
