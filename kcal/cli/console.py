@@ -101,7 +101,9 @@ def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
             return command(*arguments, **options)
         for name, checked in names.items():
             value = given.get(name)
-            for path in value if isinstance(value, list | tuple) else [value]:
+            paths = value if isinstance(value, list | tuple) else [value]
+            # Beside a stream no files are allowed at all, which the command says.
+            for path in [] if any(_is_stream(str(path)) for path in paths) else paths:
                 if checked and path is not None and not _is_there(str(path)):
                     what = "no such file or folder" if name == "images" else "cannot read: No such file or directory"
                     raise FileError(f"{path}: {what}")
@@ -111,9 +113,13 @@ def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
+def _is_stream(text: str) -> bool:
+    return "://" in text or text.startswith("camera:")
+
+
 def _is_there(text: str) -> bool:
-    """Whether a text names a file or folder, a wildcard, a stream, or a camera of a file (`RIG.json:left`)."""
-    elsewhere = text == "-" or "://" in text or text.startswith("camera:") or any(c in text for c in "*?[")
+    """Whether a text names a file or folder, a wildcard, or a camera of a file (`RIG.json:left`)."""
+    elsewhere = text == "-" or any(c in text for c in "*?[")
     return elsewhere or os.path.lexists(text) or os.path.lexists(text.rpartition(":")[0])
 
 

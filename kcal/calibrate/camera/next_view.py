@@ -18,6 +18,7 @@ from torch import Tensor
 from kcal.calibrate.lensfit.board_modes import board_modes
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
+from kcal.lens.information import CameraInformation
 from kcal.lens.pose import rotation_from_vector, step_rows
 from kcal.lens.projection import project_components
 from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
@@ -139,17 +140,11 @@ def next_view(camera: Camera, board: Board, noise: float) -> NextView | None:
     if known is None or not views.words:
         return None
     half = known.half()
-    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
-    onto = known.selection()[wanted]
-    slopes = _image_slopes(camera, wanted) @ onto @ half.T
-    shapes = board_modes(board.points).shapes if known.board_size else None
+    slopes = _image_slopes(camera, known) @ half.T
+    shapes = board_modes(board.points).shapes
     gains = []
     for rotation, translation in zip(views.rotation, views.translation, strict=True):
-        by_camera, by_board, by_pose = _view_slopes(camera, wanted, board.points, shapes, rotation, translation)
-        rows = by_camera @ onto
-        if by_board is not None:
-            rows[:, known.lens_size :] = by_board
-        rows = torch.linalg.qr(by_pose, mode="complete").Q[:, by_pose.shape[1] :].T @ rows @ half.T / noise
+        rows = _view_rows(camera, known, board.points, shapes, rotation, translation) @ half.T / noise
         # Variance that this view takes away: G Aᵀ (1 + A Aᵀ)⁻¹ A Gᵀ.
         lower = torch.linalg.cholesky(torch.eye(len(rows), dtype=rows.dtype) + rows @ rows.T)
         gains.append(float(torch.linalg.solve_triangular(lower, rows @ slopes.T, upper=False).square().sum()))
@@ -162,24 +157,27 @@ def _kept(items: Sequence[T], good: Tensor) -> list[T]:
     return [item for item, fits in zip(items, good.tolist(), strict=True) if fits]
 
 
-def _image_slopes(camera: Camera, wanted: list[int]) -> Tensor:
-    """(2 G, C) derivatives of the image's grid by parameters, far away, after the best turn."""
+def _image_slopes(camera: Camera, known: CameraInformation) -> Tensor:
+    """(2 G, U) derivatives of the image's grid by the unknowns, far away, after the best turn."""
+    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
     by_camera, by_motion, good = pixel_slopes(camera, camera.grid(*_GRID).reshape(-1, 2), math.inf, wanted)
     flat, by_turn = by_camera[good].flatten(0, 1), by_motion[good][..., :3].flatten(0, 1)
-    return flat - by_turn @ torch.linalg.lstsq(by_turn, flat).solution
+    return (flat - by_turn @ torch.linalg.lstsq(by_turn, flat).solution) @ known.selection()[wanted]
 
 
-def _view_slopes(
-    camera: Camera, wanted: list[int], points: Tensor, shapes: Tensor | None, rotation: Tensor, translation: Tensor
-) -> tuple[Tensor, Tensor | None, Tensor]:
-    """Derivatives of a view's corners (2 N, ...) by parameters, by modes of the board, and by the view's pose."""
+def _view_rows(
+    camera: Camera, known: CameraInformation, points: Tensor, shapes: Tensor, rotation: Tensor, translation: Tensor
+) -> Tensor:
+    """(2 N - 6, U) derivatives of a view's corners by the unknowns, off the view's pose; `shapes` are board modes."""
+    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
     placed = points @ rotation.T + translation
     seen = project_components(placed.T, camera.params.detach(), camera.model, wanted)
-    by_board = None
-    if shapes is not None:
+    rows = seen.by_camera.flatten(1).T @ known.selection()[wanted]
+    if known.board_size:
         by_point = torch.einsum("pcn,pk->kcn", seen.by_point, rotation)
-        by_board = torch.einsum("kcn,bkn->cnb", by_point, shapes).flatten(0, 1)
-    return seen.by_camera.flatten(1).T, by_board, step_rows(seen.by_point, placed.T).flatten(1).T
+        rows[:, known.lens_size :] = torch.einsum("kcn,bkn->cnb", by_point, shapes).flatten(0, 1)
+    by_pose = step_rows(seen.by_point, placed.T).flatten(1).T
+    return torch.linalg.qr(by_pose, mode="complete").Q[:, by_pose.shape[1] :].T @ rows
 
 
 def _rotation(x: float, y: float, z: float) -> Tensor:

@@ -20,7 +20,6 @@ from kcal.calibrate.rig.blocks import FeatureBlock, LandmarkBlock, RigState
 from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.uncertainty import SharedCovariance, relative_rows
 from kcal.errors import DegenerateError
-from kcal.lens.pose import rotation_from_vector
 
 # Measured on simulated landmarks (docs/measured/weak_geometry.md): up to the first ratio first-order intervals contain
 # the truth as often as they should; above it, once they are widened by the ratio's square, at most three times. Hardly
@@ -128,21 +127,19 @@ class _Targets(NamedTuple):
         near: the largest inverse range.
         half: (3, T, K) how an inverse range follows K independent standard normal errors of the rig, at infinity, at
             half of `near` and at `near`; a parabola in between.
-        lens: (3, T, K) the part of that which comes through the lenses.
         own: (T,) variance of an inverse range by its marks alone.
     """
 
     rays: Tensor
     near: float
     half: Tensor
-    lens: Tensor
     own: Tensor
 
-    def at(self, nodes: Tensor, inverse_range: Tensor) -> Tensor:
-        """`half` or `lens` (..., T, K) at inverse ranges (..., T)."""
+    def at(self, inverse_range: Tensor) -> Tensor:
+        """`half` (..., T, K) at inverse ranges (..., T)."""
         share = (inverse_range / self.near)[..., None]
         weights = (1.0 - share) * (1.0 - 2.0 * share), 4.0 * share * (1.0 - share), share * (2.0 * share - 1.0)
-        return sum((weight * node for weight, node in zip(weights, nodes, strict=True)), torch.zeros(()))
+        return sum((weight * node for weight, node in zip(weights, self.half, strict=True)), torch.zeros(()))
 
 
 def open_place(
@@ -163,16 +160,22 @@ def open_place(
     across = torch.eye(3, dtype=torch.float64) - targets.rays[:, :, None] * targets.rays[:, None, :]
     share = torch.linalg.matrix_norm(across @ places.T, 2) / (across @ center).norm(dim=-1)
     steps = _SIGMAS * _DIRECTIONS @ ways
-    # (D, W, T, 3): directions in which targets at D distances are seen from W second cameras, in the solved rig's axes.
-    there = targets.rays - inverse[:, None, None, None] * (center + steps @ places)[:, None]
-    seen = there @ (rotation.T @ rotation_from_vector(steps @ turns) @ rotation).mT
-    sight = torch.nn.functional.normalize(seen, dim=-1)
-    base = center - (sight @ center)[..., None] * sight
-    found = (base * targets.rays).sum(-1) / base.square().sum(-1)
     true = inverse[:, None, None]
-    by_lens = (targets.at(targets.lens, true.expand_as(found)) @ steps[:, :, None])[..., 0]
-    variance = targets.own + targets.at(targets.half, found).square().sum(-1)
-    errors = (found - true - by_lens).square() / variance
+
+    def seen_from(moved: Tensor) -> tuple[Tensor, Tensor]:
+        """Inverse ranges (D, W, T) that are found for targets at D distances seen from W places, and their rays."""
+        there = targets.rays - true[..., None] * (center + moved)[:, None]
+        sight = torch.nn.functional.normalize(there, dim=-1)
+        base = center - (sight @ center)[..., None] * sight
+        return (base * targets.rays).sum(-1) / base.square().sum(-1), there
+
+    # Turns and lenses, which trade with each other by far more than both together are off, count to first order.
+    found, seen = seen_from(steps @ places)
+    one = torch.ones((), dtype=torch.float64)
+    by_place = torch.func.jvp(lambda share: seen_from(share * (steps @ places))[0], (0.0 * one,), (one,))[1]
+    found = found - by_place - (targets.at(true.expand_as(found)) @ steps[:, :, None])[..., 0]
+    variance = targets.own + targets.at(found).square().sum(-1)
+    errors = (found - true).square() / variance
     common = _common(problem, second, seen @ rotation.T)
     mean = torch.where(common, errors.nan_to_num(math.inf), 0.0).sum(-1) / common.sum(-1).clamp_min(1)
     return OpenPlace(float(share.median()), math.sqrt(float(mean.max())) / _SIGMAS, axes[:, 0], float(sigmas[0]))
@@ -211,9 +214,8 @@ def _targets(
     if slot is not None:
         # The range is from where the first camera stands, not from where it was found.
         rows[:, slot] += inverse.square()[:, None] * direction
-    through = torch.where(torch.arange(problem.shared_size) < len(problem.unknowns), rows, 0.0)
-    half, lens = covariance.half_of(rows), covariance.half_of(through)
-    if half is None or lens is None or not len(rays):
+    half = covariance.half_of(rows)
+    if half is None or not len(rays):
         return None
     own = own.unflatten(0, (3, -1))[0, :, -1, -1]
-    return _Targets(rays, near, half.T.unflatten(0, (3, -1)), lens.T.unflatten(0, (3, -1)), own)
+    return _Targets(rays, near, half.T.unflatten(0, (3, -1)), own)

@@ -40,10 +40,11 @@ def test_it_gives_what_it_promises(model: str, monkeypatch: pytest.MonkeyPatch) 
     found = next_view(camera, BOARD, noise)
     assert found is not None
     promised = []
-    views = possible_views(camera, BOARD)
+    views, shapes = possible_views(camera, BOARD), module.board_modes(BOARD.points).shapes
     some = [i for i, text in enumerate(views.words) if text == found.words] + [0, 20, 40]
     for i in some:
-        rows = module._view_rows(camera, known, BOARD, views.rotation[i], views.translation[i]) / noise
+        held = views.rotation[i], views.translation[i]
+        rows = module._view_rows(camera, known, BOARD.points, shapes, *held) / noise
         more = dataclasses.replace(
             known, rows=torch.cat([known.rows, rows]), residuals=torch.cat([known.residuals, torch.zeros(len(rows))])
         )
@@ -62,9 +63,9 @@ def test_rows_are_derivatives_of_what_is_seen() -> None:
     assert known is not None
     views = possible_views(camera, BOARD)
     rotation, translation = views.rotation[3], views.translation[3]
-    rows = module._view_rows(camera, known, BOARD, rotation, translation)
-    assert rows.shape == (2 * BOARD.corners - 6, len(known.estimate))
     shapes = module.board_modes(BOARD.points).shapes
+    rows = module._view_rows(camera, known, BOARD.points, shapes, rotation, translation)
+    assert rows.shape == (2 * BOARD.corners - 6, len(known.estimate))
     assert known.board_size == len(shapes)
     step = 1e-6
 

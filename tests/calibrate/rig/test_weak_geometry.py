@@ -15,6 +15,9 @@ from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Landmarks, MeasuredPosition, RigData
 from kcal.calibrate.rig.weak_geometry import OpenPlace, _targets, open_place
 from kcal.errors import DegenerateError
+from kcal.lens.calibration import CameraCalibration
+from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
 from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance
 from kcal.locate.localizer import StereoLocalizer
@@ -125,6 +128,20 @@ class TestOrdinary:
         assert place(found).share < 0.05
         assert place(found).ratio < 1.0
 
+    def test_a_turn_that_a_lens_undoes_says_nothing(self) -> None:
+        """Tilts of the sensor, open by themselves, undo what a turn of the camera does to ranges."""
+        spread = tensor(30, 30, 60, 60, 0, *[0.05, 0.1, 1.5e-3, 1.5e-3, 0.1], *[0.05] * 3, *[0.03] * 4, *[0.1] * 2)
+        cameras = []
+        for camera in CAMERAS[:2]:
+            params = torch.cat([camera.params.detach(), torch.zeros(9).double()])
+            rich = Camera(params, size=camera.size, model=LensModel.named("opencv14"))
+            rich.calibration = CameraCalibration(covariance=torch.diag(spread.square()))
+            cameras.append(rich)
+        data = RigData(cameras=tuple(cameras), names=NAMES[:2], landmarks=landmarks(noise=0.05, error=0.02))
+        found = solve_rig(data)
+        assert found.warnings == ()
+        assert place(found).ratio < 1.0
+
     def test_sigmas_are_those_of_the_localizer(self) -> None:
         found = solved(landmarks(noise=0.2, error=0.02))
         rig = found.stereo()
@@ -134,7 +151,7 @@ class TestOrdinary:
         for far in (200.0, 370.0, 900.0, 5000.0):
             left, right, good = rig(far * targets.rays)
             wanted = localize(left, right).inverse_range_sigma[good]
-            by_rig = targets.at(targets.half, torch.full((len(targets.rays),), 1.0 / far).double()).square().sum(-1)
+            by_rig = targets.at(torch.full((len(targets.rays),), 1.0 / far).double()).square().sum(-1)
             # The variance by the marks is that at infinity.
             torch.testing.assert_close((targets.own + by_rig).sqrt()[good], wanted, rtol=0.03, atol=0.0)
             assert math.isfinite(float(wanted.max()))
