@@ -489,5 +489,10 @@ def test_help_shows_examples(command: str, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("arguments", [["calibrate"], ["calibrate", "a.json"], ["rig", "a.json", "b.json", "-o", "c"]])
-def test_missing_arguments_are_a_usage_error(arguments: list[str]) -> None:
+def test_missing_arguments_are_a_usage_error(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.json", "b.json"):
+        Path(name).write_text("{}")
     assert CliRunner().invoke(app, arguments).exit_code == 2
