@@ -3,8 +3,8 @@
     python -m scripts.check.demo --out seeds.jsonl --seeds 40        # seeds that the file holds are kept
     python -m scripts.check.demo --out seeds.jsonl --write           # the page, from what is there
 
-Every seed has its own lenses' errors of assembly, poses, noise, survey and marks. The intervals are those that the
-command prints: 95 %.
+Every seed has its own poses, noise, survey and marks; lenses and board are those of the site. The intervals are those
+that the command prints: 95 %.
 """
 
 from __future__ import annotations
