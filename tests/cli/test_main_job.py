@@ -223,6 +223,7 @@ class TestBadInput:
         assert not Path("a.obs.json").exists()
 
     def test_length_without_unit(self, run: Run) -> None:
+        write_png("a.png", np.zeros((240, 320), dtype=np.uint8))
         refused(run("detect", "a.png", "--board", "9x6", "--square", "25", "-o", "a.obs.json"), "unit", "25mm")
 
     def test_one_view(self, run: Run) -> None:
