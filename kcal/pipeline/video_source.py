@@ -155,7 +155,7 @@ class VideoPairs:
             self._count(name)
             if self.live and getattr(self.counts, name) == _ALONE and not self._met:
                 self._tell(
-                    f"{_ALONE} frames of the {name} camera came, none within {self._apart:g} s of one of the other: do "
+                    f"{_ALONE} frames of the {name} camera came, none within {self._apart:g} s of one of the other: do"
                     " the clocks of both cameras agree? --clock-offset corrects a known difference"
                 )
             yield frame
