@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from kcal.corners.images import IMAGE_SUFFIXES, Gray, decode_gray
-from kcal.corners.video import Frame, is_stream, read_frames, sharpest, source_name
+from kcal.corners.video import Frame, read_frames, sharpest
 from kcal.errors import FileError
 from kcal.files import read_bytes
+from kcal.sources import is_stream, source_name
 
 # Seconds between two looks into a folder.
 _LOOK = 0.5

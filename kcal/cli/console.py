@@ -19,6 +19,7 @@ from rich.text import Text
 from typer.models import ArgumentInfo
 
 from kcal.errors import FileError
+from kcal.sources import is_stream
 from kcal.texts import one_line, visible
 
 
@@ -103,7 +104,7 @@ def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
             value = given.get(name)
             paths = value if isinstance(value, list | tuple) else [value]
             # Beside a stream no files are allowed at all, which the command says.
-            for path in [] if any(_is_stream(str(path)) for path in paths) else paths:
+            for path in [] if any(is_stream(str(path)) for path in paths) else paths:
                 if checked and path is not None and not _is_there(str(path)):
                     what = "no such file or folder" if name == "images" else "cannot read: No such file or directory"
                     raise FileError(f"{path}: {what}")
@@ -111,10 +112,6 @@ def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
 
     run.__signature__ = signature  # type: ignore[attr-defined]
     return run
-
-
-def _is_stream(text: str) -> bool:
-    return "://" in text or text.startswith("camera:")
 
 
 def _is_there(text: str) -> bool:

@@ -74,7 +74,8 @@ def detect_command(
     from kcal.corners.detect import detect_images
     from kcal.corners.images import expand_images
     from kcal.corners.orientation import turned_images
-    from kcal.corners.video import VIDEO_SUFFIXES, detect_video, is_stream, source_name
+    from kcal.corners.video import VIDEO_SUFFIXES, detect_video
+    from kcal.sources import is_stream, source_name
 
     turned: list[Path] = []
     streams = [source_name(image) for image in images if is_stream(image)]

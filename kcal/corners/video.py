@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
-from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -22,12 +21,12 @@ from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.refine import Refinement
 from kcal.errors import FileError, InputError
 from kcal.files import write_atomic
+from kcal.sources import is_stream, source_name
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"})
 MOST_VIEWS = 40
 DURATION = 120.0  # seconds: how long a live stream is read by default
 _STREAM_TIMEOUT_MS = 10_000  # for opening, and for each frame
-_STREAM = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|srt)://|camera:\d+$", re.IGNORECASE)
 NEW = 0.04  # of the image's width: how far the board's corners must have moved from every earlier view
 _GROUP = 7  # frames, of which only the sharpest is searched
 
@@ -37,29 +36,6 @@ class Frame(NamedTuple):
 
     number: int
     image: npt.NDArray[np.uint8]
-
-
-def is_stream(source: str | Path) -> bool:
-    """Whether a source is live: an address such as `rtsp://...`, or `camera:0`, a device of this machine.
-
-    Example:
-        >>> is_stream("rtsp://10.0.0.7/main"), is_stream("camera:0"), is_stream("shots.mp4")
-        (True, True, False)
-    """
-    return _STREAM.match(str(source)) is not None
-
-
-def source_name(source: str | Path) -> str:
-    """The name of a source in its views: the file's name, the device, or the stream's host without any password.
-
-    Example:
-        >>> source_name("rtsp://user:secret@10.0.0.7:554/main?token=1"), source_name("camera:0")
-        ('10.0.0.7', 'camera:0')
-    """
-    text = str(source)
-    if "://" in text and is_stream(source):
-        return urlsplit(text).hostname or "stream"
-    return text if is_stream(source) else Path(source).name
 
 
 def read_frames(source: str | Path, duration: float | None = None) -> Iterator[Frame]:

@@ -263,6 +263,16 @@ def by_pose(fit: PointFit, number: int) -> Tensor:
     return torch.cat([turn, shift * fit.inverse[..., None, None, :]], -3)
 
 
+def unreached_direction(fit: PointFit) -> Tensor:
+    """(N, 4) for two cameras: the unit combination of pixel coordinates to which the point does not respond."""
+    rows = fit.gain.movedim(-1, 0)
+    # One over the length of each row: they are angles and one over meters.
+    rows = rows / torch.linalg.vector_norm(rows, dim=-1, keepdim=True).clamp_min(1e-300)
+    # The vector across three others in four dimensions, by their minors.
+    minors = [torch.linalg.det(rows[..., [j for j in range(4) if j != i]]) * (-1.0) ** i for i in range(4)]
+    return torch.nn.functional.normalize(torch.stack(minors, -1), dim=-1)
+
+
 def symmetric(six: Sequence[Tensor]) -> Tensor:
     """Six entries (..., N) as symmetric matrices (..., N, 3, 3)."""
     a, b, c, d, e, f = six

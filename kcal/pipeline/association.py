@@ -21,7 +21,7 @@ from torch import Tensor
 from kcal.corners.filters import as_gray
 from kcal.errors import InputError
 from kcal.lens.rig import RigCovariance, StereoRig
-from kcal.locate.max_likelihood import by_pose, calibration_effect
+from kcal.locate.max_likelihood import by_pose, calibration_effect, unreached_direction
 from kcal.locate.stereo import PairFit, PositionStatus, fit_pairs, inverse_range
 from kcal.pipeline.detections import Anchor, Detections
 from kcal.pipeline.epipolar_band import near_epipolar_lines
@@ -174,12 +174,7 @@ def epipolar_cost(found: PairFit, variance: float, covariance: RigCovariance | N
     The combination of the four coordinates that no point explains is orthogonal to the rows of `gain`.
     """
     fit = found.fit
-    rows = fit.gain.movedim(-1, 0)
-    # The vector across three others in four dimensions, by their minors.
-    across = torch.stack(
-        [(-1.0) ** i * torch.linalg.det(rows[:, :, [k for k in range(4) if k != i]]) for i in range(4)], -1
-    )
-    across = torch.nn.functional.normalize(across, dim=-1)
+    across = unreached_direction(fit)
     error = (across * fit.residual.mT).sum(-1)
     spread = torch.full_like(error, variance)
     if covariance is not None:

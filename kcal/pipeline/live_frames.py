@@ -10,16 +10,15 @@ from collections.abc import Callable, Iterator
 import av
 from av.container import InputContainer
 
-from kcal.corners.video import source_name
 from kcal.errors import FileError
+from kcal.pipeline.stream import CALENDAR
 from kcal.pipeline.video_frames import TimedFrame, check_size, decoded, open_video
+from kcal.sources import source_name
 
 # Seconds before the first and the last attempts to connect again.
 _FIRST_WAIT, _LAST_WAIT = 1.0, 30.0
 # Seconds without a sender report after which there are none: RFC 3550 recommends one every five.
 _NO_REPORT = 12.0
-# The year 2001 in Unix seconds: a camera whose clock was never set tells earlier times.
-_CALENDAR = 1e9
 
 
 class _NoReportsError(Exception):
@@ -98,7 +97,8 @@ def _timed(container: InputContainer, by_arrival: bool, undecoded: Callable[[], 
         report = packet.get_sidedata("prft") if packet.has_sidedata("prft") else None
         if report is not None and packet.pts is not None and packet.time_base is not None:
             wall = 1e-6 * struct.unpack("<q", bytes(report)[:8])[0]
-            if wall < _CALENDAR:
+            # A camera whose clock was never set tells earlier times.
+            if wall < CALENDAR:
                 raise _NoReportsError
             shift = wall - float(packet.pts * packet.time_base)
         if shift is None and time.monotonic() - began > _NO_REPORT:

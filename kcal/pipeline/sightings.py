@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kcal.lens.projection import Projection
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.max_likelihood import calibration_effect, symmetric
+from kcal.locate.max_likelihood import PointFit, calibration_effect, symmetric, unreached_direction
 from kcal.locate.stereo import PositionStatus, fit_pairs
 from kcal.pipeline.pairs import ObjectPairs
 
@@ -65,7 +65,7 @@ def sightings(localize: StereoLocalizer, pairs: ObjectPairs) -> Sightings:
     rig = localize.rig
     found = fit_pairs(rig, pairs.left, pairs.right, pairs.covariance, by_camera=True)
     fit, scale = found.fit, found.scale
-    across = _miss_direction(fit.gain, pairs.covariance)
+    across = _miss_direction(fit, pairs.covariance)
     fourth = fit._replace(gain=torch.cat([fit.gain, across.mT[None]], 0))
     shared = pairs.left.new_zeros(len(pairs), 4, 0)
     if localize.calibration_factor is not None:
@@ -94,16 +94,12 @@ def sightings(localize: StereoLocalizer, pairs: ObjectPairs) -> Sightings:
     )
 
 
-def _miss_direction(gain: Tensor, covariance: Tensor) -> Tensor:
+def _miss_direction(fit: PointFit, covariance: Tensor) -> Tensor:
     """(N, 4) the combination of pixels with unit variance that the point cannot explain.
 
     The gain (3, 4, N) is (Jᵀ W J)⁻¹ Jᵀ W: what it maps to zero is W⁻¹ times what J does not reach.
     """
-    rows = gain.movedim(-1, 0)
-    # One over the length of each row: they are angles and one over meters.
-    rows = rows / torch.linalg.vector_norm(rows, dim=-1, keepdim=True).clamp_min(1e-300)
-    minors = [torch.linalg.det(rows[..., [j for j in range(4) if j != i]]) * (-1.0) ** i for i in range(4)]
-    kernel = torch.stack(minors, -1)
+    kernel = unreached_direction(fit)
     white = torch.linalg.solve_ex(covariance, kernel)[0]
     variance = (kernel * white).sum(-1, keepdim=True)
     return white / variance.clamp_min(1e-300).sqrt()

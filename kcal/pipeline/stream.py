@@ -10,7 +10,6 @@ import dataclasses
 import datetime
 import math
 import os
-import queue
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -21,6 +20,7 @@ from kcal.errors import FileError, InputError
 from kcal.locate.columns import PositionColumns
 from kcal.locate.export import APPENDED, appended
 from kcal.locate.positions import Located
+from kcal.pipeline.handover import Handover
 from kcal.pipeline.ledger import Ledger
 from kcal.pipeline.lines import Moment
 from kcal.pipeline.senders import Sender
@@ -33,7 +33,7 @@ _WAITING, _CHECKPOINT = 32, 250
 # Bytes; a longer line is malformed, so that memory stays bounded.
 _LONGEST = 1 << 22
 # The year 2001 in Unix seconds: smaller times are not of the calendar.
-_CALENDAR = 1e9
+CALENDAR = 1e9
 
 
 class SourceItem(NamedTuple):
@@ -101,7 +101,6 @@ class Stream:
         self.start, self.shown = start, shown
         self.counts = StreamCounts()
         self._stop = threading.Event()
-        self._error: BaseException | None = None
         self.ledger = Ledger(journal, outputs)
         if self.ledger.state is not None:
             restore(tracker, self.ledger.state)
@@ -119,23 +118,16 @@ class Stream:
             resumes: whether it can begin at an offset; else it gives what comes now.
         """
         place, checkpoint = self.ledger.place, self.ledger.checkpoint_at
-        items: queue.Queue[SourceItem | None] = queue.Queue(_WAITING)
         begin = checkpoint.offset if resumes else 0
-        reader = threading.Thread(target=self._read, args=(source, begin, items, waits), daemon=True)
         # Moments after the checkpoint that are in the outputs already bring only the tracker to where it was.
         behind = resumes and self.ledger.state is not None and checkpoint.sequence < place.sequence
         if not behind:
             self.ledger.checkpoint(snapshot(self.tracker))
         latest = place.time if place.time is not None and not resumes else -math.inf
-        reader.start()
+        items = Handover(source(begin), _WAITING, waits=waits, stop=self._stop)
         try:
-            while not self._stop.is_set():
-                try:
-                    item = items.get(timeout=0.2)
-                except queue.Empty:
-                    continue
-                if item is None:
-                    break
+            for item in items:
+                self.counts.dropped = items.dropped
                 if isinstance(item.moment, InputError):
                     # Of lines that are read again after a restart, each was counted in the run before.
                     if item.offset > place.offset or not resumes:
@@ -168,9 +160,7 @@ class Stream:
             close = getattr(source, "close", None)
             if close is not None:
                 close()
-            reader.join(0.5 if close is None else 10.0)
-        if self._error is not None:
-            raise self._error
+            items.close(0.5 if close is None else 10.0)
         return self.counts
 
     def _write(self, moment: Moment, offset: int, sequence: int) -> None:
@@ -193,45 +183,11 @@ class Stream:
     def _calendar(self, time: float) -> datetime.datetime:
         if self.start is not None:
             return self.start + datetime.timedelta(seconds=time)
-        if time > _CALENDAR:
+        if time > CALENDAR:
             return datetime.datetime.fromtimestamp(time, datetime.UTC)
         if self.senders or any(path.suffix.lower() == ".cot" for path in self.ledger.outputs):
             raise InputError(f"time {time:g} s is not in Unix seconds, which events need; give the start of the count")
         return datetime.datetime.fromtimestamp(0, datetime.UTC)
-
-    def _read(
-        self,
-        source: Callable[[int], Iterator[SourceItem]],
-        begin: int,
-        items: queue.Queue[SourceItem | None],
-        waits: bool,
-    ) -> None:
-        try:
-            for item in source(begin):
-                while not self._stop.is_set():
-                    try:
-                        items.put(item, timeout=0.2 if waits else 0.0)
-                        break
-                    except queue.Full:
-                        if not waits:
-                            self._drop(items)
-                if self._stop.is_set():
-                    return
-        except BaseException as error:  # whatever it is, the other thread must not wait for ever
-            self._error = error
-        while not self._stop.is_set():
-            try:
-                items.put(None, timeout=0.2)
-                return
-            except queue.Full:
-                continue
-
-    def _drop(self, items: queue.Queue[SourceItem | None]) -> None:
-        try:
-            items.get_nowait()
-            self.counts.dropped += 1
-        except queue.Empty:
-            pass
 
 
 def lines_of(path: Path | None, read: Callable[[bytes], Moment]) -> Callable[[int], Iterator[SourceItem]]:

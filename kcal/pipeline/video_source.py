@@ -11,7 +11,6 @@ from pathlib import Path
 
 import torch
 
-from kcal.corners.video import is_stream, source_name
 from kcal.errors import FileError, InputError
 from kcal.lens.rig import StereoRig
 from kcal.pipeline.association import AssociationOptions
@@ -24,6 +23,7 @@ from kcal.pipeline.live_frames import live_frames
 from kcal.pipeline.pairing import pair_objects
 from kcal.pipeline.stream import SourceItem
 from kcal.pipeline.video_frames import TimedFrame, file_frames
+from kcal.sources import is_stream, source_name
 
 # Decoded frames that wait for their partners: a third of a second of video.
 _FRAMES = 8

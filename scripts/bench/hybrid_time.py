@@ -24,8 +24,10 @@ from typing import Any
 
 import numpy as np
 
+from kcal.corners.board import Board
 from scripts.bench import solver
 from scripts.shared.memory import peak_megabytes
+from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 from scripts.shared.views import COLUMNS, ROWS, SIZE, SQUARE, observed, simulate
@@ -60,31 +62,16 @@ def own(way: str, views: int, cameras: int = 1) -> dict[str, Any]:
 
 
 def spline(data: dict[str, np.ndarray], timeout: float) -> dict[str, Any]:
-    """Mrcal's splined lens by `scripts/bench/peer_mrcal.py`, with no view held out."""
-    count = len(data["pixels"])
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "problem.npz")
-        np.savez(
-            path,
-            corners=data["pixels"],
-            weight=np.ones((count, ROWS * COLUMNS)),
-            train=np.arange(count),
-            held=np.arange(0),
-            image_size=np.array(SIZE),
-            board_size=np.array([COLUMNS, ROWS]),
-            square_m=SQUARE,
-            focal=1500.0,
-        )
-        try:
-            done = subprocess.run(
-                [os.environ["KCAL_MRCAL"], "scripts/bench/peer_mrcal.py", str(path), SPLINE],
-                capture_output=True, text=True, timeout=timeout, check=True,
-            )  # fmt: skip
-        except subprocess.TimeoutExpired:
-            return {"failed": f"> {timeout:.0f} s"}
-        except subprocess.CalledProcessError as error:
-            return {"failed": error.stderr.strip().splitlines()[-1][:60]}
-    return {"seconds": json.loads(done.stdout.strip().splitlines()[-1])["cpu_s"]}
+    """Mrcal's splined lens, with no view held out."""
+    board, none = Board(columns=COLUMNS, rows=ROWS, square=SQUARE), np.arange(0)
+    weight = np.ones(data["pixels"].shape[:2])
+    try:
+        found = splined(SPLINE, data["pixels"], weight, none, size=SIZE, board=board, focal=1500.0, timeout=timeout)
+    except subprocess.TimeoutExpired:
+        return {"failed": f"> {timeout:.0f} s"}
+    except subprocess.CalledProcessError as error:
+        return {"failed": error.stderr.strip().splitlines()[-1][:60]}
+    return {"seconds": found["cpu_s"]}
 
 
 def compare(views: int, repeats: int, timeout: float) -> list[Any]:

@@ -17,11 +17,8 @@ Sampson's distance of held-out corners in pixels, which needs no board.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -40,6 +37,7 @@ from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
+from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import write_section
 from scripts.shared.timing import row, show
 from scripts.shared.wide_lens import folds, held_out, load, warped
@@ -77,26 +75,12 @@ MODELS: dict[str, Fitter] = {
 
 
 def with_mrcal(seen: Observations, weight: Tensor, parts: list[np.ndarray]) -> str:
-    """Mrcal's splined lens with a warped board, by `scripts/bench/peer_mrcal.py`."""
-    total, seconds, count = 0.0, 0.0, 0
-    with tempfile.TemporaryDirectory() as folder:
-        for out in parts:
-            path = Path(folder, "problem.npz")
-            np.savez(
-                path,
-                corners=seen.pixels().numpy(),
-                weight=weight.numpy(),
-                train=np.setdiff1d(np.arange(len(seen.views)), out),
-                held=out,
-                image_size=np.array(seen.image_size),
-                board_size=np.array([seen.board.columns, seen.board.rows]),
-                square_m=seen.board.square,
-                focal=FOCAL,
-            )
-            command = [os.environ["KCAL_MRCAL"], "scripts/bench/peer_mrcal.py", str(path), SPLINE]
-            done = subprocess.run(command, capture_output=True, text=True, check=True)
-            found = json.loads(done.stdout.strip().splitlines()[-1])
-            total, seconds, count = total + found["sum"], seconds + found["cpu_s"], count + found["count"]
+    """Mrcal's splined lens with a warped board."""
+    corners, weights = seen.pixels().numpy(), weight.numpy()
+    found = [
+        splined(SPLINE, corners, weights, out, size=seen.image_size, board=seen.board, focal=FOCAL) for out in parts
+    ]
+    total, seconds, count = (sum(one[key] for one in found) for key in ("sum", "cpu_s", "count"))
     return row(f"mrcal, {SPLINE}", f"{math.sqrt(total / count):.4f}", f"{seconds / len(parts):.1f}")
 
 
