@@ -1,7 +1,8 @@
-"""The paper's rig for `reproduce_paper.py`: its three kinds of lenses, its images, and the corners found in them.
+"""The paper's rig for `reproduce.py`: its three kinds of lenses, its printed board, images, and the corners in them.
 
-Images are rendered through a ray-traced lens, get noise, a gamma and JPEG's losses, and go through kcal's detector and
-through OpenCV's; nothing that is calibrated ever sees the truth.
+Entrance pupils move as those of real lenses of that size. Images are rendered through a ray-traced lens, get noise, a
+gamma and JPEG's losses, and go through kcal's detector and through OpenCV's; nothing that is calibrated ever sees the
+truth.
 """
 
 from __future__ import annotations
@@ -18,10 +19,11 @@ import torch
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
 from kcal.corners.observations import Failure, Observations, View
+from kcal.sim.board import PrintedBoard
 from kcal.sim.captures import PAPER_BOARD
 from kcal.sim.poses import sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
-from kcal.sim.scene import DemoScene, Places
+from kcal.sim.scene import FOCAL_MM, DemoScene, Places
 from kcal.sim.true_rig import drawn_rig
 from kcal.sim.truth import TruthLens
 
@@ -37,24 +39,28 @@ CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
 class Kind(NamedTuple):
-    """A kind of camera: lens, how badly it is put together, its look, and how much of the site's field it sees."""
+    """A kind of camera: lens, how badly it is put together, its size, its look, and what it sees of the site's field.
+
+    Its size sets how far the entrance pupil moves.
+    """
 
     title: str
     lens: str
     strength: float
+    focal_mm: float = FOCAL_MM
     look: str = "cctv"
     field: float = 1.0
 
 
 KINDS = {
     "glass": Kind("wide glass lens, poorly centered", "surveillance", 3.0),
-    "plastic": Kind("plastic aspheres", "webcam", 1.0, field=0.7),
+    "plastic": Kind("plastic aspheres", "webcam", 1.0, focal_mm=2.8, field=0.7),
     "vision": Kind("machine vision lens", "machine-vision", 1.0, look="vision", field=0.88),
 }
 
 
 def paper_scene(kind: Kind, seed: int) -> DemoScene:
-    """The site of one draw: its own lenses, survey and marks."""
+    """The site of one draw: its own lenses, print of the board, survey and marks."""
     plain = DemoScene()
 
     def seen(places: Places) -> Places:
@@ -63,8 +69,8 @@ def paper_scene(kind: Kind, seed: int) -> DemoScene:
     return dataclasses.replace(
         plain,
         seed=seed,
-        rig=drawn_rig(kind.lens, kind.strength, 100 + seed),
-        near_board=PAPER_BOARD,
+        rig=drawn_rig(kind.lens, kind.strength, 100 + seed, focal_mm=kind.focal_mm, wander=1.0),
+        near_board=PrintedBoard(*PAPER_BOARD, seed),
         render=LOOKS[kind.look],
         mark_sigma=MARK_SIGMA,
         survey_sigma=SURVEY_SIGMA,
@@ -83,15 +89,16 @@ def lenses(name: str, seed: int) -> dict[str, TruthLens]:
 def observe(folder: Path, name: str, seed: int, side: str, lens: TruthLens, views: int) -> dict[str, float]:
     """Render, spoil and search the images of one camera; the corners go to files, the times come back."""
     kind = KINDS[name]
+    board = paper_scene(kind, seed).near_board
     # Streams of their own for poses and noise, whatever else was drawn.
     generator = torch.Generator().manual_seed(1_000_003 * (seed + 1) + 17 * len(name) + (side == "right"))
-    poses = sample_board_poses(lens, PAPER_BOARD, views, generator, fill=(0.25, 0.8))
+    poses = sample_board_poses(lens, board, views, generator, fill=(0.25, 0.8))
     spent = {"render": 0.0, "detect": 0.0, "detect, OpenCV": 0.0}
     found: dict[str, list[View]] = {"kcal": [], "opencv": []}
     failures: dict[str, list[Failure]] = {"kcal": [], "opencv": []}
     for number, pose in enumerate(poses):
         start = time.process_time()
-        light = render_board(lens, pose, PAPER_BOARD, LOOKS[kind.look], generator)
+        light = render_board(lens, pose, board, LOOKS[kind.look], generator)
         packed = cv2.imencode(".jpg", light.numpy(), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
         image = np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
         spent["render"] += time.process_time() - start
