@@ -33,7 +33,7 @@ def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose:
         (f, _, cx, cy), (sf, sx, sy) = result.camera.params[:4].tolist(), (result.sigma[n] for n in ("fx", "cx", "cy"))
         out.print(f"focal length {f:.3f} ± {sf:.3f} px; principal point {cx:.2f} ± {sx:.2f}, {cy:.2f} ± {sy:.2f} px")
     if brief.pupil is not None and brief.pupil_sigma is not None:
-        out.print(f"entrance pupil: {1e3 * brief.pupil:+.2f} ± {1e3 * brief.pupil_sigma:.2f} mm at the image's corner")
+        out.print(f"entrance pupil: {1e3 * brief.pupil:+z.2f} ± {1e3 * brief.pupil_sigma:.2f} mm at the image's corner")
     if (board := result.measured_board) is not None and bool(board.amplitudes.any()):
         (bend, bend_s), (wide, wide_s), (skew, skew_s), (rest, rest_s) = (
             board.bending, board.stretch, board.shear, board.print_error,

@@ -203,7 +203,10 @@ def locate_command(
     if place is None or heading is None:
         stored = solved.mounting
         if stored is None:
-            raise InputError(f"{rig}: the file has no position of the rig; give --origin and --heading")
+            raise InputError(
+                f"{rig}: the file has no position of the rig; give --origin and --heading (or --origin 0,0,0 "
+                "--heading 0, if you only need meters from the left camera: the columns east_m, north_m and up_m)"
+            )
         if stored.covariance is not None:
             more = len(stored.covariance) - len(mounting)
             mounting = torch.nn.functional.pad(mounting, (0, more, 0, more)) + stored.covariance

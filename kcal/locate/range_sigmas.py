@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -40,6 +41,24 @@ class RangeSigmas(NamedTuple):
     total: Tensor
     ranged: Tensor
     sideways: Tensor
+
+
+def usual_ranges(rig: StereoRig) -> list[float]:
+    """Three ranges at which a rig is near, usual and far: about 25, 100 and 500 baselines, as round numbers of meters.
+
+    Example:
+        >>> from kcal.locate.budget import planned_rig
+        >>> usual_ranges(planned_rig())
+        [250.0, 1000.0, 5000.0]
+    """
+    baseline = float(rig.baseline)
+    found = []
+    for share in (25.0, 100.0, 500.0):
+        decade = 10.0 ** math.floor(math.log10(share * baseline))
+        found.append(
+            min((decade * k for k in (1.0, 2.5, 5.0, 10.0)), key=lambda d: abs(math.log(d / share / baseline)))
+        )
+    return found
 
 
 def range_sigmas(

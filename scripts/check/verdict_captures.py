@@ -57,8 +57,9 @@ def observed(
     pixels: Tensor, size: tuple[int, int], spread: Tensor | None = None, names: list[str] | None = None
 ) -> Observations:
     """Corners (V, N, 2) as observations; `spread` (V,) is the stated noise of each view's corners, px."""
+    inside = ((pixels >= -0.5) & (pixels <= pixels.new_tensor(size) - 0.5)).all(-1, keepdim=True)
     views = []
-    for i, view in enumerate(pixels.tolist()):
+    for i, view in enumerate(torch.where(inside, pixels, torch.nan).tolist()):
         corners = tuple(None if u != u else (u, v) for u, v in view)
         own = None if spread is None else float(spread[i]) ** 2
         covariance = None if own is None else tuple(None if c is None else (own, 0.0, own) for c in corners)

@@ -14,7 +14,7 @@ from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import mounting_covariance
-from kcal.locate.range_sigmas import range_sigmas
+from kcal.locate.range_sigmas import range_sigmas, usual_ranges
 from kcal.report.tables import range_sigma_rows
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
@@ -111,3 +111,16 @@ def test_rows_and_what_cannot_be_told() -> None:
     exact = planned_rig()
     exact.covariance = RigCovariance.of(exact)
     assert torch.equal(range_sigmas(exact).total, range_sigmas(exact).marks)
+
+
+@pytest.mark.parametrize(
+    ("baseline", "ranges"),
+    [
+        (0.083, [2.5, 10.0, 50.0]),
+        (0.5, [10.0, 50.0, 250.0]),
+        (8.0, [250.0, 1000.0, 5000.0]),
+        (12.5, [250.0, 1000.0, 5000.0]),
+    ],
+)
+def test_usual_ranges_follow_the_baseline(baseline: float, ranges: list[float]) -> None:
+    assert usual_ranges(planned_rig(baseline_m=baseline)) == pytest.approx(ranges)
