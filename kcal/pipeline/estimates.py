@@ -14,7 +14,6 @@ from kcal.locate.mounting import by_mounting
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
 from kcal.locate.stereo import PositionStatus, flag_positions
 from kcal.pipeline.beliefs import Summary
-from kcal.pipeline.consider import CLOCK_TERMS
 
 
 class TrackStates(NamedTuple):
@@ -23,7 +22,8 @@ class TrackStates(NamedTuple):
     Attributes:
         enu: (T, 3) meters east, north, up of the left camera; zeros unless the status is OK.
         covariance: (T, 3, 3) of `enu`; an infinite diagonal unless OK.
-        systematic: (T, 3, 3) the part of it that more frames do not reduce: calibration, mounting, clocks, refraction.
+        systematic: (T, 3, 3) the part of it that more frames do not reduce: calibration, mounting, clocks,
+            refraction, and what lasts of errors in the marks.
         velocity: (T, 3) m/s east, north, up; zeros unless OK.
         velocity_covariance: (T, 3, 3); an infinite diagonal unless OK.
         geodetic: (T, 3) latitude, longitude (degrees), ellipsoidal height (meters); the origin unless OK.
@@ -95,7 +95,7 @@ def track_states(localize: StereoLocalizer, frame: Tensor, beliefs: Summary, roo
         systematic = systematic + turn @ localize.mounting @ turn.mT
         if localize.link is not None and localize.calibration_factor is not None:
             link = torch.linalg.pinv(localize.calibration_factor) @ localize.link
-            own = beliefs.effect[..., :-CLOCK_TERMS]
+            own = beliefs.effect[..., : len(link)]
             mixed = -by_state @ own @ link @ turn.mT
             systematic = systematic + mixed + mixed.mT
     whole = random + systematic

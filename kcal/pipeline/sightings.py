@@ -31,7 +31,7 @@ class Sightings(NamedTuple):
         inverse: (N,) one over meters; may be negative.
         noise: (N, 3, 3) covariance of a, b and `inverse` from noise in the pixels; that of the miss is one.
         miss: (N,) how far the rays miss each other, in sigmas.
-        shared: (N, 4, K) effect of the calibration's K independent unit errors on the four.
+        shared: (N, 4, K) effect of K independent unit errors on the four: of the calibration, and the two that last.
         late: (2, N, 4, 3) how the four move by rates of (a, b, inverse) if the left or the right mark is a second late.
         time: (N, 2) seconds.
         row: (N,) row of the right mark, -0.5 at the top of the image to 0.5 at its bottom.
@@ -60,8 +60,14 @@ class Sightings(NamedTuple):
 
 
 @torch.no_grad()
-def sightings(localize: StereoLocalizer, pairs: ObjectPairs) -> Sightings:
-    """Measure pairs with a rig; the calibration's errors are those that `localize` includes."""
+def sightings(localize: StereoLocalizer, pairs: ObjectPairs, lasting_px: float = 0.0) -> Sightings:
+    """Measure pairs with a rig; the calibration's errors are those that `localize` includes.
+
+    Args:
+        localize: the rig and how well it is known.
+        pairs: of one moment.
+        lasting_px: standard deviation along each axis of errors of the right marks that stay as long as a target.
+    """
     rig = localize.rig
     found = fit_pairs(rig, pairs.left, pairs.right, pairs.covariance, by_camera=True)
     fit, scale = found.fit, found.scale
@@ -70,11 +76,13 @@ def sightings(localize: StereoLocalizer, pairs: ObjectPairs) -> Sightings:
     shared = pairs.left.new_zeros(len(pairs), 4, 0)
     if localize.calibration_factor is not None:
         shared = calibration_effect(fourth, scale) @ localize.calibration_factor
+    gain = fourth.gain.movedim(-1, 0)  # (N, 4, 4 pixels)
+    if lasting_px:
+        shared = torch.cat([shared, lasting_px * gain[..., 2:]], -1)
     left = _pixel_slopes(fit.projections[0], (*fit.sides.unbind(0), torch.zeros_like(fit.direction)))
     turn = rig.right_from_left_rotation
     shift = (rig.right_from_left_translation / scale)[:, None].expand_as(fit.direction)
     right = _pixel_slopes(fit.projections[1], (*(turn @ side for side in fit.sides.unbind(0)), shift))
-    gain = fourth.gain.movedim(-1, 0)  # (N, 4, 4 pixels)
     late = torch.stack([gain[..., :2] @ left, gain[..., 2:] @ right])
     # From ρ in units of the rig's size to one over meters.
     unit = torch.stack([torch.ones_like(scale), torch.ones_like(scale), 1.0 / scale])

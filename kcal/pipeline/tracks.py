@@ -39,9 +39,12 @@ class TrackOptions:
         forget_after_s: seconds without a sighting in which it may still be recognized by its motion.
         gate: largest squared Mahalanobis distance of a sighting from its track; 23.5 loses one in 10,000.
         recognize: the same of a new track from a lost one, in place and velocity; 16.8 loses one in 100.
+        lasting_px: standard deviation of the part of a mark's error that stays the same as long as a target is seen,
+            along each axis of the right image, pixels. Matched images have 0.01 px of it, compressed ones 0.02 px
+            (`scripts/check/compression.py`).
 
     Raises:
-        InputError: a value that is not positive, or a forgetting before the losing.
+        InputError: a value that is not positive (`lasting_px` may be zero), or a forgetting before the losing.
     """
 
     motions: tuple[Motion, ...] = MOTIONS
@@ -52,11 +55,13 @@ class TrackOptions:
     forget_after_s: float = 15.0
     gate: float = 23.5
     recognize: float = 16.8
+    lasting_px: float = 0.01
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if field.name != "motions" and not 0 < value < math.inf:
+            zero = field.name == "lasting_px" and value == 0
+            if field.name != "motions" and not zero and not 0 < value < math.inf:
                 raise InputError(f"{field.name} {value}: a positive number is needed")
         if not self.motions or self.forget_after_s < self.lose_after_s:
             raise InputError("tracks: at least one motion is needed, and forget_after_s not below lose_after_s")
@@ -106,8 +111,8 @@ class Tracks(NamedTuple):
 class Tracker:
     """Follow targets through pairs of marks; call it with the pairs of each moment in turn.
 
-    Errors of calibration, mounting and clocks are shared by all tracks and frames: frames reduce the noise of the
-    marks, and never what these contribute.
+    Errors of calibration, mounting and clocks are shared by all tracks and frames, and a part of each target's errors
+    in the marks lasts: frames reduce the noise of the marks, and never what these contribute.
 
     Args:
         localize: the rig, where it stands, and how well both are known.
@@ -140,7 +145,8 @@ class Tracker:
     ) -> None:
         self.localize, self.options = localize, options or TrackOptions()
         factor = localize.calibration_factor
-        self.calibration = 0 if factor is None else factor.shape[1]
+        # What lasts of the marks' errors behaves as the calibration's errors do, though each track has its own.
+        self.calibration = (0 if factor is None else factor.shape[1]) + (2 if self.options.lasting_px else 0)
         device = localize.enu_from_rig.device
         self.shared = SharedErrors(self.calibration, clock or ClockPrior(), device)
         self.time = -math.inf
@@ -174,7 +180,7 @@ class Tracker:
             self.shared.start = time
         self._predict(time)
         if len(pairs):
-            self._take(pairs, sightings(self.localize, pairs))
+            self._take(pairs, sightings(self.localize, pairs, self.options.lasting_px))
         self._sort_out()
         if self.history is not None:
             keys = [track.key for track in self.records]

@@ -1,18 +1,21 @@
-"""What compression of videos does to matched disparities: ten moving plates of 16 by 12 px at several qualities.
+"""What compression of videos does to matched disparities: ten plates of 16 by 12 px at several paces and qualities.
 
-    python -m scripts.check.compression
+    python -m scripts.check.compression --write            docs/measured/pairing.md, section compression
 
-The default of `kcal live --match-sigma` is what compression adds at CRF 23.
+The default of `kcal live --match-sigma` is what compression adds at CRF 23. A part of the errors stays the same over
+all frames, which the tracker must know (`TrackOptions.lasting_px`): it shows in the mean of each plate's errors.
 """
 
 from __future__ import annotations
 
+import argparse
 import functools
 import itertools
 import math
 import tempfile
 from collections.abc import Iterator
 from fractions import Fraction
+from typing import NamedTuple
 
 import av
 import numpy as np
@@ -24,24 +27,30 @@ from kcal.lens.rig import StereoRig
 from kcal.pipeline.association import AssociationOptions
 from kcal.pipeline.video_source import VideoPairs
 from scripts.shared.object_scene import Floats, exposed, paint_plate, plate, true_box
-from scripts.shared.page import table
+from scripts.shared.page import table, write_section
 
-SIZE, FOCAL, FRAMES, RATE = (320, 240), 400.0, 40, 25
+SIZE, FOCAL, FRAMES, RATE = (320, 240), 400.0, 100, 25
+# Shares of the full pace, at which plates move by some 0.4 px a frame.
+PACES = (1.0, 0.2, 0.0)
 ACROSS = [(-120, -80), (-40, -80), (40, -80), (110, -80), (-100, 0), (-20, 0), (60, 0), (-90, 80), (0, 80), (90, 80)]
 DEPTHS = [40.0, 50.0, 60.0, 45.0, 70.0, 40.0, 80.0, 55.0, 65.0, 45.0]
 
 
-def places(time: float) -> Tensor:
+def places(time: float, pace: float) -> Tensor:
     depth = torch.tensor(DEPTHS, dtype=torch.float64)
     start = torch.tensor(ACROSS, dtype=torch.float64) * depth[:, None] / FOCAL
-    pace = torch.from_numpy(np.random.default_rng(3).normal(0.0, 1.5, (len(depth), 3)))
-    return torch.cat([start, depth[:, None]], 1) + time * pace
+    velocity = torch.from_numpy(np.random.default_rng(3).normal(0.0, 1.5, (len(depth), 3)))
+    return torch.cat([start, depth[:, None]], 1) + time * pace * velocity
 
 
-def drawn(rig: StereoRig, side: int, time: float, random: np.random.Generator) -> tuple[Tensor, list[Floats]]:
+def drawn(
+    rig: StereoRig, side: int, time: float, pace: float, random: np.random.Generator
+) -> tuple[Tensor, list[Floats]]:
     """Gray levels and the true boxes."""
     image = np.full(SIZE[::-1], 30.0)
-    items = [plate(point, (16.0, 12.0), FOCAL, 60.0, np.random.default_rng(k)) for k, point in enumerate(places(time))]
+    items = [
+        plate(point, (16.0, 12.0), FOCAL, 60.0, np.random.default_rng(k)) for k, point in enumerate(places(time, pace))
+    ]
     for item in items:
         paint_plate(image, rig, side, item)
     return exposed(image, 1.0, random).round().clamp(0, 255).byte(), [true_box(rig, side, item) for item in items]
@@ -62,43 +71,73 @@ def next_of(turns: Iterator[Floats], _: object) -> Floats:
     return next(turns)
 
 
+class Errors(NamedTuple):
+    """Of matched disparities (frames, plates), and the variances stated for them; NaN where a plate was not matched."""
+
+    error: Floats
+    variance: Floats
+
+
+def errors_of(rig: StereoRig, films: list[list[Tensor]], boxes: list[list[Floats]], pace: float, crf: int) -> Errors:
+    """Of videos of a quality."""
+    found = Errors(*(np.full((FRAMES, len(DEPTHS)), np.nan) for _ in Errors._fields))
+    with tempfile.TemporaryDirectory() as folder:
+        videos = [f"{folder}/{side}.mp4" for side in (0, 1)]
+        for video, film in zip(videos, films, strict=True):
+            write(video, film, crf)
+        # The detector is asked for the left and the right image in turn, and knows the answers.
+        turns = itertools.chain.from_iterable(zip(*boxes, strict=True))
+        source = VideoPairs(
+            videos[0], videos[1], rig, functools.partial(next_of, turns), AssociationOptions(),
+            late=lambda: 0.0, match_sigma=0.0,
+        )  # fmt: skip
+        for frame, item in enumerate(source(0)):
+            assert not isinstance(item.moment, Exception)
+            pairs = item.moment.pairs
+            left, right, _ = rig(places(item.moment.time, pace))
+            which = torch.cdist(pairs.left, left).argmin(-1)
+            c = pairs.covariance
+            error = (pairs.left - pairs.right)[:, 0] - (left - right)[which, 0]
+            variance = c[:, 0, 0] + c[:, 2, 2] - 2 * c[:, 0, 2]
+            for i in (c[:, 0, 2] > 0.5).nonzero()[:, 0].tolist():
+                found.error[frame, which[i]], found.variance[frame, which[i]] = error[i], variance[i]
+    return found
+
+
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
     torch.set_num_threads(1)
     camera = Camera.build(focal=(FOCAL, FOCAL), center=(159.5, 119.5), size=SIZE, model="pinhole")
     rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
-    films, boxes = [], []
-    for side in (0, 1):
-        random = np.random.default_rng(side)
-        made = [drawn(rig, side, number / RATE, random) for number in range(FRAMES)]
-        films.append([image for image, _ in made])
-        boxes.append([np.array(found) + 0.5 for _, found in made])
     rows: list[list[object]] = []
-    for crf in (0, 17, 23, 28):
-        with tempfile.TemporaryDirectory() as folder:
-            videos = [f"{folder}/{side}.mp4" for side in (0, 1)]
-            for video, film in zip(videos, films, strict=True):
-                write(video, film, crf)
-            # The detector is asked for the left and the right image in turn, and knows the answers.
-            turns = itertools.chain.from_iterable(zip(*boxes, strict=True))
-            source = VideoPairs(
-                videos[0], videos[1], rig, functools.partial(next_of, turns), AssociationOptions(),
-                late=lambda: 0.0, match_sigma=0.0,
-            )  # fmt: skip
-            errors, stated = [], []
-            for item in source(0):
-                assert not isinstance(item.moment, Exception)
-                pairs, true = item.moment.pairs, places(item.moment.time)
-                left, right, _ = rig(true)
-                which = torch.cdist(pairs.left, left).argmin(-1)
-                c = pairs.covariance
-                matched = c[:, 0, 2] > 0.5
-                error = (pairs.left - pairs.right)[:, 0] - (left - right)[which, 0]
-                errors.append(error[matched])
-                stated.append((c[:, 0, 0] + c[:, 2, 2] - 2 * c[:, 0, 2])[matched])
-        error, variance = float(torch.cat(errors).square().mean()), float(torch.cat(stated).mean())
-        more = math.sqrt(max(error - variance, 0.0))
-        rows.append([crf, f"{math.sqrt(error):.3f}", f"{math.sqrt(variance):.3f}", f"{more:.3f}"])
-    print("\n".join(table(["CRF of x264", "RMS of disparity, px", "stated, px", "compression adds, px"], rows)))
+    for pace in PACES:
+        films, boxes = [], []
+        for side in (0, 1):
+            random = np.random.default_rng(side)
+            made = [drawn(rig, side, number / RATE, pace, random) for number in range(FRAMES)]
+            films.append([image for image, _ in made])
+            boxes.append([np.array(found) + 0.5 for _, found in made])
+        for crf in (0, 17, 23, 28):
+            error, variance = errors_of(rig, films, boxes, pace, crf)
+            rms, stated = (math.sqrt(float(np.nanmean(value))) for value in (error**2, variance))
+            more = math.sqrt(max(rms**2 - stated**2, 0.0))
+            # The mean over n frames has this variance, besides that of noise: its scatter within the plate over n.
+            noise = np.nanvar(error, 0, ddof=1) / (~np.isnan(error)).sum(0)
+            lasting = math.sqrt(max(float((np.nanmean(error, 0) ** 2 - noise).mean()), 0.0))
+            rows.append([f"{pace:g}", crf, *(f"{value:.3f}" for value in (rms, stated, more, lasting))])
+            print(*rows[-1], sep=" | ", flush=True)
+    heads = ["pace", "CRF of x264", "RMS of disparity, px", "stated, px", "compression adds, px", "lasts, px"]
+    lines = [
+        f"Ten plates of 16 by 12 px in {FRAMES} frames, H.264 by x264. *Pace*: 1 is some 0.4 px a frame, 0 stands "
+        "still. *Lasts*: the part of each plate's error that is the same in all frames. Made by "
+        "`scripts/check/compression.py`.",
+        "",
+        *table(heads, rows),
+    ]
+    if options.write:
+        write_section("pairing.md", "compression", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ filter (the package `stonesoup`) get the same pairs.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -164,7 +165,8 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
     plain = StereoLocalizer(
         site.true, origin=site.localize.origin, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0
     )
-    equal = Tracker(plain, options, clock=ClockPrior(offset_s=OFFSET))
+    # The rival knows no errors that last, and the marks have none.
+    equal = Tracker(plain, dataclasses.replace(options, lasting_px=0.0), clock=ClockPrior(offset_s=OFFSET))
     positions, pixels = OfPositions(ACCELERATION, options.speed_mps), OfPixels(ACCELERATION, options.speed_mps)
     for frame in range(frames):
         time = frame / 10.0
