@@ -18,6 +18,8 @@ from torch import Tensor
 
 from kcal.errors import FileError
 
+# A file whose frames end this much before it says, in seconds or as a share of its length, is damaged or cut off.
+_SHORT_S, _SHORT_SHARE = 1.0, 0.02
 # Seconds before a wanted frame to which a file is wound: decoders are exact again after the next key frame.
 _RUN_UP = 1.0
 # No playlists and descriptions of sessions, which name other files and addresses.
@@ -58,7 +60,11 @@ def check_size(frame: av.VideoFrame | VideoStream, size: tuple[int, int], name: 
 
 
 def file_frames(
-    path: Path, size: tuple[int, int], since: float = 0.0, undecoded: Callable[[], None] = lambda: None
+    path: Path,
+    size: tuple[int, int],
+    since: float = 0.0,
+    undecoded: Callable[[], None] = lambda: None,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> Iterator[TimedFrame]:
     """The frames of a file in the order of their times, in the orientation in which the sensor wrote them.
 
@@ -67,24 +73,27 @@ def file_frames(
         size: (width, height) of the camera's images.
         since: seconds of the first frame that is wanted; some frames before it come too.
         undecoded: called for each frame that is damaged or not later than the one before; it is left out.
+        tell: called if the frames end long before the file says.
 
     Raises:
         FileError: no such file, no video, one without times, no frame that can be decoded, or frames of another size.
     """
     if since > 0:
-        with contextlib.closing(_wound(path, size, since, lambda: None)) as frames:
+        with contextlib.closing(_wound(path, size, since, lambda: None, lambda _: None)) as frames:
             first = next(frames, None)
         # Where winding overshoots, the whole file is decoded.
         since = since if first is not None and first.time <= since else 0.0
     count = 0
-    for frame in _wound(path, size, since, undecoded):
+    for frame in _wound(path, size, since, undecoded, tell):
         count += 1
         yield frame
     if not count:
         raise FileError(f"{path}: no frame can be decoded")
 
 
-def _wound(path: Path, size: tuple[int, int], since: float, undecoded: Callable[[], None]) -> Generator[TimedFrame]:
+def _wound(
+    path: Path, size: tuple[int, int], since: float, undecoded: Callable[[], None], tell: Callable[[str], None]
+) -> Generator[TimedFrame]:
     if not path.is_file():
         raise FileError(f"{path}: no such file")
     allowed = {"protocol_whitelist": "file", "format_whitelist": _CONTAINERS}
@@ -110,6 +119,10 @@ def _wound(path: Path, size: tuple[int, int], since: float, undecoded: Callable[
                 continue
             latest = frame.place
             yield frame
+        begin, length = container.start_time or 0, (container.duration or 0) / av.time_base
+        missing = begin / av.time_base + length - 1e-6 * latest
+        if missing > max(_SHORT_S, _SHORT_SHARE * length):
+            tell(f"{path}: its frames end {missing:.1f} s before its stated end: it is damaged or was cut off")
 
 
 def open_video(address: str, name: str, **options: str) -> InputContainer:

@@ -75,7 +75,7 @@ class VideoPairs:
         match_sigma: pixels, error of a match along each axis besides what its pixels tell; compression makes it: 0.06
             in H.264 of usual quality (CRF 23 of x264, `scripts/check/compression.py`).
         apart_s: frames that are farther apart in time are not paired.
-        tell: called with what happens to live streams, from another thread.
+        tell: called with what happens to live streams, and of files that end early, from another thread.
 
     Raises:
         InputError: a `match_sigma` that is negative or not finite, or a file beside a live stream.
@@ -148,7 +148,7 @@ class VideoPairs:
         if self.live:
             frames = live_frames(video, size, self._ended, self._tell, undecoded)
         else:
-            frames = file_frames(Path(video), size, since, undecoded)
+            frames = file_frames(Path(video), size, since, undecoded, self._tell)
         running = Handover(frames, _FRAMES, waits=not self.live)
         self._running.append(running)
         for frame in running:

@@ -47,10 +47,18 @@ def drawn_image(rig: StereoRig, side: int, time: float, random: np.random.Genera
 
 
 def write_video(
-    path: Path, images: Sequence[Image], times: Sequence[float], pixel_format: str = "yuvj420p", crf: int = 0
+    path: Path,
+    images: Sequence[Image],
+    times: Sequence[float],
+    pixel_format: str = "yuvj420p",
+    crf: int = 0,
+    index_first: bool = False,
 ) -> Path:
-    """A video whose frames have the given times, to a millisecond; without losses if `crf` is 0."""
-    with av.open(str(path), "w") as container:
+    """A video whose frames have the given times, to a millisecond; without losses if `crf` is 0.
+
+    With `index_first` an MP4 file can be read as far as it goes when its end is missing.
+    """
+    with av.open(str(path), "w", options={"movflags": "faststart"} if index_first else {}) as container:
         stream = container.add_stream("libx264", rate=25, options={"crf": str(crf), "preset": "fast", "g": "12"})
         stream.width, stream.height = images[0].shape[1], images[0].shape[0]
         stream.pix_fmt = pixel_format

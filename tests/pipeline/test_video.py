@@ -146,6 +146,23 @@ def test_damaged_frames_are_left_out_and_counted(tmp_path: Path) -> None:
         assert np.abs(frame.gray().numpy().astype(float) - scene[number]).mean() < 1.0, number
 
 
+@pytest.mark.parametrize("name", ["cut.mkv", "cut.mp4"])
+def test_a_file_that_was_cut_off_is_told(tmp_path: Path, name: str) -> None:
+    times = [number / 10 for number in range(40)]
+    whole = write_video(tmp_path / f"whole-{name}", images(40), times, index_first=name.endswith("mp4"))
+    told: list[str] = []
+    assert len(list(file_frames(whole, SIZE, tell=told.append))) == 40
+    assert not told
+    content = whole.read_bytes()
+    path = tmp_path / name
+    path.write_bytes(content[: int(0.6 * len(content))])
+    found = list(file_frames(path, SIZE, tell=told.append))
+    assert 8 < len(found) < 30
+    missing = 4.0 - found[-1].time
+    assert len(told) == 1
+    assert abs(float(told[0].split("end ")[1].split()[0]) - missing) < 0.15
+
+
 def test_a_handover_waits_or_drops_the_oldest() -> None:
     made: list[int] = []
     release = threading.Event()
