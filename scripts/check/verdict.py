@@ -169,7 +169,7 @@ def page(lines: list[dict[str, Any]]) -> str:
         "the model. *Mirrored or mixed*: all views mirrored, some mirrored, or two boards whose squares differ by 1 to "
         "3 % in one direction. Mirroring does not change a camera's calibration, only everything that is seen with it.",
     ]  # fmt: skip
-    return "\n".join(["# May it be used?", "", CONCLUSIONS.get("verdict.md", ""), "", *text, ""])
+    return "\n".join(["# May it be used?", "", CONCLUSIONS["verdict.md"], "", *text, ""])
 
 
 def main() -> None:
