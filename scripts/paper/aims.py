@@ -167,10 +167,16 @@ def _limits(name: str, runs: list[dict]) -> str:
 
 
 def _pipeline(name: str, runs: list[dict]) -> str:
-    """What of the distance to OpenCV is not its cameras."""
+    """Step by step from OpenCV's pipeline to kcal's default."""
     both, mixed, own = (median(everywhere(run, label) for run in runs) for label in ("OpenCV", MIXED, "14"))
-    return (
-        f"*{name}*, all over the image: OpenCV's pipeline {number(both, 0)} m, its cameras in kcal's rig "
-        f"{number(mixed, 0)} m, kcal's camera of as many coefficients {number(own, 0)} m: the first step is rig and "
-        "inverse, the second corners and fit."
-    )
+    default = median(everywhere(run, "hybrid") for run in runs)
+    parts = [
+        f"{title}: {f'{value:.0f} m' if math.isfinite(value) else 'some points have no place in half of the draws'}"
+        for title, value in (
+            ("OpenCV's pipeline", both),
+            ("its cameras in kcal's rig", mixed),
+            ("kcal's cameras of as many coefficients", own),
+            ("kcal's default", default),
+        )
+    ]
+    return f"*{name}*, all over the image: {'; '.join(parts)}."

@@ -66,7 +66,7 @@ def _head(results: Results, views: int) -> list[str]:
         "bent by 0.7 mm about an oblique axis, off by smooth errors of 0.03 mm; another print for each draw, the same "
         "for both cameras. Nobody is told.",
         "",
-        f"**The pictures.** {_look('cctv')}, for *vision* {_look('vision')}; JPEG of "
+        f"**The pictures.** Rendered with {_look('cctv')}, for *vision* {_look('vision')}; JPEG of "
         f"quality {QUALITY}. kcal gets the corners that its own detector finds; OpenCV those of "
         "`findChessboardCorners` and `cornerSubPix` (window 11, as in its tutorial).",
         "",
@@ -134,7 +134,9 @@ def _figure_3(results: Results) -> list[str]:
             ["held-out views, px", *(middle(held_out[m], 4) for m in models)],
         ]
         best, chosen = (lowest({m: median(each[m]) for m in models}) for each in (positions, held_out))
-        rises.append(f"{number(100 * (median(positions['24']) / median(positions['20']) - 1), 1)} % ({name})")
+        rise = 100 * (median(positions["24"]) / median(positions["20"]) - 1)
+        if math.isfinite(rise):
+            rises.append(f"{rise:.1f} % ({name})")
         lines += [
             *table([name, *models], rows),
             "",
@@ -145,7 +147,7 @@ def _figure_3(results: Results) -> list[str]:
         *lines,
         "The paper finds its minimum at 20 and a rise beyond. From 20 to 24 coefficients the median position error "
         f"here changes by {', '.join(rises)}. Error at infinity: over the whole image, after the best rotation. "
-        "A held-out residual that is missing: a corner was where that lens has no pixel.",
+        "A value that is missing: in half of the draws or more, the lens has no ray or pixel for a point or corner.",
     ]
 
 
