@@ -157,7 +157,7 @@ def edges(results: Results) -> list[str]:
         "![The seven points in the image, and reprojection error at the center and at the edge](paper-edges.png)",
         "",
         "Center: the middle half of the image's width. Mean reprojection error of the seven points there, and of the "
-        "others, pixels:",
+        "others, pixels. A bar or value that is missing: half of the draws have a point there without a pixel.",
         "",
     ]
     for name, runs in results.items():
