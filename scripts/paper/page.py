@@ -158,7 +158,8 @@ def _marks(results: Results) -> list[str]:
         "![Seven points, true and estimated: whole pixels, sub-pixel marks, models](paper-map.png)",
         "",
         "The map shows the first draw of *plastic*, true in magenta, estimated in blue, ranges logarithmic; a point "
-        "without blue has no place with that lens. Below: the median range error of the points at 1 km and beyond over all draws, percent.",
+        "without blue has no place with that lens. Below: the median range error of the points at 1 km and beyond over "
+        "all draws, percent.",
         "",
     ]
     shown = [("14", "integer"), ("14", "marked"), ("20", "marked"), ("hybrid", "marked")]
