@@ -78,7 +78,8 @@ def interpreter(version: str) -> str | None:
     if sys.version.startswith(f"{version}."):
         return str(Path(sys.base_prefix, "bin", "python3"))
     found = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))
-    return shutil.which(f"python{version}") or (str(found[-1]) if found else None)
+    # Its own files first: what a version manager puts on the PATH runs only where that version was chosen.
+    return str(found[-1]) if found else shutil.which(f"python{version}")
 
 
 def call(*words: object, **options: Any) -> str:
