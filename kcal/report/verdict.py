@@ -175,7 +175,7 @@ class Verdict:
             return "mark targets more accurately, or use a longer baseline or focal length: no calibration mends this"
         if self.advice and not self.usable:
             return self.advice[0]
-        return "none is needed" if self.usable else "take more views of the board, near the borders of the image too"
+        return "nothing is needed" if self.usable else "take more views of the board, near the borders of the image too"
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain numbers and texts, for JSON; a range that cannot be told has no sigma."""
