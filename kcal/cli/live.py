@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
-import math
 import os
 import signal
 import sys
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.live_map import LiveMap
     from kcal.pipeline.stream import StreamCounts
-    from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
+    from kcal.pipeline.tracks import Tracker, Tracks
     from kcal.pipeline.video_source import VideoPairs
 
 
@@ -123,7 +121,7 @@ def live_command(
     from kcal.pipeline.lines import read_moment
     from kcal.pipeline.senders import sender_to
     from kcal.pipeline.stream import Stream, lines_of
-    from kcal.pipeline.tracks import Tracker
+    from kcal.pipeline.tracks import Tracker, TrackOptions
 
     if (origin is None) != (heading is None):
         raise typer.BadParameter("--origin and --heading belong together")
@@ -141,7 +139,7 @@ def live_command(
     locate = Locator(load_rig(rig), origin=place, heading_deg=heading, pixel_sigma=pixel_sigma)
     solved = locate.localize.rig
 
-    tracker = Tracker(locate.localize, _track_options(match_sigma if videos else 0.0), clock=clock)
+    tracker = Tracker(locate.localize, TrackOptions.for_video(match_sigma) if videos else None, clock=clock)
     pairs = _video_pairs(videos, detector, tracker, options, match_sigma) if videos and detector else None
     source = pairs or lines_of(lines, lambda line: read_moment(line, solved, options, pixel_sigma))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
@@ -184,14 +182,6 @@ def summary(counts: StreamCounts) -> str:
     ):
         parts += [f"{count:,} {what}"] if count else []
     return "; ".join(parts)
-
-
-def _track_options(match_sigma: float) -> TrackOptions:
-    """A third of what compression adds to a match lasts (`scripts/check/compression.py`)."""
-    from kcal.pipeline.tracks import TrackOptions
-
-    plain = TrackOptions()
-    return dataclasses.replace(plain, lasting_px=math.hypot(plain.lasting_px, match_sigma / 3.0))
 
 
 def _video_pairs(

@@ -107,9 +107,9 @@ def told_usable(
 
 def print_verdict(verdict: Verdict) -> None:
     """Print answers, reason, next step and findings."""
-    for answer in verdict.answers:
-        if len(verdict.answers) == 1 and answer.text == verdict.reason:
-            break  # it is the line below
+    # A single answer is the reason, and said once.
+    single = [answer.text for answer in verdict.answers] == [verdict.reason]
+    for answer in () if single else verdict.answers:
         out.print(f"{'[green]yes[/]' if answer.ok else '[red]no[/]'}: {answer.text}")
     out.print(f"[bold]{'YES' if verdict.usable else 'NO'}[/]:", end=" ")
     out.print(verdict.reason, markup=False)

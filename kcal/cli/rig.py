@@ -121,7 +121,7 @@ def solve_command(
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
     from kcal.locate.mounting import placed_rig
-    from kcal.locate.range_sigmas import range_sigmas, usual_ranges
+    from kcal.locate.range_sigmas import range_sigmas
     from kcal.report.tables import range_sigma_rows
 
     sources = Sources(
@@ -164,7 +164,7 @@ def solve_command(
         save_rig_picture(picture, result)
     print_rig(result, lines)
     try:
-        print_table(range_sigma_rows(range_sigmas(rig, usual_ranges(rig), pixel_sigma=mark_sigma)))
+        print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=mark_sigma)))
     except InputError as error:
         warn(f"range errors are not split: {error}")
     print_wrote(output, picture)

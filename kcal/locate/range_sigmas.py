@@ -51,19 +51,19 @@ def usual_ranges(rig: StereoRig) -> list[float]:
         >>> usual_ranges(planned_rig())
         [250.0, 1000.0, 5000.0]
     """
-    baseline = float(rig.baseline)
-    found = []
-    for share in (25.0, 100.0, 500.0):
-        decade = 10.0 ** math.floor(math.log10(share * baseline))
-        found.append(
-            min((decade * k for k in (1.0, 2.5, 5.0, 10.0)), key=lambda d: abs(math.log(d / share / baseline)))
-        )
-    return found
+    wanted = [share * float(rig.baseline) for share in (25.0, 100.0, 500.0)]
+    return [_round_number(meters) for meters in wanted]
+
+
+def _round_number(meters: float) -> float:
+    """The nearest of 1, 2.5, 5, 10, 25 and so on, by ratio."""
+    decade = 10.0 ** math.floor(math.log10(meters))
+    return min((decade * k for k in (1.0, 2.5, 5.0, 10.0)), key=lambda number: abs(math.log(number / meters)))
 
 
 def range_sigmas(
     rig: StereoRig,
-    distances: Tensor | Sequence[float] = (250.0, 1000.0, 5000.0),
+    distances: Tensor | Sequence[float] | None = None,
     *,
     pixel_sigma: float = 0.3,
     pixel: Sequence[float] | None = None,
@@ -76,7 +76,7 @@ def range_sigmas(
 
     Args:
         rig: with its `covariance` and `mounting`; where one is None, its part is 0.
-        distances: (D,) ranges from the left camera, meters.
+        distances: (D,) ranges from the left camera, meters; `usual_ranges` if left out.
         pixel_sigma: of a mark along each axis, px.
         pixel: where in the left image; the direction in which both cameras' axes look, if left out.
 
@@ -95,7 +95,7 @@ def range_sigmas(
         [221, 0, 44, 225]
     """
     variance = checked_rig(rig, pixel_sigma) ** 2
-    far, points, left, right = points_at(rig, distances, pixel)
+    far, points, left, right = points_at(rig, usual_ranges(rig) if distances is None else distances, pixel)
     with torch.no_grad():
         found = fit_pairs(rig, left, right, by_camera=rig.covariance is not None)
         # Meters of range by the fit's inverse distance.

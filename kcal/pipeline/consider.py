@@ -77,7 +77,8 @@ class SharedErrors:
     b counts from `values` for the clock: after each `settle`, the best estimate of b is zero.
 
     Args:
-        calibration: K, how many independent unit errors the calibration has.
+        calibration: K, how many independent unit errors are not estimated: those of the calibration, and what lasts of
+            errors in the marks.
         clock: what is known of the clocks.
         device: of the tensors.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -65,6 +65,14 @@ class TrackOptions:
                 raise InputError(f"{field.name} {value}: a positive number is needed")
         if not self.motions or self.forget_after_s < self.lose_after_s:
             raise InputError("tracks: at least one motion is needed, and forget_after_s not below lose_after_s")
+
+    @classmethod
+    def for_video(cls, match_sigma: float) -> Self:
+        """Options for matches in compressed video; `match_sigma` is as in `kcal live`.
+
+        A third of what compression adds to a match lasts (`scripts/check/compression.py`).
+        """
+        return cls(lasting_px=math.hypot(cls.lasting_px, match_sigma / 3.0))
 
 
 @dataclasses.dataclass

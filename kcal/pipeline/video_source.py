@@ -73,7 +73,8 @@ class VideoPairs:
         options: of the pairing of boxes.
         late: seconds by which the right images are later than their times say, as known at present.
         match_sigma: pixels, error of a match along each axis besides what its pixels tell; compression makes it: 0.06
-            in H.264 of usual quality (CRF 23 of x264, `scripts/check/compression.py`).
+            in H.264 of usual quality (CRF 23 of x264, `scripts/check/compression.py`). Make the tracker with
+            `TrackOptions.for_video(match_sigma)`.
         apart_s: frames that are farther apart in time are not paired.
         tell: called with what happens to live streams, and of files that end early, from another thread.
 

@@ -57,9 +57,8 @@ def observed(
     pixels: Tensor, size: tuple[int, int], spread: Tensor | None = None, names: list[str] | None = None
 ) -> Observations:
     """Corners (V, N, 2) as observations; `spread` (V,) is the stated noise of each view's corners, px."""
-    inside = ((pixels >= -0.5) & (pixels <= pixels.new_tensor(size) - 0.5)).all(-1, keepdim=True)
     views = []
-    for i, view in enumerate(torch.where(inside, pixels, torch.nan).tolist()):
+    for i, view in enumerate(pixels.tolist()):
         corners = tuple(None if u != u else (u, v) for u, v in view)
         own = None if spread is None else float(spread[i]) ** 2
         covariance = None if own is None else tuple(None if c is None else (own, 0.0, own) for c in corners)
@@ -68,12 +67,13 @@ def observed(
 
 
 def corners_of(lens: TruthLens, points: Tensor, poses: Sequence[tuple[Tensor, Tensor]], noise: Tensor) -> Tensor:
-    """(V, N, 2) corners of a board whose corners truly are at `points`, with noise (V, N, 2)."""
+    """(V, N, 2) corners of a board whose corners truly are at `points`, with noise (V, N, 2); NaN outside the image."""
     seen = []
     for rotation, translation in poses:
         pixels, valid = lens.project(points @ rotation.T + translation)
         seen.append(torch.where(valid[:, None], pixels, torch.nan))
-    return torch.stack(seen) + noise
+    noisy = torch.stack(seen) + noise
+    return torch.where(lens.inside(noisy)[..., None], noisy, torch.nan)
 
 
 def drawn(kind: str, seed: int) -> Planted | PlantedPair:
@@ -186,7 +186,8 @@ def _pair(kind: str, draw: random.Random, seed: int, generator: torch.Generator)
             points = large.points @ rotation.T + translation + c * moved
             pixels, valid = lens.project(points if c == 0 else rig.right_from_left(points))
             noise = sigma * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
-            seen[c].append(torch.where(valid[:, None], pixels + noise, torch.nan))
+            noisy = pixels + noise
+            seen[c].append(torch.where((valid & lens.inside(noisy))[:, None], noisy, torch.nan))
     pairs = [
         observed(torch.stack(side), lens.size).model_copy(update={"board": large})
         for side, lens in zip(seen, (rig.left, rig.right), strict=True)

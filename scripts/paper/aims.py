@@ -170,8 +170,9 @@ def _pipeline(name: str, runs: list[dict]) -> str:
     """Step by step from OpenCV's pipeline to kcal's default."""
     both, mixed, own = (median(everywhere(run, label) for run in runs) for label in ("OpenCV", MIXED, "14"))
     default = median(everywhere(run, "hybrid") for run in runs)
+    lost = "some points have no place in half of the draws"
     parts = [
-        f"{title}: {f'{value:.0f} m' if math.isfinite(value) else 'some points have no place in half of the draws'}"
+        f"{title}: {number(value, 0)} m" if math.isfinite(value) else f"{title}: {lost}"
         for title, value in (
             ("OpenCV's pipeline", both),
             ("its cameras in kcal's rig", mixed),

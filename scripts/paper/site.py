@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,7 +25,6 @@ from kcal.sim.poses import sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
 from kcal.sim.scene import FOCAL_MM, DemoScene, Places
 from kcal.sim.true_rig import drawn_rig
-from kcal.sim.truth import TruthLens
 
 BOARD = Board(columns=PAPER_BOARD.columns, rows=PAPER_BOARD.rows, square=PAPER_BOARD.square)
 QUALITY = 90  # of JPEG
@@ -80,25 +79,18 @@ def paper_scene(kind: Kind, seed: int) -> DemoScene:
     )
 
 
-def lenses(name: str, seed: int) -> dict[str, TruthLens]:
-    """The two cameras of a kind's rig."""
-    rig: Any = paper_scene(KINDS[name], seed).rig
-    return {"left": rig.left, "right": rig.right}
-
-
-def observe(folder: Path, name: str, seed: int, side: str, lens: TruthLens, views: int) -> dict[str, float]:
+def observe(folder: Path, name: str, scene: DemoScene, side: str, views: int) -> dict[str, float]:
     """Render, spoil and search the images of one camera; the corners go to files, the times come back."""
-    kind = KINDS[name]
-    board = paper_scene(kind, seed).near_board
+    lens, board = getattr(scene.rig, side), scene.near_board
     # Streams of their own for poses and noise, whatever else was drawn.
-    generator = torch.Generator().manual_seed(1_000_003 * (seed + 1) + 17 * len(name) + (side == "right"))
+    generator = torch.Generator().manual_seed(1_000_003 * (scene.seed + 1) + 17 * len(name) + (side == "right"))
     poses = sample_board_poses(lens, board, views, generator, fill=(0.25, 0.8))
     spent = {"render": 0.0, "detect": 0.0, "detect, OpenCV": 0.0}
     found: dict[str, list[View]] = {"kcal": [], "opencv": []}
     failures: dict[str, list[Failure]] = {"kcal": [], "opencv": []}
     for number, pose in enumerate(poses):
         start = time.process_time()
-        light = render_board(lens, pose, board, LOOKS[kind.look], generator)
+        light = render_board(lens, pose, board, scene.render, generator)
         packed = cv2.imencode(".jpg", light.numpy(), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
         image = np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
         spent["render"] += time.process_time() - start

@@ -20,7 +20,7 @@ from kcal.lens.camera import Camera
 from kcal.sim.infinity import error_at_infinity
 from kcal.sim.truth import TruthLens
 from scripts.paper.locate import bound, by_kcal, by_opencv, judge, nowhere
-from scripts.paper.site import KINDS, lenses, observe, paper_scene
+from scripts.paper.site import KINDS, observe, paper_scene
 
 # What the paper calls 14, 16, 18, 20, 20 (its second one), 22 and 24 parameters.
 MODELS = {
@@ -51,17 +51,18 @@ class _Run:
 
     def __init__(self, folder: Path, name: str, seed: int, views: int) -> None:
         self.folder, self.seed, self.name = folder, seed, name
-        self.true: dict[str, TruthLens] = lenses(name, seed)
         self.scene = paper_scene(KINDS[name], seed)
+        rig: Any = self.scene.rig
+        self.true: dict[str, TruthLens] = {"left": rig.left, "right": rig.right}
         self.path = folder / "result.json"
         self.result: dict[str, Any] = {
             "name": name, "seed": seed, "spent": {}, "cameras": {}, "held_out": {}, "located": {}, "failed": [],
         }  # fmt: skip
         if self.path.exists():
             self.result |= json.loads(self.path.read_text())
-        for side, lens in self.true.items():
+        for side in self.true:
             if not all((folder / f"{side}.{who}.json").exists() for who in ("kcal", "opencv")):
-                for stage, seconds in observe(folder, name, seed, side, lens, views).items():
+                for stage, seconds in observe(folder, name, self.scene, side, views).items():
                     self.result["spent"][stage] = self.result["spent"].get(stage, 0.0) + seconds
                 self._keep()
         self.seen = {side: Observations.load(folder / f"{side}.kcal.json") for side in self.true}

@@ -36,9 +36,9 @@ CONCLUSIONS = {
         "cameras held 87 to 94 %."
     ),
     "demo.md": (
-        "**Conclusion.** The demonstration's intervals are as honest as they say: over 40 sites, each with its own "
-        "photographs, survey and marks, 96.4 ± 1.9 % of the 95 % intervals contain the true range, and every target is "
-        "located in every run. In 10 of 40 runs one of the seven intervals misses."
+        "**Conclusion.** The intervals of `kcal demo` contain the true range as often as they state: over 40 runs, "
+        "each with its own photographs, survey and marks, 96.4 ± 1.9 % of the 95 % intervals do. Every target is "
+        "located in every run. In 10 of the 40 runs, one of the seven intervals does not contain the true range."
     ),
     "fields.md": (
         "**Conclusion.** Keep Zernike modes. Fields of every kind predict held-out views equally well to 3 %. "
@@ -68,8 +68,8 @@ CONCLUSIONS = {
         "**Conclusion.** `kcal locate` takes tables of any length in the memory of a short one: 413 MB for a CSV of a "
         "million rows, 384 MB for a hundred thousand. A row costs 15 µs of processor time to CSV (67,600 rows a "
         "second; 22 µs with the covariances of cameras and pose) and 43 to 54 µs to GeoJSON, which contains a region "
-        "of 73 corners for each point. The aims of 100,000 and 30,000 rows a second are missed. Tables of a thousand "
-        "rows are dominated by the start. The version before took 3,500 µs a row."
+        "of 73 corners for each point. The aims of 100,000 and 30,000 rows a second are missed. With a thousand rows, "
+        "start-up takes most of the time. The version before took 3,500 µs a row."
     ),
     "verdict.md": (
         "**Conclusion.** A no can be believed, and tells why: of 200 captures with a planted fault, 167 of which were "

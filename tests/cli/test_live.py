@@ -13,7 +13,6 @@ import torch
 from track_scenes import ORIGIN, seen_by, tracked_site
 from typer.testing import CliRunner
 
-from kcal.cli.live import _track_options
 from kcal.cli.main import app
 from kcal.errors import FileError, InputError
 from kcal.io.rig_file import save_rig
@@ -111,5 +110,5 @@ def test_a_rig_that_does_not_say_where_it_stands(folder: Path) -> None:
 
 def test_what_compression_leaves_lasts_in_tracks() -> None:
     """Pairs that come matched keep the default; of what compression adds to matches, a third lasts."""
-    assert _track_options(0.0) == TrackOptions()
-    assert _track_options(0.06).lasting_px == pytest.approx((0.01**2 + 0.02**2) ** 0.5, rel=1e-12)
+    assert TrackOptions.for_video(0.0) == TrackOptions()
+    assert TrackOptions.for_video(0.06).lasting_px == pytest.approx((0.01**2 + 0.02**2) ** 0.5, rel=1e-12)
