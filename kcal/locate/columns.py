@@ -82,5 +82,6 @@ def number_lines(values: NDArray[np.float64]) -> list[str]:
     some = bool(infinite.any())
     finite = np.ascontiguousarray(np.where(infinite, _LARGEST, values) if some else values)
     text = orjson.dumps(finite, option=orjson.OPT_SERIALIZE_NUMPY)
+    text = text[2:-2].translate(None, b"nul")
     text = text.replace(orjson.dumps(_LARGEST), b"inf") if some else text
-    return text[2:-2].replace(b"null", b"").decode().split("],[")
+    return text.decode().split("],[")

@@ -66,6 +66,21 @@ def ecef_to_geodetic(ecef: Tensor) -> Tensor:
 
 def geodetic_components(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Latitude, longitude, height of ECEF coordinates that are given one by one; see `ecef_to_geodetic`."""
+    lat, lon, distance = _angles(x, y, z)
+    sine, cosine = torch.sin(lat), torch.cos(lat)
+    # p cos φ + z sin φ - a √(1 - e² sin² φ) needs no division by a cosine that is zero at the poles.
+    height = distance * cosine + z * sine - SEMI_MAJOR * torch.sqrt(1.0 - _E2 * sine * sine)
+    return lat * _DEGREES, lon * _DEGREES, height
+
+
+def latitude_longitude(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    """The same without the height, degrees."""
+    lat, lon, _ = _angles(x, y, z)
+    return lat * _DEGREES, lon * _DEGREES
+
+
+def _angles(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Latitude and longitude in radians, and the distance from the Earth's axis."""
     squared = x * x + y * y
     off_axis = squared > _AT_POLE**2
     distance = torch.sqrt(torch.where(off_axis, squared, _AT_POLE**2))
@@ -78,11 +93,7 @@ def geodetic_components(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor
         above = z + _E2_SECOND * SEMI_MINOR * sine**3
         beside = distance - _E2 * SEMI_MAJOR * cosine**3
         up, out = above * SEMI_MINOR, beside * SEMI_MAJOR
-    lat = arc_tangent(above, beside)
-    sine, cosine = torch.sin(lat), torch.cos(lat)
-    # p cos φ + z sin φ - a √(1 - e² sin² φ) needs no division by a cosine that is zero at the poles.
-    height = distance * cosine + z * sine - SEMI_MAJOR * torch.sqrt(1.0 - _E2 * sine * sine)
-    return lat * _DEGREES, lon * _DEGREES, height
+    return arc_tangent(above, beside), lon, distance
 
 
 def arc_tangent(y: Tensor, x: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import orjson
 
-from kcal.locate.columns import NUMBERS, PositionColumns
+from kcal.locate.columns import NUMBERS, TEXTS, PositionColumns
 from kcal.locate.positions import Located
 from kcal.locate.region import REGION_SHARE, cut_at_antimeridian, ring_blocks
 from kcal.locate.stereo import PositionStatus
@@ -19,6 +19,9 @@ _JSON_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(\.[0-9]+)?([eE][+-]?[0-9]+)?")
 # Whole numbers beyond this lose digits in programs that read every number as a float64.
 _LARGEST_WHOLE = 2**53
 _POLYGON = (b'{"type":"Feature","geometry":{"type":"Polygon","coordinates":[[[', b']]]},"properties":')
+_PROPERTIES = ("kind", *TEXTS, *NUMBERS)
+# Of the degrees of a region's corners: 0.1 mm (section 11.2). Positions keep all digits.
+_DECIMALS = 9
 _HEIGHT = NUMBERS.index("height_ellipsoidal_m")
 
 
@@ -49,9 +52,9 @@ def point_features(columns: PositionColumns) -> Iterator[bytes]:
     rows = zip(columns.names, columns.status.tolist(), columns.reasons, columns.numbers.tolist(), strict=True)
     for place, (name, status, reason, numbers) in enumerate(rows):
         lat, lon, height = numbers[0], numbers[1], numbers[_HEIGHT]
-        properties: dict[str, Any] = {"kind": "point", "name": name, "status": statuses[status], "reason": reason}
         # JSON has neither NaN nor infinity: both become null.
-        properties.update(zip(NUMBERS, numbers, strict=True))
+        values = ("point", name, statuses[status], reason, *numbers)
+        properties: dict[str, Any] = dict(zip(_PROPERTIES, values, strict=True))
         if place in infinite:
             properties |= {
                 f"{column.removesuffix('_m')}_infinite": True
@@ -66,7 +69,8 @@ def region_features(columns: PositionColumns, run: Located) -> Iterator[bytes]:
     """A polygon for each position: its 95 % region, a long and slightly skewed ellipse."""
     names = iter([columns.names[place] for place in np.flatnonzero(columns.located).tolist()])
     for block in ring_blocks(columns, run.origin):
-        texts = orjson.dumps(np.ascontiguousarray(block[..., ::-1]), option=orjson.OPT_SERIALIZE_NUMPY)
+        corners = np.ascontiguousarray(block[..., ::-1]).round(_DECIMALS)
+        texts = orjson.dumps(corners, option=orjson.OPT_SERIALIZE_NUMPY)
         beyond = (np.abs(block[..., 1]).max(-1) > 180.0).tolist()
         # Section 3.1.6: closed, counterclockwise; section 3.1.9: a polygon across the antimeridian is cut in two.
         for text, cut, ring in zip(texts[3:-3].split(b"]],[["), beyond, block, strict=True):

@@ -338,9 +338,9 @@ def _sensitivity(found: PairFit) -> Sensitivity:
     # d range = -range dρ / ρ
     slope = scale * found.length / (inverse * inverse)
     by_mark = fit.gain[..., 2, :, :]
-    by_side = torch.linalg.vector_norm(by_mark.unflatten(-2, (2, 2)), dim=-2)
+    by_side = by_mark.unflatten(-2, (2, 2)).square().sum(-2).sqrt()
     turn = (by_mark[..., None, 2:, :] * by_pose(fit, 1)[..., :3, :, :]).sum(-2)
     return Sensitivity(
         torch.where(known, slope * by_side.amax(-2), math.inf),
-        torch.where(known, slope * torch.linalg.vector_norm(turn, dim=-2) * math.radians(1.0), math.inf),
+        torch.where(known, slope * turn.square().sum(-2).sqrt() * math.radians(1.0), math.inf),
     )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcal.lens.mounting import Origin
 from kcal.locate.columns import NUMBERS, PositionColumns
-from kcal.locate.ellipsoid import geodetic_components
+from kcal.locate.ellipsoid import latitude_longitude
 from kcal.locate.geodesy import anchor
 from kcal.locate.positions import Located, Position, columns_of
 
@@ -97,7 +97,7 @@ def ring_blocks(columns: PositionColumns, origin: Origin) -> Iterator[NDArray[np
             row[0] * outline[0] + row[1] * outline[1] + (row[2] * up[:, None] + offset)
             for row, offset in zip(rotation, translation, strict=True)
         )
-        lat, lon, _ = geodetic_components(x, y, z)
+        lat, lon = latitude_longitude(x, y, z)
         lon = lon + 360.0 * torch.round((lon_of_point[:, None] - lon) / 360.0)
         yield torch.stack([torch.cat([value, value[:, :1]], 1) for value in (lat, lon)], -1).numpy()
 

@@ -170,7 +170,8 @@ class PairFit(NamedTuple):
     @property
     def length(self) -> Tensor:
         """(..., N) of `fit.direction`."""
-        return torch.linalg.vector_norm(self.fit.direction, dim=-2)
+        # `vector_norm` takes twenty times as long along this axis.
+        return self.fit.direction.square().sum(-2).sqrt()
 
 
 def fit_pairs(

@@ -85,6 +85,24 @@ class TestCrossing:
         # 4e-4: steps of 0.02 px in the integral; at 50° the series leaves out 2e-3.
         torch.testing.assert_close(levels, torch.stack(wanted), rtol=0, atol=3e-3 if opening == 50.0 else 6e-4)
 
+    def test_values_of_bent_lines_are_the_blurred_pattern(self):
+        """A blurred bent edge lies beside the line itself, by half the bend times the blur squared."""
+        bend, blur = torch.tensor([0.02, 0.0], dtype=torch.float64), 1.0
+        fine = torch.arange(-6, 6, 0.02, dtype=torch.float64) + 0.01
+        v, u = torch.meshgrid(fine, fine, indexing="ij")
+        kernel = torch.exp(-0.5 * (u**2 + v**2) / blur**2)
+        kernel = kernel / kernel.sum()
+        # Three sigmas beside the other edge: nearer, both bend into each other, which is left out.
+        where = torch.tensor([[3.0, 0.0], [3.0, 0.5], [-3.0, 0.2], [-3.0, -0.4]], dtype=torch.float64)
+        wanted = []
+        for x, y in where.tolist():
+            # Edge 1 lies along x with its normal along y, edge 2 along y with its normal along -x.
+            sides = ((y - v) - 0.5 * bend[0] * (x - u) ** 2).sign() * (u - x).sign()
+            wanted.append((sides * kernel).sum())
+        parameters = torch.tensor([0, 0, 0, math.pi / 2, math.log(blur), 0, 1, 0, 0, 0]).double()
+        # 0.01 px of shift changes these by 0.008.
+        torch.testing.assert_close(crossing(parameters, where, bend)[0], torch.stack(wanted), rtol=0, atol=2e-3)
+
     def test_values_are_those_of_the_next_squares_too(self):
         # Lines 4 px to the right (more squares) and 5 px below (the margin, light), as they are in `wanted`.
         fine = torch.arange(-16, 16, 0.04, dtype=torch.float64) + 0.02

@@ -125,6 +125,10 @@ def test_to_8bit_of_almost_flat_image():
     assert to_8bit(deep)[1, 1] == 0
 
 
+def test_to_8bit_uses_the_whole_scale_for_two_neighboring_levels():
+    assert to_8bit(np.array([[7, 8], [8, 7]], np.uint16)).tolist() == [[0, 255], [255, 0]]
+
+
 def test_expand_folders_wildcards_and_files(tmp_path):
     for name in ("b10.png", "b9.PNG", "b1.jpg", "notes.txt", ".hidden.png"):
         (tmp_path / name).write_bytes(b"x")

@@ -92,6 +92,19 @@ def test_everything_lies_on_the_page(columns, rows, square, page):
         assert sheet.quiet >= 1 - slack
 
 
+def test_pages_are_those_of_the_standards():
+    """ISO 216: A0 is a square meter with sides as 1 to the root of 2, and each next page half of it, cut to mm."""
+    width, height = 841.0, 1189.0
+    assert width * height == pytest.approx(1e6, rel=1e-4)
+    assert height / width == pytest.approx(2**0.5, rel=1e-3)
+    for name in ("A0", "A1", "A2", "A3", "A4", "A5"):
+        assert PAGES[name] == (width, height), name
+        width, height = height // 2, width
+    inches = {"letter": (8.5, 11.0), "legal": (8.5, 14.0), "tabloid": (11.0, 17.0)}
+    for name, (across, up) in inches.items():
+        assert PAGES[name] == pytest.approx((25.4 * across, 25.4 * up), rel=1e-12), name
+
+
 def test_page_choice():
     assert board_sheet(A4, "a4").page == "A4"
     tall = board_sheet(Board(columns=6, rows=9, square=0.02), "A4").drawing

@@ -342,6 +342,15 @@ def test_bad_input_is_refused() -> None:
         baked("opencv14")[1].unproject(torch.tensor([[1, 2]]))
 
 
+def test_the_image_ends_half_a_pixel_beyond_its_outer_pixels() -> None:
+    camera, lookup = baked("opencv14")
+    width, height = lookup.size
+    u, v = (torch.tensor([-0.6, -0.4, 100.0, side - 0.6, side - 0.4]).double() for side in (width, height))
+    pixels = torch.stack(torch.meshgrid(u, v, indexing="ij"), -1)
+    assert torch.equal(lookup.inside(pixels), camera.inside(pixels))
+    assert lookup.inside(pixels).sum() == 9
+
+
 class TestSpline:
     def test_cubics_are_exact(self) -> None:
         generator = torch.Generator().manual_seed(2)

@@ -128,3 +128,16 @@ def test_side_axes_are_orthonormal() -> None:
     rays = torch.cat([rays, tensor([0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0])])
     frame = torch.stack([rays, *side_axes(rays)], -1)
     assert torch.allclose(frame.mT @ frame, torch.eye(3, dtype=torch.float64).expand_as(frame), atol=1e-14)
+
+
+def test_cameras_one_above_the_other() -> None:
+    """The axes that the solution works in are made from the baseline, which may point anywhere."""
+    points = world_points()
+    for step in ([0.0, -10.0, 0.0], [0.0, 0.0, -10.0], [-6.0, -8.0, 0.0], [0.1, 9.0, 0.1]):
+        cameras = torch.eye(3, 4, dtype=torch.float64).repeat(2, 1, 1)
+        cameras[1, :, 3] = tensor(*step)
+        rays = rays_to(points, cameras)
+        found, valid = triangulate_pairs(rays[:, 0], rays[:, 1], (cameras[1, :, :3], cameras[1, :, 3]))
+        assert valid.all()
+        # Parallaxes down to 2e-5 rad where one camera stands behind the other.
+        assert ((found - points).norm(dim=-1) / points.norm(dim=-1)).max() < 1e-10

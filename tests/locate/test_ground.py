@@ -55,6 +55,21 @@ def test_refraction_lowers_what_is_far() -> None:
     assert float(straight.enu[0, 1] - bent.enu[0, 1]) == pytest.approx(lower / slope, rel=0.1)
 
 
+def test_refraction_counts_the_level_distance() -> None:
+    """Seen steeply from above: light bends by the level distance squared, whatever the height."""
+    high = Origin(lat=19.07, lon=72.87, height=5000.0)
+    steep = {"origin": high, "heading_deg": 0.0, "pitch_deg": -60.0, "roll_deg": 0.0}
+    mark = torch.tensor([[960.0, 540.0]], dtype=torch.float64)
+    straight, bent = (
+        locate_on_ground(CAMERA, stands(**steep, refraction=k), mark, level_ground(0.0), pixel_sigma=0.1).enu[0]
+        for k in (0.0, 0.5)
+    )
+    level = float(straight[1])
+    lower = 0.5 * level**2 / 2 / 6.35e6
+    # It falls by tan 60° for each meter forward, and the ground by 0.0005.
+    assert float(straight[1] - bent[1]) == pytest.approx(lower / math.tan(math.radians(60.0)), rel=0.01)
+
+
 def test_errors_are_as_large_as_stated() -> None:
     generator = torch.Generator().manual_seed(0)
     known = mounting_covariance(origin_m=(0.5, 0.5, 0.3), attitude_deg=(0.01, 0.01, 0.02))

@@ -207,6 +207,18 @@ BAD = [
 ]  # fmt: skip
 
 
+def test_rounded_covariances_are_accepted() -> None:
+    """A matrix may be symmetric to rounding only, and have zeros."""
+    cov = torch.diag(tensor(0.09, 0.04, 0.09, 0.04))
+    cov[0, 2], cov[2, 0] = 0.01, 0.01 * (1 + 1e-12)
+    localize = StereoLocalizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)
+    left, right = tensor([980.0, 540.0], [980.0, 540.0]), tensor([970.0, 540.0], [970.0, 540.0])
+    crooked = cov.clone()
+    crooked[2, 0] = 0.02
+    statuses = localize(left, right, torch.stack([cov, crooked])).status.tolist()
+    assert statuses == [int(PositionStatus.OK), int(PositionStatus.BAD_COVARIANCE)]
+
+
 def test_statuses_and_no_nan_in_values_or_gradients() -> None:
     left = tensor(*(row[0] for row in BAD)).requires_grad_()
     right = tensor(*(row[1] for row in BAD)).requires_grad_()

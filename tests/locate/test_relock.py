@@ -126,3 +126,10 @@ def test_sigma_of_a_drift_by_the_disparity() -> None:
     rig = pinhole_rig(1600.0, 10.0)
     yaw = torch.diag(tensor(0.0, 1e-5, 0.0) ** 2)
     assert drift_effect(rig, rig, yaw, (1000.0,)).sigma.item() == pytest.approx(1.0, rel=2e-3)
+
+
+@pytest.mark.parametrize("distance", [0.0, -100.0, math.inf, math.nan])
+def test_effect_of_a_drift_at_impossible_distances(distance: float) -> None:
+    rig = pinhole_rig(1600.0, 10.0)
+    with pytest.raises(InputError, match="positive numbers of meters"):
+        drift_effect(rig, rig, torch.zeros(3, 3).double(), (250.0, distance))

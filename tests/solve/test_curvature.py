@@ -1,0 +1,59 @@
+"""The exact Hessian of a cost with local blocks, and the system it makes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.solve.implicit import curvature
+from kcal.solve.schur import SchurLinearization
+
+
+def quadratic(shared: int, views: int, local: int) -> tuple[Tensor, Tensor]:
+    """A positive matrix over (shared, local of each view) whose views are coupled through the shared part alone."""
+    generator = torch.Generator().manual_seed(4)
+    size = shared + views * local
+    matrix = torch.zeros(size, size, dtype=torch.float64)
+    for v in range(views):
+        which = [*range(shared), *range(shared + v * local, shared + (v + 1) * local)]
+        root = torch.randn(len(which), len(which) + 2, generator=generator, dtype=torch.float64)
+        matrix[torch.tensor(which)[:, None], torch.tensor(which)] += root @ root.T
+    return matrix, torch.randn(size, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("shared", "views", "local"), [(3, 4, 2), (1, 2, 6), (5, 1, 1)])
+def test_a_quadratic_gives_its_matrix_back_and_newton_its_minimum(shared: int, views: int, local: int) -> None:
+    matrix, slope = quadratic(shared, views, local)
+
+    def cost(s: Tensor, own: Tensor) -> Tensor:
+        x = torch.cat([s, own.flatten()])
+        return slope @ x + 0.5 * x @ matrix @ x
+
+    (by_shared, by_local), found = curvature(cost, torch.zeros(shared).double(), torch.zeros(views, local).double())
+    torch.testing.assert_close(torch.cat([by_shared, by_local.flatten()]), slope, rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(found.shared, matrix[:shared, :shared], rtol=1e-13, atol=1e-13)
+    for v in range(views):
+        own = slice(shared + v * local, shared + (v + 1) * local)
+        torch.testing.assert_close(found.local[v], matrix[own, own], rtol=1e-13, atol=1e-13)
+        torch.testing.assert_close(found.coupling[v], matrix[own, :shared], rtol=1e-13, atol=1e-13)
+    (step, own_step), _ = found.system(by_shared, by_local).step(torch.zeros((), dtype=torch.float64))
+    # As well as the matrix is conditioned.
+    whole = torch.cat([step, own_step.flatten()])
+    torch.testing.assert_close(whole, -torch.linalg.solve(matrix, slope), rtol=1e-9, atol=1e-9)
+
+
+def test_rows_of_the_shared_parameters_alone_count_once() -> None:
+    """As if a view of their own had them, whatever their number."""
+    generator = torch.Generator().manual_seed(5)
+    rows = torch.randn(3, 2 + 3 + 1, 12, generator=generator, dtype=torch.float64)
+    alone = torch.randn(3 + 1, 7, generator=generator, dtype=torch.float64)
+    found = SchurLinearization.of_gram(rows @ rows.mT, 2, alone)
+    # The same residuals in the first view, whose own parameters do not touch them.
+    wider = torch.zeros(3, 6, 12 + 7, dtype=torch.float64)
+    wider[..., :12], wider[0, 2:, 12:] = rows, alone
+    expected = SchurLinearization.of_gram(wider @ wider.mT, 2)
+    torch.testing.assert_close(found.cost, expected.cost, rtol=1e-13, atol=0)
+    lam = torch.full((), 0.1, dtype=torch.float64)
+    for own, other in zip(found.step(lam)[0], expected.step(lam)[0], strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-11, atol=1e-12)
