@@ -34,6 +34,11 @@ _CHORDS = 2
 # A step that moves no pixel by more than this, in units of the noise, is the last.
 _SMALLEST_STEP = 1e-7
 
+# Minors of a 3x4 matrix: the column pairs 01, 02, 03, 12, 13, 23; and for each column left out, those of the others.
+_FIRST, _SECOND = [0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3]
+_ALONG, _PAIR = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], [[5, 4, 3], [5, 2, 1], [4, 2, 0], [3, 1, 0]]
+_SIGN = [[1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]]
+
 Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
@@ -268,9 +273,11 @@ def unreached_direction(fit: PointFit) -> Tensor:
     rows = fit.gain.movedim(-1, 0)
     # One over the length of each row: they are angles and one over meters.
     rows = rows / torch.linalg.vector_norm(rows, dim=-1, keepdim=True).clamp_min(1e-300)
-    # The vector across three others in four dimensions, by their minors.
-    minors = [torch.linalg.det(rows[..., [j for j in range(4) if j != i]]) * (-1.0) ** i for i in range(4)]
-    return torch.nn.functional.normalize(torch.stack(minors, -1), dim=-1)
+    # The vector across three others in four dimensions: minors along the first, of the 2x2 minors of the other two.
+    a, b, c = rows.unbind(-2)
+    pairs = b[..., _FIRST] * c[..., _SECOND] - b[..., _SECOND] * c[..., _FIRST]
+    across = (a[..., _ALONG] * pairs[..., _PAIR] * rows.new_tensor(_SIGN)).sum(-1)
+    return torch.nn.functional.normalize(across, dim=-1)
 
 
 def symmetric(six: Sequence[Tensor]) -> Tensor:

@@ -76,8 +76,11 @@ def mark_numbers(left: Tensor, right: Tensor) -> NDArray[np.int64]:
         >>> mark_numbers(left, left + torch.tensor([[0.0], [1.0]])).tolist()
         [[0, 0], [0, 1]]
     """
-    numbers = [torch.unique(marks, dim=0, return_inverse=True)[1] for marks in (left, right)]
-    return torch.stack(numbers, -1).cpu().numpy()
+    numbers = []
+    for marks in (left, right):
+        known: dict[tuple[float, ...], int] = {}
+        numbers.append([known.setdefault(tuple(mark), len(known)) for mark in marks.tolist()])
+    return np.array(numbers, dtype=np.int64).T
 
 
 def assigned(

@@ -85,6 +85,8 @@ class SharedErrors:
 
     def __init__(self, calibration: int, clock: ClockPrior, device: torch.device | None = None) -> None:
         self.calibration = calibration
+        # With clocks that are exact, there is nothing to estimate.
+        self.estimated = any(clock.sigmas)
         sigmas = torch.tensor(clock.sigmas, dtype=torch.float64, device=device)
         self.scale = torch.cat([sigmas.new_ones(calibration), sigmas])
         self.values = sigmas.new_tensor([clock.offset_s, 0.0, 0.0])
@@ -97,6 +99,8 @@ class SharedErrors:
 
     def add(self, effect: Tensor, innovation: Tensor, covariance: Tensor) -> None:
         """Collect independent innovations (N, 4) = effect (N, 4, K + 3) b + noise of the covariance (N, 4, 4)."""
+        if not self.estimated:
+            return
         scaled = effect * self.scale
         white = torch.linalg.solve_ex(covariance, torch.cat([scaled, innovation[..., None]], -1))[0]
         both = (scaled.mT @ white).sum(0)
@@ -110,7 +114,7 @@ class SharedErrors:
         prior, because its errors must not average away where the model of its errors is not exact.
         """
         k = self.calibration
-        if not bool((self.scale[k:] > 0).any()):
+        if not self.estimated:
             return torch.zeros_like(self.values)
         joint = torch.linalg.inv(self.information)
         move = joint @ self.score
