@@ -63,6 +63,7 @@ class TestValues:
         found = import_cameras(write(tmp_path, "a.yaml", ROS.replace("BASE", "0")))
         assert (found.format, found.names, found.is_rig()) == ("ros", ("narrow",), False)
         assert found.cameras[0].params.tolist() == [500, 510, 320, 240, 0, -0.2, 0.05, 0.001, -0.002, 0.01]
+        assert found.cameras[0].size == (640, 480)
 
     def test_a_pair_of_ros(self, tmp_path: Path) -> None:
         """Tx = -fx B: the right camera is B to the right."""
@@ -71,11 +72,16 @@ class TestValues:
         ]
         rig = import_cameras(*paths).rig()
         assert rig.right_from_left_translation.tolist() == pytest.approx([-0.12, 0, 0])
+        # One above the other: Ty = -fy B.
+        above = ROS.replace("BASE", "0").replace("0, 400, 240, 0,", "0, 400, 240, -20,")
+        rig = import_cameras(paths[0], write(tmp_path, "above.yaml", above)).rig()
+        assert rig.right_from_left_translation.tolist() == pytest.approx([0, -0.05, 0])
 
     def test_kalibr(self, tmp_path: Path) -> None:
         found = import_cameras(write(tmp_path, "chain.yaml", KALIBR))
         assert [str(camera.model) for camera in found.cameras] == ["fisheye4", "opencv4"]
         assert found.cameras[0].center.tolist() == [315.5269754313737, 244.46893770533453]
+        assert [camera.size for camera in found.cameras] == [(640, 480)] * 2
         rig = found.rig()
         assert rig.right_from_left_translation.tolist() == [-0.1, 0.02, 0.03]
         assert rig.right_from_left(torch.tensor([[1.0, 0.0, 0.0]])).tolist() == [[-0.1, 1.02, 0.03]]
@@ -83,6 +89,7 @@ class TestValues:
     def test_mrcal(self, tmp_path: Path) -> None:
         found = import_cameras(write(tmp_path, "left.cameramodel", MRCAL))
         assert found.cameras[0].params.tolist() == [1000.1, 1001.2, 320.5, 240.25, 0, -0.1, 0.02, 0.001, -0.002, 0.003]
+        assert found.cameras[0].size == (640, 480)
         rotation, translation = found.poses[0]
         assert (rotation @ torch.tensor([1.0, 0, 0]).double()).tolist() == pytest.approx([0, 1, 0])
         assert translation.tolist() == [1, 2, 3]
@@ -104,11 +111,27 @@ class TestValues:
         found = import_cameras(inside, outside, size=(640, 480), meters=1e-3)
         assert found.rig().right_from_left_translation.tolist() == pytest.approx([-0.12, 0, 0.001])
         assert found.cameras[1].params.tolist() == [500, 510, 320, 240, 0, -0.2, 0.05, 0, 0, 0.01]
+        assert found.cameras[1].size == (640, 480)
         assert "taken as meters" in import_cameras(inside, outside, size=(640, 480)).notes[0]
         with pytest.raises(FileError, match="image size is not in the file"):
             import_cameras(inside)
         with pytest.raises(InputError, match="without its cameras"):
             import_cameras(outside)
+
+    @pytest.mark.parametrize("names", [("image_size",), ("imageSize",), ("image_Width", "image_Height")])
+    def test_sizes_of_opencv_are_width_and_height(self, tmp_path: Path, names: tuple[str, ...]) -> None:
+        path = tmp_path / "camera.yml"
+        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        if len(names) == 1:
+            file.startWriteStruct(names[0], cv2.FILE_NODE_SEQ + cv2.FILE_NODE_FLOW)
+        for name, value in zip(names if len(names) == 2 else ("", ""), (640, 480), strict=True):
+            file.write(name, value)
+        if len(names) == 1:
+            file.endWriteStruct()
+        file.write("camera_matrix", np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]))
+        file.write("distortion_coefficients", np.zeros((1, 5)))
+        file.release()
+        assert import_cameras(path).cameras[0].size == (640, 480)
 
     def test_four_coefficients_of_opencv_are_told(self, tmp_path: Path) -> None:
         path = tmp_path / "four.xml"
@@ -133,6 +156,7 @@ class TestValues:
     def test_colmap(self, tmp_path: Path, line: str, model: str, params: list[float]) -> None:
         camera = import_cameras(write(tmp_path, "cameras.txt", f"# comment\n7 {line}\n")).cameras[0]
         assert (str(camera.model), camera.params.tolist()) == (model, params)
+        assert camera.size == (640, 480)
 
     def test_colmap_binary(self, tmp_path: Path) -> None:
         path = tmp_path / "cameras.bin"
@@ -140,6 +164,7 @@ class TestValues:
         found = import_cameras(path)
         assert found.names == ("3",)
         assert found.cameras[0].params.tolist() == [500, 500, 319.5, 239.5, 0]
+        assert found.cameras[0].size == (640, 480)
         path.write_bytes(path.read_bytes()[:-1])
         with pytest.raises(FileError, match="ends too early"):
             import_cameras(path)
@@ -149,21 +174,31 @@ class TestValues:
         content |= {"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4, "frames": [{"file_path": "a", "transform_matrix": []}]}
         found = import_cameras(write(tmp_path, "transforms.json", json.dumps(content)))
         assert found.cameras[0].params.tolist() == [500, 510, 319.5, 239.5, 0, 0.1, 0.2, 0.3, 0.4]
+        assert found.cameras[0].size == (640, 480)
+        assert found.notes == ("the poses of the frames are not kept",)
+        assert import_cameras(write(tmp_path, "t.json", json.dumps(content | {"frames": []}))).notes == ()
         with pytest.raises(FileError, match="k4"):
             import_cameras(write(tmp_path, "k4.json", json.dumps(content | {"k4": 0.1})))
 
     @pytest.mark.parametrize("old", [False, True])
-    def test_matlab(self, tmp_path: Path, old: bool) -> None:
+    @pytest.mark.parametrize("pose", ["rows", "matrix", "object"])
+    def test_matlab(self, tmp_path: Path, old: bool, pose: str) -> None:
         matrix = np.array([[500, 0.5, 321], [0, 510, 241], [0, 0, 1]])
         one = {"ImageSize": [480, 640], "RadialDistortion": [-0.2, 0.05], "TangentialDistortion": [0.001, 0.002]}
         one |= {"IntrinsicMatrix": matrix.T} if old else {"K": matrix}
         turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-        pose = {"RotationOfCamera2": turn.T, "TranslationOfCamera2": [-120.0, 0, 1]}
-        savemat(tmp_path / "s.mat", {"s": {"CameraParameters1": one, "CameraParameters2": one, **pose}})
+        whole = np.block([[turn, np.array([[-120.0], [0.0], [1.0]])], [np.zeros((1, 3)), np.ones((1, 1))]])
+        second = {
+            "rows": {"RotationOfCamera2": turn.T, "TranslationOfCamera2": [-120.0, 0, 1]},
+            "matrix": {"PoseCamera2": whole},
+            "object": {"PoseCamera2": {"A": whole}},
+        }[pose]
+        savemat(tmp_path / "s.mat", {"s": {"CameraParameters1": one, "CameraParameters2": one, **second}})
         found = import_cameras(tmp_path / "s.mat")
         assert "taken as millimeters" in found.notes[0]
         rig = found.rig()
         assert rig.left.params.tolist() == [500, 510, 320, 240, 0.5, -0.2, 0.05, 0.001, 0.002]
+        assert rig.left.size == (640, 480)
         assert rig.right_from_left_rotation.tolist() == turn.tolist()
         assert rig.right_from_left_translation.tolist() == pytest.approx([-0.12, 0, 0.001])
 
@@ -173,6 +208,7 @@ class TestValues:
         found = import_cameras(write(tmp_path, "camera_models.json", json.dumps({"v2 x": camera})))
         assert found.names == ("v2 x",)
         assert found.cameras[0].params.tolist() == [512, 576, 325.9, 239.5, 0, 0.1, 0.2, 0.3, 0.4, 0.5]
+        assert found.cameras[0].size == (640, 480)
 
 
 class TestRefusals:

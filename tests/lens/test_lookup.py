@@ -231,6 +231,21 @@ class TestFile:
             assert valid
             np.testing.assert_allclose(found, pixel.numpy(), atol=sum(lookup.bound))
 
+    def test_nothing_in_a_file_is_executed(self, tmp_path: Path) -> None:
+        """An array of objects is a pickle, which may call anything when it is loaded."""
+
+        class Trap:
+            def __reduce__(self) -> tuple[Any, ...]:
+                return Path.touch, (tmp_path / "executed",)
+
+        _, lookup = baked("opencv14")
+        arrays = dict(np.load(save_lookup(lookup, tmp_path / "camera.npz")))
+        for name in arrays:
+            np.savez(tmp_path / "trap.npz", **(arrays | {name: np.array([Trap()], dtype=object)}))
+            with pytest.raises(FileError):
+                load_lookup(tmp_path / "trap.npz")
+        assert not (tmp_path / "executed").exists()
+
     def test_what_is_no_such_file(self, tmp_path: Path) -> None:
         path = tmp_path / "camera.npz"
         path.write_text("not a table")
