@@ -112,6 +112,18 @@ def test_possible_views_are_seen_whole() -> None:
     assert float((corners[0, -1] - corners[0, 0]).norm()) < 0.9 * float((corners[-1, -1] - corners[-1, 0]).norm())
 
 
+def test_a_rolled_board_lies_in_the_same_plane() -> None:
+    """It is turned about its own normal, wherever it is held and however it leans."""
+    views = possible_views(CAMERA, BOARD)
+    normal, across = views.rotation[..., 2], views.rotation[..., 0]
+    pairs = [(i, views.words.index(f"{text}, rolled by a quarter")) for i, text in enumerate(views.words)
+             if f"{text}, rolled by a quarter" in views.words]  # fmt: skip
+    assert len(pairs) > 40
+    for i, rolled in pairs:
+        torch.testing.assert_close(normal[i], normal[rolled], rtol=0, atol=1e-12)
+        assert abs(float(across[i] @ across[rolled])) < 1e-12
+
+
 def test_without_error_bars() -> None:
     assert math.isnan(far_sigma(CAMERA))
     assert next_view(CAMERA, BOARD, 0.1) is None

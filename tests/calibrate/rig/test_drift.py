@@ -11,7 +11,7 @@ from rig_scenes import CAMERAS, CENTER, ROTATION, landmarks, normal, see, spread
 from torch import Tensor
 
 from kcal.calibrate.rig.drift import measure_drift
-from kcal.calibrate.rig.sources import Features
+from kcal.calibrate.rig.sources import Features, Landmarks
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import StereoRig
@@ -225,6 +225,15 @@ class TestLandmarks:
             for k, (error, spread) in enumerate(zip(errors, spreads, strict=True)):
                 total[k] += float(error @ torch.linalg.solve(spread, error))
         assert bool(((total - 48).abs() < 4 * (2 * 48) ** 0.5).all())
+
+    def test_two_landmarks_are_enough(self) -> None:
+        """Four pixels in each camera for the three numbers of its turn."""
+        every = landmarks()
+        pixels = seen(every.points, TURN)
+        two = torch.tensor([0, int((pixels[:, 0] - pixels[0, 0]).norm(dim=-1).argmax())])
+        marks = Landmarks(names=("a", "b"), points=every.points[two], sigma=every.sigma[two], pixels=pixels[two])
+        found = measure_drift(RIG, landmarks=marks, pose=(ROTATION[0], CENTER[0]), refraction=(0.0, 0.0))
+        torch.testing.assert_close(found.relative, relative_turn(), rtol=0, atol=1e-9)
 
     def test_how_well_the_rig_was_known_counts(self) -> None:
         marks = landmarks()
