@@ -10,6 +10,9 @@ import typer
 from kcal.cli.console import out, print_table, print_wrote
 from kcal.errors import InputError
 
+# Ranges in the table, if none are given.
+_BASELINES = (10.0, 25.0, 50.0, 100.0, 250.0, 500.0)
+
 
 def budget_command(
     rig: Annotated[
@@ -20,8 +23,9 @@ def budget_command(
         float, typer.Option(metavar="M", help="Distance between the cameras of the planned rig, meters.")
     ] = 10.0,
     distances: Annotated[
-        str, typer.Option(metavar="M,M,...", help="Ranges in the table, meters.")
-    ] = "100,250,500,1000,2500,5000",
+        str | None,
+        typer.Option(metavar="M,M,...", help="Ranges in the table, meters; 10 to 500 baselines if not given."),
+    ] = None,
     disparity: Annotated[float, typer.Option(metavar="PX", help="Disparity error, pixels.", min=0)] = 0.1,
     yaw: Annotated[float, typer.Option(metavar="DEG", help="Relative yaw error, degrees.", min=0)] = 0.01,
     baseline_error: Annotated[float, typer.Option(metavar="M", help="Baseline error, meters.", min=0)] = 0.001,
@@ -55,21 +59,21 @@ def budget_command(
 
     from kcal.io.rig_file import load_rig
     from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
-    from kcal.locate.range_sigmas import range_sigmas
+    from kcal.locate.range_sigmas import range_sigmas, usual_ranges
     from kcal.report.budget import save_budget_picture
     from kcal.report.figures import check_picture
     from kcal.report.tables import range_sigma_rows
 
     if picture is not None:
         check_picture(picture)
-    try:
-        far = [float(value) for value in distances.split(",")]
-    except ValueError:
-        raise InputError(f"distances {distances!r}: write numbers of meters, for example 250,1000,5000") from None
     errors = BudgetErrors(
         disparity_px=disparity, yaw_deg=yaw, baseline_m=baseline_error, timing_s=timing, speed_mps=speed
     )
     chosen = planned_rig(focal_px=focal, baseline_m=baseline) if rig is None else load_rig(rig)
+    try:
+        far = [float(value) for value in distances.split(",")] if distances else usual_ranges(chosen, _BASELINES)
+    except ValueError:
+        raise InputError(f"distances {distances!r}: write numbers of meters, for example 250,1000,5000") from None
     labels = {
         "disparity": f"disparity {disparity:g} px",
         "yaw": f"relative yaw {yaw:g}°",

@@ -12,6 +12,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
+from kcal.locate.range_sigmas import usual_ranges
 from kcal.locate.stereo import PositionStatus, sight_lines
 
 
@@ -30,7 +31,7 @@ class DriftEffect(NamedTuple):
 
 
 def drift_effect(
-    old: StereoRig, new: StereoRig, turn_covariance: Tensor, distances: Sequence[float] = (250.0, 1000.0, 5000.0)
+    old: StereoRig, new: StereoRig, turn_covariance: Tensor, distances: Sequence[float] | None = None
 ) -> DriftEffect:
     """Ranges that are found with the old rig after it has turned into the new one, in the direction both look.
 
@@ -38,7 +39,7 @@ def drift_effect(
         old: what is believed.
         new: what is.
         turn_covariance: (3, 3) of the relative turn about the right camera's axes, radians².
-        distances: meters.
+        distances: meters; `usual_ranges` if left out.
 
     Example:
         >>> from kcal.locate.budget import planned_rig
@@ -49,7 +50,7 @@ def drift_effect(
         >>> [round(value) for value in drift_effect(old, new, torch.zeros(3, 3).double()).found.tolist()]
         [251, 1018, 5478]
     """
-    far = torch.tensor(list(distances), dtype=torch.float64)
+    far = torch.tensor(usual_ranges(old) if distances is None else list(distances), dtype=torch.float64)
     if not bool(((far > 0) & torch.isfinite(far)).all()):
         raise InputError("distances: positive numbers of meters are needed")
     with torch.no_grad():

@@ -43,16 +43,15 @@ class RangeSigmas(NamedTuple):
     sideways: Tensor
 
 
-def usual_ranges(rig: StereoRig) -> list[float]:
-    """Three ranges at which a rig is near, usual and far: about 25, 100 and 500 baselines, as round numbers of meters.
+def usual_ranges(rig: StereoRig, baselines: Sequence[float] = (25.0, 100.0, 500.0)) -> list[float]:
+    """Ranges at which a rig is near, usual and far: about so many baselines, as round numbers of meters.
 
     Example:
         >>> from kcal.locate.budget import planned_rig
         >>> usual_ranges(planned_rig())
         [250.0, 1000.0, 5000.0]
     """
-    wanted = [share * float(rig.baseline) for share in (25.0, 100.0, 500.0)]
-    return [_round_number(meters) for meters in wanted]
+    return [_round_number(count * float(rig.baseline)) for count in baselines]
 
 
 def _round_number(meters: float) -> float:

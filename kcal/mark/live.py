@@ -20,7 +20,6 @@ from kcal.locate.positions import Located, locate_points
 from kcal.locate.range_sigmas import range_sigmas
 from kcal.locate.survey import Survey, match_landmarks
 
-DISTANCES = (250.0, 1000.0, 5000.0)
 LEAST_LANDMARKS = 4
 _LEAST_SIGMA = 0.05  # px: a survey's and a lens's errors are not smaller, whatever marks say of themselves
 NOWHERE = Origin(lat=0.0, lon=0.0, height=0.0)
@@ -49,11 +48,11 @@ class LiveRig(NamedTuple):
         rig: the rig; None without a solution.
         origin: of the survey's frame; None if that is local.
         items: how well each landmark agrees with the others.
-        promises: at 250 m, 1 km and 5 km.
+        promises: at the usual ranges; of a baseline of 10 m, 250 m, 1 km and 5 km.
         marked: landmarks marked in both images.
         sigma: px, with which marks took part.
         text: what the operator should know, in one sentence.
-        enough: whether more landmarks would still matter: errors of the rig are below those of marks at 5 km.
+        enough: whether more landmarks would still matter: errors of the rig are below those of marks at the farthest.
         warnings: of the solution.
     """
 
@@ -112,20 +111,20 @@ def marks_sigma(marks: Marks, hand_sigma: float) -> float:
 def promised(rig: StereoRig, sigma: float) -> tuple[Promise, ...]:
     """Predicted standard deviations of ranges; empty where the rig cannot see that way."""
     try:
-        found = range_sigmas(rig, DISTANCES, pixel_sigma=sigma)
+        found = range_sigmas(rig, pixel_sigma=sigma)
     except KcalError:
         return ()
     parts = torch.hypot(found.lenses, found.pose).tolist()
     known = rig.covariance is not None
-    rows = zip(DISTANCES, found.marks.tolist(), parts, found.total.tolist(), strict=True)
+    rows = zip(found.distance.tolist(), found.marks.tolist(), parts, found.total.tolist(), strict=True)
     return tuple(Promise(distance, marks, part if known else None, total) for distance, marks, part, total in rows)
 
 
 def verdict(promises: tuple[Promise, ...], count: int) -> tuple[str, bool]:
     """Whether landmarks suffice, in words, and about how many are missing.
 
-    They do where errors of the rig are below those of the marks of a single target at 5 km: better landmarks would
-    then hardly change a range. The variance of the rig falls as one over the number of landmarks.
+    They do where errors of the rig are below those of the marks of a single target at the farthest range: better
+    landmarks would then hardly change a range. The variance of the rig falls as one over the number of landmarks.
 
     Example:
         >>> verdict((Promise(5000.0, 150.0, 300.0, 335.0),), 8)
@@ -136,7 +135,9 @@ def verdict(promises: tuple[Promise, ...], count: int) -> tuple[str, bool]:
     far = promises[-1]
     if far.rig is None:
         return "these landmarks do not determine the rig well enough to predict its ranges", False
-    share = f"at {far.distance / 1000:g} km the rig errs by {far.rig:.0f} m, marks by {far.marks:.0f} m"
+    distance = f"{far.distance / 1000:g} km" if far.distance >= 1000 else f"{far.distance:g} m"
+    rig, marks = (f"{error:.0f} m" if error >= 10 else f"{error:.2g} m" for error in (far.rig, far.marks))
+    share = f"at {distance} the rig errs by {rig}, marks by {marks}"
     if far.rig <= far.marks:
         return f"enough: {share}", True
     more = math.ceil(count * ((far.rig / far.marks) ** 2 - 1))

@@ -102,5 +102,8 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert min(pose, sideways) > 0
     assert run(monkeypatch, str(SAMPLE), "--disparity", "0") == 0
     assert "What the rig file knows" not in capsys.readouterr().out
+    assert run(monkeypatch, "--baseline", "0.08") == 0
+    ranges = [line.split()[0] for line in capsys.readouterr().out.splitlines() if "disparity" in line]
+    assert ranges == ["1", "2.5", "5", "10", "25", "50"]
     assert run(monkeypatch, "--distances", "near") == 1
     assert "distances 'near'" in capsys.readouterr().err

@@ -188,6 +188,9 @@ class TestLiveRig:
             "enough: at 5 km the rig errs by 100 m, marks by 150 m", True,
         )  # fmt: skip
         assert "landmarks farther away" in verdict((Promise(5000.0, 15.0, 300.0, 335.0),), 8)[0]
+        # A rig of 8 cm.
+        text, _ = verdict((Promise(50.0, 0.84, 0.52, 0.99),), 8)
+        assert text == "enough: at 50 m the rig errs by 0.52 m, marks by 0.84 m"
 
 
 class TestDrift:
