@@ -2,8 +2,8 @@
 
 Mistakes (`scripts/check/mutations.py`) are drawn at random and planted one at a time in memory; no file is changed. For
 each, tests run that call the function that was changed: those of the same folder of tests/ and its examples in
-docstrings, the quickest first, then those of the other folders that were seen before. Each mistake costs a forked
-process that has the libraries loaded already.
+docstrings, the quickest first, then those of other folders. Each mistake costs a forked process that has the libraries
+loaded already.
 
     python -m scripts.check.mutants [FOLDER ...] [--sample 40] [--seed 0] [--seconds 3600] [--budget 60] [--write]
 
@@ -38,12 +38,15 @@ from typing import Any
 
 import pytest
 
+from scripts.check.harmless import HARMLESS
 from scripts.check.mutations import Site, sites
 from scripts.shared.page import DOCS, table
 
 ROOT = Path(__file__).parents[2]
 STATE = ROOT / ".mutants"
 FOLDERS = ("lens", "solve", "calibrate", "locate", "corners", "io")
+# Folders of tests that count too, if those of the folders above notice nothing.
+ELSEWHERE = ("report", "capture", "sim")
 # Loaded once, before anything is forked.
 LIBRARIES = ("torch", "kornia", "scipy.stats", "scipy.spatial", "skimage", "cv2", "pydantic", "hypothesis", "typer")
 # A mistake that makes tests so much slower is noticed. Seconds of processor time, and of the clock for each of them.
@@ -263,21 +266,26 @@ def interval(hits: int, count: int) -> tuple[float, float]:
 
 def report(seed: int) -> str:
     """The page: a table of the folders, and what was not noticed, line by line."""
-    kept, rows, missed, counts = results(), [], [], {}
+    kept, rows, missed, idle, counts = results(), [], [], [], {}
     for folder in FOLDERS:
         every = draws(folder, seed)
         judged = [(path, site, kept[site.key]) for path, _, site in every if site.key in kept]
         if not judged:
             continue
-        hits = sum(entry["noticed"] for *_, entry in judged)
-        counts[folder] = hits, len(judged)
-        low, high = interval(hits, len(judged))
-        share = f"{100 * hits / len(judged):.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %"
-        rows.append((f"`{folder}`", len(every), len(judged), hits, *share))
+        before = len(idle)
         for path, site, entry in sorted(judged, key=lambda row: (row[0], row[1].line)):
-            if not entry["noticed"]:
-                before, after = (" ".join(text.split())[:70].replace("|", "\\|") for text in (site.before, site.after))
-                missed.append((f"{path}:{site.line}", site.kind, f"`{before}`", f"`{after}`", entry["tests"]))
+            texts = (f"`{' '.join(text.split())[:70]}`".replace("|", "\\|") for text in (site.before, site.after))
+            where = f"{path}:{site.line}", site.kind, *texts
+            if site.key in HARMLESS:
+                idle.append((*where, HARMLESS[site.key]))
+            elif not entry["noticed"]:
+                missed.append((*where, entry["tests"]))
+        harmless = len(idle) - before
+        hits = sum(entry["noticed"] and site.key not in HARMLESS for _, site, entry in judged)
+        counts[folder] = hits, len(judged) - harmless
+        low, high = interval(*counts[folder])
+        share = f"{100 * hits / counts[folder][1]:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %"
+        rows.append((f"`{folder}`", len(every), len(judged), harmless, hits, *share))
     hits, total = (sum(values) for values in zip(*counts.values(), strict=True))
     worst = min(counts, key=lambda folder: counts[folder][0] / counts[folder][1])
     shares = (
@@ -285,13 +293,15 @@ def report(seed: int) -> str:
     )
     return "\n".join([
         "# What the tests notice", "",
-        f"**Conclusion.** The tests notice {hits} of {total} small mistakes planted at random: {shares}, the lowest. "
-        "Some of the others change no result, but only how fast it is found.", "",
+        f"**Conclusion.** The tests notice {hits} of {total} small mistakes planted at random that change a result: "
+        f"{shares}, the lowest.", "",
         "Made by `scripts/check/mutants.py`, which says what a mistake is and which tests run. The intervals tell how "
         "well so few mistakes know the share.", "",
-        *table(("folder", "possible mistakes", "planted", "noticed", "share", "95 % interval"), rows), "",
+        *table(("folder", "possible mistakes", "planted", "harmless", "noticed", "share", "95 % interval"), rows), "",
         f"## Not noticed ({len(missed)})", "", "With the number of tests that call the function.", "",
         *table(("line", "kind", "before", "after", "tests"), missed), "",
+        f"## Harmless ({len(idle)})", "", "They change no result (`scripts/check/harmless.py`), and are in no share.", "",
+        *table(("line", "kind", "before", "after", "why"), idle), "",
     ])  # fmt: skip
 
 
@@ -312,6 +322,8 @@ def main() -> None:
     others: dict[str, dict] = {}
     for folder in FOLDERS:
         others |= observe(folder, -math.inf)
+    for folder in ELSEWHERE:
+        others |= observe(folder, stop)
     for folder in arguments.folders:
         own, kept = observe(folder, stop), results()
         groups = own, {file: known for file, known in others.items() if file not in own}

@@ -1,0 +1,17 @@
+"""Planted mistakes that change no result, each judged by reading; `scripts.check.mutants` leaves them out of its shares.
+
+By the key of `scripts.check.mutations.Site`: a change of the code around such a mistake brings it back.
+"""
+
+from __future__ import annotations
+
+HARMLESS = {
+    "ad42b6f7fdeaa86c": "compares no elements at all: it asks whether values may be read",
+    "cc931d9fd18dd576": "`repr` or `compare` of a field that follows from the others",
+    "b0297d28c7fdb75f": "how finely a start of Newton's method is tabulated",
+    "1861c5cc51a9507f": "a cell is cut in unequal parts that still cover it: the proof takes longer",
+    "a2e2c6fb0726f3ff": "a point with Z = 0 has no finite image, which makes it invalid before",
+    "c1c0d87e7ed882a1": "a number that stands where it is not read",
+    "97f4df08b85439b6": "when stopped elements are dropped from a batch: only time",
+    "b65b2b83f420b66c": "cells without spaces are stripped: only time",
+}
