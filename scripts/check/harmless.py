@@ -1,4 +1,4 @@
-"""Planted mistakes that change no result, each judged by reading; `scripts.check.mutants` leaves them out of its shares.
+"""Planted mistakes that change no result, judged one by one; `scripts.check.mutants` leaves them out of its shares.
 
 By the key of `scripts.check.mutations.Site`: a change of the code around such a mistake brings it back.
 """

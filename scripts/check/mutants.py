@@ -266,7 +266,8 @@ def interval(hits: int, count: int) -> tuple[float, float]:
 
 def report(seed: int) -> str:
     """The page: a table of the folders, and what was not noticed, line by line."""
-    kept, rows, missed, idle, counts = results(), [], [], [], {}
+    kept, rows, missed, counts = results(), [], [], {}
+    idle: list[tuple[object, ...]] = []
     for folder in FOLDERS:
         every = draws(folder, seed)
         judged = [(path, site, kept[site.key]) for path, _, site in every if site.key in kept]
@@ -300,7 +301,8 @@ def report(seed: int) -> str:
         *table(("folder", "possible mistakes", "planted", "harmless", "noticed", "share", "95 % interval"), rows), "",
         f"## Not noticed ({len(missed)})", "", "With the number of tests that call the function.", "",
         *table(("line", "kind", "before", "after", "tests"), missed), "",
-        f"## Harmless ({len(idle)})", "", "They change no result (`scripts/check/harmless.py`), and are in no share.", "",
+        f"## Harmless ({len(idle)})", "", "They change no result and are in no share (`scripts/check/harmless.py`).",
+        "",
         *table(("line", "kind", "before", "after", "why"), idle), "",
     ])  # fmt: skip
 

@@ -51,6 +51,10 @@ def test_small_residuals_count_fully_and_nan_stays(kind: str) -> None:
     assert loss.weight(torch.tensor([torch.nan])).isnan().all()
 
 
+def test_huber_with_a_scale_of_one_unless_told_otherwise() -> None:
+    assert RobustLoss() == RobustLoss(kind="huber", scale=1.0)
+
+
 @pytest.mark.parametrize("wrong", [{"kind": "square"}, {"scale": 0.0}, {"scale": -1.0}, {"scale": math.inf}])
 def test_what_cannot_be_is_refused(wrong: dict) -> None:
     with pytest.raises(InputError, match="robust loss"):
