@@ -201,7 +201,10 @@ def observe(folder: str, stop: float) -> dict[str, dict]:
 
 
 def chosen(known: dict[str, dict], path: str, function: str, budget: float) -> tuple[list[str], int, float]:
-    """Tests that call a function, the quickest first; how many the budget leaves out; seconds of processor time."""
+    """Tests that call a function, the quickest first; how many the budget leaves out; seconds of processor time.
+
+    Outside of functions, all tests of a file that calls any of the module: they may read a constant alone.
+    """
 
     def calls(places: list[list[str]]) -> bool:
         return any(place[0] == path and function in ("", place[1]) for place in places)
@@ -209,6 +212,8 @@ def chosen(known: dict[str, dict], path: str, function: str, budget: float) -> t
     found = []
     for file in known.values():
         shared = calls(file["fixtures"])
+        if not function:
+            shared = shared or any(calls(test["calls"]) for test in file["tests"].values())
         for name, test in file["tests"].items():
             if test["passed"] and (shared or calls(test["calls"])):
                 found.append((test["seconds"], name, file["setup"]))

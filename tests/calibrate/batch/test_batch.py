@@ -339,7 +339,10 @@ def test_command_line(folder, tmp_path, monkeypatch):
         rows = list(csv.DictReader(file))
     assert [row["status"] for row in rows] == ["ok", "failed", "ok"]
     (folder / "empty").rmdir()
-    assert kcal("batch", folder, *WHAT, "-o", tmp_path / "out").exit_code == 0
+    again = kcal("batch", folder, *WHAT, "-o", tmp_path / "out")
+    assert again.exit_code == 0
+    # Of each camera, four images, the calibration alone, and that with what both share.
+    assert "12 of 12 pieces of work were there already" in again.output
     assert "give both" in str(kcal("batch", folder, "--board", "6x5", "-o", tmp_path / "out").exception)
     assert "model" in str(kcal("batch", folder, *WHAT, "--model", "best", "-o", tmp_path / "out").exception)
     assert not (tmp_path / "none").exists()
