@@ -158,7 +158,7 @@ def locate_command(
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import STREAM, check_format, open_writers
     from kcal.locate.locator import Locator
-    from kcal.locate.long_table import located_chunks
+    from kcal.locate.marks import filled, read_mark_chunks
     from kcal.locate.mounting import mounting_covariance
     from kcal.locate.positions import located_by
     from kcal.locate.sample import PositionSample
@@ -225,8 +225,10 @@ def locate_command(
         size = points.stat().st_size if points.is_file() else None
         with open_writers(outputs, located_by(locate), suffix) as writers, steps("locating", size) as advance:
             read, stated = 0, False
-            for chunk, columns in located_chunks(locate, points):
-                stated = stated or chunk.covariance is not None
+            for chunk in read_mark_chunks(points):
+                cov = filled(chunk.covariance, pixel_sigma)
+                stated = stated or cov is not None
+                columns = locate(chunk.names, chunk.pixels, cov, chunk.extras)
                 for writer in writers:
                     writer.add(columns)
                 sample.add(columns)

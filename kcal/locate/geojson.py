@@ -18,7 +18,7 @@ from kcal.locate.stereo import PositionStatus
 _JSON_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(\.[0-9]+)?([eE][+-]?[0-9]+)?")
 # Whole numbers beyond this lose digits in programs that read every number as a float64.
 _LARGEST_WHOLE = 2**53
-_POLYGON = (b'{"type":"Feature","geometry":{"type":"Polygon","coordinates":[[[', b']]]},"properties":')
+_POLYGON = (b'{"type":"Feature","geometry":{"type":"Polygon","coordinates":[', b']},"properties":')
 _PROPERTIES = ("kind", *TEXTS, *NUMBERS)
 # Of the degrees of a region's corners: 0.1 mm (section 11.2). Positions keep all digits.
 _DECIMALS = 9
@@ -61,7 +61,8 @@ def point_features(columns: PositionColumns) -> Iterator[bytes]:
                 for column, value in zip(NUMBERS, numbers, strict=True)
                 if value == float("inf")
             }
-        properties.update((column, cells[place]) for column, cells in extras)
+        if extras:
+            properties.update((column, cells[place]) for column, cells in extras)
         yield _feature({"type": "Point", "coordinates": [lon, lat, height]} if lat == lat else None, properties)
 
 
@@ -70,15 +71,15 @@ def region_features(columns: PositionColumns, run: Located) -> Iterator[bytes]:
     names = iter([columns.names[place] for place in np.flatnonzero(columns.located).tolist()])
     for block in ring_blocks(columns, run.origin):
         corners = np.ascontiguousarray(block[..., ::-1]).round(_DECIMALS)
-        texts = orjson.dumps(corners, option=orjson.OPT_SERIALIZE_NUMPY)
         beyond = (np.abs(block[..., 1]).max(-1) > 180.0).tolist()
         # Section 3.1.6: closed, counterclockwise; section 3.1.9: a polygon across the antimeridian is cut in two.
-        for text, cut, ring in zip(texts[3:-3].split(b"]],[["), beyond, block, strict=True):
+        for lon_lat, cut, ring in zip(corners, beyond, block, strict=True):
             properties = {"kind": "region", "name": next(names), "share": REGION_SHARE}
             if cut:
                 yield _feature(_cut(ring.tolist()), properties)
             else:
                 # Most of the file: copied once.
+                text = orjson.dumps(lon_lat, option=orjson.OPT_SERIALIZE_NUMPY)
                 yield b"".join([_POLYGON[0], text, _POLYGON[1], orjson.dumps(properties), b"}"])
 
 

@@ -2,9 +2,8 @@
 
     python -m scripts.bench.locate_table [--rows 1000 10000 ...] [--repeat 3] [--source FOLDER] [--write]
 
-Each run is a process of its own, which locates a table of one row first. Processor time (user and system) counts less
-what else the machine does; by the clock it is faster, because the next rows are located while some are written. Tensors
-are worked on by one thread. Of several runs the fastest counts. `--source`
+Each run is a process of its own with one thread, which locates a table of one row first. Processor time (user and
+system), not time of day, so that other work on the machine counts less. Of several runs the fastest counts. `--source`
 measures another copy of kcal, for example an earlier version.
 """
 
@@ -37,14 +36,14 @@ from kcal.cli.main import main
 rig, small, large, out = sys.argv[1:]
 for points in (small, large):
     sys.argv = ["kcal", "locate", rig, points, "-o", out]
-    start, clock = time.process_time(), time.perf_counter()
+    start = time.process_time()
     try:
         main()
     except SystemExit as end:
         assert not end.code, end.code
 lines = pathlib.Path("/proc/self/status").read_text().splitlines()
 peak = next(line.split()[1] for line in lines if line.startswith("VmHWM"))
-print("measured", time.process_time() - start, time.perf_counter() - clock, peak)
+print("measured", time.process_time() - start, peak)
 """
 
 
@@ -61,8 +60,8 @@ def write_table(path: Path, count: int) -> Path:
     return path
 
 
-def run(source: Path, *arguments: Path) -> tuple[float, float, float]:
-    """Seconds of the processor and of the clock, and peak megabytes of one table, after a table of one row."""
+def run(source: Path, *arguments: Path) -> tuple[float, float]:
+    """Processor seconds and peak megabytes of one table, after a table of one row."""
     paths = os.pathsep.join([str(source), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", _RUN, *map(str, arguments)]
@@ -70,7 +69,7 @@ def run(source: Path, *arguments: Path) -> tuple[float, float, float]:
     found = [line.split() for line in done.stdout.splitlines() if line.startswith("measured ")]
     if done.returncode != 0 or not found:
         raise SystemExit(done.stderr)
-    return float(found[0][1]), float(found[0][2]), int(found[0][3]) / 1024.0
+    return float(found[0][1]), int(found[0][2]) / 1024.0
 
 
 def measure(source: Path, folder: Path, suffixes: tuple[str, ...], counts: list[int], repeat: int) -> list[str]:
@@ -91,16 +90,13 @@ def measure(source: Path, folder: Path, suffixes: tuple[str, ...], counts: list[
             out = folder / f"out.{suffix}"
             for count in counts:
                 found = [run(source, path, tables[1], tables[count], out) for _ in range(repeat)]
-                seconds, clock = (min(each[i] for each in found) for i in (0, 1))
-                peak, size = max(each[2] for each in found), out.stat().st_size / 2**20
-                speeds = f"{count / seconds:,.0f}", f"{count / clock:,.0f}"
-                cells = [f".{suffix}", name, f"{count:,}", *speeds, f"{peak:.0f}", f"{size:.1f}"]
+                seconds, peak = min(each[0] for each in found), max(each[1] for each in found)
+                size = out.stat().st_size / 2**20
+                cells = [f".{suffix}", name, f"{count:,}", f"{count / seconds:,.0f}", f"{peak:.0f}", f"{size:.1f}"]
                 print(*cells, f"{1e6 * seconds / count:.1f} us a row", sep="  ", flush=True)
                 lines.append(cells)
                 out.unlink()
-    return table(
-        ["file", "rig", "rows", "rows a second of processor time", "of the clock", "peak MB", "file MB"], lines
-    )
+    return table(["file", "rig", "rows", "rows a second of processor time", "peak MB", "file MB"], lines)
 
 
 def main() -> None:
@@ -119,8 +115,8 @@ def main() -> None:
         CONCLUSIONS["locate_table.md"],
         "",
         f"Made by `scripts/bench/locate_table.py` with kcal {kcal.__version__}, torch {torch.__version__} on "
-        f"{platform.machine()} with {os.cpu_count()} cores, one thread for tensors; the fastest of {arguments.repeat} "
-        "runs. Times of the command from its second call in a process on. The rig is that of `locate.md`: exact, or with the covariances of "
+        f"{platform.machine()}, one thread; the fastest of {arguments.repeat} runs. Processor time of the command "
+        "from its second call in a process on. The rig is that of `locate.md`: exact, or with the covariances of "
         "cameras, pose and mounting.",
         "",
     ]
