@@ -156,9 +156,7 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
 @contextmanager
 def steps(description: str, total: int | None) -> Iterator[Callable[..., None]]:
     """Show a progress bar on the error stream: call the value with a text, and how many if not one, after each step."""
-    # Long work begins: the garbage collector need not search the imported libraries again and again, 50 ms each time.
-    gc.freeze()
-    with Progress(
+    bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -166,10 +164,16 @@ def steps(description: str, total: int | None) -> Iterator[Callable[..., None]]:
         console=err,
         transient=True,
         disable=not err.is_terminal,
-    ) as progress:
-        task = progress.add_task(description, total=total)
+    )
+    # Long work: meanwhile the garbage collector need not search the imported libraries, which takes 50 ms each time.
+    gc.freeze()
+    try:
+        with bar as progress:
+            task = progress.add_task(description, total=total)
 
-        def advance(text: str, by: int = 1) -> None:
-            progress.update(task, advance=by, description=f"{description}: {escape(one_line(text))}")
+            def advance(text: str, by: int = 1) -> None:
+                progress.update(task, advance=by, description=f"{description}: {escape(one_line(text))}")
 
-        yield advance
+            yield advance
+    finally:
+        gc.unfreeze()

@@ -27,7 +27,8 @@ from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection
 from kcal.lens.tracing import is_traced, known_true
 
-# Graphs cannot stop early: three steps err by 4e-6 of the noise where marks are 10 px off, one leaves 1e-2.
+# Evaluations. Graphs cannot stop early: with three they err by 4e-6 of the noise where marks are 10 px off, with two by
+# 1e-2.
 _MOST_STEPS, _TRACED_STEPS = 5, 3
 # The derivative of the optimum comes from this many steps with a fixed matrix; each leaves a share of about the
 # residual over the focal length, 1e-4, of the error.
@@ -151,7 +152,7 @@ def most_likely(
         length, noise = torch.full_like(zero, torch.inf), _least_noise(weight)
         for number in range(_TRACED_STEPS if is_traced() else _MOST_STEPS):
             at = _evaluate(later if number else fixed, theta)
-            # Behind a step that is as short, rounding may raise the cost.
+            # After so short a step, rounding may raise the cost.
             better = (at.cost <= cost) | (length <= _SHORT_STEP * noise)
             every = known_true(better)
             covariance = _covariance(at, usable)
