@@ -16,7 +16,7 @@ from kcal.corners.crossing import NAMES, LineDistances, crossing
 from kcal.corners.detect import detect_images
 from kcal.corners.erf import erf_saddle
 from kcal.corners.grid import line_bend, local_side, neighbors
-from kcal.corners.refine import refine_corners
+from kcal.corners.refine import _saturation_levels, refine_corners
 from kcal.corners.saddle import CornerStatus
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -302,6 +302,15 @@ class TestRejection:
         found = refine_corners(white, start, side, "erf", (5, 4))
         assert bool((found.status == CornerStatus.GOOD).all())
         assert float((found.pixels - truth).square().mean().sqrt()) < 0.01
+
+    @pytest.mark.parametrize(
+        ("brightest", "kind", "level"),
+        [(200, np.uint8, 255), (255, np.uint8, 255), (4000, np.uint16, 4095), (4095, np.uint16, 4095),
+         (4094, np.uint16, 4094), (65535, np.uint16, 65535), (0, np.uint8, 255)],
+    )  # fmt: skip
+    def test_a_pixel_is_saturated_at_the_end_of_its_bits(self, brightest, kind, level):
+        """A camera's 10, 12 or 14 bits; a level nearly as high that is the brightest of all counts as the end."""
+        assert _saturation_levels(np.array([[0, brightest]], kind)) == (0.0, float(level))
 
     def test_blurred_corners(self):
         image, _, start, side = scene(12, blur=5.0, noise=0.2)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from skimage.registration import phase_cross_correlation
 
-from kcal.corners.match import MatchOptions, MatchStatus, match_points
+from kcal.corners.match import MatchOptions, MatchStatus, blurred_window, match_points
 from kcal.corners.point import enlarge, refine_point
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -211,3 +211,19 @@ class TestMatch:
             match_points(rig, left, right, PIXELS)
         with pytest.raises(InputError, match="half"):
             MatchOptions(half=0)
+
+
+@pytest.mark.parametrize(
+    ("where", "shape", "corner"),
+    [((3000.0, -900.0), (1, 1), (199, 0)), ((-900.0, 3000.0), (1, 1), (0, 99)), ((100.0, 50.0), None, None)],
+)
+def test_windows_beyond_the_image_hold_its_nearest_pixel(where, shape, corner):
+    """They are never empty, and never larger than what was asked for."""
+    image = torch.rand(100, 200, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    window = blurred_window(image, torch.tensor([where], dtype=torch.float64))
+    assert window.size == (200, 100)
+    if shape is None:
+        assert window.values.shape[0] == window.values.shape[1] < 100
+    else:
+        assert tuple(window.values.shape) == shape
+        assert tuple(window.corner.tolist()) == corner

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import torch
 from calibrate_scenes import camera, motions, observe, pixels_of
 
@@ -51,3 +52,22 @@ def test_all_that_is_known_is_in_the_file(tmp_path: Path) -> None:
     assert carried.record.excluded == result.excluded
     assert carried.sigma is not None
     assert carried.sigma["fx"] == result.sigma["fx"]
+
+
+@pytest.mark.parametrize("options", [{"model": "opencv5"}, {"model": "opencv5", "board_warp": True}, {}])
+def test_how_the_board_deviates_is_kept_where_it_was_solved(tmp_path: Path, options: dict) -> None:
+    """Of a warped board and of a printed one; a board that was taken as exact has nothing to keep."""
+    truth = camera()
+    pixels = pixels_of(truth, motions(truth, 8, 2))
+    seen = observe(pixels + 0.1 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(3)))
+    result = calibrate_camera(seen, CalibrationOptions(**options))
+    path = result.save(tmp_path / "a.camera.json")
+    record = CameraFile.load(path).calibration
+    assert record is not None
+    if options == {"model": "opencv5"}:
+        assert record.board_deviation is None
+        return
+    assert record.board_deviation is not None
+    moved = result.board_points - seen.board.points
+    assert record.board_deviation == tuple((x, y, z) for x, y, z in moved.tolist())
+    assert float(moved.abs().max()) > 0
