@@ -50,7 +50,9 @@ CONCLUSIONS = {
         "**Conclusion.** None of 10,000 lenses that were built to fold unseen gave two rays for a pixel; of the first "
         "1,000, 240 did before regions were proven. Single directions are proven; whether the images of different "
         "directions overlap is sampled at 1,024 places of the edge, so a lens with strong prism terms could still "
-        "escape. The proof takes 2 to 9 ms of processor time for each camera, a fifth to a half of the time before."
+        "escape. Of 424 ordinary cameras one loses pixels that samples found valid: 24 coefficients fitted to a wide "
+        "lens, which fold inside the image. The proof takes 3 to 12 ms of processor time for each camera, a fifth to "
+        "two fifths of the time before."
     ),
     "lens.md": (
         "**Conclusion.** For many points, compile the camera. From 10,000 points on, compiled kcal projects 5 to 18 "
