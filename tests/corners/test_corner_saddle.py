@@ -214,3 +214,12 @@ def test_bad_arguments():
         saddle(image, pixels.long(), 10.0)
     with pytest.raises(InputError, match="choose one of"):
         refine_corners(np.zeros((40, 40), np.uint8), pixels, torch.ones(3), "best")
+
+
+def test_how_far_a_corner_may_move_depends_on_its_squares():
+    """At most 2 px, and 0.3 of the side: 1.7 px are too far in squares of 5 px, and not in squares of 8 px."""
+    y, x = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
+    image = torch.tanh((x - 40) / 2) * torch.tanh((y - 30) / 2)
+    start = torch.tensor([[41.2, 31.2]]).double()
+    statuses = [int(saddle(image, start, torch.tensor([side])).status) for side in (5.0, 8.0)]
+    assert statuses == [CornerStatus.MOVED, CornerStatus.GOOD]

@@ -140,6 +140,22 @@ def test_unknown_ground_is_not_guessed(tmp_path: Path) -> None:
     ).tolist() == [-50.0]
 
 
+def test_heights_are_interpolated_between_the_centers_of_cells(tmp_path: Path) -> None:
+    """To the centers of the outermost cells, and no farther."""
+    rasterio = pytest.importorskip("rasterio")
+    path = tmp_path / "four.tif"
+    transform = rasterio.transform.from_origin(72.0, 19.0, 0.1, 0.1)
+    with rasterio.open(path, "w", driver="GTiff", height=3, width=2, count=1, dtype="float32", crs="EPSG:4326",
+                       transform=transform) as file:  # fmt: skip
+        file.write(np.array([[1.0, 2.0], [3.0, 5.0], [7.0, 11.0]], dtype=np.float32), 1)
+    # Just inside the centers at the northwest and the southeast, in the middle, and just beyond the centers.
+    lat = [18.95 - 1e-9, 18.75 + 1e-9, 18.90, 18.95 + 1e-6, 18.75 - 1e-6, 18.90, 18.90]
+    lon = [72.05 + 1e-9, 72.15 - 1e-9, 72.10, 72.10, 72.10, 72.05 - 1e-6, 72.15 + 1e-6]
+    found = terrain(path)(*torch.tensor([lat, lon], dtype=torch.float64))
+    assert found[:3].tolist() == pytest.approx([1.0, 11.0, 2.75], abs=1e-6)
+    assert found[3:].isnan().all()
+
+
 def test_a_flat_line_of_sight_is_a_bearing_only() -> None:
     level = stands(pitch_deg=0.0, roll_deg=0.0)
     grazing = torch.tensor([[960.0, 549.0], [5000.0, 700.0], [math.nan, 0.0]]).double()

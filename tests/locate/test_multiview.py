@@ -66,6 +66,15 @@ def test_likelihood_weighs_by_covariance_and_its_covariance_is_true() -> None:
     assert ((spread - claimed) / scale[:, None] / scale[None, :]).abs().max() < 0.06
 
 
+def test_one_covariance_may_stand_for_all_pixels() -> None:
+    marks = seen(tensor([40.0, 10.0, 800.0], [-60.0, 20.0, 900.0]) + SHIFT)
+    cov = tensor([0.04, 0.01], [0.01, 0.09])
+    locate = TriangulateViews(CAMERAS, poses())
+    shared, each = locate(marks, cov), locate(marks, cov.expand(*marks.shape, 2))
+    assert torch.equal(shared.covariance, each.covariance)
+    assert torch.equal(shared.points, each.points)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_gradients(method: str) -> None:
     marks = seen(tensor([3.0, 1.0, 90.0], [20.0, 8.0, 300.0]) + SHIFT)
