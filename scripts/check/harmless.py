@@ -17,4 +17,5 @@ HARMLESS = {
     "b32215be7946701c": "zero times a number, added or subtracted",
     "4beb85845d5b49a6": "a number that is set again before it is read",
     "ffa3e8654c336e29": "a row of nodes more, beyond the image",
+    "9d350f625c8848c9": "a negative number, which means none whatever its size",
 }
