@@ -13,9 +13,10 @@ HARMLESS = {
     "a2e2c6fb0726f3ff": "a point with Z = 0 has no finite image, which makes it invalid before",
     "c1c0d87e7ed882a1": "a number that stands where it is not read",
     "97f4df08b85439b6": "when stopped elements are dropped from a batch: only time",
-    "b65b2b83f420b66c": "cells without spaces are stripped: only time",
+    "b65b2b83af420b66": "cells without spaces are stripped: only time",
     "b32215be7946701c": "zero times a number, added or subtracted",
     "4beb85845d5b49a6": "a number that is set again before it is read",
     "ffa3e8654c336e29": "a row of nodes more, beyond the image",
+    "7900d21ef92672db": "a number that stands where it is not read",
     "9d350f625c8848c9": "a negative number, which means none whatever its size",
 }
