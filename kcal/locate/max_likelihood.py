@@ -155,7 +155,7 @@ def most_likely(
             # After so short a step, rounding may raise the cost.
             better = (at.cost <= cost) | (length <= _SHORT_STEP * noise)
             every = known_true(better)
-            covariance = _covariance(at, usable)
+            covariance = _covariance_at(at, usable)
             newton = -_product(covariance, _cost_slope(at))
             moved = (at.jacobian * newton[..., None, :]).sum(-3)
             if every:
@@ -176,12 +176,12 @@ def most_likely(
         else:
             theta = best
     if differentiated:
-        inverse = tuple(value.detach() for value in _covariance(_evaluate(fixed, theta), usable))
+        inverse = tuple(value.detach() for value in _covariance_at(_evaluate(fixed, theta), usable))
         for _ in range(_CHORDS):
             at = _evaluate(fixed, theta)
             theta = theta - torch.where(usable[..., None, :], _product(inverse, _cost_slope(at)), 0.0)
     at = _evaluate(whole, theta)
-    return _fit_at(at, theta, sides, _covariance(at, usable))
+    return _fit_at(at, theta, sides, _covariance_at(at, usable))
 
 
 def _least_noise(weight: Tensor | None) -> Tensor | float:
@@ -239,7 +239,7 @@ def _cost_slope(at: _Evaluated) -> Tensor:
     return (at.weighted * at.residual[..., None, :, :]).sum(-2)
 
 
-def _covariance(at: _Evaluated, usable: Tensor) -> Six:
+def _covariance_at(at: _Evaluated, usable: Tensor) -> Six:
     """Of (a, b, ρ), from the noise of the pixels."""
     return _inverse_of_six(_normal_matrix(at, usable))
 
