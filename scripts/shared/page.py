@@ -70,8 +70,8 @@ CONCLUSIONS = {
         "**Conclusion.** `kcal locate` takes tables of any length in the memory of a short one: 405 MB for a CSV of a "
         "million rows, 378 MB for a hundred thousand. A row costs 9 µs of processor time to CSV (108,000 rows a "
         "second; 16 µs with the covariances of cameras and pose) and 33 to 42 µs to GeoJSON, which contains a region "
-        "of 73 corners for each point: 28,000 to 30,000 rows a second with exact cameras, where 30,000 were the aim. With "
-        "a thousand rows, start-up takes most of the time."
+        "of 73 corners for each point: 28,000 to 30,000 rows a second with exact cameras, where 30,000 were the aim. "
+        "With a thousand rows, start-up takes most of the time."
     ),
     "verdict.md": (
         "**Conclusion.** A no can be believed, and tells why: of 200 captures with a planted fault, 167 of which were "
