@@ -168,11 +168,11 @@ def steps(description: str, total: int | None) -> Iterator[Callable[..., None]]:
     # Long work: meanwhile the garbage collector need not search the imported libraries, which takes 50 ms each time.
     gc.freeze()
     try:
-        with bar as progress:
-            task = progress.add_task(description, total=total)
+        with bar:
+            task = bar.add_task(description, total=total)
 
             def advance(text: str, by: int = 1) -> None:
-                progress.update(task, advance=by, description=f"{description}: {escape(one_line(text))}")
+                bar.update(task, advance=by, description=f"{description}: {escape(one_line(text))}")
 
             yield advance
     finally:

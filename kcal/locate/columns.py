@@ -82,6 +82,7 @@ def number_lines(values: NDArray[np.float64]) -> list[str]:
     some = bool(infinite.any())
     finite = np.ascontiguousarray(np.where(infinite, _LARGEST, values) if some else values)
     text = orjson.dumps(finite, option=orjson.OPT_SERIALIZE_NUMPY)
+    # Without the letters of null, which no number has.
     text = text[2:-2].translate(None, b"nul")
     text = text.replace(orjson.dumps(_LARGEST), b"inf") if some else text
     return text.decode().split("],[")

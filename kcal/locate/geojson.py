@@ -11,7 +11,7 @@ import orjson
 
 from kcal.locate.columns import NUMBERS, TEXTS, PositionColumns
 from kcal.locate.positions import Located
-from kcal.locate.region import REGION_SHARE, cut_at_antimeridian, ring_blocks
+from kcal.locate.region import CORNER_DECIMALS, REGION_SHARE, cut_at_antimeridian, ring_blocks
 from kcal.locate.stereo import PositionStatus
 
 # What JSON calls a number; "007" is none, and stays a text.
@@ -20,8 +20,6 @@ _JSON_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(\.[0-9]+)?([eE][+-]?[0-9]+)?")
 _LARGEST_WHOLE = 2**53
 _POLYGON = (b'{"type":"Feature","geometry":{"type":"Polygon","coordinates":[', b']},"properties":')
 _PROPERTIES = ("kind", *TEXTS, *NUMBERS)
-# Of the degrees of a region's corners: 0.1 mm (section 11.2). Positions keep all digits.
-_DECIMALS = 9
 _HEIGHT = NUMBERS.index("height_ellipsoidal_m")
 
 
@@ -70,7 +68,7 @@ def region_features(columns: PositionColumns, run: Located) -> Iterator[bytes]:
     """A polygon for each position: its 95 % region, a long and slightly skewed ellipse."""
     names = iter([columns.names[place] for place in np.flatnonzero(columns.located).tolist()])
     for block in ring_blocks(columns, run.origin):
-        corners = np.ascontiguousarray(block[..., ::-1]).round(_DECIMALS)
+        corners = np.ascontiguousarray(block[..., ::-1]).round(CORNER_DECIMALS)
         beyond = (np.abs(block[..., 1]).max(-1) > 180.0).tolist()
         # Section 3.1.6: closed, counterclockwise; section 3.1.9: a polygon across the antimeridian is cut in two.
         for lon_lat, cut, ring in zip(corners, beyond, block, strict=True):

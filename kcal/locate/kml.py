@@ -8,7 +8,7 @@ import numpy as np
 
 from kcal.locate.columns import PositionColumns, number_lines
 from kcal.locate.positions import Located, columns_of
-from kcal.locate.region import ring_blocks
+from kcal.locate.region import CORNER_DECIMALS, ring_blocks
 from kcal.texts import visible
 
 KML_END = " </Document>\n</kml>\n"
@@ -72,7 +72,8 @@ def kml_regions(columns: PositionColumns, run: Located) -> str:
     placemarks = []
     rings = (ring for block in ring_blocks(columns, run.origin) for ring in block)
     for name, ring in zip(names, rings, strict=True):
-        places = number_lines(np.stack([(ring[:, 1] + 180.0) % 360.0 - 180.0, ring[:, 0]], -1))
+        corners = np.stack([(ring[:, 1] + 180.0) % 360.0 - 180.0, ring[:, 0]], -1)
+        places = number_lines(corners.round(CORNER_DECIMALS))
         placemarks.append(
             f"  <Placemark>\n   <name>{_xml(name)}, 95 %</name>\n   <styleUrl>#region</styleUrl>\n   <Polygon>\n"
             f"    <outerBoundaryIs><LinearRing><coordinates>{' '.join(places)}</coordinates></LinearRing>"

@@ -158,13 +158,14 @@ def most_likely(
             covariance = _covariance_at(at, usable)
             newton = -_product(covariance, _cost_slope(at))
             moved = (at.jacobian * newton[..., None, :]).sum(-3)
+            farthest = moved.abs().amax(-2)
             if every:
-                best, step, cost, length = theta, newton, at.cost, moved.abs().amax(-2)
+                best, step, cost, length = theta, newton, at.cost, farthest
             else:
                 best = torch.where(better[..., None, :], theta, best)
                 step = torch.where(better[..., None, :], newton, 0.25 * step)
                 cost = torch.where(better, at.cost, cost)
-                length = torch.where(better, moved.abs().amax(-2), 0.25 * length)
+                length = torch.where(better, farthest, 0.25 * length)
             theta = best + step
             if every and known_true(length <= _SHORT_STEP * noise):
                 if differentiated or (by_camera and not number):

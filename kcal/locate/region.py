@@ -18,6 +18,9 @@ from kcal.locate.geodesy import anchor
 from kcal.locate.positions import Located, Position, columns_of
 
 REGION_SHARE = 0.95
+# In files, of the degrees of a region's corners: 0.1 mm (RFC 7946, section 11.2). Positions keep all digits. The last
+# digits of functions such as the arc tangent depend on how many values are computed at once.
+CORNER_DECIMALS = 9
 _RING_POINTS = 72
 # An ellipse that comes this close to the camera, in shares of the distance, has no inverse to speak of.
 _TOO_WIDE = 0.85

@@ -18,6 +18,7 @@ from kcal.locate.marks import Marks
 from kcal.locate.mounting import placed_rig
 from kcal.locate.positions import Located, locate_points
 from kcal.locate.range_sigmas import range_sigmas
+from kcal.locate.ranges import range_text
 from kcal.locate.survey import Survey, match_landmarks
 
 LEAST_LANDMARKS = 4
@@ -135,9 +136,8 @@ def verdict(promises: tuple[Promise, ...], count: int) -> tuple[str, bool]:
     far = promises[-1]
     if far.rig is None:
         return "these landmarks do not determine the rig well enough to predict its ranges", False
-    distance = f"{far.distance / 1000:g} km" if far.distance >= 1000 else f"{far.distance:g} m"
     rig, marks = (f"{error:.0f} m" if error >= 10 else f"{error:.2g} m" for error in (far.rig, far.marks))
-    share = f"at {distance} the rig errs by {rig}, marks by {marks}"
+    share = f"at {range_text(far.distance)} the rig errs by {rig}, marks by {marks}"
     if far.rig <= far.marks:
         return f"enough: {share}", True
     more = math.ceil(count * ((far.rig / far.marks) ** 2 - 1))

@@ -76,11 +76,6 @@ def plain_number(value: float, _: object = None) -> str:
     return f"{value:g}"
 
 
-def range_text(meters: float) -> str:
-    """Write a range with its unit: 250 m, 5 km."""
-    return f"{meters / 1000:g} km" if meters >= 1000 else f"{meters:g} m"
-
-
 def frame_image(axes: Axes, size: tuple[int, int], margin: float = 0.0) -> None:
     """Show an image's pixels (width, height), v down, with a margin of that share of its size."""
     (width, height), (across, down) = size, (margin * size[0], margin * size[1])

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.locate.positions import Located, Position
+from kcal.locate.ranges import range_text
 from kcal.locate.stereo import PositionStatus
-from kcal.report.figures import CAMERA_COLORS, FAINT, GRAY, HALO, INK, WARN, new_figure, range_text, save_picture
+from kcal.report.figures import CAMERA_COLORS, FAINT, GRAY, HALO, INK, WARN, new_figure, save_picture
 
 Array = NDArray[np.float64]
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from kcal.calibrate.rig.result import ItemResidual, RigResult
 from kcal.lens.camera import Camera
+from kcal.locate.ranges import range_text
 from kcal.report.figures import new_figure, save_picture
 
 Array = NDArray[np.float64]
@@ -133,8 +134,9 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
         if nearest / 4 <= radius <= reach:
             ring = np.log1p(radius / unit) / math.log1p(reach / unit)
             axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=_FAINT, linewidth=0.7, linestyle=":")
-            text = f"{radius / 1000:g} km" if radius >= 1000 else f"{radius:g} m"
-            axes.text(0.0, ring, text, fontsize=8, color="#4b5563", ha="center", va="bottom", path_effects=_HALO)
+            axes.text(
+                0.0, ring, range_text(radius), fontsize=8, color="#4b5563", ha="center", va="bottom", path_effects=_HALO
+            )
     for kind, (points, names, used) in places.items():
         drawn, good = place(points), np.array(used)
         marker = {"landmarks": "^", "boards": "s", "features": "o"}[kind]

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from kcal.errors import InputError
-from kcal.report.figures import range_text
+from kcal.locate.ranges import range_text
 
 Severity = Literal["stop", "doubt", "fine"]
 

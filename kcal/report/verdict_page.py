@@ -15,7 +15,7 @@ import kcal
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.files import write_atomic
 from kcal.lens.camera import Camera
-from kcal.report.figures import range_text
+from kcal.locate.ranges import range_text
 from kcal.report.verdict import RangeAnswer, Verdict
 from kcal.report.verdict_pictures import range_picture
 from kcal.texts import page_policy, visible

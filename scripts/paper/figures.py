@@ -13,6 +13,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from kcal.corners.observations import Observations
+from kcal.locate.ranges import range_text
 from kcal.report.figures import new_figure, save_picture
 from scripts.paper.aims import LIMIT
 from scripts.paper.numbers import (
@@ -238,7 +239,7 @@ def _plan(axes: Axes, true: list, found: list) -> None:
     for arc in (100, 250, 500, 1000, 2500, 5000, 10000):
         turn = np.linspace(math.radians(-25), math.radians(60), 60)
         axes.plot(radius(arc) * np.sin(turn), radius(arc) * np.cos(turn), color=FAINT, linewidth=0.6)
-        label = f"{arc / 1000:g} km" if arc >= 1000 else f"{arc} m"
+        label = range_text(arc)
         axes.text(radius(arc) * math.sin(turn[-1]), radius(arc) * math.cos(turn[-1]), label, fontsize=6, color=FAINT)
     for number, (a, b) in enumerate(zip(true, found, strict=True), 1):
         start = place(a)
