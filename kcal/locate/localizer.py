@@ -270,10 +270,9 @@ class StereoLocalizer(nn.Module):
         fit, scale, _, usable = found
         spread = [variance * entry for entry in fit.covariance]
         if self.calibration_factor is not None:
-            effect = calibration_effect(fit, scale)  # (..., N, 3, P)
-            moved = effect @ self.calibration_factor  # (..., N, 3, K)
+            moved = calibration_effect(fit, scale, self.calibration_factor)  # (..., 3, K, N)
             for number, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-                spread[number] = spread[number] + (moved[..., i, :] * moved[..., j, :]).sum(-1)
+                spread[number] = spread[number] + (moved[..., i, :, :] * moved[..., j, :, :]).sum(-2)
         reach = inverse_range(found, spread[5], PositionStatus.BEARING_ONLY)
         ok = reach.status == int(PositionStatus.OK)
         there = usable | (reach.status == int(PositionStatus.PARALLEL))
@@ -289,7 +288,7 @@ class StereoLocalizer(nn.Module):
             turn = torch.cat([by_mounting(enu), -self.half_curvature * up[..., None]], -1)
             covariance = covariance + turn @ self.mounting @ turn.mT
             if self.link is not None and self.calibration_factor is not None:
-                mixed = slope @ (effect @ self.link) @ turn.mT
+                mixed = slope @ calibration_effect(fit, scale, self.link).movedim(-1, -3) @ turn.mT
                 covariance = covariance + mixed + mixed.mT
         covariance = torch.where(ok[..., None, None], covariance, torch.diag(covariance.new_full((3,), math.inf)))
         geodetic = place_enu(enu, self.ecef_from_enu, self.ecef_of_origin)

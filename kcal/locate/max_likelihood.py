@@ -61,6 +61,7 @@ class PointFit(NamedTuple):
         sides: (..., 2, 3, N) the vectors e1 and e2.
         covariance: the six of the (..., N) symmetric 3x3 covariance of (a, b, ρ) from the noise of the pixels.
         gain: (..., 3, M, N) change of (a, b, ρ) by each pixel coordinate.
+        jacobian: (..., 3, M, N) change of each pixel coordinate by (a, b, ρ).
         residual: (..., M, N) predicted minus measured pixels.
         projections: one for each camera, at the optimum.
         turned: one for each camera, (..., 3, N): the direction in the camera's axes, before its translation.
@@ -71,6 +72,7 @@ class PointFit(NamedTuple):
     sides: Tensor
     covariance: Six
     gain: Tensor
+    jacobian: Tensor
     residual: Tensor
     projections: tuple[Projection, ...]
     turned: tuple[Tensor, ...]
@@ -265,7 +267,9 @@ def _fit_at(at: _Evaluated, theta: Tensor, sides: Tensor, covariance: Six) -> Po
     spread = [entry[..., None, :] for entry in covariance]
     gain = _product(spread, at.weighted.movedim(-3, -2)).movedim(-2, -3)
     turned = at.turned.unbind(-3)
-    return PointFit(turned[0], theta[..., 2, :], sides, covariance, gain, at.residual, at.projections, turned)
+    return PointFit(
+        turned[0], theta[..., 2, :], sides, covariance, gain, at.jacobian, at.residual, at.projections, turned
+    )
 
 
 def by_pose(fit: PointFit, number: int) -> Tensor:
@@ -280,15 +284,14 @@ def by_pose(fit: PointFit, number: int) -> Tensor:
 
 
 def unreached_direction(fit: PointFit) -> Tensor:
-    """(N, 4) for two cameras: the unit combination of pixel coordinates to which the point does not respond."""
-    rows = fit.gain.movedim(-1, 0)
+    """(4, N) for two cameras: the unit combination of pixel coordinates to which the point does not respond."""
     # One over the length of each row: they are angles and one over meters.
-    rows = rows / torch.linalg.vector_norm(rows, dim=-1, keepdim=True).clamp_min(1e-300)
+    length = fit.gain.square().sum(1, keepdim=True).sqrt()
     # The vector across three others in four dimensions: minors along the first, of the 2x2 minors of the other two.
-    a, b, c = rows.unbind(-2)
-    pairs = b[..., _FIRST] * c[..., _SECOND] - b[..., _SECOND] * c[..., _FIRST]
-    across = (a[..., _ALONG] * pairs[..., _PAIR] * rows.new_tensor(_SIGN)).sum(-1)
-    return torch.nn.functional.normalize(across, dim=-1)
+    a, b, c = fit.gain / length.clamp_min(1e-300)
+    pairs = b[_FIRST, :] * c[_SECOND, :] - b[_SECOND, :] * c[_FIRST, :]
+    across = (a[_ALONG, :] * pairs[_PAIR, :] * a.new_tensor(_SIGN)[..., None]).sum(1)
+    return across / across.square().sum(0).sqrt().clamp_min(1e-12)
 
 
 def symmetric(six: Sequence[Tensor]) -> Tensor:
@@ -305,21 +308,26 @@ def position_slope(fit: PointFit, scale: Tensor, ok: Tensor) -> Tensor:
     return ((scale / inverse)[..., None, :, None] * columns).movedim(-3, -2)
 
 
-def calibration_effect(fit: PointFit, scale: Tensor) -> Tensor:
-    """(..., N, 3, P) derivatives of a, b and ρ by the parameters in the order of `RigCovariance`; `fit` of two cameras.
+def calibration_effect(fit: PointFit, scale: Tensor, factor: Tensor) -> Tensor:
+    """(..., R, K, N) effect on a, b and ρ (the R rows of `fit.gain`) of K independent errors; `fit` of two cameras.
 
     A rise of a parameter that moves predicted pixels acts as a measurement that moved the other way.
+
+    Args:
+        fit: with derivatives by the cameras' parameters.
+        scale: meters, the unit of ρ.
+        factor: (P, K) what the errors change in the parameters, in the order of `RigCovariance`.
     """
     left, right = (projection.by_camera for projection in fit.projections)
     pose = by_pose(fit, 1)
     pose = torch.cat([pose[..., :3, :, :], pose[..., 3:, :, :] / scale], -3)
-    gain_left, gain_right = fit.gain[..., :2, :], fit.gain[..., 2:, :]
+    own, other = factor.split([left.shape[-3], len(factor) - left.shape[-3]])
 
-    def through(gain: Tensor, moved: Tensor) -> Tensor:
-        return -(gain[..., :, None, :, :] * moved[..., None, :, :, :]).sum(-2)
+    def pixels(factor: Tensor, moved: Tensor) -> Tensor:
+        return (factor.mT @ moved.flatten(-2)).unflatten(-1, (2, -1))
 
-    effect = torch.cat([through(gain_left, left), through(gain_right, right), through(gain_right, pose)], -2)
-    return effect.movedim(-1, -3)
+    moved = torch.cat([pixels(own, left), pixels(other, torch.cat([right, pose], -3))], -2)  # (..., K, 4, N)
+    return -(fit.gain[..., :, None, :, :] * moved[..., None, :, :, :]).sum(-2)
 
 
 def inverse_covariances(cov: Tensor | None) -> tuple[Tensor | None, Tensor]:

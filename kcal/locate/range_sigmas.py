@@ -103,7 +103,7 @@ def range_sigmas(
         lenses = pose = sideways = torch.zeros_like(far)
         if rig.covariance is not None:
             factor = rig.covariance.half.T
-            effect = (slope[:, None] * calibration_effect(found.fit, found.scale)[:, 2]) @ factor
+            effect = slope[:, None] * calibration_effect(found.fit, found.scale, factor)[2].mT
             by_lenses = effect @ _row_space(factor[:-6])
             lenses = by_lenses.norm(dim=-1)
             pose = (effect.square().sum(-1) - lenses.square()).clamp_min(0.0).sqrt()

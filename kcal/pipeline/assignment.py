@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from kcal.pipeline.beliefs import Beliefs, Innovations, Timing, fit_of, innovations
+from kcal.pipeline.beliefs import Beliefs, Fit, Innovations, Timing, fit_of, innovations
+from kcal.pipeline.lanes import product
 from kcal.pipeline.sightings import Anchored, Sightings, anchored
 
 
 class Candidates(NamedTuple):
-    """Possible matches, one a row.
+    """L possible matches.
 
     Attributes:
         track: (L,) numbers of tracks.
@@ -34,38 +35,49 @@ class Candidates(NamedTuple):
     log_density: Tensor
 
 
-def candidates(
-    beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, gate: float
-) -> Candidates:
-    """Compare all tracks with all pairs near them.
+def nearby(beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, gate: float) -> Tensor:
+    """(T, N) bool: pairs that are roughly in the direction of a track.
 
     Args:
-        beliefs: merged, (T, 1, ...), predicted.
-        frame: (T, 3, 3).
+        beliefs: merged, (..., 1, T), predicted.
+        frame: (3, 3, T).
         seen: N pairs.
         timing: of the pairs.
         root: of the covariance of the shared errors.
         gate: largest squared Mahalanobis distance.
     """
-    ray = torch.cat([beliefs.mean[:, 0, :2], torch.ones_like(beliefs.mean[:, 0, :1])], -1)
-    ray = torch.nn.functional.normalize((frame.mT @ ray[..., None])[..., 0], dim=-1)
-    apart = torch.cdist(ray, torch.nn.functional.normalize(seen.direction, dim=-1))
-    spread = (beliefs.effect[:, 0, :2] @ root).square().sum((-2, -1))
-    own = beliefs.noise[:, 0].diagonal(dim1=-2, dim2=-1)[:, :2].sum(-1)
+    mean, noise = beliefs.mean[:, 0], beliefs.noise[:, :, 0]
+    ray = torch.cat([mean[:2], torch.ones_like(mean[:1])])
+    ray = product(frame.transpose(0, 1), ray[:, None])[:, 0]
+    ray, other = (value / value.square().sum(0).sqrt() for value in (ray, seen.direction))
+    apart = (ray[:, :, None] - other[:, None]).square().sum(0)
+    spread = product(beliefs.effect[:2, :, 0], root[..., None]).square().sum((0, 1))
     # A mark that is late has moved on.
-    pace = beliefs.mean[:, 0, 3:5].square().sum(-1) + beliefs.noise[:, 0].diagonal(dim1=-2, dim2=-1)[:, 3:5].sum(-1)
-    late = timing.delay.abs().amax(-1) + timing.unsure
-    reach = (own + spread)[:, None] + seen.noise.diagonal(dim1=-2, dim2=-1)[:, :2].sum(-1)
-    reach = reach + seen.shared[:, :2].square().sum((-2, -1)) + pace[:, None] * late.square()
-    track, pair = ((apart.square() <= 2.0 * gate * reach) & seen.usable).nonzero(as_tuple=True)
-    local = anchored(seen.at(pair), frame[track])
-    found = innovations(beliefs.at(track), local, timing.at(pair))
-    fit = fit_of(found, root)
-    good = local.ahead & (fit.squared[:, 0] <= gate)
-    return Candidates(
-        track[good], pair[good], Anchored(*(v[:, good] if i == 3 else v[good] for i, v in enumerate(local))),
-        Innovations(*(value[good] for value in found)), fit.squared[good, 0], fit.log_density[good, 0],
-    )  # fmt: skip
+    pace = mean[3:5].square().sum(0) + noise[3, 3] + noise[4, 4]
+    late = timing.delay.abs().amax(0) + timing.unsure
+    reach = (noise[0, 0] + noise[1, 1] + spread)[:, None] + seen.noise[0, 0] + seen.noise[1, 1]
+    reach = reach + seen.shared[:2].square().sum((0, 1)) + pace[:, None] * late.square()
+    return (apart <= 2.0 * gate * reach) & seen.usable
+
+
+def judged(
+    beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor
+) -> tuple[Anchored, Innovations, Fit]:
+    """Sightings against merged beliefs, one for each of L tracks."""
+    local = anchored(seen, frame)
+    found = innovations(beliefs, local, timing)
+    return local, found, fit_of(found, root)
+
+
+def within(possible: tuple[Anchored, Innovations, Fit], track: Tensor, pair: Tensor, gate: float) -> Candidates:
+    """Those in front of the track and within the gate."""
+    local, found, fit = possible
+    good = local.ahead & (fit.squared[0] <= gate)
+    which = good.nonzero()[:, 0]
+    if len(which) < len(good):
+        track, pair, local, found = track[which], pair[which], local.at(which), found.at(which)
+        fit = Fit(fit.squared[:, which], fit.log_density[:, which])
+    return Candidates(track, pair, local, found, fit.squared[0], fit.log_density[0])
 
 
 def mark_numbers(left: Tensor, right: Tensor) -> NDArray[np.int64]:

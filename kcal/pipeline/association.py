@@ -21,7 +21,7 @@ from torch import Tensor
 from kcal.corners.filters import as_gray
 from kcal.errors import InputError
 from kcal.lens.rig import RigCovariance, StereoRig
-from kcal.locate.max_likelihood import by_pose, calibration_effect, unreached_direction
+from kcal.locate.max_likelihood import calibration_effect, unreached_direction
 from kcal.locate.stereo import PairFit, PositionStatus, fit_pairs, inverse_range
 from kcal.pipeline.detections import Anchor, Detections
 from kcal.pipeline.epipolar_band import near_epipolar_lines
@@ -156,8 +156,8 @@ def pair_costs(
     found = fit_pairs(rig, first, second, by_camera=rig.covariance is not None)
     spread = variance * found.fit.covariance[5]
     if rig.covariance is not None:
-        moved = calibration_effect(found.fit, found.scale)[..., 2, :] @ rig.covariance.half.T
-        spread = spread + moved.square().sum(-1)
+        moved = calibration_effect(found.fit, found.scale, rig.covariance.half.T)[2]
+        spread = spread + moved.square().sum(0)
     reach = inverse_range(found, spread, PositionStatus.BEARING_ONLY)
     nearest = options.nearest if options.nearest is not None else 10.0 * float(rig.baseline)
     beyond = (1.0 / options.farthest - reach.value).clamp_min(0.0)
@@ -173,17 +173,12 @@ def epipolar_cost(found: PairFit, variance: float, covariance: RigCovariance | N
 
     The combination of the four coordinates that no point explains is orthogonal to the rows of `gain`.
     """
-    fit = found.fit
-    across = unreached_direction(fit)
-    error = (across * fit.residual.mT).sum(-1)
+    across = unreached_direction(found.fit)
+    error = (across * found.fit.residual).sum(0)
     spread = torch.full_like(error, variance)
     if covariance is not None:
-        left, right = (projection.by_camera for projection in fit.projections)
-        pose = by_pose(fit, 1)
-        pose = torch.cat([pose[:3], pose[3:] / found.scale])
-        unit = across.mT
-        slopes = [(unit[:2] * left).sum(1), (unit[2:] * right).sum(1), (unit[2:] * pose).sum(1)]
-        spread = spread + (torch.cat(slopes).T @ covariance.half.T).square().sum(-1)
+        moved = calibration_effect(found.fit._replace(gain=across[None]), found.scale, covariance.half.T)
+        spread = spread + moved[0].square().sum(0)
     return error.square() / spread
 
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.pipeline.lanes import eliminate, solved
 
 # Offset, drift, slope over the rows.
 CLOCK_TERMS = 3
@@ -98,12 +99,12 @@ class SharedErrors:
         self.root = torch.diag(self.scale)
 
     def add(self, effect: Tensor, innovation: Tensor, covariance: Tensor) -> None:
-        """Collect independent innovations (N, 4) = effect (N, 4, K + 3) b + noise of the covariance (N, 4, 4)."""
+        """Collect independent innovations (4, N) = effect (4, K + 3, N) b + noise of the covariance (4, 4, N)."""
         if not self.estimated:
             return
-        scaled = effect * self.scale
-        white = torch.linalg.solve_ex(covariance, torch.cat([scaled, innovation[..., None]], -1))[0]
-        both = (scaled.mT @ white).sum(0)
+        scaled = effect * self.scale[:, None]
+        white = solved(eliminate(covariance, torch.cat([scaled, innovation[:, None]], 1)))
+        both = (scaled[:, :, None] * white[:, None]).sum((0, -1))
         self.information = self.information + both[:, :-1]
         self.score = self.score + both[:, -1]
 

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.pipeline.lanes import outer, product
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,32 +55,21 @@ class Transition(NamedTuple):
     """One step of J models for T targets: positions move by `reach` velocity, velocities become `keep` velocity.
 
     Attributes:
-        reach: (T, J, 3, 3) seconds.
-        keep: (T, J, 3, 3).
-        noise: (T, J, 6, 6) covariance of position and velocity, meters and seconds.
+        reach: (3, 3, J, T) seconds.
+        keep: (3, 3, J, T), a rotation times `left`.
+        left: (J, 1) share of the velocity that is left.
+        noise: (3, J, 1) variances of position, of position with velocity, and of velocity, along each axis.
     """
 
     reach: Tensor
     keep: Tensor
+    left: Tensor
     noise: Tensor
 
 
-def transition(motions: tuple[Motion, ...], dt: float, up: Tensor) -> Transition:
-    """The step of some models by `dt` seconds.
-
-    Args:
-        motions: J models.
-        dt: seconds, not negative.
-        up: (T, 3) unit vectors: the axis of turns in each target's frame.
-    """
-    zero = torch.zeros_like(up[:, 0])
-    x, y, z = up.unbind(-1)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    still = torch.eye(3, dtype=up.dtype, device=up.device)
-    along = up[:, :, None] * up[:, None, :]
-    # Of what is level, of its turn to the left, and of what is upright.
-    parts = torch.stack([still - along, cross, along], 1)[:, None, None]
-    steps, blocks = [], []
+def step_numbers(motions: tuple[Motion, ...], dt: float) -> list[list[float]]:
+    """What `transition` needs of J models and a step of `dt` seconds: nine rows of J numbers."""
+    columns = []
     for motion in motions:
         # Velocity decays and turns at once: v(t) = e^(-t / memory) exp(t rate [up]x) v, integrated for the position.
         decay, rate = 1.0 / motion.memory_s, motion.turn_rate
@@ -88,12 +78,28 @@ def transition(motions: tuple[Motion, ...], dt: float, up: Tensor) -> Transition
         kept *= complex(math.cos(rate * dt), math.sin(rate * dt))
         moved = (kept - 1.0) / turned if abs(turned) * dt > 1e-9 else complex(dt)
         upright = (1.0 - left) / decay if decay * dt > 1e-9 else dt
-        steps.append([[moved.real, moved.imag, upright], [kept.real, kept.imag, left]])
-        place, both, velocity = _noise_entries(motion, dt)
-        blocks.append([[place, both], [both, velocity]])
-    reach, keep = (up.new_tensor(steps)[..., None, None] * parts).sum(3).unbind(2)
-    noise = torch.kron(up.new_tensor(blocks), still).expand(len(up), -1, 6, 6)
-    return Transition(reach, keep, noise)
+        entries = _noise_entries(motion, dt)
+        columns.append([moved.real, moved.imag, upright, kept.real, kept.imag, left, *entries])
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def transition(numbers: Tensor, up: Tensor) -> Transition:
+    """The step of some models.
+
+    Args:
+        numbers: (9, J) from `step_numbers`.
+        up: (3, T) unit vectors: the axis of turns in each target's frame.
+    """
+    x, y, z = up
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).unflatten(0, (3, 3))
+    along = outer(up, up)
+    still = torch.eye(3, dtype=up.dtype, device=up.device)[..., None]
+    # Of what is level, of its turn to the left, and of what is upright.
+    parts = torch.stack([still - along, cross, along])[..., None, :]
+    steps = numbers[:6].unflatten(0, (2, 3))[:, :, None, None, :, None]
+    reach, keep = (steps * parts).sum(1)
+    return Transition(reach, keep, numbers[5, :, None], numbers[6:, :, None])
 
 
 def _noise_entries(motion: Motion, dt: float) -> tuple[float, float, float]:
@@ -112,47 +118,71 @@ def _noise_entries(motion: Motion, dt: float) -> tuple[float, float, float]:
     )
 
 
-def moved(state: Tensor, step: Transition, turn: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """Move states (T, J, 6) by a step, and turn their frames.
+class Moved(NamedTuple):
+    """States (6, J, T) after a step: new = carried(state) / ahead, a projective map.
+
+    Attributes:
+        state: (6, J, T).
+        ahead: (J, T) what the new numbers are divided by.
+        noise: (6, 6, J, T) what the step adds.
+        linear: (7, 6, J, T) derivatives before the division: of the new numbers, and of `ahead`.
+    """
+
+    state: Tensor
+    ahead: Tensor
+    noise: Tensor
+    linear: Tensor
+
+    def through(self, columns: Tensor) -> Tensor:
+        """The derivatives (6, 6, J, T) of the new state by the old one, times columns (6, C, J, T)."""
+        found = product(self.linear, columns)
+        return (found[:6] - outer(self.state, found[6])) / self.ahead
+
+
+def moved(state: Tensor, step: Transition, turn: Tensor | None = None) -> Moved:
+    """Move states (6, J, T) by a step, and turn their frames.
 
     Args:
         state: see the module.
         step: from `transition`.
-        turn: (T, 3, 3) rotations from the old frames into new ones; None: the frames stay.
-
-    Returns:
-        The new states, derivatives (T, J, 6, 6) by the old ones, and the noise (T, J, 6, 6) added.
+        turn: (3, 3, T) rotations from the old frames into new ones; None: the frames stay.
     """
-    reach, keep, rotation = step.reach, step.keep, None
+    reach, keep, zero = step.reach, step.keep, torch.zeros_like(step.reach[0])
+    rotation = torch.eye(3, dtype=state.dtype, device=state.device)[..., None, None]
     if turn is not None:
-        rotation = turn[:, None]
-        reach, keep = rotation @ reach, rotation @ keep
-    inverse, velocity = state[..., 2], state[..., 3:]
-    ray = torch.cat([state[..., :2], torch.ones_like(state[..., :1])], -1)
-    ray = ray if rotation is None else (rotation @ ray[..., None])[..., 0]
-    ahead = ray + (reach @ velocity[..., None])[..., 0]
-    share = 1.0 / ahead[..., 2:]
-    new = torch.cat([ahead[..., :2], inverse[..., None], (keep @ velocity[..., None])[..., 0]], -1) * share
-    by_ray = torch.zeros(*state.shape, 3, dtype=state.dtype, device=state.device)
-    by_ray[..., 0, 0] = by_ray[..., 1, 1] = share[..., 0]
-    by_ray[..., 2] = -new * share
-    by_state = torch.zeros(*state.shape, 6, dtype=state.dtype, device=state.device)
-    by_state[..., :2] = by_ray[..., :2] if rotation is None else by_ray @ rotation[..., :2]
-    by_state[..., 2, 2] = share[..., 0]
-    by_velocity = torch.nn.functional.pad(keep * share[..., None], (0, 0, 3, 0))
-    by_state[..., 3:] = by_ray @ reach + by_velocity
-    push = torch.nn.functional.pad(torch.eye(3).to(state) * share[..., None], (0, 0, 3, 0))
-    by_noise = inverse[..., None, None] * torch.cat([by_ray, push], -1)
-    return new, by_state, by_noise @ step.noise @ by_noise.mT
+        rotation = turn[:, :, None]
+        reach, keep = product(rotation, reach), product(rotation, keep)
+    # Directions and velocities as they were make directions, the inverse range and velocities.
+    by_direction = rotation[:, :2].expand(3, 2, *zero.shape[1:])
+    to_ray = torch.cat([by_direction, zero[:, None], reach], 1)
+    unit = torch.eye(6, dtype=state.dtype, device=state.device)[..., None, None]
+    to_inverse = unit[2].expand_as(to_ray[0])
+    to_velocity = torch.cat([torch.stack([zero] * 3, 1), keep], 1)
+    linear = torch.cat([to_ray[:2], to_inverse[None], to_velocity, to_ray[2:]])
+    carried = (linear * state).sum(1)
+    ahead = carried[6] + rotation[2, 2]
+    straight = torch.nn.functional.pad(rotation[:2, 2], (0, 0, 0, 0, 0, 4))
+    new = (carried[:6] + straight) / ahead
+    return Moved(new, ahead, (state[2] / ahead).square() * _step_noise(new, step.noise), linear)
+
+
+def _step_noise(new: Tensor, noise: Tensor) -> Tensor:
+    """Isotropic noise of position and velocity in the new state's numbers, where 1 / z is one: (6, 6, J, T)."""
+    # Slopes are [E - n e3ᵀ, e3 I] with E of the first two directions: what does not depend on n, and what does.
+    basis = torch.zeros(3, 6, 6, dtype=new.dtype, device=new.device)
+    basis[0, :2, :2] = basis[1, :2, 3:5] = basis[1, 3:5, :2] = torch.eye(2)
+    basis[2, 3:, 3:] = torch.eye(3)
+    fixed = (basis[..., None, None] * noise[:, None, None]).sum(0)
+    last = torch.eye(6, dtype=new.dtype, device=new.device)[5, :, None, None]
+    half = outer(new, 0.5 * noise[0] * new - noise[1] * last)
+    return fixed + half + half.transpose(0, 1)
 
 
 def rates(state: Tensor) -> tuple[Tensor, Tensor]:
-    """Rates (..., 3) of the first three numbers, and their derivatives (..., 3, 6) by the state."""
-    x, y, inverse, u, v, closing = state.unbind(-1)
-    zero, one = torch.zeros_like(x), torch.ones_like(x)
-    slope = torch.stack([
-        -closing, zero, zero, one, zero, -x,
-        zero, -closing, zero, zero, one, -y,
-        zero, zero, -closing, zero, zero, -inverse,
-    ], -1).unflatten(-1, (3, 6))  # fmt: skip
-    return torch.stack([u - x * closing, v - y * closing, -inverse * closing], -1), slope
+    """Rates (3, ...) of the first three numbers, and their derivatives (3, 6, ...) by the state (6, ...)."""
+    place, closing = state[:3], state[5]
+    across = torch.cat([state[3:5], torch.zeros_like(state[:1])])
+    still = torch.eye(3, dtype=state.dtype, device=state.device).reshape(3, 3, *[1] * closing.ndim)
+    by_place = (-closing * still).expand(3, 3, *closing.shape)
+    by_pace = torch.cat([still[:, :2].expand(3, 2, *closing.shape), -place[:, None]], 1)
+    return across - place * closing, torch.cat([by_place, by_pace], 1)

@@ -12,28 +12,28 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from kcal.lens.projection import Projection
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.max_likelihood import PointFit, calibration_effect, symmetric, unreached_direction
 from kcal.locate.stereo import PositionStatus, fit_pairs
+from kcal.pipeline.lanes import congruent, eliminate, outer, product, solved
 from kcal.pipeline.pairs import ObjectPairs
 
 
 class Sightings(NamedTuple):
-    """N pairs of one moment, in the rig frame.
+    """N pairs of one moment, in the rig frame; the last axis of all counts them.
 
     The four measured numbers are a, b (shares of `direction` along `sides`), the inverse range and the miss; the point
     is (direction + a * sides[0] + b * sides[1]) / inverse at a = b = 0.
 
     Attributes:
-        direction: (N, 3), of unit length to first order.
-        sides: (N, 2, 3) across it.
+        direction: (3, N), of unit length to first order.
+        sides: (2, 3, N) across it.
         inverse: (N,) one over meters; may be negative.
-        noise: (N, 3, 3) covariance of a, b and `inverse` from noise in the pixels; that of the miss is one.
+        noise: (4, 4, N) covariance of the four from noise in the pixels; that of the miss is one.
         miss: (N,) how far the rays miss each other, in sigmas.
-        shared: (N, 4, K) effect of K independent unit errors on the four: of the calibration, and the two that last.
-        late: (2, N, 4, 3) how the four move by rates of (a, b, inverse) if the left or the right mark is a second late.
-        time: (N, 2) seconds.
+        shared: (4, K, N) effect of K independent unit errors on the four: of the calibration, and the two that last.
+        late: (2, 4, 3, N) how the four move by rates of (a, b, inverse) if the left or the right mark is a second late.
+        time: (2, N) seconds.
         row: (N,) row of the right mark, -0.5 at the top of the image to 0.5 at its bottom.
         usable: (N,) bool: the rays exist and are not along the baseline.
     """
@@ -51,15 +51,9 @@ class Sightings(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The sightings at some places."""
-        return self._replace(
-            **{
-                name: value[:, which] if name == "late" else value[which]
-                for name, value in zip(self._fields, self, strict=True)
-            }
-        )
+        return type(self)(*(value[..., which] for value in self))
 
 
-@torch.no_grad()
 def sightings(localize: StereoLocalizer, pairs: ObjectPairs, lasting_px: float = 0.0) -> Sightings:
     """Measure pairs with a rig; the calibration's errors are those that `localize` includes.
 
@@ -68,65 +62,65 @@ def sightings(localize: StereoLocalizer, pairs: ObjectPairs, lasting_px: float =
         pairs: of one moment.
         lasting_px: standard deviation along each axis of errors of the right marks that stay as long as a target.
     """
+    return measured(localize, pairs.left, pairs.right, pairs.covariance, pairs.time, lasting_px)
+
+
+@torch.no_grad()
+def measured(
+    localize: StereoLocalizer, left: Tensor, right: Tensor, covariance: Tensor, time: Tensor, lasting_px: float
+) -> Sightings:
+    """`sightings` of tensors (N, ...) alone."""
     rig = localize.rig
-    found = fit_pairs(rig, pairs.left, pairs.right, pairs.covariance, by_camera=True)
+    found = fit_pairs(rig, left, right, covariance, by_camera=True)
     fit, scale = found.fit, found.scale
-    across = _miss_direction(fit, pairs.covariance)
-    fourth = fit._replace(gain=torch.cat([fit.gain, across.mT[None]], 0))
-    shared = pairs.left.new_zeros(len(pairs), 4, 0)
+    across = _miss_direction(fit, covariance.movedim(0, -1))
+    gain = torch.cat([fit.gain, across[None]])  # (4, 4 pixels, N)
+    shared = gain[:, :0]
     if localize.calibration_factor is not None:
-        shared = calibration_effect(fourth, scale) @ localize.calibration_factor
-    gain = fourth.gain.movedim(-1, 0)  # (N, 4, 4 pixels)
+        shared = calibration_effect(fit._replace(gain=gain), scale, localize.calibration_factor)
     if lasting_px:
-        shared = torch.cat([shared, lasting_px * gain[..., 2:]], -1)
-    left = _pixel_slopes(fit.projections[0], (*fit.sides.unbind(0), torch.zeros_like(fit.direction)))
-    turn = rig.right_from_left_rotation
-    shift = (rig.right_from_left_translation / scale)[:, None].expand_as(fit.direction)
-    right = _pixel_slopes(fit.projections[1], (*(turn @ side for side in fit.sides.unbind(0)), shift))
-    late = torch.stack([gain[..., :2] @ left, gain[..., 2:] @ right])
+        shared = torch.cat([shared, lasting_px * gain[:, 2:]], 1)
+    by_left = product(gain[:, :2], fit.jacobian[:, :2].transpose(0, 1))
+    # Where both marks are late, the point is: its three numbers move as they do, and the miss does not.
+    both = torch.eye(4, 3, dtype=gain.dtype, device=gain.device)[..., None]
     # From ρ in units of the rig's size to one over meters.
-    unit = torch.stack([torch.ones_like(scale), torch.ones_like(scale), 1.0 / scale])
-    four = torch.cat([unit, unit.new_ones(1)])
+    unit = torch.stack([torch.ones_like(scale), torch.ones_like(scale), 1.0 / scale])[:, None]
+    four = torch.cat([unit, torch.ones_like(unit[:1])])[:, None]
+    noise = symmetric(fit.covariance).movedim(0, -1) * four[:3] * unit
+    last = torch.eye(4, dtype=gain.dtype, device=gain.device)[3]
     usable = found.usable & (found.status != int(PositionStatus.BAD_COVARIANCE))
     return Sightings(
-        direction=fit.direction.mT,
-        sides=fit.sides.permute(2, 0, 1),
+        direction=fit.direction,
+        sides=fit.sides,
         inverse=fit.inverse / scale,
-        noise=symmetric(fit.covariance) * unit[:, None] * unit,
-        miss=-(across * fit.residual.mT).sum(-1),
-        shared=shared * four[:, None],
-        late=late * four[:, None] / unit,
-        time=pairs.time,
-        row=pairs.right[:, 1] / rig.right.size[1] - 0.5,
+        noise=torch.nn.functional.pad(noise, (0, 0, 0, 1, 0, 1)) + outer(last, last)[..., None],
+        miss=-(across * fit.residual).sum(0),
+        shared=shared * four,
+        late=torch.stack([by_left, both - by_left]) * four / unit,
+        time=time.T,
+        row=right[:, 1] / rig.right.size[1] - 0.5,
         usable=usable,
     )
 
 
 def _miss_direction(fit: PointFit, covariance: Tensor) -> Tensor:
-    """(N, 4) the combination of pixels with unit variance that the point cannot explain.
+    """(4, N) the combination of pixels with unit variance that the point cannot explain.
 
     The gain (3, 4, N) is (Jᵀ W J)⁻¹ Jᵀ W: what it maps to zero is W⁻¹ times what J does not reach.
     """
     kernel = unreached_direction(fit)
-    white = torch.linalg.solve_ex(covariance, kernel)[0]
-    variance = (kernel * white).sum(-1, keepdim=True)
-    return white / variance.clamp_min(1e-300).sqrt()
-
-
-def _pixel_slopes(projection: Projection, columns: tuple[Tensor, ...]) -> Tensor:
-    """(N, 2, 3) derivatives of pixels by three unknowns that move the seen point along `columns` (3, N) each."""
-    moved = torch.stack(columns)  # (3 unknowns, 3, N)
-    return (moved[:, :, None] * projection.by_point).sum(1).permute(2, 1, 0)
+    white = solved(eliminate(covariance, kernel[:, None]))[:, 0]
+    return white / (kernel * white).sum(0).clamp_min(1e-300).sqrt()
 
 
 class Anchored(NamedTuple):
     """Sightings in frames of tracks: x / z, y / z and 1 / z there, and the miss.
 
     Attributes:
-        value: (N, 4).
-        noise: (N, 4, 4).
-        shared: (N, 4, K).
-        late: (2, N, 4, 3), by rates of the first three.
+        value: (4, N).
+        noise: (4, 4, N).
+        shared: (4, K, N).
+        late: (2, 4, 3, N), by rates of the first three.
         ahead: (N,) bool: in front of the frame's plane.
     """
 
@@ -136,23 +130,34 @@ class Anchored(NamedTuple):
     late: Tensor
     ahead: Tensor
 
+    def at(self, which: Tensor) -> Self:
+        """The sightings at some places."""
+        return type(self)(*(value[..., which] for value in self))
+
 
 def anchored(seen: Sightings, frame: Tensor) -> Anchored:
-    """Express sightings in frames (N, 3, 3): rotations from the rig's axes."""
-    ray = (frame @ seen.direction[..., None])[..., 0]
-    ahead = seen.usable & (ray[..., 2] > 0.1)
-    ray = torch.where(ahead[..., None], ray, ray.new_tensor([0.0, 0.0, 1.0]))
-    along, inverse = ray[..., 2:], seen.inverse[..., None] / ray[..., 2:]
-    place = torch.cat([ray[..., :2] / along, inverse], -1)
-    sides = frame @ seen.sides.mT  # (N, 3, 2), columns a and b
-    turn = torch.zeros(*ray.shape[:-1], 4, 4, dtype=ray.dtype, device=ray.device)
-    turn[..., :2, :2] = (sides[..., :2, :] - place[..., :2, None] * sides[..., 2:, :]) / along[..., None]
-    turn[..., 2:3, :2] = -inverse[..., None] * sides[..., 2:, :] / along[..., None]
-    turn[..., 2, 2] = 1.0 / along[..., 0]
-    turn[..., 3, 3] = 1.0
-    noise = torch.zeros_like(turn)
-    noise[..., :3, :3] = turn[..., :3, :3] @ seen.noise @ turn[..., :3, :3].mT
-    noise[..., 3, 3] = 1.0
-    back = torch.linalg.inv_ex(turn[..., :3, :3])[0]
-    value = torch.cat([place, seen.miss[..., None]], -1)
-    return Anchored(value, noise, turn @ seen.shared, turn @ seen.late @ back, ahead)
+    """Express sightings in frames (3, 3, N): rotations from the rig's axes."""
+    ray = (frame * seen.direction).sum(1)
+    ahead = seen.usable & (ray[2] > 0.1)
+    axis = torch.eye(3, dtype=ray.dtype, device=ray.device)[2, :, None]
+    ray = torch.where(ahead, ray, axis)
+    along, inverse = ray[2], seen.inverse / ray[2]
+    place = torch.cat([ray[:2] / along, inverse[None]])
+    sides = product(frame, seen.sides.transpose(0, 1)) / along  # (3, 2, N), columns a and b
+    # x / z, y / z, 1 / z by a, b and the inverse range along `direction`.
+    by_sides = torch.cat([sides[:2], torch.zeros_like(sides[:1])]) - place[:, None] * sides[2]
+    unit = torch.eye(4, dtype=ray.dtype, device=ray.device)
+    turn = torch.cat([by_sides, (axis / along)[:, None]], 1)
+    turn = torch.nn.functional.pad(turn, (0, 0, 0, 1, 0, 1)) + outer(unit[3], unit[3])[..., None]
+    # And back: the matrix is [A 0; r d], whose inverse is [A⁻¹ 0; -r A⁻¹ / d, 1 / d].
+    (a, b), (c, d) = by_sides[:2]
+    inverse_sides = torch.stack([d, -b, -c, a]).unflatten(0, (2, 2)) / (a * d - b * c)
+    last = torch.cat([-along * (by_sides[2, :, None] * inverse_sides).sum(0), along[None]])
+    back = torch.cat([torch.nn.functional.pad(inverse_sides, (0, 0, 0, 1)), last[None]])
+    return Anchored(
+        value=torch.cat([place, seen.miss[None]]),
+        noise=congruent(turn, seen.noise),
+        shared=product(turn, seen.shared),
+        late=torch.stack([product(product(turn, late), back) for late in seen.late]),
+        ahead=ahead,
+    )

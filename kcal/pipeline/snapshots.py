@@ -16,13 +16,21 @@ from kcal.errors import FileError
 from kcal.pipeline.beliefs import Beliefs
 from kcal.pipeline.tracks import Tracker, TrackRecord
 
+# Of the tensors: a journal of another one is of no use.
+_LAYOUT = "tracks last"
 _SHARED = ("information", "score", "values", "root")
 
 
 def settings_of(tracker: Tracker) -> str:
     """Hex digits that change with the rig, its errors and all options."""
     localize, shared = tracker.localize, tracker.shared
-    parts = [localize.rig.fingerprint, repr(tracker.options), repr(shared.scale.tolist()), repr(localize.attitude_deg)]
+    parts = [
+        _LAYOUT,
+        localize.rig.fingerprint,
+        repr(tracker.options),
+        repr(shared.scale.tolist()),
+        repr(localize.attitude_deg),
+    ]
     parts += [repr(localize.origin), repr(localize.drop)]
     parts += [
         "none" if value is None else _packed(value)["data"]

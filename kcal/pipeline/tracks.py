@@ -13,13 +13,24 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.assignment import Candidates, assigned, candidates, mark_numbers
-from kcal.pipeline.beliefs import Beliefs, Timing, born, fit_of, innovations, predicted, updated
-from kcal.pipeline.consider import CLOCK_TERMS, ClockEstimate, ClockPrior, SharedErrors
+from kcal.pipeline.assignment import Candidates, assigned, judged, mark_numbers, nearby, within
+from kcal.pipeline.beliefs import (
+    Beliefs,
+    Timing,
+    born,
+    cross_covariance,
+    fit_of,
+    innovations,
+    no_beliefs,
+    predicted,
+    updated,
+)
+from kcal.pipeline.consider import ClockEstimate, ClockPrior, SharedErrors
 from kcal.pipeline.estimates import TrackStates, track_states
-from kcal.pipeline.motion import MOTIONS, Motion, transition
+from kcal.pipeline.lanes import eliminate, product, squared
+from kcal.pipeline.motion import MOTIONS, Motion, step_numbers, transition
 from kcal.pipeline.pairs import ObjectPairs
-from kcal.pipeline.sightings import Anchored, Sightings, anchored, sightings
+from kcal.pipeline.sightings import Sightings, anchored, sightings
 from kcal.pipeline.smoothing import History, SmoothedTrack
 
 # A frame is turned toward its target when that is farther from the axis than this tangent: 17°.
@@ -162,9 +173,9 @@ class Tracker:
         self.history: History | None = History() if record else None
         models = len(self.options.motions)
         empty = torch.zeros(0, dtype=torch.float64, device=device)
-        self.frame = empty.reshape(0, 3, 3)
-        shapes = ((6,), (6, 6), (6, self.calibration), (6, CLOCK_TERMS, 3), ())
-        self.beliefs = Beliefs(*(empty.reshape(0, models, *shape) for shape in shapes))
+        # (3, 3, T) rotations from the rig's axes.
+        self.frame = empty.reshape(3, 3, 0)
+        self.beliefs = no_beliefs(self.calibration, models, device)
         self.next_number = self.next_key = 1
 
     @torch.no_grad()
@@ -192,14 +203,14 @@ class Tracker:
         self._sort_out()
         if self.history is not None:
             keys = [track.key for track in self.records]
-            self.history.filtered(time, keys, self.frame, self.beliefs.summary(), self.shared.values)
+            self.history.filtered(time, keys, self.frame.movedim(-1, 0), self.beliefs.summary(), self.shared.values)
         return self.tracks()
 
     def tracks(self) -> Tracks:
         """The confirmed tracks as they are now."""
         told = [i for i, track in enumerate(self.records) if self._is_told(track)]
         which = torch.tensor(told, dtype=torch.long, device=self.frame.device)
-        beliefs = self.beliefs.at(which)
+        frame, beliefs = self.frame[..., which].movedim(-1, 0), self.beliefs.at(which)
         records = [self.records[i] for i in told]
         return Tracks(
             time=self.time,
@@ -207,8 +218,8 @@ class Tracker:
             category=tuple(track.category for track in records),
             hits=torch.tensor([track.hits for track in records], dtype=torch.long),
             unseen_s=torch.tensor([self.time - track.last for track in records], dtype=torch.float64),
-            state=track_states(self.localize, self.frame[which], beliefs.summary(), self.shared.root),
-            models=beliefs.weight,
+            state=track_states(self.localize, frame, beliefs.summary(), self.shared.root),
+            models=beliefs.weight.T,
         )
 
     def clock_estimate(self) -> ClockEstimate:
@@ -232,15 +243,18 @@ class Tracker:
         dt, self.time = time - self.time, time
         if not self.records:
             return
-        beliefs = self.beliefs.mixed(math.exp(-dt / self.options.switch_s))
-        up, turn = self.frame @ self.localize.enu_from_rig[2], None
-        aim = beliefs.middle[:, 0, :2]
-        if bool((aim.abs().amax(-1) > _TURN).any()):
+        options, new_tensor = self.options, self.frame.new_tensor
+        beliefs = self.beliefs.mixed(new_tensor(math.exp(-dt / options.switch_s)))
+        up, turn = (self.frame * self.localize.enu_from_rig[2, :, None]).sum(1), None
+        aim = beliefs.middle[:2, 0]
+        if bool((aim.abs() > _TURN).any()):
             turn = _toward(aim)
-            self.frame = turn @ self.frame
-        self.beliefs, cross = predicted(beliefs, transition(self.options.motions, dt, up), turn)
+            self.frame = product(turn, self.frame)
+        step = transition(new_tensor(step_numbers(options.motions, dt)), up)
+        self.beliefs = predicted(beliefs, step, turn)
         if self.history is not None:
             keys = [track.key for track in self.records]
+            cross = cross_covariance(beliefs, self.beliefs, step, turn)
             self.history.predicted(keys, self.beliefs.summary(), cross, self.shared.values)
 
     def _take(self, pairs: ObjectPairs, seen: Sightings) -> None:
@@ -248,8 +262,10 @@ class Tracker:
         marks = mark_numbers(pairs.left, pairs.right)
         taken = np.zeros(len(pairs), dtype=bool)
         if self.records:
-            merged = self.beliefs.merged()
-            possible = candidates(merged, self.frame, seen, timing, self.shared.root, self.options.gate)
+            merged, root, gate = self.beliefs.merged(), self.shared.root, self.options.gate
+            track, pair = nearby(merged, self.frame, seen, timing, root, gate).nonzero(as_tuple=True)
+            found = judged(merged.at(track), self.frame[..., track], seen.at(pair), timing.at(pair), root)
+            possible = within(found, track, pair, gate)
             tiers = np.array([self._tier(track) for track in self.records])
             evidence = np.array([track.evidence for track in self.records])
             accepted = assigned(possible, marks, evidence, tiers)
@@ -260,17 +276,17 @@ class Tracker:
         fresh = [i for i in range(len(pairs)) if not taken[i] and bool(seen.usable[i])]
         if fresh:
             self._begin(torch.tensor(fresh), pairs, seen, timing)
-        move = self.shared.settle()
-        beliefs = self.beliefs
-        self.beliefs = beliefs._replace(mean=beliefs.mean + beliefs.effect[..., self.calibration :] @ move)
+        if self.shared.estimated:
+            move = self.shared.settle()
+            shift = (self.beliefs.effect[:, self.calibration :] * move[:, None, None]).sum(1)
+            self.beliefs = self.beliefs._replace(mean=self.beliefs.mean + shift)
 
     def _delays(self, seen: Sightings) -> Timing:
-        since = seen.time[:, 1] - (self.shared.start or 0.0)
-        clock = torch.stack([torch.ones_like(since), since, seen.row], -1)
-        delay = seen.time - self.time
-        delay[:, 1] += clock @ self.shared.values
-        unsure = torch.linalg.vector_norm(clock @ self.shared.root[self.calibration :], dim=-1)
-        return Timing(delay, clock, unsure)
+        since = seen.time[1] - (self.shared.start or 0.0)
+        clock = torch.stack([torch.ones_like(since), since, seen.row])
+        known = torch.stack([torch.zeros_like(since), self.shared.values @ clock])
+        unsure = (self.shared.root[self.calibration :].T @ clock).square().sum(0).sqrt()
+        return Timing(seen.time - self.time + known, clock, unsure)
 
     def _tier(self, track: TrackRecord) -> int:
         if track.number == 0:
@@ -279,15 +295,13 @@ class Tracker:
 
     def _update(self, possible: Candidates, rows: Tensor, pairs: ObjectPairs, timing: Timing) -> None:
         track, pair = possible.track[rows], possible.pair[rows]
-        seen = Anchored(*(v[:, rows] if i == 3 else v[rows] for i, v in enumerate(possible.seen)))
-        merged = possible.found
         sure = (possible.squared[rows] < 13.3) & torch.tensor([self.records[i].number > 0 for i in track.tolist()])
-        which = rows[sure]
-        self.shared.add(merged.effect[which, 0], merged.value[which, 0], merged.noise[which, 0])
-        beliefs = self.beliefs.at(track)
-        found = innovations(beliefs, seen, timing.at(pair))
-        new = updated(beliefs, found, fit_of(found, self.shared.root))
-        self.beliefs = Beliefs(*(old.index_copy(0, track, value) for old, value in zip(self.beliefs, new, strict=True)))
+        merged = possible.found.at(rows[sure])
+        self.shared.add(merged.effect[..., 0, :], merged.value[:, 0], merged.noise[..., 0, :])
+        found = innovations(self.beliefs.at(track), possible.seen.at(rows), timing.at(pair))
+        new = updated(self.beliefs.at(track), found, fit_of(found, self.shared.root))
+        both = zip(self.beliefs, new, strict=True)
+        self.beliefs = Beliefs(*(old.index_copy(-1, track, value) for old, value in both))
         densities, scores = possible.log_density[rows].tolist(), pairs.score.tolist()
         for t, p, density in zip(track.tolist(), pair.tolist(), densities, strict=True):
             record = self.records[t]
@@ -298,13 +312,11 @@ class Tracker:
 
     def _begin(self, which: Tensor, pairs: ObjectPairs, seen: Sightings, timing: Timing) -> None:
         seen = seen.at(which)
-        ray = torch.nn.functional.normalize(seen.direction, dim=-1)
-        frame = torch.stack([*side_axes(ray), ray], -2)
-        models = len(self.options.motions)
-        local = anchored(seen, frame)
-        new = born(local, timing.at(which), self.options.speed_mps, models)
-        self.beliefs = Beliefs(*(torch.cat(both) for both in zip(self.beliefs, new, strict=True)))
-        self.frame = torch.cat([self.frame, frame])
+        ray = torch.nn.functional.normalize(seen.direction.T, dim=-1)
+        frame = torch.stack([*side_axes(ray), ray]).movedim(-1, 1)
+        new = born(anchored(seen, frame), timing.at(which), self.options.speed_mps, len(self.options.motions))
+        self.beliefs = Beliefs(*(torch.cat(both, -1) for both in zip(self.beliefs, new, strict=True)))
+        self.frame = torch.cat([self.frame, frame], -1)
         for i in which.tolist():
             needed = self.options.confirm_hits * (2 if bool(pairs.ambiguous[i]) else 1)
             scores = {pairs.category[i]: float(pairs.score[i])}
@@ -330,7 +342,7 @@ class Tracker:
         kept = [i for i, track in enumerate(self.records) if self.time - track.last <= limits[i]]
         if len(kept) < len(self.records):
             which = torch.tensor(kept, dtype=torch.long, device=self.frame.device)
-            self.beliefs, self.frame = self.beliefs.at(which), self.frame[which]
+            self.beliefs, self.frame = self.beliefs.at(which), self.frame[..., which]
             self.records = [self.records[i] for i in kept]
 
     def _recognized(self, new: int) -> int | None:
@@ -343,23 +355,20 @@ class Tracker:
             return None
         which = torch.tensor(lost, device=self.frame.device)
         old, here = self.beliefs.at(which).merged(), self.beliefs.at(torch.tensor([new])).merged()
-        still = transition((Motion(acceleration=0.0),), 0.0, self.frame[which] @ self.localize.enu_from_rig[2])
-        old = predicted(old, still, self.frame[new] @ self.frame[which].mT).beliefs
-        effect = here.effect - old.effect
-        apart = here.mean - old.mean
-        spread = effect @ self.shared.root
-        covariance = here.noise + old.noise + spread @ spread.mT
-        unit = covariance.diagonal(dim1=-2, dim2=-1).rsqrt()
-        white = unit[..., :, None] * covariance * unit[..., None, :]
-        scaled = (apart * unit)[..., None]
-        squared = (scaled.mT @ torch.linalg.solve_ex(white, scaled)[0])[:, 0, 0, 0]
-        near = [i for i, value in zip(lost, squared.tolist(), strict=True) if value <= self.options.recognize]
+        frame, to = self.frame[..., which], self.frame[..., new, None]
+        up = (frame * self.localize.enu_from_rig[2, :, None]).sum(1)
+        still = transition(frame.new_tensor(step_numbers((Motion(acceleration=0.0),), 0.0)), up)
+        old = predicted(old, still, product(to, frame.transpose(0, 1)))
+        spread = product(here.effect - old.effect, self.shared.root[..., None, None])
+        done = eliminate(here.noise + old.noise + squared(spread), (here.mean - old.mean)[:, None])
+        distance = (done.columns[:, 0].square() / done.pivots).sum(0)[0]
+        near = [i for i, value in zip(lost, distance.tolist(), strict=True) if value <= self.options.recognize]
         return near[0] if len(near) == 1 else None
 
 
 def _toward(aim: Tensor) -> Tensor:
-    """Rotations (T, 3, 3) that bring the directions (x, y, 1) onto the axis; none where they are near it."""
-    ray = torch.nn.functional.normalize(torch.cat([aim, torch.ones_like(aim[:, :1])], -1), dim=-1)
-    turned = torch.stack([*side_axes(ray), ray], -2)
-    still = torch.eye(3).to(turned).expand_as(turned)
-    return torch.where((aim.abs().amax(-1) > _TURN)[:, None, None], turned, still)
+    """Rotations (3, 3, T) that bring the directions (x, y, 1) onto the axis; none where they are near it."""
+    ray = torch.nn.functional.normalize(torch.cat([aim, torch.ones_like(aim[:1])]).T, dim=-1)
+    turned = torch.stack([*side_axes(ray), ray]).movedim(-1, 1)
+    still = torch.eye(3, dtype=aim.dtype, device=aim.device)[..., None].expand_as(turned)
+    return torch.where(aim.abs().amax(0) > _TURN, turned, still)

@@ -40,9 +40,11 @@ def test_one_sighting_is_what_the_localizer_says() -> None:
     seen = sightings(localize, pairs)
     turned = torch.linalg.qr(torch.eye(3).double() + 0.2 * mix[:3, :3])[0]
     frame = (turned * torch.sign(turned.diagonal())).T.expand(4, 3, 3)
-    timing = Timing(torch.zeros(4, 2).double(), torch.zeros(4, 3).double(), torch.zeros(4).double())
+    timing = Timing(torch.zeros(2, 4).double(), torch.zeros(3, 4).double(), torch.zeros(4).double())
     shared = SharedErrors(localize.calibration_factor.shape[1], ClockPrior())
-    found = track_states(localize, frame, born(anchored(seen, frame), timing, 10.0, 1).summary(), shared.root)
+    found = track_states(
+        localize, frame, born(anchored(seen, frame.movedim(0, -1)), timing, 10.0, 1).summary(), shared.root
+    )
     assert found.status.tolist() == expected.status.tolist() == [0, 0, 0, 6]
     for name in ("enu", "covariance", "geodetic", "bearing", "inverse_range", "inverse_range_sigma", "range_low"):
         torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-9, msg=name)
@@ -81,8 +83,8 @@ def test_errors_are_as_large_as_stated() -> None:
     tracker = Tracker(localize, STEADY)
     tracks, places = followed(tracker, [yawed_rig(localize.rig, float(y)) for y in yaws], start, velocity, 12, 5)
     assert tracks.number == tuple(range(1, count + 1))
-    ray = (tracker.frame @ places[..., None])[..., 0]
-    pace = (tracker.frame @ velocity[..., None])[..., 0]
+    ray = (tracker.frame.movedim(-1, 0) @ places[..., None])[..., 0]
+    pace = (tracker.frame.movedim(-1, 0) @ velocity[..., None])[..., 0]
     true = torch.cat([ray[:, :2] / ray[:, 2:], 1.0 / ray[:, 2:], pace / ray[:, 2:]], -1)
     belief = tracker.beliefs.summary()
     spread = belief.effect @ tracker.shared.root
@@ -169,7 +171,9 @@ def test_a_wide_sweep_turns_the_frame_and_stays_exact() -> None:
     tracker = Tracker(localize, TrackOptions(motions=(Motion(acceleration=0.1),)))
     tracks, places = followed(tracker, [localize.rig], start, velocity, 40, 1)
     assert tracks.number == (1,)
-    assert not torch.allclose(tracker.frame[0] @ torch.nn.functional.normalize(start[0], dim=0), tensor(0.0, 0.0, 1.0))
+    assert not torch.allclose(
+        tracker.frame[..., 0] @ torch.nn.functional.normalize(start[0], dim=0), tensor(0.0, 0.0, 1.0)
+    )
     error = (tracks.state.enu - places @ localize.enu_from_rig.T)[..., None]
     assert float((error.mT @ torch.linalg.solve(tracks.state.covariance, error)).squeeze()) < 16.3
 

@@ -89,13 +89,13 @@ def test_filter_and_smoother_are_those_of_stone_soup() -> None:
         pairs = pairs_of(*seen_by(localize.rig, start + time * velocity, 0.3, generator), time)
         found = localize(pairs.left, pairs.right, pairs.covariance)
         tracker(pairs)
-        belief = tracker.beliefs.merged()
-        filtered.append((belief.mean[0, 0], belief.noise[0, 0]))
+        belief = tracker.beliefs.summary()
+        filtered.append((belief.mean[0], belief.noise[0]))
         when = START + datetime.timedelta(seconds=time)
         if frame == 0:
-            first = belief.mean[0, 0][:, None].numpy(), belief.noise[0, 0].numpy()
+            first = belief.mean[0][:, None].numpy(), belief.noise[0].numpy()
             track.append(GaussianState(*first, timestamp=when))
-            frame_axes = tracker.frame[0]
+            frame_axes = tracker.frame[..., 0]
             continue
         # The position and its covariance from the localizer, by numpy into the filter's coordinates.
         place = (frame_axes @ (localize.enu_from_rig.T @ found.enu[0])).numpy()
