@@ -60,7 +60,7 @@ def nearby(beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, roo
     return (apart <= 2.0 * gate * reach) & seen.usable
 
 
-def judged(
+def scored(
     beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor
 ) -> tuple[Anchored, Innovations, Fit]:
     """Sightings against merged beliefs, one for each of L tracks."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.assignment import Candidates, assigned, judged, mark_numbers, nearby, within
+from kcal.pipeline.assignment import Candidates, assigned, mark_numbers, nearby, scored, within
 from kcal.pipeline.beliefs import (
     Beliefs,
     Timing,
@@ -264,7 +264,7 @@ class Tracker:
         if self.records:
             merged, root, gate = self.beliefs.merged(), self.shared.root, self.options.gate
             track, pair = nearby(merged, self.frame, seen, timing, root, gate).nonzero(as_tuple=True)
-            found = judged(merged.at(track), self.frame[..., track], seen.at(pair), timing.at(pair), root)
+            found = scored(merged.at(track), self.frame[..., track], seen.at(pair), timing.at(pair), root)
             possible = within(found, track, pair, gate)
             tiers = np.array([self._tier(track) for track in self.records])
             evidence = np.array([track.evidence for track in self.records])
