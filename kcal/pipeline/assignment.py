@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from kcal.pipeline.beliefs import Beliefs, Fit, Innovations, Timing, fit_of, innovations
+from kcal.pipeline.beliefs import Beliefs, Fit, Innovations, Timing
 from kcal.pipeline.lanes import product
-from kcal.pipeline.sightings import Anchored, Sightings, anchored
+from kcal.pipeline.sightings import Anchored, Sightings
 
 
 class Candidates(NamedTuple):
@@ -35,7 +36,7 @@ class Candidates(NamedTuple):
     log_density: Tensor
 
 
-def nearby(beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, gate: float) -> Tensor:
+def nearby(beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, gate: Tensor) -> Tensor:
     """(T, N) bool: pairs that are roughly in the direction of a track.
 
     Args:
@@ -58,15 +59,6 @@ def nearby(beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, roo
     reach = (noise[0, 0] + noise[1, 1] + spread)[:, None] + seen.noise[0, 0] + seen.noise[1, 1]
     reach = reach + seen.shared[:2].square().sum((0, 1)) + pace[:, None] * late.square()
     return (apart <= 2.0 * gate * reach) & seen.usable
-
-
-def scored(
-    beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor
-) -> tuple[Anchored, Innovations, Fit]:
-    """Sightings against merged beliefs, one for each of L tracks."""
-    local = anchored(seen, frame)
-    found = innovations(beliefs, local, timing)
-    return local, found, fit_of(found, root)
 
 
 def within(possible: tuple[Anchored, Innovations, Fit], track: Tensor, pair: Tensor, gate: float) -> Candidates:
@@ -96,7 +88,7 @@ def mark_numbers(left: Tensor, right: Tensor) -> NDArray[np.int64]:
 
 
 def assigned(
-    possible: Candidates, marks: NDArray[np.int64], evidence: NDArray[np.float64], tiers: NDArray[np.int64]
+    possible: Candidates, marks: NDArray[np.int64], evidence: Sequence[float], tiers: Sequence[int]
 ) -> list[int]:
     """Rows of `possible` to accept: each track, pair and mark at most once, with the largest sum of log densities.
 
@@ -106,37 +98,40 @@ def assigned(
         evidence: (T,) of each track so far: settles between tracks that want the same mark by different pairs.
         tiers: (T,) tracks of tier 0 choose before those of tier 1; tracks of a negative tier do not choose.
     """
-    track, pair = possible.track.cpu().numpy(), possible.pair.cpu().numpy()
-    density = possible.log_density.cpu().numpy()
+    track, pair, density = possible.track.tolist(), possible.pair.tolist(), possible.log_density.tolist()
+    ends = [tuple(both) for both in marks.tolist()]
     left: set[int] = set()
     right: set[int] = set()
     done: set[int] = set()
     accepted: list[int] = []
     for tier in (0, 1):
-        rows = [i for i in range(len(track)) if tiers[track[i]] == tier]
+        rows = [i for i, t in enumerate(track) if tiers[t] == tier]
         while rows := [
-            i for i in rows if track[i] not in done and marks[pair[i], 0] not in left and marks[pair[i], 1] not in right
-        ]:
+            i for i in rows
+            if track[i] not in done and ends[pair[i]][0] not in left and ends[pair[i]][1] not in right
+        ]:  # fmt: skip
             chosen = _best(rows, track, pair, density)
             for i in sorted(chosen, key=lambda i: -(evidence[track[i]] + density[i])):
-                ends = int(marks[pair[i], 0]), int(marks[pair[i], 1])
-                if ends[0] not in left and ends[1] not in right:
+                first, second = ends[pair[i]]
+                if first not in left and second not in right:
                     accepted.append(i)
-                    done.add(int(track[i]))
-                    left.add(ends[0])
-                    right.add(ends[1])
+                    done.add(track[i])
+                    left.add(first)
+                    right.add(second)
     return accepted
 
 
-def _best(
-    rows: list[int], track: NDArray[np.int64], pair: NDArray[np.int64], density: NDArray[np.float64]
-) -> list[int]:
-    tracks, at_track = np.unique(track[rows], return_inverse=True)
-    pairs, at_pair = np.unique(pair[rows], return_inverse=True)
+def _best(rows: list[int], track: list[int], pair: list[int], density: list[float]) -> list[int]:
+    """The rows of the best assignment, each track and pair once."""
+    if len({track[i] for i in rows}) == len({pair[i] for i in rows}) == len(rows):
+        return rows
+    tracks, at_track = np.unique([track[i] for i in rows], return_inverse=True)
+    pairs, at_pair = np.unique([pair[i] for i in rows], return_inverse=True)
+    densities = np.array([density[i] for i in rows])
     # Worse than any that is possible: such a match is dropped afterwards.
-    worst = density[rows].min() - (np.ptp(density[rows]) + 1.0) * (len(tracks) + 1)
+    worst = densities.min() - (np.ptp(densities) + 1.0) * (len(tracks) + 1)
     gain = np.full((len(tracks), len(pairs)), worst)
     number = np.full(gain.shape, -1)
-    gain[at_track, at_pair] = density[rows]
+    gain[at_track, at_pair] = densities
     number[at_track, at_pair] = rows
     return [int(i) for i in number[linear_sum_assignment(gain, maximize=True)] if i >= 0]

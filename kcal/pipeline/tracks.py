@@ -13,25 +13,23 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.assignment import Candidates, assigned, mark_numbers, nearby, scored, within
+from kcal.pipeline.assignment import Candidates, assigned, mark_numbers, within
 from kcal.pipeline.beliefs import (
     Beliefs,
     Timing,
     born,
     cross_covariance,
-    fit_of,
-    innovations,
     no_beliefs,
     predicted,
-    updated,
 )
 from kcal.pipeline.consider import ClockEstimate, ClockPrior, SharedErrors
-from kcal.pipeline.estimates import TrackStates, track_states
+from kcal.pipeline.estimates import TrackStates
 from kcal.pipeline.lanes import eliminate, product, squared
 from kcal.pipeline.motion import MOTIONS, Motion, step_numbers, transition
 from kcal.pipeline.pairs import ObjectPairs
-from kcal.pipeline.sightings import Sightings, anchored, sightings
+from kcal.pipeline.sightings import Sightings, anchored
 from kcal.pipeline.smoothing import History, SmoothedTrack
+from kcal.pipeline.track_steps import compiled_steps, track_steps
 
 # A frame is turned toward its target when that is farther from the axis than this tangent: 17°.
 _TURN = 0.3
@@ -138,6 +136,8 @@ class Tracker:
         options: when tracks begin and end.
         clock: what is known of the clocks; with sigmas above zero they are estimated from the tracks.
         record: keep what `smoothed` needs; memory then grows with time.
+        compiled: translate the filter to C++ first, which takes one or two minutes, less where torch remembers; each
+            moment of many tracks then takes about half the time.
 
     Example:
         >>> from kcal.lens.mounting import Origin
@@ -161,6 +161,7 @@ class Tracker:
         *,
         clock: ClockPrior | None = None,
         record: bool = False,
+        compiled: bool = False,
     ) -> None:
         self.localize, self.options = localize, options or TrackOptions()
         factor = localize.calibration_factor
@@ -177,6 +178,9 @@ class Tracker:
         self.frame = empty.reshape(3, 3, 0)
         self.beliefs = no_beliefs(self.calibration, models, device)
         self.next_number = self.next_key = 1
+        self.steps = track_steps(localize, self.options.lasting_px)
+        if compiled:
+            self.steps = compiled_steps(self.steps, self.calibration, models, self.shared.root)
 
     @torch.no_grad()
     def __call__(self, pairs: ObjectPairs, time: float | None = None) -> Tracks:
@@ -199,7 +203,7 @@ class Tracker:
             self.shared.start = time
         self._predict(time)
         if len(pairs):
-            self._take(pairs, sightings(self.localize, pairs, self.options.lasting_px))
+            self._take(pairs, self.steps.measure(pairs.left, pairs.right, pairs.covariance, pairs.time))
         self._sort_out()
         if self.history is not None:
             keys = [track.key for track in self.records]
@@ -210,7 +214,6 @@ class Tracker:
         """The confirmed tracks as they are now."""
         told = [i for i, track in enumerate(self.records) if self._is_told(track)]
         which = torch.tensor(told, dtype=torch.long, device=self.frame.device)
-        frame, beliefs = self.frame[..., which].movedim(-1, 0), self.beliefs.at(which)
         records = [self.records[i] for i in told]
         return Tracks(
             time=self.time,
@@ -218,8 +221,8 @@ class Tracker:
             category=tuple(track.category for track in records),
             hits=torch.tensor([track.hits for track in records], dtype=torch.long),
             unseen_s=torch.tensor([self.time - track.last for track in records], dtype=torch.float64),
-            state=track_states(self.localize, frame, beliefs.summary(), self.shared.root),
-            models=beliefs.weight.T,
+            state=self.steps.place(self.beliefs, self.frame, self.shared.root, which),
+            models=self.beliefs.weight[:, which].T,
         )
 
     def clock_estimate(self) -> ClockEstimate:
@@ -243,14 +246,17 @@ class Tracker:
         dt, self.time = time - self.time, time
         if not self.records:
             return
-        options, new_tensor = self.options, self.frame.new_tensor
-        beliefs = self.beliefs.mixed(new_tensor(math.exp(-dt / options.switch_s)))
-        up, turn = (self.frame * self.localize.enu_from_rig[2, :, None]).sum(1), None
-        aim = beliefs.middle[:2, 0]
+        numbers = self.frame.new_tensor(step_numbers(self.options.motions, dt))
+        stay = self.frame.new_tensor(math.exp(-dt / self.options.switch_s))
+        up = (self.frame * self.localize.enu_from_rig[2, :, None]).sum(1)
+        aim, turn = self.beliefs.middle[:2, 0], None
         if bool((aim.abs() > _TURN).any()):
             turn = _toward(aim)
             self.frame = product(turn, self.frame)
-        step = transition(new_tensor(step_numbers(options.motions, dt)), up)
+        elif self.history is None:
+            self.beliefs = self.steps.move(self.beliefs, up, numbers, stay)
+            return
+        beliefs, step = self.beliefs.mixed(stay), transition(numbers, up)
         self.beliefs = predicted(beliefs, step, turn)
         if self.history is not None:
             keys = [track.key for track in self.records]
@@ -262,18 +268,18 @@ class Tracker:
         marks = mark_numbers(pairs.left, pairs.right)
         taken = np.zeros(len(pairs), dtype=bool)
         if self.records:
-            merged, root, gate = self.beliefs.merged(), self.shared.root, self.options.gate
-            track, pair = nearby(merged, self.frame, seen, timing, root, gate).nonzero(as_tuple=True)
-            found = scored(merged.at(track), self.frame[..., track], seen.at(pair), timing.at(pair), root)
+            frame, root, gate = self.frame, self.shared.root, self.options.gate
+            merged, close = self.steps.look(self.beliefs, frame, seen, timing, root, root.new_tensor(gate))
+            track, pair = close.nonzero(as_tuple=True)
+            found = self.steps.score(merged, frame, seen, timing, root, track, pair)
             possible = within(found, track, pair, gate)
-            tiers = np.array([self._tier(track) for track in self.records])
-            evidence = np.array([track.evidence for track in self.records])
-            accepted = assigned(possible, marks, evidence, tiers)
+            evidence = [track.evidence for track in self.records]
+            accepted = assigned(possible, marks, evidence, [self._tier(track) for track in self.records])
             if accepted:
                 self._update(possible, torch.tensor(accepted), pairs, timing)
                 used = marks[possible.pair[accepted].cpu().numpy()]
                 taken = np.isin(marks[:, 0], used[:, 0]) | np.isin(marks[:, 1], used[:, 1])
-        fresh = [i for i in range(len(pairs)) if not taken[i] and bool(seen.usable[i])]
+        fresh = [i for i, usable in enumerate(seen.usable.tolist()) if usable and not taken[i]]
         if fresh:
             self._begin(torch.tensor(fresh), pairs, seen, timing)
         if self.shared.estimated:
@@ -295,13 +301,11 @@ class Tracker:
 
     def _update(self, possible: Candidates, rows: Tensor, pairs: ObjectPairs, timing: Timing) -> None:
         track, pair = possible.track[rows], possible.pair[rows]
-        sure = (possible.squared[rows] < 13.3) & torch.tensor([self.records[i].number > 0 for i in track.tolist()])
-        merged = possible.found.at(rows[sure])
-        self.shared.add(merged.effect[..., 0, :], merged.value[:, 0], merged.noise[..., 0, :])
-        found = innovations(self.beliefs.at(track), possible.seen.at(rows), timing.at(pair))
-        new = updated(self.beliefs.at(track), found, fit_of(found, self.shared.root))
-        both = zip(self.beliefs, new, strict=True)
-        self.beliefs = Beliefs(*(old.index_copy(-1, track, value) for old, value in both))
+        if self.shared.estimated:
+            known = torch.tensor([self.records[i].number > 0 for i in track.tolist()])
+            merged = possible.found.at(rows[known & (possible.squared[rows] < 13.3)])
+            self.shared.add(merged.effect[..., 0, :], merged.value[:, 0], merged.noise[..., 0, :])
+        self.beliefs = self.steps.take(self.beliefs, possible.seen, timing, self.shared.root, rows, track, pair)
         densities, scores = possible.log_density[rows].tolist(), pairs.score.tolist()
         for t, p, density in zip(track.tolist(), pair.tolist(), densities, strict=True):
             record = self.records[t]

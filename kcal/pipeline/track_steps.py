@@ -1,0 +1,159 @@
+"""What a tracker computes at each moment, as functions of tensors alone: as they are, or compiled.
+
+Sizes are T tracks under J models, N pairs, L possible matches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.errors import InputError
+from kcal.locate.localizer import StereoLocalizer
+from kcal.pipeline.assignment import nearby
+from kcal.pipeline.beliefs import Beliefs, Fit, Innovations, Timing, fit_of, innovations, no_beliefs, predicted, updated
+from kcal.pipeline.estimates import TrackStates, track_states
+from kcal.pipeline.motion import transition
+from kcal.pipeline.sightings import Anchored, Sightings, anchored, measured
+
+# Of stand-ins from which graphs are made: sizes that no other axis has, so that none seem to belong together.
+_PAIRS, _TRACKS, _MATCHES, _TAKEN, _TOLD = 1009, 1013, 1019, 1021, 1031
+
+
+class TrackSteps(NamedTuple):
+    """The steps, in their order.
+
+    Attributes:
+        measure: pixels (N, 2) of both cameras, covariances (N, 4, 4) and times (N, 2) as sightings.
+        move: beliefs to another time; see `moved_on`.
+        look: see `looked_at`.
+        score: see `scored`.
+        take: see `taken_in`.
+        place: see `placed`, without its first argument.
+    """
+
+    measure: Callable[[Tensor, Tensor, Tensor, Tensor], Sightings]
+    move: Callable[[Beliefs, Tensor, Tensor, Tensor], Beliefs]
+    look: Callable[[Beliefs, Tensor, Sightings, Timing, Tensor, Tensor], tuple[Beliefs, Tensor]]
+    score: Callable[[Beliefs, Tensor, Sightings, Timing, Tensor, Tensor, Tensor], tuple[Anchored, Innovations, Fit]]
+    take: Callable[[Beliefs, Anchored, Timing, Tensor, Tensor, Tensor, Tensor], Beliefs]
+    place: Callable[[Beliefs, Tensor, Tensor, Tensor], TrackStates]
+
+
+def moved_on(beliefs: Beliefs, up: Tensor, numbers: Tensor, stay: Tensor) -> Beliefs:
+    """Beliefs after a step: `up` and `numbers` as in `transition`, `stay` as in `Beliefs.mixed`."""
+    return predicted(beliefs.mixed(stay), transition(numbers, up))
+
+
+def looked_at(
+    beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, gate: Tensor
+) -> tuple[Beliefs, Tensor]:
+    """The merged beliefs, and (T, N) which pairs are roughly in their directions."""
+    merged = beliefs.merged()
+    return merged, nearby(merged, frame, seen, timing, root, gate)
+
+
+def scored(
+    merged: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, track: Tensor, pair: Tensor
+) -> tuple[Anchored, Innovations, Fit]:
+    """Pairs (L,) against tracks (L,), whose beliefs are merged."""
+    local = anchored(seen.at(pair), frame[..., track])
+    found = innovations(merged.at(track), local, timing.at(pair))
+    return local, found, fit_of(found, root)
+
+
+def taken_in(
+    beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor, rows: Tensor, track: Tensor, pair: Tensor
+) -> Beliefs:
+    """Beliefs with sightings: those at `rows` of `seen`, which are of these pairs, for these tracks."""
+    old = beliefs.at(track)
+    found = innovations(old, seen.at(rows), timing.at(pair))
+    new = updated(old, found, fit_of(found, root))
+    return Beliefs(*(value.index_copy(-1, track, part) for value, part in zip(beliefs, new, strict=True)))
+
+
+def placed(localize: StereoLocalizer, beliefs: Beliefs, frame: Tensor, root: Tensor, which: Tensor) -> TrackStates:
+    """Some of the tracks on the Earth."""
+    return track_states(localize, frame[..., which].movedim(-1, 0), beliefs.at(which).summary(), root)
+
+
+def track_steps(localize: StereoLocalizer, lasting_px: float) -> TrackSteps:
+    """The steps as they are."""
+
+    def measure(left: Tensor, right: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
+        return measured(localize, left, right, covariance, time, lasting_px)
+
+    def place(beliefs: Beliefs, frame: Tensor, root: Tensor, which: Tensor) -> TrackStates:
+        return placed(localize, beliefs, frame, root, which)
+
+    return TrackSteps(measure, moved_on, looked_at, scored, taken_in, place)
+
+
+@torch.no_grad()
+def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) -> TrackSteps:
+    """The steps in C++ for any numbers of tracks and pairs: this takes a minute or two, less where torch remembers.
+
+    Args:
+        steps: from `track_steps`.
+        errors: K, independent errors of the calibration and those that last.
+        models: J.
+        root: (K + 3, R) of the covariance of the shared errors.
+
+    Raises:
+        InputError: torch could not compile, for want of a C++ compiler for instance.
+    """
+    new = root.new_zeros
+    made = TrackSteps(*(_Compiled(step) for step in steps))
+    try:
+        unit = torch.eye(4).to(root).expand(_PAIRS, 4, 4)
+        seen = made.measure(new(_PAIRS, 2), new(_PAIRS, 2), unit, new(_PAIRS, 2))
+        timing = Timing(new(2, _PAIRS), new(3, _PAIRS), new(_PAIRS))
+        empty = no_beliefs(errors, models, root.device)
+        beliefs = Beliefs(*(torch.nn.functional.pad(value, (0, _TRACKS), value=1.0) for value in empty))
+        frame = torch.eye(3).to(root)[..., None].expand(3, 3, _TRACKS)
+        beliefs = made.move(beliefs, frame[2], new(9, models), new(()))
+        merged, _ = made.look(beliefs, frame, seen, timing, root, new(()))
+        first = [torch.zeros(size, dtype=torch.long, device=root.device) for size in (_MATCHES, _TAKEN, _TOLD)]
+        local, _, _ = made.score(merged, frame, seen, timing, root, first[0], first[0])
+        made.take(beliefs, local, timing, root, first[1], torch.arange(_TRACKS), first[1])
+        made.place(beliefs, frame, root, first[2])
+    except RuntimeError as error:
+        raise InputError(f"tracks cannot be compiled here; without compiling they work ({error})") from error
+    return made
+
+
+class _Compiled:
+    """A step that is compiled at its first call; few rows, to which compiled code does not apply, go as before."""
+
+    def __init__(self, step: Callable[..., Any]) -> None:
+        self.step, self.made = step, torch.compile(step, fullgraph=True)
+        self.first = True
+
+    def __call__(self, *arguments: Any) -> Any:
+        if min(size for argument in arguments for size in _sizes(argument)) < 2:
+            return self.step(*arguments)
+        given = [_contiguous(argument) for argument in arguments]
+        if self.first:
+            self.first = False
+            for value in _tensors(given):
+                for axis, size in enumerate(value.shape):
+                    if size >= _PAIRS:
+                        torch._dynamo.mark_dynamic(value, axis, min=2)
+        return self.made(*given)
+
+
+def _tensors(value: Any) -> list[Tensor]:
+    return [value] if isinstance(value, Tensor) else [tensor for part in value for tensor in _tensors(part)]
+
+
+def _sizes(value: Any) -> list[int]:
+    return [value.shape[-1] if value.ndim else 2 for value in _tensors(value)]
+
+
+def _contiguous(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        return value.contiguous()
+    return type(value)(*map(_contiguous, value))
