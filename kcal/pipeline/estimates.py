@@ -14,6 +14,7 @@ from kcal.locate.mounting import by_mounting
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
 from kcal.locate.stereo import PositionStatus, flag_positions
 from kcal.pipeline.beliefs import Summary
+from kcal.pipeline.lanes import congruent, product, squared
 
 
 class TrackStates(NamedTuple):
@@ -58,47 +59,45 @@ def track_states(localize: StereoLocalizer, frame: Tensor, beliefs: Summary, roo
         beliefs: of T tracks.
         root: (B, R) of the covariance of the shared errors.
     """
-    spread = beliefs.effect @ root
-    mean = beliefs.mean
-    axes = localize.enu_from_rig @ frame.mT
-    ray = torch.cat([mean[:, :2], torch.ones_like(mean[:, :1])], -1)
-    length = torch.linalg.vector_norm(ray, dim=-1)
-    inverse_range = mean[:, 2] / length
-    slope = torch.cat([-mean[:, 2:3] * ray[:, :2] / length[:, None] ** 3, 1.0 / length[:, None]], -1)
-    noise = beliefs.noise
-    variance = (slope[:, None] @ noise[:, :3, :3])[:, 0].mul(slope).sum(-1)
-    variance = variance + (slope[:, None] @ spread[:, :3])[:, 0].square().sum(-1)
-    sigma = variance.clamp_min(0.0).sqrt()
-    status = torch.zeros_like(mean[:, 0], dtype=torch.int8)
+    mean, noise, effect = (value.movedim(0, -1) for value in beliefs)
+    spread = product(effect, root[..., None])
+    axes = product(localize.enu_from_rig[..., None], frame.movedim(0, -1).transpose(0, 1))
+    ray = torch.cat([mean[:2], torch.ones_like(mean[:1])])
+    squares = ray.square().sum(0)
+    length = squares.sqrt()
+    inverse_range = mean[2] / length
+    slope = torch.cat([-inverse_range * ray[:2] / squares, (1.0 / length)[None]])
+    variance = ((slope[:, None] * noise[:3, :3]).sum(0) * slope).sum(0)
+    sigma = (variance + (slope[:, None] * spread[:3]).sum(0).square().sum(0)).clamp_min(0.0).sqrt()
+    status = torch.zeros_like(inverse_range, dtype=torch.int8)
     status = flag_positions(status, inverse_range < BEARING_SIGMAS * sigma, PositionStatus.BEARING_ONLY)
     status = flag_positions(status, inverse_range <= 0, PositionStatus.PARALLEL)
     ok = status == int(PositionStatus.OK)
     interval = range_interval(inverse_range, sigma)
 
-    depth = 1.0 / torch.where(ok, mean[:, 2], 1.0)
-    straight = (axes @ ray[..., None])[..., 0] * depth[:, None]
-    velocity = (axes @ mean[:, 3:, None])[..., 0] * depth[:, None]
-    by_state = torch.zeros(len(mean), 6, 6).to(mean)
-    by_state[:, :3, :2] = axes[..., :2] * depth[:, None, None]
-    by_state[:, :3, 2] = -straight * depth[:, None]
-    by_state[:, 3:, 2] = -velocity * depth[:, None]
-    by_state[:, 3:, 3:] = axes * depth[:, None, None]
-    shared = by_state @ spread
-    random, systematic = by_state @ noise @ by_state.mT, shared @ shared.mT
-    level = straight[:, :2].square().sum(-1)
-    enu = straight - localize.drop * torch.nn.functional.pad(level[:, None], (2, 0))
+    depth = 1.0 / torch.where(ok, mean[2], 1.0)
+    bearing = (axes * ray).sum(1)
+    straight, velocity = bearing * depth, (axes * mean[3:]).sum(1) * depth
+    # East, north, up and the velocity by the state.
+    none = torch.zeros_like(axes)
+    by_place = torch.cat([axes[:, :2], -straight[:, None], none], 1)
+    by_state = torch.cat([by_place, torch.cat([none[:, :2], -velocity[:, None], axes], 1)]) * depth
+    random, systematic = congruent(by_state, noise), squared(product(by_state, spread))
+    level = straight[:2].square().sum(0)
+    up = torch.eye(3).to(mean)[2, :, None]
+    enu = (straight - localize.drop * level * up).T
     if localize.mounting is not None:
-        bent = torch.nn.functional.pad(-localize.half_curvature * level[:, None, None], (0, 0, 2, 0))
-        still = torch.zeros(len(mean), 3, 3).to(mean)
-        turn = torch.cat([torch.cat([by_mounting(enu), bent], -1),
-                          torch.cat([still, by_mounting(velocity)[..., 3:], still[..., :1]], -1)], 1)  # fmt: skip
-        systematic = systematic + turn @ localize.mounting @ turn.mT
+        bent = (-localize.half_curvature * level * up)[:, None]
+        by_place, by_velocity = (by_mounting(value).movedim(0, -1) for value in (enu, velocity.T))
+        lower = torch.cat([torch.zeros_like(by_place[:, :3]), by_velocity[:, 3:], torch.zeros_like(bent)], 1)
+        turn = torch.cat([torch.cat([by_place, bent], 1), lower])
+        systematic = systematic + congruent(turn, localize.mounting[..., None])
         if localize.link is not None and localize.calibration_factor is not None:
-            link = torch.linalg.pinv(localize.calibration_factor) @ localize.link
-            own = beliefs.effect[..., : len(link)]
-            mixed = -by_state @ own @ link @ turn.mT
-            systematic = systematic + mixed + mixed.mT
-    whole = random + systematic
+            link = (torch.linalg.pinv(localize.calibration_factor) @ localize.link)[..., None]
+            own = product(by_state, effect[:, : len(link)])
+            mixed = -product(product(own, link), turn.transpose(0, 1))
+            systematic = systematic + mixed + mixed.transpose(0, 1)
+    whole, systematic = (value.movedim(-1, 0) for value in (random + systematic, systematic))
     nowhere = torch.diag(mean.new_full((3,), math.inf))
     there = ok[:, None, None]
     geodetic = place_enu(enu, localize.ecef_from_enu, localize.ecef_of_origin)
@@ -106,13 +105,13 @@ def track_states(localize: StereoLocalizer, frame: Tensor, beliefs: Summary, roo
         enu=torch.where(ok[:, None], enu, 0.0),
         covariance=torch.where(there, whole[:, :3, :3], nowhere),
         systematic=torch.where(there, systematic[:, :3, :3], nowhere),
-        velocity=torch.where(ok[:, None], velocity, 0.0),
+        velocity=torch.where(ok[:, None], velocity.T, 0.0),
         velocity_covariance=torch.where(there, whole[:, 3:, 3:], nowhere),
         geodetic=torch.where(ok[:, None], geodetic, localize.geodetic_of_origin),
         range_low=interval.low,
         range_high=interval.high,
         status=status,
-        bearing=(axes @ ray[..., None])[..., 0] / length[:, None],
+        bearing=(bearing / length).T,
         inverse_range=inverse_range,
         inverse_range_sigma=sigma,
     )

@@ -29,7 +29,7 @@ class TrackSteps(NamedTuple):
     Attributes:
         measure: pixels (N, 2) of both cameras, covariances (N, 4, 4) and times (N, 2) as sightings.
         move: beliefs to another time; see `moved_on`.
-        look: see `looked_at`.
+        look: see `looked_at`, with beliefs that have come to the same moment.
         score: see `scored`.
         take: see `taken_in`.
         place: see `placed`, without its first argument.
@@ -39,7 +39,7 @@ class TrackSteps(NamedTuple):
     move: Callable[[Beliefs, Tensor, Tensor, Tensor], Beliefs]
     look: Callable[[Beliefs, Tensor, Sightings, Timing, Tensor, Tensor], tuple[Beliefs, Tensor]]
     score: Callable[[Beliefs, Tensor, Sightings, Timing, Tensor, Tensor, Tensor], tuple[Anchored, Innovations, Fit]]
-    take: Callable[[Beliefs, Anchored, Timing, Tensor, Tensor, Tensor, Tensor], Beliefs]
+    take: Callable[[Beliefs, Anchored, Timing, Tensor], Beliefs]
     place: Callable[[Beliefs, Tensor, Tensor, Tensor], TrackStates]
 
 
@@ -65,14 +65,10 @@ def scored(
     return local, found, fit_of(found, root)
 
 
-def taken_in(
-    beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor, rows: Tensor, track: Tensor, pair: Tensor
-) -> Beliefs:
-    """Beliefs with sightings: those at `rows` of `seen`, which are of these pairs, for these tracks."""
-    old = beliefs.at(track)
-    found = innovations(old, seen.at(rows), timing.at(pair))
-    new = updated(old, found, fit_of(found, root))
-    return Beliefs(*(value.index_copy(-1, track, part) for value, part in zip(beliefs, new, strict=True)))
+def taken_in(beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor) -> Beliefs:
+    """Beliefs with sightings, one for each track."""
+    found = innovations(beliefs, seen, timing)
+    return updated(beliefs, found, fit_of(found, root))
 
 
 def placed(localize: StereoLocalizer, beliefs: Beliefs, frame: Tensor, root: Tensor, which: Tensor) -> TrackStates:
@@ -116,10 +112,11 @@ def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) ->
         frame = torch.eye(3).to(root)[..., None].expand(3, 3, _TRACKS)
         beliefs = made.move(beliefs, frame[2], new(9, models), new(()))
         merged, _ = made.look(beliefs, frame, seen, timing, root, new(()))
-        first = [torch.zeros(size, dtype=torch.long, device=root.device) for size in (_MATCHES, _TAKEN, _TOLD)]
-        local, _, _ = made.score(merged, frame, seen, timing, root, first[0], first[0])
-        made.take(beliefs, local, timing, root, first[1], torch.arange(_TRACKS), first[1])
-        made.place(beliefs, frame, root, first[2])
+        # Each its own tensor: the same one twice would become a rule.
+        track, pair, taken, told = (torch.zeros(size, dtype=torch.long) for size in (_MATCHES, _MATCHES, _TAKEN, _TOLD))
+        local, _, _ = made.score(merged, frame, seen, timing, root, track, pair)
+        made.take(beliefs.at(taken), local.at(taken), timing.at(taken), root)
+        made.place(beliefs, frame, root, told)
     except RuntimeError as error:
         raise InputError(f"tracks cannot be compiled here; without compiling they work ({error})") from error
     return made
@@ -141,7 +138,7 @@ class _Compiled:
             for value in _tensors(given):
                 for axis, size in enumerate(value.shape):
                     if size >= _PAIRS:
-                        torch._dynamo.mark_dynamic(value, axis, min=2)
+                        torch._dynamo.mark_dynamic(value, axis)
         return self.made(*given)
 
 

@@ -6,7 +6,6 @@ import dataclasses
 import math
 from typing import NamedTuple, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -266,7 +265,7 @@ class Tracker:
     def _take(self, pairs: ObjectPairs, seen: Sightings) -> None:
         timing = self._delays(seen)
         marks = mark_numbers(pairs.left, pairs.right)
-        taken = np.zeros(len(pairs), dtype=bool)
+        taken = [False] * len(pairs)
         if self.records:
             frame, root, gate = self.frame, self.shared.root, self.options.gate
             merged, close = self.steps.look(self.beliefs, frame, seen, timing, root, root.new_tensor(gate))
@@ -278,7 +277,8 @@ class Tracker:
             if accepted:
                 self._update(possible, torch.tensor(accepted), pairs, timing)
                 used = marks[possible.pair[accepted].cpu().numpy()]
-                taken = np.isin(marks[:, 0], used[:, 0]) | np.isin(marks[:, 1], used[:, 1])
+                left, right = (set(column) for column in used.T.tolist())
+                taken = [first in left or second in right for first, second in marks.tolist()]
         fresh = [i for i, usable in enumerate(seen.usable.tolist()) if usable and not taken[i]]
         if fresh:
             self._begin(torch.tensor(fresh), pairs, seen, timing)
@@ -305,7 +305,10 @@ class Tracker:
             known = torch.tensor([self.records[i].number > 0 for i in track.tolist()])
             merged = possible.found.at(rows[known & (possible.squared[rows] < 13.3)])
             self.shared.add(merged.effect[..., 0, :], merged.value[:, 0], merged.noise[..., 0, :])
-        self.beliefs = self.steps.take(self.beliefs, possible.seen, timing, self.shared.root, rows, track, pair)
+        old, seen = self.beliefs.at(track), possible.seen.at(rows)
+        new = self.steps.take(old, seen, timing.at(pair), self.shared.root)
+        both = zip(self.beliefs, new, strict=True)
+        self.beliefs = Beliefs(*(value.index_copy(-1, track, part) for value, part in both))
         densities, scores = possible.log_density[rows].tolist(), pairs.score.tolist()
         for t, p, density in zip(track.tolist(), pair.tolist(), densities, strict=True):
             record = self.records[t]

@@ -49,10 +49,10 @@ def marks(rig: StereoRig, targets: int, second: float, generator: torch.Generato
     return left + noise[0], right + noise[1]
 
 
-def cost_of_tracks(targets: int = 50, moments: int = 60) -> float:
+def cost_of_tracks(targets: int = 50, moments: int = 60, compiled: bool = False) -> float:
     """Processor milliseconds of one moment of the tracker."""
     rig, generator = site_rig(), torch.Generator().manual_seed(0)
-    tracker = Tracker(StereoLocalizer(rig))
+    tracker = Tracker(StereoLocalizer(rig), compiled=compiled)
     spent = 0.0
     for moment in range(moments):
         left, right = marks(rig, targets, moment / 30.0, generator)
