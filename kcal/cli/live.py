@@ -85,6 +85,10 @@ def live_command(
             metavar="S", help="Its standard deviation, also as a drift in an hour; above 0 it is estimated.", min=0
         ),
     ] = 0.0,
+    compiled: Annotated[
+        bool,
+        typer.Option("--compile", help="Translate the filter to C++ first, in one or two minutes: for many targets."),
+    ] = False,
     start: Annotated[
         str | None,
         typer.Option(metavar="ISO", help="Calendar time of second 0, if times are not Unix seconds; for events."),
@@ -139,7 +143,10 @@ def live_command(
     locate = Locator(load_rig(rig), origin=place, heading_deg=heading, pixel_sigma=pixel_sigma)
     solved = locate.localize.rig
 
-    tracker = Tracker(locate.localize, TrackOptions.for_video(match_sigma) if videos else None, clock=clock)
+    if compiled:
+        err.print("compiling, one or two minutes")
+    follow = TrackOptions.for_video(match_sigma) if videos else None
+    tracker = Tracker(locate.localize, follow, clock=clock, compiled=compiled)
     pairs = _video_pairs(videos, detector, tracker, options, match_sigma) if videos and detector else None
     source = pairs or lines_of(lines, lambda line: read_moment(line, solved, options, pixel_sigma))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")

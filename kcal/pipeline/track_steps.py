@@ -20,7 +20,7 @@ from kcal.pipeline.motion import transition
 from kcal.pipeline.sightings import Anchored, Sightings, anchored, measured
 
 # Of stand-ins from which graphs are made: sizes that no other axis has, so that none seem to belong together.
-_PAIRS, _TRACKS, _MATCHES, _TAKEN, _TOLD = 1009, 1013, 1019, 1021, 1031
+_STAND_INS = _PAIRS, _TRACKS, _MATCHES, _TAKEN, _TOLD = 1009, 1013, 1019, 1021, 1031
 
 
 class TrackSteps(NamedTuple):
@@ -123,34 +123,32 @@ def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) ->
 
 
 class _Compiled:
-    """A step that is compiled at its first call; few rows, to which compiled code does not apply, go as before."""
+    """A step that is compiled at its first call, for any sizes from 2; with fewer it is done as it is."""
 
     def __init__(self, step: Callable[..., Any]) -> None:
         self.step, self.made = step, torch.compile(step, fullgraph=True)
-        self.first = True
+        # Of all tensors in the arguments: which, and which axis, may have any size.
+        self.free: list[tuple[int, int]] | None = None
 
     def __call__(self, *arguments: Any) -> Any:
-        if min(size for argument in arguments for size in _sizes(argument)) < 2:
-            return self.step(*arguments)
+        # Other strides would need other code.
         given = [_contiguous(argument) for argument in arguments]
-        if self.first:
-            self.first = False
-            for value in _tensors(given):
-                for axis, size in enumerate(value.shape):
-                    if size >= _PAIRS:
-                        torch._dynamo.mark_dynamic(value, axis)
+        tensors = [tensor for argument in given for tensor in _tensors(argument)]
+        if self.free is None:
+            every = [(i, axis) for i, tensor in enumerate(tensors) for axis in range(tensor.ndim)]
+            self.free = [(i, axis) for i, axis in every if tensors[i].shape[axis] in _STAND_INS]
+            for i, axis in self.free:
+                torch._dynamo.mark_dynamic(tensors[i], axis)
+        if min(tensors[i].shape[axis] for i, axis in self.free) < 2:
+            return self.step(*arguments)
         return self.made(*given)
 
 
-def _tensors(value: Any) -> list[Tensor]:
-    return [value] if isinstance(value, Tensor) else [tensor for part in value for tensor in _tensors(part)]
-
-
-def _sizes(value: Any) -> list[int]:
-    return [value.shape[-1] if value.ndim else 2 for value in _tensors(value)]
+def _tensors(value: Any) -> tuple[Tensor, ...]:
+    return (value,) if isinstance(value, Tensor) else value
 
 
 def _contiguous(value: Any) -> Any:
     if isinstance(value, Tensor):
         return value.contiguous()
-    return type(value)(*map(_contiguous, value))
+    return type(value)(*(part.contiguous() for part in value))

@@ -1,0 +1,58 @@
+"""Compiled tracks are those of the steps as they are: from one target to many, through births, occlusion and turns."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from track_scenes import pairs_of, seen_by, tracked_site
+
+from kcal.errors import InputError
+from kcal.locate.localizer import StereoLocalizer
+from kcal.pipeline.consider import ClockPrior
+from kcal.pipeline.track_steps import compiled_steps, track_steps
+from kcal.pipeline.tracks import Tracker
+
+
+def scene(localize: StereoLocalizer, frame: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Targets on lines, one of which sweeps by closely; first one, then four, then nine, three of which pause."""
+    count = 1 if frame < 4 else 4 if frame < 8 else 9
+    number = torch.arange(count, dtype=torch.float64)
+    z = 100.0 + 150.0 * number
+    x = (number / 4.0 - 1.0) * 0.4 * z + torch.where(number > 0, 0.5, 2.0) * frame
+    seen = torch.ones(count, dtype=torch.bool)
+    if frame in (12, 13):
+        seen[2:5] = False
+    generator = torch.Generator().manual_seed(frame)
+    return seen_by(localize.rig, torch.stack([x, 0.01 * z, z], -1)[seen], 0.2, generator)
+
+
+def test_compiled_tracks_are_the_same() -> None:
+    localize = tracked_site(0.002)
+    clock = ClockPrior(offset_sigma_s=0.01)
+    plain, compiled = Tracker(localize, clock=clock), Tracker(localize, clock=clock, compiled=True)
+    for frame in range(25):
+        time = torch.tensor([frame / 10.0, frame / 10.0 + 0.004], dtype=torch.float64)
+        pairs = pairs_of(*scene(localize, frame), time, 0.2)
+        both = plain(pairs), compiled(pairs)
+        assert both[0].number == both[1].number
+        for name, value, other in zip(both[0].state._fields, both[0].state, both[1].state, strict=True):
+            torch.testing.assert_close(other, value, rtol=1e-7, atol=1e-10, msg=f"{name}, frame {frame}")
+        torch.testing.assert_close(both[1].models, both[0].models, rtol=1e-7, atol=1e-10)
+    assert len(both[0].number) == 9
+    assert float(plain.clock_estimate().offset(2.4)[1]) < 0.01
+    for value, other in zip(plain.beliefs, compiled.beliefs, strict=True):
+        torch.testing.assert_close(other, value, rtol=1e-6, atol=1e-10)
+
+
+def test_steps_that_cannot_be_compiled_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **__: object) -> object:
+        def call(*_: object) -> object:
+            raise RuntimeError("no compiler")
+
+        return call
+
+    monkeypatch.setattr(torch, "compile", fails)
+    localize = tracked_site()
+    root = torch.eye(4, dtype=torch.float64)
+    with pytest.raises(InputError, match="no compiler"):
+        compiled_steps(track_steps(localize, 0.01), 1, 4, root)
