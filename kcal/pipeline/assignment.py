@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -11,29 +11,60 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from kcal.pipeline.beliefs import Beliefs, Fit, Innovations, Timing
+from kcal.pipeline.beliefs import Beliefs, Timing
 from kcal.pipeline.lanes import product
 from kcal.pipeline.sightings import Anchored, Sightings
 
 
-class Candidates(NamedTuple):
-    """L possible matches.
+class Scores(NamedTuple):
+    """L possible matches of sightings with merged beliefs, before the gate: flat, with the fields of `Anchored` first.
 
     Attributes:
-        track: (L,) numbers of tracks.
-        pair: (L,) numbers of pairs.
-        seen: the pair in the track's frame.
-        found: innovations of the merged belief.
+        value: (4, L) of the sighting in the track's frame, as the next four; see `Anchored`.
+        noise: (4, 4, L).
+        shared: (4, K, L).
+        late: (2, 4, 3, L).
+        ahead: (L,) bool.
+        effect: (4, K + 3, L) of the shared errors on the innovation.
+        innovation: (4, L).
+        covariance: (4, 4, L) of its noise.
         squared: (L,) squared Mahalanobis distance.
         log_density: (L,).
     """
 
-    track: Tensor
-    pair: Tensor
-    seen: Anchored
-    found: Innovations
+    value: Tensor
+    noise: Tensor
+    shared: Tensor
+    late: Tensor
+    ahead: Tensor
+    effect: Tensor
+    innovation: Tensor
+    covariance: Tensor
     squared: Tensor
     log_density: Tensor
+
+    def at(self, which: Tensor) -> Self:
+        """The matches at some places."""
+        return type(self)(*(value[..., which] for value in self))
+
+    @property
+    def seen(self) -> Anchored:
+        """The sightings in the tracks' frames."""
+        return Anchored(*self[:5])
+
+
+class Candidates(NamedTuple):
+    """L possible matches within the gate.
+
+    Attributes:
+        track: (L,) numbers of tracks.
+        pair: (L,) numbers of pairs.
+        scores: how well they match.
+    """
+
+    track: Tensor
+    pair: Tensor
+    scores: Scores
 
 
 def nearby(beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, gate: Tensor) -> Tensor:
@@ -61,15 +92,13 @@ def nearby(beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, roo
     return (apart <= 2.0 * gate * reach) & seen.usable
 
 
-def within(possible: tuple[Anchored, Innovations, Fit], track: Tensor, pair: Tensor, gate: float) -> Candidates:
+def within(scores: Scores, track: Tensor, pair: Tensor, gate: float) -> Candidates:
     """Those in front of the track and within the gate."""
-    local, found, fit = possible
-    good = local.ahead & (fit.squared[0] <= gate)
+    good = scores.ahead & (scores.squared <= gate)
     which = good.nonzero()[:, 0]
     if len(which) < len(good):
-        track, pair, local, found = track[which], pair[which], local.at(which), found.at(which)
-        fit = Fit(fit.squared[:, which], fit.log_density[:, which])
-    return Candidates(track, pair, local, found, fit.squared[0], fit.log_density[0])
+        track, pair, scores = track[which], pair[which], scores.at(which)
+    return Candidates(track, pair, scores)
 
 
 def mark_numbers(left: Tensor, right: Tensor) -> NDArray[np.int64]:
@@ -98,7 +127,7 @@ def assigned(
         evidence: (T,) of each track so far: settles between tracks that want the same mark by different pairs.
         tiers: (T,) tracks of tier 0 choose before those of tier 1; tracks of a negative tier do not choose.
     """
-    track, pair, density = possible.track.tolist(), possible.pair.tolist(), possible.log_density.tolist()
+    track, pair, density = possible.track.tolist(), possible.pair.tolist(), possible.scores.log_density.tolist()
     ends = [tuple(both) for both in marks.tolist()]
     left: set[int] = set()
     right: set[int] = set()

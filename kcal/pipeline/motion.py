@@ -119,24 +119,31 @@ def _noise_entries(motion: Motion, dt: float) -> tuple[float, float, float]:
 
 
 class Moved(NamedTuple):
-    """States (6, J, T) after a step: new = carried(state) / ahead, a projective map.
+    """States (6, J, T) after a step, a projective map: what is linear in the old state, divided by `ahead`.
 
     Attributes:
         state: (6, J, T).
         ahead: (J, T) what the new numbers are divided by.
         noise: (6, 6, J, T) what the step adds.
-        linear: (7, 6, J, T) derivatives before the division: of the new numbers, and of `ahead`.
+        by_pace: (6, 3, J, T) derivatives of ray and velocity by the old velocity, before the division.
+        turn: (3, 3, 1, T) what turns rays, or None.
     """
 
     state: Tensor
     ahead: Tensor
     noise: Tensor
-    linear: Tensor
+    by_pace: Tensor
+    turn: Tensor | None
 
     def through(self, columns: Tensor) -> Tensor:
         """The derivatives (6, 6, J, T) of the new state by the old one, times columns (6, C, J, T)."""
-        found = product(self.linear, columns)
-        return (found[:6] - outer(self.state, found[6])) / self.ahead
+        ray = torch.cat([columns[:2], torch.zeros_like(columns[:1])])
+        if self.turn is not None:
+            ray = product(self.turn, ray)
+        carried = product(self.by_pace, columns[3:])
+        ray = ray + carried[:3]
+        new = torch.cat([ray[:2], columns[2:3], carried[3:]])
+        return (new - outer(self.state, ray[2])) / self.ahead
 
 
 def moved(state: Tensor, step: Transition, turn: Tensor | None = None) -> Moved:
@@ -147,23 +154,16 @@ def moved(state: Tensor, step: Transition, turn: Tensor | None = None) -> Moved:
         step: from `transition`.
         turn: (3, 3, T) rotations from the old frames into new ones; None: the frames stay.
     """
-    reach, keep, zero = step.reach, step.keep, torch.zeros_like(step.reach[0])
-    rotation = torch.eye(3, dtype=state.dtype, device=state.device)[..., None, None]
+    reach, keep, rotation = step.reach, step.keep, None
+    ray = torch.cat([state[:2], torch.ones_like(state[:1])])
     if turn is not None:
         rotation = turn[:, :, None]
-        reach, keep = product(rotation, reach), product(rotation, keep)
-    # Directions and velocities as they were make directions, the inverse range and velocities.
-    by_direction = rotation[:, :2].expand(3, 2, *zero.shape[1:])
-    to_ray = torch.cat([by_direction, zero[:, None], reach], 1)
-    unit = torch.eye(6, dtype=state.dtype, device=state.device)[..., None, None]
-    to_inverse = unit[2].expand_as(to_ray[0])
-    to_velocity = torch.cat([torch.stack([zero] * 3, 1), keep], 1)
-    linear = torch.cat([to_ray[:2], to_inverse[None], to_velocity, to_ray[2:]])
-    carried = (linear * state).sum(1)
-    ahead = carried[6] + rotation[2, 2]
-    straight = torch.nn.functional.pad(rotation[:2, 2], (0, 0, 0, 0, 0, 4))
-    new = (carried[:6] + straight) / ahead
-    return Moved(new, ahead, (state[2] / ahead).square() * _step_noise(new, step.noise), linear)
+        reach, keep, ray = product(rotation, reach), product(rotation, keep), (rotation * ray).sum(1)
+    by_pace = torch.cat([reach, keep])
+    carried = (by_pace * state[3:]).sum(1)
+    ray = ray + carried[:3]
+    new = torch.cat([ray[:2], state[2:3], carried[3:]]) / ray[2]
+    return Moved(new, ray[2], (state[2] / ray[2]).square() * _step_noise(new, step.noise), by_pace, rotation)
 
 
 def _step_noise(new: Tensor, noise: Tensor) -> Tensor:

@@ -16,7 +16,6 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.max_likelihood import PointFit, calibration_effect, symmetric, unreached_direction
 from kcal.locate.stereo import PositionStatus, fit_pairs
 from kcal.pipeline.lanes import congruent, eliminate, outer, product, solved
-from kcal.pipeline.pairs import ObjectPairs
 
 
 class Sightings(NamedTuple):
@@ -54,22 +53,25 @@ class Sightings(NamedTuple):
         return type(self)(*(value[..., which] for value in self))
 
 
-def sightings(localize: StereoLocalizer, pairs: ObjectPairs, lasting_px: float = 0.0) -> Sightings:
-    """Measure pairs with a rig; the calibration's errors are those that `localize` includes.
+@torch.no_grad()
+def sightings(
+    localize: StereoLocalizer,
+    left: Tensor,
+    right: Tensor,
+    covariance: Tensor,
+    time: Tensor,
+    lasting_px: float = 0.0,
+) -> Sightings:
+    """Measure N pairs of one moment; the calibration's errors are those that `localize` includes.
 
     Args:
         localize: the rig and how well it is known.
-        pairs: of one moment.
+        left: (N, 2) pixels.
+        right: (N, 2).
+        covariance: (N, 4, 4) of the four coordinates.
+        time: (N, 2) seconds.
         lasting_px: standard deviation along each axis of errors of the right marks that stay as long as a target.
     """
-    return measured(localize, pairs.left, pairs.right, pairs.covariance, pairs.time, lasting_px)
-
-
-@torch.no_grad()
-def measured(
-    localize: StereoLocalizer, left: Tensor, right: Tensor, covariance: Tensor, time: Tensor, lasting_px: float
-) -> Sightings:
-    """`sightings` of tensors (N, ...) alone."""
     rig = localize.rig
     found = fit_pairs(rig, left, right, covariance, by_camera=True)
     fit, scale = found.fit, found.scale

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.assignment import nearby
-from kcal.pipeline.beliefs import Beliefs, Fit, Innovations, Timing, fit_of, innovations, no_beliefs, predicted, updated
+from kcal.pipeline.assignment import Scores, nearby
+from kcal.pipeline.beliefs import Beliefs, Timing, fit_of, innovations, no_beliefs, predicted, updated
 from kcal.pipeline.estimates import TrackStates, track_states
 from kcal.pipeline.motion import transition
-from kcal.pipeline.sightings import Anchored, Sightings, anchored, measured
+from kcal.pipeline.sightings import Anchored, Sightings, anchored, sightings
 
 # Of stand-ins from which graphs are made: sizes that no other axis has, so that none seem to belong together.
 _STAND_INS = _PAIRS, _TRACKS, _MATCHES, _TAKEN, _TOLD = 1009, 1013, 1019, 1021, 1031
@@ -38,7 +38,7 @@ class TrackSteps(NamedTuple):
     measure: Callable[[Tensor, Tensor, Tensor, Tensor], Sightings]
     move: Callable[[Beliefs, Tensor, Tensor, Tensor], Beliefs]
     look: Callable[[Beliefs, Tensor, Sightings, Timing, Tensor, Tensor], tuple[Beliefs, Tensor]]
-    score: Callable[[Beliefs, Tensor, Sightings, Timing, Tensor, Tensor, Tensor], tuple[Anchored, Innovations, Fit]]
+    score: Callable[[Beliefs, Tensor, Sightings, Timing, Tensor, Tensor, Tensor], Scores]
     take: Callable[[Beliefs, Anchored, Timing, Tensor], Beliefs]
     place: Callable[[Beliefs, Tensor, Tensor, Tensor], TrackStates]
 
@@ -58,11 +58,14 @@ def looked_at(
 
 def scored(
     merged: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, root: Tensor, track: Tensor, pair: Tensor
-) -> tuple[Anchored, Innovations, Fit]:
+) -> Scores:
     """Pairs (L,) against tracks (L,), whose beliefs are merged."""
     local = anchored(seen.at(pair), frame[..., track])
     found = innovations(merged.at(track), local, timing.at(pair))
-    return local, found, fit_of(found, root)
+    fit = fit_of(found, root)
+    return Scores(
+        *local, found.effect[..., 0, :], found.value[:, 0], found.noise[..., 0, :], fit.squared[0], fit.log_density[0]
+    )
 
 
 def taken_in(beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor) -> Beliefs:
@@ -80,7 +83,7 @@ def track_steps(localize: StereoLocalizer, lasting_px: float) -> TrackSteps:
     """The steps as they are."""
 
     def measure(left: Tensor, right: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
-        return measured(localize, left, right, covariance, time, lasting_px)
+        return sightings(localize, left, right, covariance, time, lasting_px)
 
     def place(beliefs: Beliefs, frame: Tensor, root: Tensor, which: Tensor) -> TrackStates:
         return placed(localize, beliefs, frame, root, which)
@@ -103,6 +106,10 @@ def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) ->
     """
     new = root.new_zeros
     made = TrackSteps(*(_Compiled(step) for step in steps))
+    # This graph is many small kernels, which Python would call one by one; of its many guards, those of the tensors in
+    # the rig cannot fail, because a tracker keeps its rig.
+    fewer = {"cpp_wrapper": True, "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe}
+    made = made._replace(measure=_Compiled(steps.measure, fewer))
     try:
         unit = torch.eye(4).to(root).expand(_PAIRS, 4, 4)
         seen = made.measure(new(_PAIRS, 2), new(_PAIRS, 2), unit, new(_PAIRS, 2))
@@ -113,9 +120,11 @@ def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) ->
         beliefs = made.move(beliefs, frame[2], new(9, models), new(()))
         merged, _ = made.look(beliefs, frame, seen, timing, root, new(()))
         # Each its own tensor: the same one twice would become a rule.
-        track, pair, taken, told = (torch.zeros(size, dtype=torch.long) for size in (_MATCHES, _MATCHES, _TAKEN, _TOLD))
-        local, _, _ = made.score(merged, frame, seen, timing, root, track, pair)
-        made.take(beliefs.at(taken), local.at(taken), timing.at(taken), root)
+        track, pair, taken, told = (
+            torch.zeros(size, dtype=torch.long, device=root.device) for size in (_MATCHES, _MATCHES, _TAKEN, _TOLD)
+        )
+        scores = made.score(merged, frame, seen, timing, root, track, pair)
+        made.take(beliefs.at(taken), scores.seen.at(taken), timing.at(taken), root)
         made.place(beliefs, frame, root, told)
     except RuntimeError as error:
         raise InputError(f"tracks cannot be compiled here; without compiling they work ({error})") from error
@@ -125,8 +134,8 @@ def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) ->
 class _Compiled:
     """A step that is compiled at its first call, for any sizes from 2; with fewer it is done as it is."""
 
-    def __init__(self, step: Callable[..., Any]) -> None:
-        self.step, self.made = step, torch.compile(step, fullgraph=True)
+    def __init__(self, step: Callable[..., Any], options: dict[str, Any] | None = None) -> None:
+        self.step, self.made = step, torch.compile(step, fullgraph=True, options=options)
         # Of all tensors in the arguments: which, and which axis, may have any size.
         self.free: list[tuple[int, int]] | None = None
 

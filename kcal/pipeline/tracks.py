@@ -300,22 +300,22 @@ class Tracker:
         return 0 if self.time - track.last <= self.options.lose_after_s else -1
 
     def _update(self, possible: Candidates, rows: Tensor, pairs: ObjectPairs, timing: Timing) -> None:
-        track, pair = possible.track[rows], possible.pair[rows]
+        track, pair, scores = possible.track[rows], possible.pair[rows], possible.scores
         if self.shared.estimated:
             known = torch.tensor([self.records[i].number > 0 for i in track.tolist()])
-            merged = possible.found.at(rows[known & (possible.squared[rows] < 13.3)])
-            self.shared.add(merged.effect[..., 0, :], merged.value[:, 0], merged.noise[..., 0, :])
-        old, seen = self.beliefs.at(track), possible.seen.at(rows)
+            sure = scores.at(rows[known & (scores.squared[rows] < 13.3)])
+            self.shared.add(sure.effect, sure.innovation, sure.covariance)
+        old, seen = self.beliefs.at(track), scores.seen.at(rows)
         new = self.steps.take(old, seen, timing.at(pair), self.shared.root)
         both = zip(self.beliefs, new, strict=True)
         self.beliefs = Beliefs(*(value.index_copy(-1, track, part) for value, part in both))
-        densities, scores = possible.log_density[rows].tolist(), pairs.score.tolist()
+        densities, weights = scores.log_density[rows].tolist(), pairs.score.tolist()
         for t, p, density in zip(track.tolist(), pair.tolist(), densities, strict=True):
             record = self.records[t]
             record.last, record.hits = self.time, record.hits + 1
             record.evidence += density
             name = pairs.category[p]
-            record.categories[name] = record.categories.get(name, 0.0) + scores[p]
+            record.categories[name] = record.categories.get(name, 0.0) + weights[p]
 
     def _begin(self, which: Tensor, pairs: ObjectPairs, seen: Sightings, timing: Timing) -> None:
         seen = seen.at(which)

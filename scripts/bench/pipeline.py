@@ -58,7 +58,9 @@ def main() -> None:
     torch.set_num_threads(1)
     rig = site_rig()
     localize = StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
-    compiled = None if options.no_compile else torch.compile(localize, fullgraph=True, dynamic=True)
+    compiled = None
+    if not options.no_compile:
+        compiled = torch.compile(localize, fullgraph=True, dynamic=True, options={"cpp_wrapper": True})
     match = ObjectDisparity(planned_rig())
     random = torch.Generator().manual_seed(0)
     texture = torch.rand(1, 1, SIZE[1] // 4, SIZE[0] // 4, generator=random)

@@ -37,7 +37,7 @@ def test_one_sighting_is_what_the_localizer_says() -> None:
     left, right, _ = rig(points)
     pairs = pairs_of(left, right + tensor([0.0, 0.4]), 7.0)
     expected = localize(pairs.left, pairs.right, pairs.covariance)
-    seen = sightings(localize, pairs)
+    seen = sightings(localize, pairs.left, pairs.right, pairs.covariance, pairs.time)
     turned = torch.linalg.qr(torch.eye(3).double() + 0.2 * mix[:3, :3])[0]
     frame = (turned * torch.sign(turned.diagonal())).T.expand(4, 3, 3)
     timing = Timing(torch.zeros(2, 4).double(), torch.zeros(3, 4).double(), torch.zeros(4).double())
