@@ -3,9 +3,9 @@
     python -m scripts.bench.pipeline --write           docs/measured/pairing.md, section latency
     python -m scripts.bench.pipeline --calls 20 --no-compile
 
-One thread. `localize` is `StereoLocalizer` alone, with a covariance for each pair, compiled with `cpp_wrapper`; `associate` pairs as many detections
-of both images; `match` is `ObjectDisparity` on boxes of 12 px, all of which have their image in both. One graph is
-compiled for any number of pairs from two; a single pair goes twice.
+One thread. `localize` is `StereoLocalizer` alone, with a covariance for each pair, compiled with `cpp_wrapper`;
+`associate` pairs as many detections of both images; `match` is `ObjectDisparity` on boxes of 12 px, all of which have
+their image in both. One graph is compiled for any number of pairs from two; a single pair goes twice.
 """
 
 from __future__ import annotations
