@@ -181,10 +181,6 @@ class Innovations(NamedTuple):
     noise: Tensor
     marks: Tensor
 
-    def at(self, which: Tensor) -> Self:
-        """The innovations at some places."""
-        return type(self)(*(value[..., which] for value in self))
-
 
 def innovations(beliefs: Beliefs, seen: Anchored, timing: Timing) -> Innovations:
     """Compare beliefs with sightings, one for each track.

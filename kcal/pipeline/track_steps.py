@@ -106,10 +106,8 @@ def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) ->
     """
     new = root.new_zeros
     made = TrackSteps(*(_Compiled(step) for step in steps))
-    # This graph is many small kernels, which Python would call one by one; of its many guards, those of the tensors in
-    # the rig cannot fail, because a tracker keeps its rig.
-    fewer = {"cpp_wrapper": True, "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe}
-    made = made._replace(measure=_Compiled(steps.measure, fewer))
+    # This graph is many small kernels, which Python would call one by one.
+    made = made._replace(measure=_Compiled(steps.measure, {"cpp_wrapper": True}))
     try:
         unit = torch.eye(4).to(root).expand(_PAIRS, 4, 4)
         seen = made.measure(new(_PAIRS, 2), new(_PAIRS, 2), unit, new(_PAIRS, 2))
