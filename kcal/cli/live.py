@@ -87,7 +87,7 @@ def live_command(
     ] = 0.0,
     compiled: Annotated[
         bool,
-        typer.Option("--compile", help="Translate the filter to C++ first, in one or two minutes: for many targets."),
+        typer.Option("--compile", help="Translate the filter to C++ first, in some minutes: for many targets."),
     ] = False,
     start: Annotated[
         str | None,
@@ -144,7 +144,7 @@ def live_command(
     solved = locate.localize.rig
 
     if compiled:
-        err.print("compiling, one or two minutes")
+        err.print("compiling: some three minutes the first time")
     follow = TrackOptions.for_video(match_sigma) if videos else None
     tracker = Tracker(locate.localize, follow, clock=clock, compiled=compiled)
     pairs = _video_pairs(videos, detector, tracker, options, match_sigma) if videos and detector else None

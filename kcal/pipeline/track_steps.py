@@ -93,7 +93,7 @@ def track_steps(localize: StereoLocalizer, lasting_px: float) -> TrackSteps:
 
 @torch.no_grad()
 def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) -> TrackSteps:
-    """The steps in C++ for any numbers of tracks and pairs: this takes a minute or two, less where torch remembers.
+    """The steps in C++ for any numbers of tracks and pairs: this takes three minutes, less where torch remembers.
 
     Args:
         steps: from `track_steps`.
