@@ -5,6 +5,7 @@ Sizes are T tracks under J models, N pairs, L possible matches.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -104,29 +105,36 @@ def compiled_steps(steps: TrackSteps, errors: int, models: int, root: Tensor) ->
     Raises:
         InputError: torch could not compile, for want of a C++ compiler for instance.
     """
-    new = root.new_zeros
     made = TrackSteps(*(_Compiled(step) for step in steps))
     # This graph is many small kernels, which Python would call one by one.
     made = made._replace(measure=_Compiled(steps.measure, {"cpp_wrapper": True}))
     try:
-        unit = torch.eye(4).to(root).expand(_PAIRS, 4, 4)
-        seen = made.measure(new(_PAIRS, 2), new(_PAIRS, 2), unit, new(_PAIRS, 2))
-        timing = Timing(new(2, _PAIRS), new(3, _PAIRS), new(_PAIRS))
-        empty = no_beliefs(errors, models, root.device)
-        beliefs = Beliefs(*(torch.nn.functional.pad(value, (0, _TRACKS), value=1.0) for value in empty))
-        frame = torch.eye(3).to(root)[..., None].expand(3, 3, _TRACKS)
-        beliefs = made.move(beliefs, frame[2], new(9, models), new(()))
-        merged, _ = made.look(beliefs, frame, seen, timing, root, new(()))
-        # Each its own tensor: the same one twice would become a rule.
-        track, pair, taken, told = (
-            torch.zeros(size, dtype=torch.long, device=root.device) for size in (_MATCHES, _MATCHES, _TAKEN, _TOLD)
-        )
-        scores = made.score(merged, frame, seen, timing, root, track, pair)
-        made.take(beliefs.at(taken), scores.seen.at(taken), timing.at(taken), root)
-        made.place(beliefs, frame, root, told)
+        # Torch warns of itself.
+        with warnings.catch_warnings(action="ignore", category=FutureWarning):
+            _compile_all(made, errors, models, root)
     except RuntimeError as error:
         raise InputError(f"tracks cannot be compiled here; without compiling they work ({error})") from error
     return made
+
+
+def _compile_all(made: TrackSteps, errors: int, models: int, root: Tensor) -> None:
+    """Call each step with stand-ins."""
+    new = root.new_zeros
+    unit = torch.eye(4).to(root).expand(_PAIRS, 4, 4)
+    seen = made.measure(new(_PAIRS, 2), new(_PAIRS, 2), unit, new(_PAIRS, 2))
+    timing = Timing(new(2, _PAIRS), new(3, _PAIRS), new(_PAIRS))
+    empty = no_beliefs(errors, models, root.device)
+    beliefs = Beliefs(*(torch.nn.functional.pad(value, (0, _TRACKS), value=1.0) for value in empty))
+    frame = torch.eye(3).to(root)[..., None].expand(3, 3, _TRACKS)
+    beliefs = made.move(beliefs, frame[2], new(9, models), new(()))
+    merged, _ = made.look(beliefs, frame, seen, timing, root, new(()))
+    # Each its own tensor: the same one twice would become a rule.
+    track, pair, taken, told = (
+        torch.zeros(size, dtype=torch.long, device=root.device) for size in (_MATCHES, _MATCHES, _TAKEN, _TOLD)
+    )
+    scores = made.score(merged, frame, seen, timing, root, track, pair)
+    made.take(beliefs.at(taken), scores.seen.at(taken), timing.at(taken), root)
+    made.place(beliefs, frame, root, told)
 
 
 class _Compiled:

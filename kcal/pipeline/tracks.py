@@ -135,7 +135,7 @@ class Tracker:
         options: when tracks begin and end.
         clock: what is known of the clocks; with sigmas above zero they are estimated from the tracks.
         record: keep what `smoothed` needs; memory then grows with time.
-        compiled: translate the filter to C++ first, which takes three minutes, or some seconds where torch remembers;
+        compiled: translate the filter to C++ first, which takes three minutes, or one where torch remembers;
             each moment of many tracks then takes about half the time.
 
     Example:
