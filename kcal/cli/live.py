@@ -87,7 +87,7 @@ def live_command(
     ] = 0.0,
     compiled: Annotated[
         bool,
-        typer.Option("--compile", help="Translate the filter to C++ first, in some minutes: for many targets."),
+        typer.Option("--compile", help="Translate the filter to C++ first, which takes minutes; for many targets."),
     ] = False,
     start: Annotated[
         str | None,

@@ -270,7 +270,9 @@ class StereoLocalizer(nn.Module):
         fit, scale, _, usable = found
         spread = [variance * entry for entry in fit.covariance]
         if self.calibration_factor is not None:
-            moved = calibration_effect(fit, scale, self.calibration_factor)  # (..., 3, K, N)
+            factors = [self.calibration_factor, *([] if self.link is None else [self.link])]
+            effect = calibration_effect(fit, scale, torch.cat(factors, 1))  # (..., 3, K, N)
+            moved, by_link = effect.tensor_split([self.calibration_factor.shape[1]], -2)
             for number, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
                 spread[number] = spread[number] + (moved[..., i, :, :] * moved[..., j, :, :]).sum(-2)
         reach = inverse_range(found, spread[5], PositionStatus.BEARING_ONLY)
@@ -288,7 +290,7 @@ class StereoLocalizer(nn.Module):
             turn = torch.cat([by_mounting(enu), -self.half_curvature * up[..., None]], -1)
             covariance = covariance + turn @ self.mounting @ turn.mT
             if self.link is not None and self.calibration_factor is not None:
-                mixed = slope @ calibration_effect(fit, scale, self.link).movedim(-1, -3) @ turn.mT
+                mixed = slope @ by_link.movedim(-1, -3) @ turn.mT
                 covariance = covariance + mixed + mixed.mT
         covariance = torch.where(ok[..., None, None], covariance, torch.diag(covariance.new_full((3,), math.inf)))
         geodetic = place_enu(enu, self.ecef_from_enu, self.ecef_of_origin)

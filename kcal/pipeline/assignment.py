@@ -17,14 +17,10 @@ from kcal.pipeline.sightings import Anchored, Sightings
 
 
 class Scores(NamedTuple):
-    """L possible matches of sightings with merged beliefs, before the gate: flat, with the fields of `Anchored` first.
+    """L possible matches of sightings with merged beliefs.
 
     Attributes:
-        value: (4, L) of the sighting in the track's frame, as the next four; see `Anchored`.
-        noise: (4, 4, L).
-        shared: (4, K, L).
-        late: (2, 4, 3, L).
-        ahead: (L,) bool.
+        seen: the sightings in the tracks' frames.
         effect: (4, K + 3, L) of the shared errors on the innovation.
         innovation: (4, L).
         covariance: (4, 4, L) of its noise.
@@ -32,11 +28,7 @@ class Scores(NamedTuple):
         log_density: (L,).
     """
 
-    value: Tensor
-    noise: Tensor
-    shared: Tensor
-    late: Tensor
-    ahead: Tensor
+    seen: Anchored
     effect: Tensor
     innovation: Tensor
     covariance: Tensor
@@ -45,12 +37,7 @@ class Scores(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """The matches at some places."""
-        return type(self)(*(value[..., which] for value in self))
-
-    @property
-    def seen(self) -> Anchored:
-        """The sightings in the tracks' frames."""
-        return Anchored(*self[:5])
+        return type(self)(self.seen.at(which), *(value[..., which] for value in self[1:]))
 
 
 class Candidates(NamedTuple):
@@ -94,7 +81,7 @@ def nearby(beliefs: Beliefs, frame: Tensor, seen: Sightings, timing: Timing, roo
 
 def within(scores: Scores, track: Tensor, pair: Tensor, gate: float) -> Candidates:
     """Those in front of the track and within the gate."""
-    good = scores.ahead & (scores.squared <= gate)
+    good = scores.seen.ahead & (scores.squared <= gate)
     which = good.nonzero()[:, 0]
     if len(which) < len(good):
         track, pair, scores = track[which], pair[which], scores.at(which)

@@ -7,12 +7,13 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from kcal.pipeline.lanes import congruent, eliminate, outer, product, solved, squared
+from kcal.pipeline.consider import CLOCK_TERMS
+from kcal.pipeline.lanes import congruent, eliminate, mahalanobis, outer, product, solved, squared
 from kcal.pipeline.motion import Transition, moved, rates
 from kcal.pipeline.sightings import Anchored
 
-# The clock's errors (offset, drift, slope over the rows) times the components of a velocity.
-_CLOCK_COLUMNS = 9
+# The clock's errors times the components of a velocity.
+_CLOCK_COLUMNS = 3 * CLOCK_TERMS
 
 
 class Summary(NamedTuple):
@@ -64,12 +65,12 @@ class Beliefs(NamedTuple):
 
         What was seen before a velocity was known counts with the velocity that is known now.
         """
-        return self.columns[:, -_CLOCK_COLUMNS:].unflatten(1, (3, 3))
+        return _late(self.columns)
 
     @property
     def effect(self) -> Tensor:
         """(6, K + 3, J, T): the true state is mean + effect b + noise."""
-        return torch.cat([self.shared, (self.late * self.mean[3:]).sum(2)], 1)
+        return _effect(self.columns[:, 6:], self.mean[3:])
 
     def at(self, which: Tensor) -> Self:
         """The tracks at some places."""
@@ -115,6 +116,16 @@ def no_beliefs(errors: int, models: int, device: torch.device) -> Beliefs:
     return Beliefs(*(torch.zeros(shape, dtype=torch.float64, device=device) for shape in shapes))
 
 
+def _late(columns: Tensor) -> Tensor:
+    """(R, 3, 3, ...) of columns (R, C, ...), the last of which are the clock's."""
+    return columns[:, -_CLOCK_COLUMNS:].unflatten(1, (CLOCK_TERMS, 3))
+
+
+def _effect(columns: Tensor, pace: Tensor) -> Tensor:
+    """(R, K + 3, ...) of columns (R, K + 9, ...), with a velocity (3, ...)."""
+    return torch.cat([columns[:, :-_CLOCK_COLUMNS], (_late(columns) * pace).sum(2)], 1)
+
+
 def _with_noise(columns: Tensor, noise: Tensor) -> Tensor:
     """The columns with more noise (6, 6, ...)."""
     return torch.cat([columns[:, :6] + noise, columns[:, 6:]], 1)
@@ -129,8 +140,7 @@ def predicted(beliefs: Beliefs, step: Transition, turn: Tensor | None = None) ->
     # velocity in the state is divided by z, and z has changed by `ahead`.
     keep = step.keep if turn is None else product(turn[:, :, None], step.keep)
     back = keep.transpose(0, 1) * (found.ahead / step.left)
-    late = columns[:, -_CLOCK_COLUMNS:].unflatten(1, (3, 3))
-    late = (late[:, :, :, None] * back).sum(2).flatten(1, 2)
+    late = (_late(columns)[:, :, :, None] * back).sum(2).flatten(1, 2)
     columns = torch.cat([noise, columns[:, 6:-_CLOCK_COLUMNS], late], 1)
     return Beliefs(found.state, columns, beliefs.weight)
 
@@ -201,8 +211,7 @@ def innovations(beliefs: Beliefs, seen: Anchored, timing: Timing) -> Innovations
     own = torch.cat([seen.shared[:, :, None].expand(-1, -1, *by_clock.shape[2:]), by_clock], 1)
     carried = product(slope, beliefs.columns)
     crossed, after = carried[:, :6], own + carried[:, 6:]
-    by_pace = (after[:, -_CLOCK_COLUMNS:].unflatten(1, (3, 3)) * beliefs.mean[3:]).sum(2)
-    effect = torch.cat([after[:, :-_CLOCK_COLUMNS], by_pace], 1)
+    effect = _effect(after, beliefs.mean[3:])
     # The product of two unknowns, a rate and a delay, is noise of second order.
     marks = seen.noise[:, :, None] + congruent(timing.unsure * by_right, beliefs.noise)
     noise = product(crossed, slope.transpose(0, 1)) + marks
@@ -219,9 +228,8 @@ class Fit(NamedTuple):
 def fit_of(found: Innovations, root: Tensor) -> Fit:
     """Judge innovations with all errors: the covariance of b is root rootᵀ."""
     covariance = found.noise + squared(product(found.effect, root[..., None, None]))
-    done = eliminate(covariance, found.value[:, None])
-    distance = (done.columns[:, 0].square() / done.pivots).sum(0)
-    return Fit(distance, -0.5 * (distance + done.pivots.log().sum(0)))
+    distance, volume = mahalanobis(covariance, found.value)
+    return Fit(distance, -0.5 * (distance + volume))
 
 
 def updated(beliefs: Beliefs, found: Innovations, fit: Fit) -> Beliefs:

@@ -82,3 +82,9 @@ def solved(done: Eliminated) -> Tensor:
         known = (done.rows[step, step + 1 :, None] * torch.stack(found)).sum(0)
         found.insert(0, (done.columns[step] - known) / done.pivots[step])
     return torch.stack(found)
+
+
+def mahalanobis(covariance: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    """valueᵀ covariance⁻¹ value and the logarithm of the determinant, (...) each, from (R, R, ...) and (R, ...)."""
+    done = eliminate(covariance, value[:, None])
+    return (done.columns[:, 0].square() / done.pivots).sum(0), done.pivots.log().sum(0)

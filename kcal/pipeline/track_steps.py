@@ -33,7 +33,7 @@ class TrackSteps(NamedTuple):
         look: see `looked_at`, with beliefs that have come to the same moment.
         score: see `scored`.
         take: see `taken_in`.
-        place: see `placed`, without its first argument.
+        place: tracks of these numbers on the Earth, from beliefs, frames and a root as in `track_states`.
     """
 
     measure: Callable[[Tensor, Tensor, Tensor, Tensor], Sightings]
@@ -65,7 +65,7 @@ def scored(
     found = innovations(merged.at(track), local, timing.at(pair))
     fit = fit_of(found, root)
     return Scores(
-        *local, found.effect[..., 0, :], found.value[:, 0], found.noise[..., 0, :], fit.squared[0], fit.log_density[0]
+        local, found.effect[..., 0, :], found.value[:, 0], found.noise[..., 0, :], fit.squared[0], fit.log_density[0]
     )
 
 
@@ -75,11 +75,6 @@ def taken_in(beliefs: Beliefs, seen: Anchored, timing: Timing, root: Tensor) -> 
     return updated(beliefs, found, fit_of(found, root))
 
 
-def placed(localize: StereoLocalizer, beliefs: Beliefs, frame: Tensor, root: Tensor, which: Tensor) -> TrackStates:
-    """Some of the tracks on the Earth."""
-    return track_states(localize, frame[..., which].movedim(-1, 0), beliefs.at(which).summary(), root)
-
-
 def track_steps(localize: StereoLocalizer, lasting_px: float) -> TrackSteps:
     """The steps as they are."""
 
@@ -87,7 +82,7 @@ def track_steps(localize: StereoLocalizer, lasting_px: float) -> TrackSteps:
         return sightings(localize, left, right, covariance, time, lasting_px)
 
     def place(beliefs: Beliefs, frame: Tensor, root: Tensor, which: Tensor) -> TrackStates:
-        return placed(localize, beliefs, frame, root, which)
+        return track_states(localize, frame[..., which].movedim(-1, 0), beliefs.at(which).summary(), root)
 
     return TrackSteps(measure, moved_on, looked_at, scored, taken_in, place)
 

@@ -23,7 +23,7 @@ from kcal.pipeline.beliefs import (
 )
 from kcal.pipeline.consider import ClockEstimate, ClockPrior, SharedErrors
 from kcal.pipeline.estimates import TrackStates
-from kcal.pipeline.lanes import eliminate, product, squared
+from kcal.pipeline.lanes import mahalanobis, product, squared
 from kcal.pipeline.motion import MOTIONS, Motion, step_numbers, transition
 from kcal.pipeline.pairs import ObjectPairs
 from kcal.pipeline.sightings import Sightings, anchored
@@ -367,8 +367,7 @@ class Tracker:
         still = transition(frame.new_tensor(step_numbers((Motion(acceleration=0.0),), 0.0)), up)
         old = predicted(old, still, product(to, frame.transpose(0, 1)))
         spread = product(here.effect - old.effect, self.shared.root[..., None, None])
-        done = eliminate(here.noise + old.noise + squared(spread), (here.mean - old.mean)[:, None])
-        distance = (done.columns[:, 0].square() / done.pivots).sum(0)[0]
+        distance = mahalanobis(here.noise + old.noise + squared(spread), here.mean - old.mean)[0][0]
         near = [i for i, value in zip(lost, distance.tolist(), strict=True) if value <= self.options.recognize]
         return near[0] if len(near) == 1 else None
 

@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from kcal.pipeline.assignment import Candidates, Scores, assigned, mark_numbers
+from kcal.pipeline.sightings import Anchored
 
 
 def candidates(track: list[int], pair: list[int], density: list[float]) -> Candidates:
     none = torch.zeros(0)
-    scores = Scores(*[none] * 9, torch.tensor(density, dtype=torch.float64))
+    scores = Scores(Anchored(*[none] * 5), *[none] * 4, torch.tensor(density, dtype=torch.float64))
     return Candidates(torch.tensor(track), torch.tensor(pair), scores)
 
 
