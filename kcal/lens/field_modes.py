@@ -33,7 +33,7 @@ class FieldModes(Protocol):
     Attributes:
         names: of the weights.
         radial_names: names of those whose field is symmetric about the axis.
-        hyperprior: mean and standard deviation of the natural logarithm of each hyperparameter.
+        hyperprior: mean, standard deviation and largest value of the natural logarithm of each hyperparameter.
         weight_priors: of each weight.
         peaks: largest displacement by each feature on the disc, to order of magnitude.
     """
@@ -45,7 +45,7 @@ class FieldModes(Protocol):
     def radial_names(self) -> frozenset[str]: ...  # noqa: D102
 
     @property
-    def hyperprior(self) -> tuple[tuple[float, float], ...]: ...  # noqa: D102
+    def hyperprior(self) -> tuple[tuple[float, float, float], ...]: ...  # noqa: D102
 
     @property
     def weight_priors(self) -> Sequence[WeightPrior]: ...  # noqa: D102

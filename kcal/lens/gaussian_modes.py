@@ -89,9 +89,9 @@ class GaussianModes(UnitModes):
         object.__setattr__(self, "names", tuple(name + axis for axis in "xy" for name in names))
 
     @property
-    def hyperprior(self) -> tuple[tuple[float, float], ...]:
+    def hyperprior(self) -> tuple[tuple[float, float, float], ...]:
         """See `FieldModes`: amplitude, and decay per octave."""
-        return (math.log(1e-3), 2.0), (math.log(1.5), 0.7)
+        return (math.log(1e-3), 2.0, math.inf), (math.log(1.5), 0.7, math.inf)
 
     @property
     def weight_priors(self) -> tuple[WeightPrior, ...]:

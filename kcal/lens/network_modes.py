@@ -71,9 +71,9 @@ class NetworkModes(UnitModes):
         return cls(hidden=tuple((a, b, c) for a, b, c in rows.tolist()))
 
     @property
-    def hyperprior(self) -> tuple[tuple[float, float], ...]:
+    def hyperprior(self) -> tuple[tuple[float, float, float], ...]:
         """See `FieldModes`: amplitude, and decay per octave."""
-        return (math.log(1e-3), 2.0), (math.log(1.0), 0.7)
+        return (math.log(1e-3), 2.0, math.inf), (math.log(1.0), 0.7, math.inf)
 
     @property
     def weight_priors(self) -> tuple[WeightPrior, ...]:

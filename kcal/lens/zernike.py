@@ -30,9 +30,18 @@ from kcal.lens.tracing import may_overwrite
 
 RADIAL, DECENTERED, ASTIGMATIC, OTHER, ASPECT = range(5)
 
-# Median and sd of ln: amplitudes of the families in this order, decays per degree of radial and of other modes.
-# Below: the degrees at which these families begin, to which the amplitudes refer.
-_HYPERPRIOR = ((5e-4, 1.75), (3e-4, 1.5), (5e-5, 1.75), (4e-5, 1.75), (0.5, 0.7), (0.6, 0.5))
+# Median, sd of ln, and largest value: amplitudes of the families in this order, decays per degree of radial and of
+# other modes. Radial modes beyond a hundredth of the disc stand for the focal length and shape of the base projection
+# (measured on halves of a fisheye's capture). Below: the degrees at which these families begin, to which the
+# amplitudes refer.
+_HYPERPRIOR = (
+    (5e-4, 1.75, 0.01),
+    (3e-4, 1.5, math.inf),
+    (5e-5, 1.75, math.inf),
+    (4e-5, 1.75, math.inf),
+    (0.5, 0.7, math.inf),
+    (0.6, 0.5, math.inf),
+)
 _FIRST_DEGREE = (5, 2, 3, 2)
 # The coefficients of Jacobi polynomials by powers of t grow by 2.4 with each second degree: 5e7 at degree 40.
 _HIGHEST = 40
@@ -127,9 +136,9 @@ class ZernikeModes:
         )
 
     @property
-    def hyperprior(self) -> tuple[tuple[float, float], ...]:
+    def hyperprior(self) -> tuple[tuple[float, float, float], ...]:
         """See `FieldModes`: amplitudes of the four families, then decays per degree of radial and of other modes."""
-        return tuple((math.log(value), sd) for value, sd in _HYPERPRIOR)
+        return tuple((math.log(value), sd, math.log(most)) for value, sd, most in _HYPERPRIOR)
 
     @property
     def weight_priors(self) -> tuple[WeightPrior, ...]:

@@ -43,7 +43,7 @@ class FreeParameters:
 
     def collapse(self, columns: Tensor, dim: int) -> Tensor:
         """Derivatives by each unknown, from those by each parameter along `dim`: tied ones are added."""
-        if len(self) == len(self.indices):
+        if self._plain:
             return columns
         shape = list(columns.shape)
         shape[dim] = len(self)
@@ -51,7 +51,12 @@ class FreeParameters:
 
     def expand(self, step: Tensor) -> Tensor:
         """A step of the unknowns (..., len) as a step of each parameter."""
-        return step if len(self) == len(self.indices) else step[..., list(self.slots)]
+        return step if self._plain else step[..., list(self.slots)]
+
+    @property
+    def _plain(self) -> bool:
+        """Whether each parameter is an unknown, in their order."""
+        return self.slots == tuple(range(len(self.slots)))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,6 @@ from kcal.calibrate.camera.outliers import (
 )
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
 from kcal.calibrate.camera.warnings import check_focal, general_warnings, hybrid_warnings, outlier_warnings
-from kcal.calibrate.lensfit.evidence import ANALOG, SQUARE
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
@@ -69,7 +68,7 @@ def _fit_views(
         observations.image_size,
         weights,
         board=options.board,
-        square=ANALOG if options.analog else SQUARE,
+        square=not options.analog,
         focal=options.start_focal(observations.image_size),
         start=start,
         robust=robust,

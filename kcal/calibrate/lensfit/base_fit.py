@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +14,7 @@ from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.board_modes import BoardModes
 from kcal.calibrate.lensfit.evidence import PriorFamilies, prior_families
 from kcal.calibrate.lensfit.fleet import LensPrior
-from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
+from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, hybrid_unknowns
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.base_map import angle_over_radius, radius_over_angle
 from kcal.lens.field_modes import FieldModes
@@ -29,6 +30,10 @@ _SHAPES = (1.0, 0.25, 0.0)
 _CORNERS = (12.0, 20.0, 30.0, 42.0, 55.0, 68.0, 80.0)
 
 
+# The logarithms of motions' standard deviations over the noise, of views that stand still.
+NO_MOTION = np.zeros(0)
+
+
 class Estimate(NamedTuple):
     """Where a fit stands."""
 
@@ -36,6 +41,7 @@ class Estimate(NamedTuple):
     families: PriorFamilies
     state: HybridState
     hyperparameters: Tensor
+    log_ratio: np.ndarray
     variance: float
     tempering: float
 
@@ -47,37 +53,47 @@ def fit_base(
     weights: Tensor,
     modes: FieldModes,
     board: BoardModes,
-    square: float,
+    square: bool,
     known_focal: float | None,
     robust: bool,
     h: Tensor,
     lens: LensPrior | None,
 ) -> tuple[Estimate, int]:
-    """Fit the base projection alone: its focal length and shape become constants of the lens. Also the trial steps."""
+    """Fit the base projection alone: its focal length and shape become constants of the lens. Also the trial steps.
+
+    Pixels that are not square have two focal lengths here already: between square and stretched ones, amplitudes of the
+    board have other local maxima of the evidence.
+    """
     focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal, lens)
+    aspect = None if square else 1.0
     radius = _REACH * 0.5 * math.hypot(*size)
     distance = float(translation.norm(dim=-1).median())
     spent = 0
 
-    def constants(focal: float, shape: float) -> tuple[LensModel, PriorFamilies]:
+    def constants(focal: float, shape: float, aspect: float | None) -> tuple[LensModel, PriorFamilies]:
         if lens is not None:
-            usual = prior_families(lens.form, lens.focal, board, size, distance, square)
+            usual = prior_families(lens.form, lens.focal, board, size, distance, aspect)
             return LensModel(hybrid=lens.form), lens.families(usual)
         form = HybridForm(shape=shape, radius=radius / focal, modes=modes)
-        return LensModel(hybrid=form), prior_families(form, focal, board, size, distance, square)
+        return LensModel(hybrid=form), prior_families(form, focal, board, size, distance, aspect)
 
-    model, families = constants(focal, shape)
+    model, families = constants(focal, shape, aspect)
     held = torch.ones(len(families.mean), dtype=torch.bool)
     held[:4] = False
+    if not square:
+        held[-1 - len(board.unit)] = False
     params = torch.zeros(5 + model.size, dtype=torch.float64)
     params[:4] = torch.tensor([focal, focal, families.mean[1], families.mean[2]])
     if lens is not None:
-        params[[0, 2, 3, *range(5, len(params))]] = lens.mean
-        params[1] = params[0]
-    state = HybridState(params, torch.zeros_like(board.unit), rotation, translation)
+        unknowns = hybrid_unknowns(model, square)
+        params[list(unknowns.indices)] = unknowns.expand(lens.mean)
+    still = rotation.new_zeros(len(rotation), 0)
+    state = HybridState(params, torch.zeros_like(board.unit), rotation, translation, still)
     for _ in range(6):
         precision = torch.where(held, torch.inf, families.deviation(h).square().reciprocal())
-        problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision)
+        problem = HybridProblem(
+            points, board.shapes, pixels, weights, model, families.mean, precision, square=square
+        )
         if robust:
             problem = problem.with_weights(cauchy_weights(problem, state, weights))
         result = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
@@ -87,12 +103,13 @@ def fit_base(
             break
         scale, bend = float(state.params[0]) / focal - 1.0, float(state.params[5])
         focal, shape = float(state.params[0]), shape + min(max(bend, -1.0), 1.0)
-        if not (0 < focal < math.inf and abs(shape) <= 10):
+        aspect = None if square else float(state.params[1]) / focal
+        if not (0 < focal < math.inf and abs(shape) <= 10 and (aspect is None or 0.1 < aspect < 10)):
             raise DegenerateError(
                 "the views do not determine the focal length: they are parallel to the image or too similar; add views "
                 "with the board tilted by 30 to 45 degrees in different directions"
             )
-        model, families = constants(focal, shape)
+        model, families = constants(focal, shape, aspect)
         params = state.params.clone()
         params[5] = 0.0
         state = state._replace(params=params)
@@ -100,7 +117,7 @@ def fit_base(
             break
     freedom = 2 * int(problem.seen.sum()) - 6 * len(pixels)
     variance = max(2.0 * float(result.cost) / freedom, LEAST_NOISE**2)
-    return Estimate(model, families, state, h, variance, 1.0), spent
+    return Estimate(model, families, state, h, NO_MOTION, variance, 1.0), spent
 
 
 def cauchy_weights(problem: HybridProblem, state: HybridState, weights: Tensor) -> Tensor:

@@ -179,18 +179,24 @@ def measure_board(
 
 
 def _begun_fleet(cameras: Sequence[CameraFit]) -> LensPrior:
-    """One form for the lenses of a type, that of the camera of middle focal length, and the amplitudes of all."""
-    middle = sorted(cameras, key=lambda camera: float(camera.fit.camera.params[0]))[len(cameras) // 2].fit
+    """One form for the lenses of a type, that of the camera of middle focal length, and the amplitudes of all.
+
+    Where pixels of one camera are not square, those of its type need not be.
+    """
+    stretched = [camera for camera in cameras if not camera.fit.square] or cameras
+    middle = sorted(stretched, key=lambda camera: float(camera.fit.camera.params[0]))[len(stretched) // 2].fit
     form = middle.camera.model.hybrid
     assert form is not None
     hyperprior, _ = fleet_priors([camera.hyper for camera in cameras], typical_hyperprior())
-    return LensPrior(form, float(middle.families.mean[0]), *typical_lens(form, middle.families, hyperprior.mean))
+    return LensPrior(form, float(middle.families.mean[0]), *typical_lens(form, middle.families, hyperprior.mean, middle.square)[:2])
 
 
 def _learned_fleet(cameras: Sequence[CameraFit], typical: LensPrior) -> tuple[LensPrior, list[LensPrior]]:
     """The lens of the next camera, and each camera's from all others: what a camera tells does not enter its prior."""
     following, each = fleet_priors([camera.lens for camera in cameras], Hyperprior(typical.mean, typical.sd))
-    return typical._replace(**following._asdict()), [typical._replace(**prior._asdict()) for prior in each]
+    return typical._replace(mean=following.mean, sd=following.sd), [
+        typical._replace(mean=prior.mean, sd=prior.sd) for prior in each
+    ]
 
 
 def _measured(

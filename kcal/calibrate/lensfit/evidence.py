@@ -22,6 +22,8 @@ from torch import Tensor
 
 from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.board_modes import KNOWN, BoardModes
+from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
+from kcal.calibrate.lensfit.readout import LARGEST, MEDIAN, SMALLEST, SPREAD
 from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.zernike import ZernikeModes
@@ -32,10 +34,10 @@ _MEAN = np.log([2e-4, 5e-4, 5e-4, 2e-4])
 _SD = np.array([2.0, 1.5, 1.5, 1.5])
 # Where the amplitudes of the board stand among the hyperparameters: the last three.
 BOARD = -3
-# Where the pupil stands among the unknowns.
-_PUPIL = 4
+# Unknowns before the field's weights: focal length, principal point, shape, pupil; where the pupil stands among them.
+LEADING_UNKNOWNS, _PUPIL = 6, 4
 # Unequal and skewed axes, in units of R: pixels are square.
-SQUARE, ANALOG = 1e-4, 2e-3
+SQUARE = 1e-4
 # Of the principal point about the middle, in diagonals.
 _CENTER = 0.05
 
@@ -46,10 +48,12 @@ class Hyperprior(NamedTuple):
     Attributes:
         mean: (H,).
         sd: (H,) standard deviations.
+        most: (H,) largest values; None: there is no limit.
     """
 
     mean: Tensor
     sd: Tensor
+    most: Tensor | None = None
 
 
 class PriorFamilies(NamedTuple):
@@ -107,7 +111,7 @@ def prior_families(
     board: BoardModes,
     size: tuple[int, int],
     distance: float,
-    square: float = SQUARE,
+    aspect: float | None = None,
 ) -> PriorFamilies:
     """The priors of a camera and the board that it saw.
 
@@ -117,25 +121,34 @@ def prior_families(
         board: modes of the board.
         size: of the image.
         distance: typical distance of the board, meters.
-        square: standard deviation of aspect and skew.
+        aspect: f_y / f_x of pixels that are not square, roughly; None: they are square.
     """
     diagonal = math.hypot(*size)
     corner = math.atan(0.5 * diagonal / focal)
     leading = [focal, _CENTER * diagonal, _CENTER * diagonal, 1.0 + 0.5 / corner**2, distance, distance]
-    mean = torch.zeros(len(leading) + len(form.modes) + len(board.unit), dtype=torch.float64)
+    rows = [] if aspect is None else [aspect * focal]
+    mean = torch.zeros(len(leading) + len(form.modes) + len(rows) + len(board.unit), dtype=torch.float64)
     mean[:4] = torch.tensor([focal, (size[0] - 1) / 2, (size[1] - 1) / 2, 0.5 - form.shape])
+    if aspect is not None:
+        mean[-1 - len(board.unit)] = aspect * focal
     amplitude, decay, degree = zip(*form.modes.weight_priors, strict=True)
     by_pupil = len(form.modes.hyperprior)
     # Without an amplitude: how surely pixels are square.
-    field_unit = [math.log(form.radius) + (math.log(square) if own is None else 0.0) for own in amplitude]
-    none = [-1] * len(leading)
+    field_unit = [math.log(form.radius) + (math.log(SQUARE) if own is None else 0.0) for own in amplitude]
+    none, more = [-1] * len(leading), [-1] * len(rows)
     board_family = torch.where(board.family == KNOWN, -1, by_pupil + 1 + board.family)
     return PriorFamilies(
         mean,
-        torch.cat([torch.tensor([*map(math.log, leading), *field_unit], dtype=torch.float64), board.unit.log()]),
-        torch.cat([torch.tensor([*none[:-2], by_pupil, by_pupil, *_numbers(amplitude)]), board_family]),
-        torch.cat([torch.tensor([*none, *_numbers(decay)]), torch.full_like(board.family, -1)]),
-        torch.cat([torch.tensor([0.0] * len(leading) + [*degree], dtype=torch.float64), torch.zeros_like(board.unit)]),
+        torch.cat([
+            torch.tensor([*map(math.log, leading), *field_unit, *map(math.log, rows)], dtype=torch.float64),
+            board.unit.log(),
+        ]),
+        torch.cat([torch.tensor([*none[:-2], by_pupil, by_pupil, *_numbers(amplitude), *more]), board_family]),
+        torch.cat([torch.tensor([*none, *_numbers(decay), *more]), torch.full_like(board.family, -1)]),
+        torch.cat([
+            torch.tensor([0.0] * len(leading) + [*degree] + [0.0] * len(rows), dtype=torch.float64),
+            torch.zeros_like(board.unit),
+        ]),
     )
 
 
@@ -145,58 +158,79 @@ def _numbers(indices: Sequence[int | None]) -> list[int]:
 
 def typical_hyperprior(modes: FieldModes | None = None) -> Hyperprior:
     """That of a camera and a board of which nothing is known; without modes, for the default field."""
-    mean, sd = np.array((modes or ZernikeModes()).hyperprior).T
+    mean, sd, most = np.array((modes or ZernikeModes()).hyperprior).T
     return Hyperprior(
         torch.from_numpy(np.concatenate([mean, _MEAN])),
         torch.from_numpy(np.concatenate([sd, _SD])),
+        torch.from_numpy(np.concatenate([most, np.full(len(_MEAN), np.inf)])),
     )
-
-
-class Quadratic(NamedTuple):
-    """Data near a solution: chi²(x) = c - 2 gᵀx + xᵀKx, poses eliminated.
-
-    Attributes:
-        K: (S, S).
-        g: (S,).
-        c: number.
-        freedom: ν, residuals without those that poses take up.
-    """
-
-    K: Tensor
-    g: Tensor
-    c: float
-    freedom: float
 
 
 def negative_log_evidence(data: Quadratic, families: PriorFamilies, v: np.ndarray) -> tuple[float, np.ndarray]:
     """The negative logarithm of the evidence of v = (h, ln σ²), (H + 1,), and its gradient."""
+    found = _evidence(data, families, v[:-1], v[-1])
+    return (math.inf, np.zeros_like(v)) if found is None else (found.value, np.append(found.by_h, found.by_noise))
+
+
+class _Evidence(NamedTuple):
+    """-ln p, its derivatives by h (H,) and ln σ², and the posterior: x (S,) and F (S, S), FᵀF its covariance."""
+
+    value: float
+    by_h: np.ndarray
+    by_noise: float
+    x: np.ndarray
+    factor: Tensor
+
+
+def _evidence(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Evidence | None:
+    """None where priors are too wide for the precision of numbers."""
     K, g, c, freedom = data.K.numpy(), data.g.numpy(), data.c, data.freedom
-    here, log_variance = torch.from_numpy(v[:-1]), v[-1]
+    here = torch.from_numpy(h)
     s2 = math.exp(log_variance)
     d = families.deviation(here).numpy()
     A = torch.from_numpy(K * d[:, None] * d / s2)
     A.diagonal().add_(1.0)
     root, info = torch.linalg.cholesky_ex(A)
     if int(info):
-        return math.inf, np.zeros_like(v)
-    inverse = torch.linalg.solve_triangular(root, torch.eye(len(g), dtype=A.dtype), upper=False).numpy()
-    y = inverse.T @ (inverse @ (d * g / s2))
-    kept = (inverse**2).sum(0)
+        return None
+    inverse = torch.linalg.solve_triangular(root, torch.eye(len(g), dtype=A.dtype), upper=False)
+    half = inverse.numpy()
+    y = half.T @ (half @ (d * g / s2))
+    kept = (half**2).sum(0)
     x = d * y
     rss = c - 2 * g @ x + x @ (K @ x)
     value = 0.5 * (freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
     by_h = families.slopes(here).numpy() @ (0.5 * (1 - y * y - kept))
-    return value, np.append(by_h, 0.5 * (freedom - (len(g) - kept.sum()) - rss / s2))
+    by_noise = 0.5 * (freedom - (len(g) - kept.sum()) - rss / s2)
+    return _Evidence(value, by_h, by_noise, x, inverse * torch.from_numpy(d))
+
+
+class Maximum(NamedTuple):
+    """Where the evidence is largest.
+
+    Attributes:
+        h: (H,) hyperparameters of the modes.
+        log_ratio: (2,) logarithms of the motions' standard deviations over the noise; () where views stand still.
+        variance: of the noise.
+        loss: the negative logarithm of the evidence.
+    """
+
+    h: Tensor
+    log_ratio: np.ndarray
+    variance: float
+    loss: float
 
 
 def maximize_evidence(
-    data: Quadratic,
+    data: Quadratic | ViewData,
     families: PriorFamilies,
     h: Tensor,
     variance: float,
     hyperprior: Hyperprior | None = None,
-) -> tuple[Tensor, float, float]:
-    """The hyperparameters and the noise variance of largest evidence, and its negative logarithm.
+    log_ratio: np.ndarray | None = None,
+    tempering: float = 1.0,
+) -> Maximum:
+    """The hyperparameters and the noise variance of largest evidence.
 
     Args:
         data: what the views say.
@@ -204,24 +238,46 @@ def maximize_evidence(
         h: start.
         variance: start.
         hyperprior: of h; the typical one of the default field if not given.
+        log_ratio: start, for views that moved while they were read.
+        tempering: by which the data count less.
     """
-    mean, sd = (part.numpy() for part in hyperprior or typical_hyperprior())
+    prior = hyperprior or typical_hyperprior()
+    mean, sd = prior.mean.numpy(), prior.sd.numpy()
+    moving = isinstance(data, ViewData)
+    ratios = np.zeros(0) if not moving or log_ratio is None else log_ratio
+    count = len(mean)
+    tempered = data.tempered(tempering) if isinstance(data, Quadratic) else None
 
     values: list[float] = []
 
     def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = negative_log_evidence(data, families, v)
-        if not math.isfinite(value):
+        here, ratio, log_variance = v[:count], v[count:-1], v[-1]
+        if isinstance(data, ViewData):
+            integrated = data.integrated(ratio)
+            found = _evidence(integrated.data.tempered(tempering), families, here, log_variance)
+        else:
+            found = _evidence(tempered, families, here, log_variance)
+        if found is None:
             # Priors are far too wide for this precision: worse than any trial before, so that a shorter step follows.
-            return max(values, default=1e30) + 1.0, slope
-        z = (v[:-1] - mean) / sd
-        values.append(value + 0.5 * float(z @ z))
-        return values[-1], slope + np.append(z / sd, 0.0)
+            return max(values, default=1e30) + 1.0, np.zeros_like(v)
+        z = (here - mean) / sd
+        value, by_noise, by_ratio = found.value + 0.5 * float(z @ z), found.by_noise, np.zeros(0)
+        if isinstance(data, ViewData):
+            # The prior of the motions' amplitudes is about these, not about their ratios to the noise.
+            w = (ratio + 0.5 * log_variance - math.log(MEDIAN)) / SPREAD
+            value += 0.5 * (integrated.log_determinant / tempering + float(w @ w))
+            by_ratio = integrated.slopes(found.x, found.factor, math.exp(log_variance), tempering) + w / SPREAD
+            by_noise += 0.5 * float(w.sum()) / SPREAD
+        values.append(value)
+        return value, np.concatenate([found.by_h + z / sd, by_ratio, [by_noise]])
 
-    start = np.append(h.numpy(), math.log(variance))
+    log_variance = math.log(variance)
+    start = np.concatenate([h.numpy(), ratios, [log_variance]])
     # The last bound is open: where all are closed, L-BFGS-B makes its first trial at the bounds.
-    bounds: list[tuple[float, float | None]] = [(m - 5 * s, m + 5 * s) for m, s in zip(mean, sd, strict=True)]
-    bounds.append((max(start[-1] - 8, 2.0 * math.log(LEAST_NOISE)), None))
+    most = mean + 5 * sd if prior.most is None else np.minimum(mean + 5 * sd, prior.most.numpy())
+    bounds: list[tuple[float, float | None]] = [*zip(mean - 5 * sd, most, strict=True)]
+    bounds += [(math.log(SMALLEST) - 0.5 * log_variance, math.log(LARGEST) - 0.5 * log_variance)] * len(ratios)
+    bounds.append((max(log_variance - 8, 2.0 * math.log(LEAST_NOISE)), None))
     found = lbfgs(
         objective,
         start,
@@ -230,4 +286,16 @@ def maximize_evidence(
         bounds=bounds,
         options={"maxiter": 80, "ftol": 1e-8, "gtol": 2e-2},
     )
-    return torch.from_numpy(found.x[:-1].copy()), math.exp(found.x[-1]), float(found.fun)
+    at = found.x
+    return Maximum(torch.from_numpy(at[:count].copy()), at[count:-1].copy(), math.exp(at[-1]), float(found.fun))
+
+
+def evidence_of_motion(data: ViewData, best: Maximum, families: PriorFamilies, tempering: float) -> float:
+    """By how much motions raise the logarithm of the evidence (nats), all other amplitudes as they are."""
+    log_variance = math.log(best.variance)
+    moving = data.integrated(best.log_ratio)
+    losses = []
+    for quadratic, determinant in ((data.still, 0.0), (moving.data, moving.log_determinant)):
+        found = _evidence(quadratic.tempered(tempering), families, best.h.numpy(), log_variance)
+        losses.append(math.inf if found is None else found.value + 0.5 * determinant / tempering)
+    return losses[0] - losses[1]

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.evidence import Hyperprior, PriorFamilies, Quadratic, negative_log_evidence
+from kcal.calibrate.lensfit.evidence import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, negative_log_evidence
+from kcal.calibrate.lensfit.quadratic import Quadratic
 from kcal.lens.hybrid_terms import HybridForm
 
 # Fewer tell no spread.
@@ -45,7 +46,8 @@ class LensPrior(NamedTuple):
     Attributes:
         form: constants of the lens.
         focal: F₀, pixels.
-        mean: (L,) of the unknowns: focal length, principal point, coefficients.
+        mean: (L,) of the unknowns: focal length, principal point, coefficients; the focal length of the rows too where
+            pixels are not square.
         sd: (L,) standard deviations.
     """
 
@@ -53,6 +55,11 @@ class LensPrior(NamedTuple):
     focal: float
     mean: Tensor
     sd: Tensor
+
+    @property
+    def square(self) -> bool:
+        """Whether pixels are square."""
+        return len(self.mean) == LEADING_UNKNOWNS + len(self.form.modes)
 
     def families(self, usual: PriorFamilies) -> PriorFamilies:
         """Priors with this lens, and the board of others."""
@@ -114,21 +121,24 @@ def fleet_priors(cameras: Sequence[Likelihood], typical: Hyperprior) -> tuple[Hy
         variance = ((_LEAST_SPREAD**2 + squares) / count).clamp_max(1.0)
         # Variance of Student's t of `count` degrees of freedom; the mean is known from `count` cameras.
         wide = (variance * (1.0 + 1.0 / count) * count / (count - 2.0)).clamp_max(1.0)
-        return Hyperprior(typical.mean + unit * total / (count + variance), unit * wide.sqrt())
+        return typical._replace(mean=typical.mean + unit * total / (count + variance), sd=unit * wide.sqrt())
 
     without = [prior(each.sum(0) - x, squares.sum(0) - s, count - 1) for x, s in zip(each, squares, strict=True)]
     return prior(each.sum(0), squares.sum(0), count), without
 
 
-def typical_lens(form: HybridForm, families: PriorFamilies, h: Tensor) -> Hyperprior:
+def typical_lens(form: HybridForm, families: PriorFamilies, h: Tensor, square: bool) -> Hyperprior:
     """What is expected of a lens with these amplitudes, from a type of which no other camera is known.
 
     Args:
         form: constants of the lens.
         families: priors that belong to these.
         h: (H,).
+        square: whether pixels are square.
     """
-    count = 6 + len(form.modes)
+    count = LEADING_UNKNOWNS + len(form.modes) + (0 if square else 1)
     mean, sd = families.mean[:count].clone(), families.deviation(h)[:count].clone()
     sd[0] = _FOCAL * mean[0]
+    if not square:
+        sd[-1] = _FOCAL * mean[-1]
     return Hyperprior(mean, sd)

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from kcal.calibrate.lensfit.board_orders import find_turns, turned_corners
 from kcal.calibrate.lensfit.board_prior import BoardMessage, BoardPrior, message_from_rows, printed_prior
-from kcal.calibrate.lensfit.evidence import BOARD, Quadratic
+from kcal.calibrate.lensfit.evidence import BOARD
 from kcal.calibrate.lensfit.fleet import LensPrior, Likelihood, hyper_likelihood
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem
+from kcal.calibrate.lensfit.quadratic import Quadratic
 from kcal.corners.observations import Observations
 from kcal.lens.zernike import ZernikeModes
 
@@ -113,11 +114,20 @@ def fit_turned(
 
 
 def _absolute_rows(fit: HybridFit, points: Tensor, pixels: Tensor, weights: Tensor) -> Tensor:
-    """(V, S + 1, 2 N) derivatives by lens and board off the poses, and the target of these rows, pixels."""
+    """(V, S + 1, R) derivatives by lens and board off poses and motions, and the target of these rows, pixels."""
     count = len(fit.state.board)
     mean = torch.cat([fit.families.mean[:-count], torch.zeros_like(fit.state.board)])
     problem = HybridProblem(
-        points, fit.board_shapes.shapes, pixels, weights, fit.camera.model, mean, torch.zeros_like(mean)
+        points,
+        fit.board_shapes.shapes,
+        pixels,
+        weights,
+        fit.camera.model,
+        mean,
+        torch.zeros_like(mean),
+        fit.readout,
+        fit.stillness,
+        fit.square,
     )
     rows = problem.without_poses(fit.state)
     rows[:, -1] = torch.einsum("s,vsn->vn", problem.shared(fit.state), rows[:, :-1]) - rows[:, -1]

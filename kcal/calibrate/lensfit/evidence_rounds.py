@@ -1,0 +1,220 @@
+"""Solve for camera, board, poses and motions, and set all amplitudes by the evidence, in turn until both come to rest."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.base_fit import NO_MOTION, Estimate, cauchy_weights
+from kcal.calibrate.lensfit.board_modes import BoardModes
+from kcal.calibrate.lensfit.evidence import Hyperprior, Maximum, evidence_of_motion, maximize_evidence
+from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
+from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, overdispersion, quadratic_of, view_data
+from kcal.calibrate.lensfit.readout import MEDIAN, MOTION, ORDERS, Readout, stillness
+from kcal.solve.lm import LMOptions, minimize
+
+_ROUNDS = 12
+# Rounds after which views stand still if motion gains nothing, and what it must gain to stay, in nats.
+_SETTLED, _GAIN = 1, 1.0
+# Steps of the solver, and squared standard deviations by which one must lower chi² to be worth the next: in the first
+# round, in the others, and at the end.
+_FIRST, _LATER, LAST = (8, 0.1), (12, 0.02), (10, 0.01)
+# Hyperparameters have come to rest when none moves by more.
+_AT_REST = 0.1
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Capture:
+    """What a camera is fitted to.
+
+    Args:
+        points: (N, 3) the board as it was before, meters.
+        board: how it may differ.
+        pixels: (V, N, 2), NaN where not seen.
+        weights: (V, N) by which residuals are multiplied.
+        readout: how views move while they are read; None: they stand still.
+        square: whether pixels are square.
+        robust: bound the weight of corners that are far off.
+        exact: the board does not differ.
+    """
+
+    points: Tensor
+    board: BoardModes
+    pixels: Tensor
+    weights: Tensor
+    readout: Readout | None
+    square: bool
+    robust: bool
+    exact: bool
+
+    @property
+    def seen(self) -> Tensor:
+        """(V, N)."""
+        return torch.isfinite(self.pixels).all(-1) & (self.weights > 0)
+
+    @property
+    def freedom(self) -> int:
+        """Residuals without those that poses take up."""
+        return 2 * int(self.seen.sum()) - 6 * len(self.pixels)
+
+    def problem(self, estimate: Estimate, never: Tensor) -> HybridProblem:
+        """The least squares at amplitudes of an estimate; unknowns of which `never` is true are held."""
+        deviation = estimate.families.deviation(estimate.hyperparameters)
+        precision = torch.where(never, torch.inf, estimate.variance / deviation.square())
+        problem = HybridProblem(
+            self.points,
+            self.board.shapes,
+            self.pixels,
+            self.weights,
+            estimate.model,
+            estimate.families.mean,
+            precision,
+            self.readout,
+            stillness(estimate.log_ratio),
+            self.square,
+        )
+        if self.robust:
+            return problem.with_weights(cauchy_weights(problem, estimate.state, self.weights))
+        return problem
+
+    def solved(
+        self, estimate: Estimate, never: Tensor, effort: tuple[int, float]
+    ) -> tuple[HybridProblem, Estimate, int]:
+        """The problem, the estimate with its solution, and the trial steps."""
+        problem = self.problem(estimate, never)
+        steps, gain = effort
+        options = LMOptions(max_iterations=steps, tolerance=gain / self.freedom, initial_damping=1e-6)
+        result = minimize(problem, estimate.state, options)
+        return problem, estimate._replace(state=HybridState(*result.state)), int(result.iterations)
+
+    def data(self, problem: HybridProblem, state: HybridState, never: Tensor) -> tuple[Quadratic | ViewData, Tensor]:
+        """What the views say near a state, and the rows of it off poses."""
+        if problem.readout is None:
+            off = problem.without_poses(state)
+            off[:, :-1][:, never] = 0.0
+            return quadratic_of(off, problem.shared(state), self.freedom), off
+        off = problem.motion_without_poses(state)
+        off[:, MOTION:-1][:, never] = 0.0
+        return view_data(off, problem.shared(state), state.motion, self.freedom), off
+
+
+class Rounds(NamedTuple):
+    """Where the rounds ended.
+
+    Attributes:
+        capture: what was fitted; views that do not move have lost their readout.
+        estimate: camera, board, poses and amplitudes.
+        data: near it.
+        loss: the negative logarithm of the evidence.
+        steps: trial steps of the solver.
+        converged: whether the hyperparameters came to rest.
+    """
+
+    capture: Capture
+    estimate: Estimate
+    data: Quadratic | ViewData
+    loss: float
+    steps: int
+    converged: bool
+
+
+def begin_motion(capture: Capture, estimate: Estimate) -> Estimate:
+    """An estimate of still views as one of views that may move, with a typical amplitude; or of views that may not."""
+    moving = capture.readout is not None
+    count = len(capture.pixels)
+    if (len(estimate.log_ratio) > 0) == moving and len(estimate.state.motion) == count:
+        return estimate
+    state = estimate.state._replace(motion=estimate.state.rotation.new_zeros(count, MOTION if moving else 0))
+    ratio = np.full(ORDERS, math.log(MEDIAN) - 0.5 * math.log(estimate.variance / estimate.tempering))
+    return estimate._replace(state=state, log_ratio=ratio if moving else NO_MOTION)
+
+
+def run_rounds(
+    capture: Capture,
+    estimate: Estimate,
+    hyperprior: Hyperprior,
+    never: Tensor,
+    *,
+    cold: bool,
+    progress: Callable[[str], object],
+) -> Rounds:
+    """Solve and set amplitudes in turn.
+
+    Args:
+        capture: what is fitted.
+        estimate: to begin with.
+        hyperprior: of the amplitudes.
+        never: (S,) unknowns that are held.
+        cold: the estimate is that of the base projection, so that its amplitudes mean nothing yet.
+        progress: called after each round.
+    """
+    spent, converged, tempered = 0, False, False
+    estimate = begin_motion(capture, estimate)
+    for turn in range(_ROUNDS):
+        first = turn == 0 and cold
+        problem, estimate, steps = capture.solved(estimate, never, _FIRST if first else _LATER)
+        spent += steps
+        data, off = capture.data(problem, estimate.state, never)
+        former = tempering = estimate.tempering
+        if not first and problem.readout is None:
+            found = _overdispersion(data, off, estimate, never)
+            # More tempering leaves fewer parameters, over which the scores scatter less, and so on: the mean of both
+            # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
+            tempering = math.sqrt(tempering * found) if tempered else found
+            tempered = True
+        best = maximize_evidence(
+            data,
+            estimate.families,
+            estimate.hyperparameters,
+            estimate.variance / former,
+            hyperprior,
+            estimate.log_ratio,
+            tempering,
+        )
+        change = _change(estimate, best)
+        resting = not first and change < _AT_REST and steps <= 2
+        estimate = estimate._replace(
+            hyperparameters=best.h,
+            log_ratio=best.log_ratio,
+            variance=best.variance * tempering,
+            tempering=tempering,
+        )
+        progress(f"evidence, round {turn + 1}")
+        if isinstance(data, ViewData) and turn >= _SETTLED:
+            gained = evidence_of_motion(data, best, estimate.families, tempering)
+            if gained < _GAIN:
+                capture = dataclasses.replace(capture, readout=None)
+                estimate = begin_motion(capture, estimate)
+                continue
+        if resting:
+            converged = True
+            break
+    if isinstance(data, ViewData):
+        # Once, at the end: amplitudes of motions that were set with it again would grow without bound where views are
+        # few, as both explain the same residuals (measured on a webcam's seven views).
+        tempering = _overdispersion(data, off, estimate, never)
+        estimate = estimate._replace(variance=estimate.variance * tempering, tempering=tempering)
+    return Rounds(capture, estimate, data, best.loss, spent, converged)
+
+
+def _change(estimate: Estimate, best: Maximum) -> float:
+    """By how much the hyperparameters moved."""
+    change = float((best.h - estimate.hyperparameters).abs().max())
+    if len(best.log_ratio):
+        change = max(change, float(np.abs(best.log_ratio - estimate.log_ratio).max()))
+    return change
+
+
+def _overdispersion(data: Quadratic | ViewData, off: Tensor, estimate: Estimate, never: Tensor) -> float:
+    deviation = torch.where(never, 0.0, estimate.families.deviation(estimate.hyperparameters))
+    if isinstance(data, ViewData):
+        K = data.integrated(estimate.log_ratio).data.K
+        return overdispersion(data.scores(estimate.log_ratio), K, deviation, estimate.variance)
+    score = (off[:, :-1] @ off[:, -1, :, None])[..., 0]
+    return overdispersion(score, data.K, deviation, estimate.variance)

@@ -1,0 +1,162 @@
+"""Data near a solution as a quadratic form of lens and board, with poses and motions eliminated.
+
+Near a solution residuals are linear in the unknowns: chi²(x) = c - 2 gᵀx + xᵀKx, poses eliminated. Motions of views
+(`kcal.calibrate.lensfit.readout`) are integrated out under a normal prior: with U their columns off the poses, R their
+prior standard deviations in units of the noise, and M = (UᵀU + R⁻²)⁻¹, a view's AᵀA becomes AᵀA - AᵀU M UᵀA, and
+ln det(R UᵀU R + I) is added to -2 ln p.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.readout import MOTION, ORDERS
+
+Array = npt.NDArray[np.float64]
+
+
+class Quadratic(NamedTuple):
+    """Data near a solution: chi²(x) = c - 2 gᵀx + xᵀKx, poses eliminated.
+
+    Attributes:
+        K: (S, S).
+        g: (S,).
+        c: number.
+        freedom: ν, residuals without those that poses take up.
+    """
+
+    K: Tensor
+    g: Tensor
+    c: float
+    freedom: float
+
+    def tempered(self, tempering: float) -> Quadratic:
+        """The same data, counting less."""
+        return Quadratic(self.K / tempering, self.g / tempering, self.c / tempering, self.freedom / tempering)
+
+
+class ViewData(NamedTuple):
+    """Data near a solution, of views that moved while they were read.
+
+    Attributes:
+        still: as if they had stood still.
+        own: (V, 12, 12) UᵀU of each view.
+        cross: (V, 12, S + 1) Uᵀ [A, b], b being the target of the rows A.
+        score: (V, S) Aᵀ r of each view, r being its residuals as if it had stood still.
+        residual: (V, 12) Uᵀ r likewise.
+    """
+
+    still: Quadratic
+    own: Tensor
+    cross: Tensor
+    score: Tensor
+    residual: Tensor
+
+    def integrated(self, log_ratio: Array) -> Integrated:
+        """With motions integrated out, whose standard deviation over the noise has these logarithms by order."""
+        ratio = np.repeat(np.exp(log_ratio), MOTION // ORDERS)
+        matrix = self.own * torch.from_numpy(ratio[:, None] * ratio)
+        matrix.diagonal(dim1=-2, dim2=-1).add_(1.0)
+        root = torch.linalg.cholesky(matrix)
+        scaled = self.cross * torch.from_numpy(ratio)[:, None]
+        half = torch.linalg.solve_triangular(root, scaled, upper=False)
+        flat = half.flatten(0, 1)
+        gram = flat.T @ flat
+        still = self.still
+        data = Quadratic(
+            still.K - gram[:-1, :-1], still.g - gram[:-1, -1], still.c - float(gram[-1, -1]), still.freedom
+        )
+        log_determinant = 2.0 * float(root.diagonal(dim1=-2, dim2=-1).log().sum())
+        return Integrated(data, log_determinant, root, half)
+
+    def scores(self, log_ratio: Array) -> Tensor:
+        """(V, S) derivatives of each view's -½ chi² by the shared unknowns, motions integrated out."""
+        ratio = np.repeat(np.exp(log_ratio), MOTION // ORDERS)
+        matrix = self.own + torch.diag(torch.from_numpy(ratio**-2.0))
+        best = torch.linalg.solve(matrix, self.residual[..., None])
+        return self.score - (self.cross[..., :-1].transpose(1, 2) @ best)[..., 0]
+
+
+class Integrated(NamedTuple):
+    """Data with motions integrated out, and what derivatives by the motions' standard deviations need.
+
+    Attributes:
+        data: the quadratic form of lens and board.
+        log_determinant: ln det(R UᵀU R + I), over the views.
+        root: (V, 12, 12) Cholesky factor of that.
+        half: (V, 12, S + 1) its inverse times R Uᵀ [A, b].
+    """
+
+    data: Quadratic
+    log_determinant: float
+    root: Tensor
+    half: Tensor
+
+    def slopes(self, x: Array, factor: Tensor, variance: float, tempering: float) -> Array:
+        """(2,) derivatives of -ln p by the logarithms of the ratios.
+
+        Each is the sum over motions of 1 less the posterior's second moment in units of the prior.
+
+        Args:
+            x: (S,) the best lens and board.
+            factor: (S, S), factorᵀ factor being their posterior covariance.
+            variance: of the noise.
+            tempering: by which the data count less.
+        """
+        _, ones, _ = torch.broadcast_tensors(self.root, torch.eye(MOTION, dtype=self.root.dtype), self.root)
+        inverse = torch.linalg.solve_triangular(self.root, ones, upper=False)
+        kept = inverse.square().sum(1)
+        direction = torch.cat([torch.from_numpy(-x)[:, None], factor.T], 1)
+        reach = self.half[..., :-1] @ direction
+        reach[..., 0] += self.half[..., -1]
+        moments = (inverse.transpose(1, 2) @ reach).square().sum(-1) / variance
+        by_motion = ((1.0 - kept) - moments).sum(0) / tempering
+        return by_motion.view(ORDERS, -1).sum(1).numpy()
+
+
+def quadratic_of(off: Tensor, x: Tensor, freedom: float) -> Quadratic:
+    """K, g, c of chi²(x) for absolute x, from rows (V, S + 1, R) off the poses at x, the residuals last."""
+    flat = off.transpose(0, 1).flatten(1)
+    target = x @ flat[:-1] - flat[-1]
+    return Quadratic(flat[:-1] @ flat[:-1].T, flat[:-1] @ target, float(target @ target), freedom)
+
+
+def view_data(off: Tensor, x: Tensor, motion: Tensor, freedom: float) -> ViewData:
+    """From rows (V, 12 + S + 1, R) off the poses, at lens and board x and motions (V, 12); the residuals last."""
+    own, others = off[:, :MOTION], off[:, MOTION:]
+    # As if all views had stood still: motions are unknowns whose prior is about zero.
+    still = others[:, -1] - torch.einsum("vm,vmr->vr", motion, own)
+    target = torch.einsum("s,vsr->vr", x, others[:, :-1]) - still
+    residual = still[..., None]
+    aimed = torch.cat([others[:, :-1], target[:, None]], 1)
+    flat = aimed.transpose(0, 1).flatten(1)
+    gram = flat @ flat.T
+    return ViewData(
+        still=Quadratic(gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1]), freedom),
+        own=own @ own.transpose(1, 2),
+        cross=own @ aimed.transpose(1, 2),
+        score=(others[:, :-1] @ residual)[..., 0],
+        residual=(own @ residual)[..., 0],
+    )
+
+
+def overdispersion(score: Tensor, K: Tensor, deviation: Tensor, variance: float) -> float:
+    """How much more the scores (V, S) of views scatter than independent corners explain, in determined directions."""
+    score = score - score.mean(0)
+    inverse = posterior_root(K, deviation, variance)
+    effective = len(K) - float(inverse.square().sum())
+    scattered = float((inverse @ (score * deviation / variance).T).square().sum()) * len(score) / (len(score) - 1)
+    return max(1.0, scattered / effective)
+
+
+def posterior_root(K: Tensor, deviation: Tensor, variance: float) -> Tensor:
+    """M of MᵀM = (I + √D K √D / σ²)⁻¹."""
+    # By eigenvalues: with wrong corners K is so large that a Cholesky factor loses the I to rounding.
+    values, vectors = torch.linalg.eigh(K * deviation[:, None] * deviation / variance)
+    return (1.0 + values.clamp_min(0.0)).rsqrt()[:, None] * vectors.T
