@@ -45,7 +45,8 @@ def calibrate_command(
         ),
     ] = "printed",
     analog: Annotated[
-        bool, typer.Option("--analog", help="Pixels may not be square: an analog camera behind a frame grabber.")
+        bool,
+        typer.Option("--analog", hidden=True, help="Not needed: the views tell whether pixels are square."),
     ] = False,
     one_type: Annotated[
         bool,
@@ -178,6 +179,8 @@ def calibrate_command(
     """
     from kcal.lens.model import LensModel
 
+    if analog:
+        warn("--analog is not needed any more and will go: the views tell whether pixels are square")
     needs = required(require)
     places = _camera_files(observations, output, picture, report, name)
     if model != "hybrid":
@@ -198,7 +201,6 @@ def calibrate_command(
         model=model,
         # An unknown kind is refused by the options themselves, and that of a loss by the loss.
         board=load_measured_board(board) if Path(board).suffix else board,  # type: ignore[arg-type]
-        analog=analog,
         board_warp=board_warp,
         focal=focal,
         field_of_view=fov,

@@ -97,7 +97,7 @@ def compare_models(
         parts: the groups are dealt into so many parts, each of which is held out once. As many parts as groups leave
             out one group at a time.
         options: for the parametric models; not given: with the board's warp. The hybrid takes
-            `board`, `analog`, `weighted`, `focal` and `field_of_view` of them.
+            `board`, `motion`, `weighted`, `focal` and `field_of_view` of them.
         progress: called after each fit.
 
     Returns:
@@ -172,8 +172,8 @@ def compare_models(
 def _options(model: str | LensModel, options: CalibrationOptions) -> CalibrationOptions:
     """The options for one model; the hybrid takes those that are its own."""
     if model != HYBRID:
-        return dataclasses.replace(options, model=model, board="printed", analog=False)
-    own = ("board", "analog", "weighted", "focal", "field_of_view")
+        return dataclasses.replace(options, model=model, board="printed")
+    own = ("board", "motion", "weighted", "focal", "field_of_view")
     return CalibrationOptions(model=HYBRID, **{name: getattr(options, name) for name in own})
 
 

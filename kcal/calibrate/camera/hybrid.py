@@ -68,7 +68,7 @@ def _fit_views(
         observations.image_size,
         weights,
         board=options.board,
-        square=not options.analog,
+        motion=options.motion,
         focal=options.start_focal(observations.image_size),
         start=start,
         robust=robust,

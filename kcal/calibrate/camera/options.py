@@ -45,7 +45,8 @@ class CalibrationOptions:
         board: "printed", the default: bending and print errors of the board are estimated with a hybrid lens. "exact":
             the board is a metrology plate. Or a `MeasuredBoard` (`measure_board`, `kcal board measure`), which is used
             as known, with what is not known of it.
-        analog: the pixels may not be square (an analog camera behind a frame grabber). Hybrid lens only.
+        motion: with the hybrid lens, views may move while their rows are read, as with a rolling shutter and a board or
+            camera that is held by hand; the views tell how much. False: nothing moved, or all rows were read at once.
         board_warp: with a parametric model, estimate how the board bends (two more parameters).
         weighted: weight corners by their covariances where all views have them (`kcal.calibrate.bundle.weights`);
             False minimizes the plain RMS, as OpenCV does.
@@ -76,7 +77,7 @@ class CalibrationOptions:
 
     model: LensModel | str = HYBRID
     board: Literal["printed", "exact"] | MeasuredBoard = "printed"
-    analog: bool = False
+    motion: bool = True
     board_warp: bool = False
     weighted: bool = True
     loss: RobustLoss | None = None
@@ -111,8 +112,6 @@ class CalibrationOptions:
         if self.hybrid:
             self._refuse_parametric()
             return
-        if self.analog:
-            raise InputError("CalibrationOptions: analog belongs to the hybrid lens; a parametric one has fx and fy")
         fixed = self._of_camera() or {name: 1.0 if value is None else value for name, value in self.fixed.items()}
         self._constraints(fixed).check(self.lens)
 

@@ -31,8 +31,6 @@ from kcal.solve.lm import LMOptions
 FEWEST_IN_HALF = 6
 # Cells of the image over which residuals are averaged, and corners that each needs.
 _COLUMNS, _ROWS, _FEWEST_IN_CELL = 8, 6, 10
-# Of the ratio of focal lengths: an error of 1e-3 is more than any calibration's, and than any digital sensor's.
-_SQUARE = 1e-3
 _POSES = LMOptions(max_iterations=60, tolerance=1e-12)
 
 
@@ -160,13 +158,8 @@ def examine(
 
 
 def _reference_options(result: CameraCalibrationResult, options: CalibrationOptions) -> CalibrationOptions:
-    fx, fy = result.camera.focal.tolist()
-    # Pixels of a parametric camera may be anything; a hybrid one must be told that they are not square.
     return CalibrationOptions(
-        weighted=options.weighted,
-        reject=options.reject,
-        focal=fx,
-        analog=options.analog or abs(fy / fx - 1.0) > _SQUARE,
+        weighted=options.weighted, reject=options.reject, focal=float(result.camera.focal[0]), motion=options.motion
     )
 
 

@@ -91,9 +91,7 @@ def fit_base(
     state = HybridState(params, torch.zeros_like(board.unit), rotation, translation, still)
     for _ in range(6):
         precision = torch.where(held, torch.inf, families.deviation(h).square().reciprocal())
-        problem = HybridProblem(
-            points, board.shapes, pixels, weights, model, families.mean, precision, square=square
-        )
+        problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision, square=square)
         if robust:
             problem = problem.with_weights(cauchy_weights(problem, state, weights))
         result = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))

@@ -157,7 +157,8 @@ def printed_board(
         messages: of the cameras that saw it.
         hyperprior: of the amplitudes; the typical one if not given.
     """
-    mean, deviation = (part[BOARD:].numpy() for part in hyperprior or typical_hyperprior())
+    prior = hyperprior or typical_hyperprior()
+    mean, deviation = prior.mean[BOARD:].numpy(), prior.sd[BOARD:].numpy()
     family = modes.family.numpy()
 
     def objective(h: np.ndarray) -> tuple[float, np.ndarray]:

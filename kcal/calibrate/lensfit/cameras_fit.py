@@ -188,7 +188,8 @@ def _begun_fleet(cameras: Sequence[CameraFit]) -> LensPrior:
     form = middle.camera.model.hybrid
     assert form is not None
     hyperprior, _ = fleet_priors([camera.hyper for camera in cameras], typical_hyperprior())
-    return LensPrior(form, float(middle.families.mean[0]), *typical_lens(form, middle.families, hyperprior.mean, middle.square)[:2])
+    usual = typical_lens(form, middle.families, hyperprior.mean, middle.square)
+    return LensPrior(form, float(middle.families.mean[0]), usual.mean, usual.sd)
 
 
 def _learned_fleet(cameras: Sequence[CameraFit], typical: LensPrior) -> tuple[LensPrior, list[LensPrior]]:

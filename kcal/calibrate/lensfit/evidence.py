@@ -139,16 +139,20 @@ def prior_families(
     board_family = torch.where(board.family == KNOWN, -1, by_pupil + 1 + board.family)
     return PriorFamilies(
         mean,
-        torch.cat([
-            torch.tensor([*map(math.log, leading), *field_unit, *map(math.log, rows)], dtype=torch.float64),
-            board.unit.log(),
-        ]),
+        torch.cat(
+            [
+                torch.tensor([*map(math.log, leading), *field_unit, *map(math.log, rows)], dtype=torch.float64),
+                board.unit.log(),
+            ]
+        ),
         torch.cat([torch.tensor([*none[:-2], by_pupil, by_pupil, *_numbers(amplitude), *more]), board_family]),
         torch.cat([torch.tensor([*none, *_numbers(decay), *more]), torch.full_like(board.family, -1)]),
-        torch.cat([
-            torch.tensor([0.0] * len(leading) + [*degree] + [0.0] * len(rows), dtype=torch.float64),
-            torch.zeros_like(board.unit),
-        ]),
+        torch.cat(
+            [
+                torch.tensor([0.0] * len(leading) + [*degree] + [0.0] * len(rows), dtype=torch.float64),
+                torch.zeros_like(board.unit),
+            ]
+        ),
     )
 
 
@@ -246,7 +250,7 @@ def maximize_evidence(
     moving = isinstance(data, ViewData)
     ratios = np.zeros(0) if not moving or log_ratio is None else log_ratio
     count = len(mean)
-    tempered = data.tempered(tempering) if isinstance(data, Quadratic) else None
+    still = (data.still if isinstance(data, ViewData) else data).tempered(tempering)
 
     values: list[float] = []
 
@@ -256,7 +260,7 @@ def maximize_evidence(
             integrated = data.integrated(ratio)
             found = _evidence(integrated.data.tempered(tempering), families, here, log_variance)
         else:
-            found = _evidence(tempered, families, here, log_variance)
+            found = _evidence(still, families, here, log_variance)
         if found is None:
             # Priors are far too wide for this precision: worse than any trial before, so that a shorter step follows.
             return max(values, default=1e30) + 1.0, np.zeros_like(v)

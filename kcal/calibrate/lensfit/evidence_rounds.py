@@ -1,4 +1,4 @@
-"""Solve for camera, board, poses and motions, and set all amplitudes by the evidence, in turn until both come to rest."""
+"""Solve for camera, board, poses and motions, and set all amplitudes by the evidence, until both come to rest."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from kcal.calibrate.lensfit.board_modes import BoardModes
 from kcal.calibrate.lensfit.evidence import Hyperprior, Maximum, evidence_of_motion, maximize_evidence
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, overdispersion, quadratic_of, view_data
-from kcal.calibrate.lensfit.readout import MEDIAN, MOTION, ORDERS, Readout, stillness
+from kcal.calibrate.lensfit.readout import LARGEST, MEDIAN, MOTION, ORDERS, Readout, motion_sigma, stillness
 from kcal.solve.lm import LMOptions, minimize
 
 _ROUNDS = 12
 # Rounds after which views stand still if motion gains nothing, and what it must gain to stay, in nats.
-_SETTLED, _GAIN = 1, 1.0
+_SETTLED, _GAIN = 1, 3.0
 # Steps of the solver, and squared standard deviations by which one must lower chi² to be worth the next: in the first
 # round, in the others, and at the end.
 _FIRST, _LATER, LAST = (8, 0.1), (12, 0.02), (10, 0.01)
+# Motions beyond this stand for something else.
+_TOO_MUCH = 0.5 * LARGEST
 # Hyperparameters have come to rest when none moves by more.
 _AT_REST = 0.1
 
@@ -142,6 +144,7 @@ def run_rounds(
     never: Tensor,
     *,
     cold: bool,
+    spent: int,
     progress: Callable[[str], object],
 ) -> Rounds:
     """Solve and set amplitudes in turn.
@@ -152,10 +155,14 @@ def run_rounds(
         hyperprior: of the amplitudes.
         never: (S,) unknowns that are held.
         cold: the estimate is that of the base projection, so that its amplitudes mean nothing yet.
+        spent: trial steps before.
         progress: called after each round.
     """
-    spent, converged, tempered = 0, False, False
+    converged, tempered = False, False
     estimate = begin_motion(capture, estimate)
+    if capture.readout is not None:
+        # That of an earlier fit, which was found after its rounds.
+        estimate = estimate._replace(variance=estimate.variance / estimate.tempering, tempering=1.0)
     for turn in range(_ROUNDS):
         first = turn == 0 and cold
         problem, estimate, steps = capture.solved(estimate, never, _FIRST if first else _LATER)
@@ -201,6 +208,33 @@ def run_rounds(
         tempering = _overdispersion(data, off, estimate, never)
         estimate = estimate._replace(variance=estimate.variance * tempering, tempering=tempering)
     return Rounds(capture, estimate, data, best.loss, spent, converged)
+
+
+def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> bool:
+    """Whether columns, read one after the other, may explain the motion of views better than rows.
+
+    They do near this solution; or there is none, because motions came to their limit.
+    """
+    readout, estimate = rounds.capture.readout, rounds.estimate
+    if readout is None:
+        return False
+    if not rounds.converged or motion_sigma(estimate.log_ratio, estimate.variance / estimate.tempering)[0] > _TOO_MUCH:
+        return True
+    losses = []
+    still = estimate.state._replace(motion=torch.zeros_like(estimate.state.motion))
+    for columns in (False, True):
+        capture = dataclasses.replace(rounds.capture, readout=dataclasses.replace(readout, columns=columns))
+        data, _ = capture.data(capture.problem(estimate, never), still, never)
+        best = maximize_evidence(
+            data,
+            estimate.families,
+            estimate.hyperparameters,
+            estimate.variance / estimate.tempering,
+            hyperprior,
+            estimate.log_ratio,
+        )
+        losses.append(best.loss)
+    return losses[1] < losses[0]
 
 
 def _change(estimate: Estimate, best: Maximum) -> float:

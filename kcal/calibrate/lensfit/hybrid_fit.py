@@ -13,16 +13,17 @@ from torch import Tensor
 
 from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.views import among
+from kcal.calibrate.lensfit.aspect import aspect_of, pixels_are_square, with_square_pixels
 from kcal.calibrate.lensfit.base_fit import Estimate, fit_base
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
 from kcal.calibrate.lensfit.board_prior import BoardPrior
 from kcal.calibrate.lensfit.evidence import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, typical_hyperprior
-from kcal.calibrate.lensfit.evidence_rounds import LAST, Capture, run_rounds
+from kcal.calibrate.lensfit.evidence_rounds import LAST, Capture, Rounds, columns_may_be_read, run_rounds
 from kcal.calibrate.lensfit.fleet import LensPrior
 from kcal.calibrate.lensfit.hybrid_problem import HybridState, hybrid_unknowns
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.calibrate.lensfit.quadratic import posterior_root, quadratic_of
-from kcal.calibrate.lensfit.readout import Readout, stillness
+from kcal.calibrate.lensfit.readout import Readout, motion_sigma, stillness
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
@@ -106,10 +107,7 @@ class HybridFit:
     @property
     def motion_sigma(self) -> tuple[float, float] | None:
         """Standard deviations of motions of first and second order: radians, and distances of the board."""
-        if self.readout is None:
-            return None
-        first, second = np.exp(self.log_ratio) * self.sigma / math.sqrt(self.tempering)
-        return float(first), float(second)
+        return motion_sigma(self.log_ratio, self.sigma**2 / self.tempering) if self.readout else None
 
     def residuals_of(self, pixels: Tensor) -> Tensor:
         """(V, N, 2) as `residuals`, of any corners of the same views; infinite where the lens has no image of one."""
@@ -124,9 +122,7 @@ class HybridFit:
     def only(self, views: Sequence[int]) -> HybridFit:
         """This fit with some of its views; the others were left out of it."""
         at, state = list(views), self.state
-        state = state._replace(
-            rotation=state.rotation[at], translation=state.translation[at], motion=state.motion[at]
-        )
+        state = state._replace(rotation=state.rotation[at], translation=state.translation[at], motion=state.motion[at])
         return dataclasses.replace(self, state=state, residuals=self.residuals[at], weights=self.weights[at])
 
     def among(self, views: Sequence[int], count: int) -> HybridFit:
@@ -157,7 +153,7 @@ def fit_hybrid(
     weights: Tensor | None = None,
     modes: FieldModes | None = None,
     board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed",
-    square: bool = True,
+    square: bool | None = None,
     motion: bool = True,
     focal: float | None = None,
     start: HybridFit | None = None,
@@ -175,7 +171,7 @@ def fit_hybrid(
         weights: (V, N) by which residuals are multiplied; 0 leaves a corner out. None: all count alike.
         modes: of the field.
         board: how it differs from the one that was ordered: as printers err, not at all, or as was measured.
-        square: whether pixels are square.
+        square: whether pixels are square; None: the views tell.
         motion: views may move while they are read; False: they stand still.
         focal: roughly known, pixels, for the start.
         start: an earlier fit of the same views with other weights or another board, to begin with.
@@ -202,25 +198,35 @@ def fit_hybrid(
         board = board.prior_for(points)
     ordered, own = points, board_modes(points)
     points, shown = board.applied(points, own) if isinstance(board, BoardPrior) else (points, own)
-    square = start.square if start is not None else lens.square if lens is not None else square
-    readout = None
-    if start is not None:
-        readout = start.readout
-    elif motion:
-        readout = Readout(center=ordered.mean(0), distance=1.0, size=size)
     capture = Capture(
-        points=points, board=shown, pixels=pixels, weights=weights, readout=readout, square=square, robust=robust,
+        points=points,
+        board=shown,
+        pixels=pixels,
+        weights=weights,
+        readout=_readout(ordered, size) if start is None and motion else start.readout if start else None,
+        square=start.square if start is not None else lens.square if lens is not None else square is True,
+        robust=robust,
         exact=board == "exact",
-    )  # fmt: skip
-    if start is None:
-        estimate, spent = fit_base(
-            points, pixels, size, weights, modes, shown, square, focal, robust, hyperprior.mean, lens
+    )
+
+    def run(capture: Capture, estimate: Estimate, spent: int, cold: bool) -> tuple[Rounds, Tensor]:
+        held = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
+        if capture.exact:
+            held[-len(shown.unit) :] = True
+        return run_rounds(capture, estimate, hyperprior, held, cold=cold, spent=spent, progress=progress), held
+
+    def begin(capture: Capture) -> tuple[Rounds, Tensor]:
+        estimate, steps = fit_base(
+            points, pixels, size, weights, modes, shown, capture.square, focal, robust, hyperprior.mean, lens
         )
         progress("base projection")
-        if readout is not None:
+        if capture.readout is not None:
             distance = float(estimate.state.translation.norm(dim=-1).median())
-            capture = dataclasses.replace(capture, readout=dataclasses.replace(readout, distance=distance))
-    else:
+            readout = dataclasses.replace(capture.readout, distance=distance)
+            capture = dataclasses.replace(capture, readout=readout)
+        return run(capture, estimate, steps, True)
+
+    if start is not None:
         state = start.state
         if isinstance(board, BoardPrior):
             state = state._replace(board=torch.zeros_like(board.mean))
@@ -233,11 +239,18 @@ def fit_hybrid(
             start.sigma**2,
             start.tempering,
         )
-        spent = start.iterations
-    never = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
-    if capture.exact:
-        never[-len(shown.unit) :] = True
-    rounds = run_rounds(capture, estimate, hyperprior, never, cold=start is None, progress=progress)
+        rounds, never = run(capture, estimate, start.iterations, False)
+    else:
+        rounds, never = begin(capture)
+        if square is None and lens is None and pixels_are_square(*aspect_of(rounds, never)):
+            one = dataclasses.replace(rounds.capture, square=True)
+            near = with_square_pixels(rounds.estimate, shown)
+            rounds, never = begin(one) if near is None else run(one, near, rounds.steps, False)
+        if capture.readout is not None and columns_may_be_read(rounds, hyperprior, never):
+            by_columns = dataclasses.replace(capture.readout, columns=True)
+            other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))
+            if other[0].loss < rounds.loss:
+                rounds, never = other
     capture, estimate = rounds.capture, rounds.estimate
     model, families, state, h, _, variance, tempering = estimate
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
@@ -283,9 +296,13 @@ def fit_hybrid(
         residuals=torch.where(capture.seen[..., None], errors.transpose(-1, -2), torch.nan),
         weights=weights,
         weighted_rms=math.sqrt(float((errors * problem.weights).square().sum()) / int(capture.seen.sum())),
-        iterations=spent + rounds.steps + steps,
+        iterations=rounds.steps + steps,
         converged=rounds.converged,
     )
+
+
+def _readout(points: Tensor, size: tuple[int, int]) -> Readout:
+    return Readout(center=points.mean(0), distance=1.0, size=size)
 
 
 def _from_rows(

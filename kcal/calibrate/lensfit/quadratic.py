@@ -8,7 +8,6 @@ ln det(R UᵀU R + I) is added to -2 ln p.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np

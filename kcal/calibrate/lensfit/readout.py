@@ -23,8 +23,8 @@ from torch import Tensor
 MOTION = 12
 ORDERS = 2
 # Median and standard deviation of the logarithm of a motion's standard deviation: radians, and distances of the board,
-# while an image is read. A hand that turns by 1 rad/s moves by 0.03 in 30 ms: beyond it is no motion. Below the smallest
-# no pixel feels it.
+# while an image is read. A hand that turns by 1 rad/s moves by 0.03 in 30 ms: beyond it is no motion. Below the
+# smallest no pixel feels it.
 MEDIAN, SPREAD, SMALLEST, LARGEST = 2e-4, 2.0, 1e-6, 0.03
 
 
@@ -86,6 +86,17 @@ class Readout:
 def stillness(log_ratio: np.ndarray) -> Tensor:
     """(12,) weights of a motion's numbers, from the logarithms (2,) of their deviations over the noise; or none, ()."""
     return torch.from_numpy(np.exp(-2.0 * log_ratio)).repeat_interleave(MOTION // ORDERS)
+
+
+def motion_sigma(log_ratio: np.ndarray, variance: float) -> tuple[float, float]:
+    """Standard deviations of motions of first and second order, radians and distances of the board.
+
+    Args:
+        log_ratio: (2,) their logarithms over the noise.
+        variance: of the noise.
+    """
+    first, second = np.exp(log_ratio) * np.sqrt(variance)
+    return float(first), float(second)
 
 
 class Moved(NamedTuple):

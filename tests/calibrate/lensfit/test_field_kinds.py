@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.lensfit.board_modes import board_modes
-from kcal.calibrate.lensfit.evidence import ANALOG, SQUARE, prior_families, typical_hyperprior
+from kcal.calibrate.lensfit.evidence import SQUARE, prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
@@ -115,11 +115,16 @@ def test_priors_of_gaussian_units_fall_by_octaves() -> None:
     assert changed.nonzero()[:, 0].tolist() == list(range(6 + len(form.modes), len(families.mean)))
 
 
-def test_pixels_are_square_only_as_surely_as_asked() -> None:
+def test_pixels_are_square_or_have_two_focal_lengths() -> None:
     board = board_modes(BOARD.points)
     form = HybridForm(shape=0.5, radius=0.9, modes=KINDS["zernike"])
     h = typical_hyperprior(form.modes).mean
     place = 3 + form.names.index("z1-1")
-    for square in (SQUARE, ANALOG):
-        families = prior_families(form, 800.0, board, SIZE, 0.6, square)
-        assert float(families.deviation(h)[place]) == pytest.approx(0.9 * square)
+    square, free = (prior_families(form, 800.0, board, SIZE, 0.6, aspect) for aspect in (None, 1.2))
+    assert float(square.deviation(h)[place]) == pytest.approx(0.9 * SQUARE)
+    rows = 6 + len(form.modes)
+    assert float(free.mean[rows]) == pytest.approx(960.0)
+    assert float(free.deviation(h)[rows]) == pytest.approx(960.0)
+    kept = torch.arange(len(free.mean)) != rows
+    torch.testing.assert_close(free.deviation(h)[kept], square.deviation(h), rtol=0, atol=0)
+    torch.testing.assert_close(free.slopes(h)[:, kept], square.slopes(h), rtol=0, atol=0)

@@ -72,7 +72,7 @@ def test_likelihood_of_hyperparameters() -> None:
     data = Quadratic(A.T @ A, A.T @ target, float(target @ target), 300.0)
     h, variance = TYPICAL.mean, 0.02
     for _ in range(3):
-        h, variance, _ = maximize_evidence(data, families, h, variance, TYPICAL)
+        h, _, variance, _ = maximize_evidence(data, families, h, variance, TYPICAL)
     found = hyper_likelihood(data, families, h, variance)
     # Of a spread known from n draws the log has information 2 n.
     torch.testing.assert_close(found.information.diagonal(), torch.full((2,), 40.0, dtype=F64), rtol=0.35, atol=0)
