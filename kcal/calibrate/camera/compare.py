@@ -20,6 +20,8 @@ from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.options import HYBRID, CalibrationOptions
+from kcal.calibrate.lensfit.hybrid_fit import HybridFit
+from kcal.calibrate.lensfit.moving_poses import moving_residuals
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
@@ -101,7 +103,8 @@ def compare_models(
         progress: called after each fit.
 
     Returns:
-        held-out residuals, which are weighted by the corners' covariances where all views have them.
+        held-out residuals, which are weighted by the corners' covariances where all views have them. Where views move
+            while their rows are read, the motion of each held-out view is solved again too, for all models alike.
 
     Raises:
         InputError: fewer groups than parts, labels that do not fit the views, or the same model twice.
@@ -135,6 +138,7 @@ def compare_models(
     members = _groups(observations, groups, parts)
     weights = torch.eye(2, dtype=torch.float64).expand(*observations.pixels().shape[:2], 2, 2)
     weighted = False
+    judge = _motion(observations, options)
     costs = torch.full((len(names), len(members)), torch.inf, dtype=torch.float64)
     failures: dict[str, KcalError] = {}
     # Groups are dealt at random, so that no part is one end of the capture.
@@ -154,8 +158,15 @@ def compare_models(
             if covariances is not None and not weighted:
                 weights, weighted = whitening(covariances, 0.5 * found.rms**2), True
             test = Views(board_points=found.board_points, pixels=observations.pixels()[out], whitening=weights[out])
-            _, by_view = poses_under(found.camera, test, _POSES)
+            poses, by_view = poses_under(found.camera, test, _POSES)
             by_view = torch.nan_to_num(2.0 * by_view, nan=math.inf)
+            if judge is not None and judge.readout is not None:
+                residuals = moving_residuals(
+                    found.camera, found.board_points, observations.pixels()[out], poses.rotation, poses.translation,
+                    judge.readout, judge.stillness,
+                )  # fmt: skip
+                white = torch.einsum("vnij,vnj->vni", weights[out], residuals)
+                by_view = torch.where(by_view.isfinite(), white.square().nansum((1, 2)), torch.inf)
             for g in held:
                 costs[number, g] = by_view[[out.index(i) for i in members[g]]].sum()
     if not bool(costs.isfinite().any()) and failures:
@@ -167,6 +178,15 @@ def compare_models(
         corners=torch.stack([seen[group].sum() for group in members]),
         failures={name: str(error) for name, error in failures.items()},
     )
+
+
+def _motion(observations: Observations, options: CalibrationOptions) -> HybridFit | None:
+    """A fit of all views, which tells how much they move: the same for all models; None: they stand still."""
+    try:
+        fit = calibrate_camera(observations, _options(HYBRID, options)).hybrid
+    except KcalError:
+        return None
+    return fit if fit is not None and fit.readout is not None else None
 
 
 def _options(model: str | LensModel, options: CalibrationOptions) -> CalibrationOptions:

@@ -20,6 +20,7 @@ from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection
 from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.lensfit.moving_poses import moving_residuals
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
@@ -42,8 +43,8 @@ class HalvesDifference:
         label: how the views were divided.
         alike: whether both halves are alike by construction (every other view), or differ in time or by name.
         difference: of the two cameras, against what their error bars say.
-        held_out: RMS in pixels of each half's corners under the camera and board of the other, with board poses solved
-            again.
+        held_out: RMS in pixels of each half's corners under the camera and board of the other, with board poses, and
+            motions where views move, solved again.
         own: RMS of the corners in the fits that used them.
     """
 
@@ -207,9 +208,7 @@ def _compare(
     results = [calibrate_camera(seen.subset(part), options) for part in parts]
     own = held_out = corners = 0.0
     for fitted, other in (results, results[::-1]):
-        test = Views(board_points=fitted.board_points, pixels=seen_pixels(other))
-        _, cost = poses_under(fitted.camera, test, _POSES)
-        held_out += 2.0 * float(torch.nan_to_num(cost, nan=math.inf).sum())
+        held_out += float(held_out_squares(fitted, seen_pixels(other)).sum())
         own += float(other.residuals.square().nansum())
         corners += int(other.residuals[..., 0].isfinite().sum())
     return HalvesDifference(
@@ -219,6 +218,22 @@ def _compare(
         held_out=math.sqrt(held_out / corners),
         own=math.sqrt(own / corners),
     )
+
+
+def held_out_squares(fitted: CameraCalibrationResult, pixels: Tensor) -> Tensor:
+    """(V,) squared residuals of held-out views (V, N, 2), with poses, and motions if there are any, solved again.
+
+    Infinite where a view has no pose.
+    """
+    poses, cost = poses_under(fitted.camera, Views(board_points=fitted.board_points, pixels=pixels), _POSES)
+    squares = torch.nan_to_num(2.0 * cost, nan=math.inf)
+    fit = fitted.hybrid
+    if fit is None or fit.readout is None:
+        return squares
+    residuals = moving_residuals(
+        fitted.camera, fitted.board_points, pixels, poses.rotation, poses.translation, fit.readout, fit.stillness
+    )
+    return torch.where(squares.isfinite(), residuals.square().nansum((1, 2)), torch.inf)
 
 
 def residual_structure(

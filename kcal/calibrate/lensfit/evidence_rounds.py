@@ -25,6 +25,8 @@ _SETTLED, _GAIN = 1, 3.0
 # Steps of the solver, and squared standard deviations by which one must lower chi² to be worth the next: in the first
 # round, in the others, and at the end.
 _FIRST, _LATER, LAST = (8, 0.1), (12, 0.02), (10, 0.01)
+# Nats by which the evidence may fall from one round to another, because the problem is not linear.
+_DRIFT = 5.0
 # Motions beyond this stand for something else.
 _TOO_MUCH = 0.5 * LARGEST
 # Hyperparameters have come to rest when none moves by more.
@@ -96,14 +98,16 @@ class Capture:
         return problem, estimate._replace(state=HybridState(*result.state)), int(result.iterations)
 
     def data(self, problem: HybridProblem, state: HybridState, never: Tensor) -> tuple[Quadratic | ViewData, Tensor]:
-        """What the views say near a state, and the rows of it off poses."""
+        """What the views say near a state, and the scores (V, S) of views as if they stood still."""
         if problem.readout is None:
             off = problem.without_poses(state)
             off[:, :-1][:, never] = 0.0
-            return quadratic_of(off, problem.shared(state), self.freedom), off
+            score = (off[:, :-1] @ off[:, -1, :, None])[..., 0]
+            return quadratic_of(off, problem.shared(state), self.freedom), score
         off = problem.motion_without_poses(state)
         off[:, MOTION:-1][:, never] = 0.0
-        return view_data(off, problem.shared(state), state.motion, self.freedom), off
+        found = view_data(off, problem.shared(state), state.motion, self.freedom)
+        return found, found.score
 
 
 class Rounds(NamedTuple):
@@ -159,6 +163,7 @@ def run_rounds(
         progress: called after each round.
     """
     converged, tempered = False, False
+    top: Rounds | None = None
     estimate = begin_motion(capture, estimate)
     if capture.readout is not None:
         # That of an earlier fit, which was found after its rounds.
@@ -167,10 +172,10 @@ def run_rounds(
         first = turn == 0 and cold
         problem, estimate, steps = capture.solved(estimate, never, _FIRST if first else _LATER)
         spent += steps
-        data, off = capture.data(problem, estimate.state, never)
+        data, score = capture.data(problem, estimate.state, never)
         former = tempering = estimate.tempering
         if not first and problem.readout is None:
-            found = _overdispersion(data, off, estimate, never)
+            found = _overdispersion(data, score, estimate, never)
             # More tempering leaves fewer parameters, over which the scores scatter less, and so on: the mean of both
             # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
             tempering = math.sqrt(tempering * found) if tempered else found
@@ -202,10 +207,19 @@ def run_rounds(
         if resting:
             converged = True
             break
+        if isinstance(data, ViewData) and turn >= _SETTLED:
+            # Few views that move much leave a direction along which the best camera drifts while the evidence falls:
+            # the round of largest evidence counts.
+            if top is None or best.loss < top.loss:
+                top = Rounds(capture, estimate, data, best.loss, spent, False)
+            elif best.loss > top.loss + _DRIFT:
+                break
+    if top is not None and not converged and isinstance(data, ViewData) and top.loss < best.loss:
+        capture, estimate, data = top.capture, top.estimate, top.data
     if isinstance(data, ViewData):
         # Once, at the end: amplitudes of motions that were set with it again would grow without bound where views are
         # few, as both explain the same residuals (measured on a webcam's seven views).
-        tempering = _overdispersion(data, off, estimate, never)
+        tempering = _overdispersion(data, data.score, estimate, never)
         estimate = estimate._replace(variance=estimate.variance * tempering, tempering=tempering)
     return Rounds(capture, estimate, data, best.loss, spent, converged)
 
@@ -245,10 +259,8 @@ def _change(estimate: Estimate, best: Maximum) -> float:
     return change
 
 
-def _overdispersion(data: Quadratic | ViewData, off: Tensor, estimate: Estimate, never: Tensor) -> float:
+def _overdispersion(data: Quadratic | ViewData, score: Tensor, estimate: Estimate, never: Tensor) -> float:
     deviation = torch.where(never, 0.0, estimate.families.deviation(estimate.hyperparameters))
     if isinstance(data, ViewData):
-        K = data.integrated(estimate.log_ratio).data.K
-        return overdispersion(data.scores(estimate.log_ratio), K, deviation, estimate.variance)
-    score = (off[:, :-1] @ off[:, -1, :, None])[..., 0]
+        score, data = data.scores(estimate.log_ratio), data.integrated(estimate.log_ratio).data
     return overdispersion(score, data.K, deviation, estimate.variance)

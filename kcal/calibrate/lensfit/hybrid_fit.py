@@ -259,7 +259,9 @@ def fit_hybrid(
     unfelt = families.deviation(h)[field] * float(state.params[0]) * peaks < _UNFELT
     never[field] |= unfelt
     state.params[5 + len(LEADING) :] = torch.where(unfelt, families.mean[field], state.params[5 + len(LEADING) :])
-    problem, estimate, steps = capture.solved(estimate, never, LAST)
+    # A fit that drifts stays where its evidence was largest.
+    drifts = capture.readout is not None and not rounds.converged
+    problem, estimate, steps = capture.solved(estimate, never, (1, LAST[1]) if drifts else LAST)
     state = estimate.state
     off = problem.without_poses(state)
     K = quadratic_of(off, problem.shared(state), capture.freedom).K

@@ -1,0 +1,64 @@
+"""Poses and motions of views that were held out, under a camera and a board that stay as they are."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
+from kcal.calibrate.lensfit.readout import MOTION, Readout
+from kcal.lens.camera import Camera
+from kcal.solve.lm import LMOptions, minimize
+
+_EFFORT = LMOptions(max_iterations=60, tolerance=1e-12, initial_damping=1e-6)
+
+
+def moving_residuals(
+    camera: Camera,
+    board_points: Tensor,
+    pixels: Tensor,
+    rotation: Tensor,
+    translation: Tensor,
+    readout: Readout,
+    stillness: Tensor,
+) -> Tensor:
+    """Residuals of views whose poses and motions are solved for, the camera and its board being held.
+
+    A lens is judged by views that were not fitted. Of views that moved while they were read the motion is unknown too,
+    and would be counted as an error of the lens.
+
+    Args:
+        camera: of any model.
+        board_points: (N, 3) the board, meters.
+        pixels: (V, N, 2), NaN where not seen.
+        rotation: (V, 3, 3) cam_from_board, to begin with; a view without a pose is NaN and stays so.
+        translation: (V, 3) meters.
+        readout: how views are read.
+        stillness: (12,) the squared noise over the variance of each number of a motion.
+
+    Returns:
+        (V, N, 2) projected minus seen, pixels; NaN where not seen.
+    """
+    posed = rotation.flatten(1).isfinite().all(1)
+    out = torch.full_like(pixels, torch.nan)
+    if not bool(posed.any()):
+        return out
+    params = camera.params.detach()
+    held = torch.full((len(params) - 2,), torch.inf, dtype=torch.float64)
+    some = pixels[posed]
+    problem = HybridProblem(
+        board_points,
+        board_points.new_zeros(0, 3, len(board_points)),
+        some,
+        torch.ones_like(some[..., 0]),
+        camera.model,
+        torch.zeros_like(held),
+        held,
+        readout,
+        stillness,
+    )
+    motion = rotation.new_zeros(len(some), MOTION)
+    state = HybridState(params, params.new_zeros(0), rotation[posed], translation[posed], motion)
+    errors = problem.errors(HybridState(*minimize(problem, state, _EFFORT).state)).transpose(-1, -2)
+    out[posed] = torch.where(problem.seen[..., None], errors, torch.nan)
+    return out
