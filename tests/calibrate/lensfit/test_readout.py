@@ -1,0 +1,302 @@
+"""Views that move while their rows are read, and pixels that are not square: found where they are, and only there."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.calibrate.lensfit.evidence import maximize_evidence, prior_families, typical_hyperprior
+from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
+from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, unknown_values
+from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, view_data
+from kcal.calibrate.lensfit.readout import LARGEST, MEDIAN, MOTION, SMALLEST, SPREAD, Readout, stillness
+from kcal.corners.board import Board
+from kcal.lens.camera import Camera
+from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import LensModel
+from kcal.lens.pose import rotation_from_vector
+from kcal.lens.zernike import ZernikeModes
+from kcal.solve.lm import LMOptions, minimize
+
+F64 = torch.float64
+BOARD = Board(columns=9, rows=7, square=0.04)
+SIZE = (1280, 960)
+MODES = ZernikeModes(radial=9, decentered=4, astigmatic=3, other=2)
+NOISE = 0.05
+
+
+def truth() -> Camera:
+    coefficients = [-0.12, 0.03, 4e-4, -3e-4, 0.0]
+    return Camera.build(focal=(800, 800), center=(645, 476), size=SIZE, coefficients=coefficients, model="opencv5")
+
+
+@functools.cache
+def capture(amplitude: float, count: int = 12, seed: int = 1, noise: float = NOISE) -> Tensor:
+    """(V, N, 2) corners of a board, each where the board stood when its row was read."""
+    generator, middle, found = torch.Generator().manual_seed(seed), BOARD.points.mean(0), []
+    camera = truth()
+    while len(found) < count:
+        u = 2.0 * torch.rand(6, generator=generator, dtype=F64) - 1.0
+        turn = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], math.pi * u[2]]))
+        shift = torch.stack([0.3 * u[3], 0.2 * u[4], 0.6 + 0.1 * u[5]])
+        rate = amplitude * torch.randn(2, 6, generator=generator, dtype=F64)
+        pixels, valid = camera.project((BOARD.points - middle) @ turn.T + shift)
+        for _ in range(8):
+            time = ((pixels[:, 1] + 0.5) / SIZE[1] - 0.5)[:, None]
+            step = time * rate[0] + time * time * rate[1]
+            moved = rotation_from_vector(step[:, :3]) @ (BOARD.points - middle)[..., None]
+            pixels, valid = camera.project(moved[..., 0] @ turn.T + shift + 0.6 * step[:, 3:])
+        if bool((valid & camera.inside(pixels)).all()):
+            found.append(pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=F64))
+    return torch.stack(found)
+
+
+@functools.cache
+def fitted(amplitude: float, motion: bool = True) -> HybridFit:
+    return fit_hybrid(BOARD.points, capture(amplitude), SIZE, modes=MODES, motion=motion)
+
+
+def off(camera: Camera) -> float:
+    """RMS over the middle of the image of the error at infinity, pixels, after the best rotation (Kabsch)."""
+    pixels = 0.7 * (truth().grid(13, 9).reshape(-1, 2) - truth().center) + truth().center
+    rays, _ = truth().unproject(pixels)
+    found, _ = camera.unproject(pixels)
+    u, _, v = torch.linalg.svd(rays.T @ found)
+    seen, valid = camera.project_rays(rays @ u @ v)
+    assert bool(valid.all())
+    return float((seen - pixels).square().sum(-1).mean().sqrt())
+
+
+def test_time_runs_from_the_first_edge_to_the_last() -> None:
+    rows = Readout(center=torch.zeros(3), distance=1.0, size=(640, 480))
+    pixels = torch.tensor([[-0.5, -0.5], [639.5, 479.5], [319.5, 239.5], [torch.nan, torch.nan]], dtype=F64)
+    assert rows.time(pixels).tolist() == [-0.5, 0.5, 0.0, 0.0]
+    columns = Readout(center=torch.zeros(3), distance=1.0, size=(640, 480), columns=True)
+    assert columns.time(pixels[:, [0, 1]] * torch.tensor([1.0, 0.0])).tolist() == [-0.5, 0.5, 0.0, 0.0]
+
+
+def moving_problem(square: bool) -> tuple[HybridProblem, HybridState]:
+    """A problem at a state where views move and the board is bent."""
+    generator = torch.Generator().manual_seed(2)
+    pixels = capture(2e-3, 4)
+    model = LensModel(hybrid=HybridForm(shape=0.6, radius=1.1, modes=MODES))
+    shapes = board_modes(BOARD.points).shapes
+    count = 3 + model.size + len(shapes) + (0 if square else 1)
+    readout = Readout(center=BOARD.points.mean(0), distance=0.6, size=SIZE)
+    problem = HybridProblem(
+        BOARD.points, shapes, pixels, torch.ones(4, BOARD.corners, dtype=F64), model, torch.zeros(count, dtype=F64),
+        torch.zeros(count, dtype=F64), readout, stillness(np.array([-3.0, -2.0])), square,
+    )  # fmt: skip
+    params = torch.zeros(5 + model.size, dtype=F64)
+    params[:4] = torch.tensor([800.0, 800.0 if square else 830.0, 640.0, 480.0])
+    params[8:] = 1e-3 * torch.randn(len(MODES), generator=generator, dtype=F64)
+    base = fitted(2e-3).state
+    motion = 5e-3 * torch.randn(4, MOTION, generator=generator, dtype=F64)
+    board = 1e-3 * torch.randn(len(shapes), generator=generator, dtype=F64)
+    return problem, HybridState(params, board, base.rotation[:4], base.translation[:4], motion)
+
+
+@pytest.mark.parametrize("square", [True, False])
+def test_rows_are_derivatives_of_residuals(square: bool) -> None:
+    """By pose, motion, lens, focal lengths and board, where views move and the board is bent."""
+    problem, state = moving_problem(square)
+    rows, local = problem.rows(state), problem.local_size
+    shared = len(problem.mean)
+    for index in (0, 1, 3, 5, 6, 8, 10, 13, 16, 17, 18, 19, 21, 22, 30, local + shared - 29, local + shared - 1):
+        step = 1e-4 if index in (local, local + 1, local + 2, local + shared - 29) else 1e-6
+        both = []
+        for sign in (step, -step):
+            others, own = torch.zeros(shared, dtype=F64), torch.zeros(4, local, dtype=F64)
+            if index < local:
+                own[:, index] = sign
+            else:
+                others[index - local] = sign
+            both.append(problem.residuals(problem.retract(state, (others, own))).flatten(1))
+        # Central differences of pixels near 1000: 1e-13 of these over the step.
+        torch.testing.assert_close(rows[:, index], (both[0] - both[1]) / (2.0 * step), rtol=1e-5, atol=2e-4)
+
+
+def test_motions_are_eliminated_like_poses() -> None:
+    """By QR with the rows of their prior, by the Schur complement, and by integrating the Gaussian model."""
+    problem, state = moving_problem(True)
+    x = problem.shared(state)
+    off_all = problem.without_poses(state)
+    flat = off_all.transpose(0, 1).flatten(1)
+    matrix, scale = problem.linearize(state).information()
+    reduced = matrix / scale[:, None] / scale
+    torch.testing.assert_close(flat[:-1] @ flat[:-1].T, reduced, rtol=1e-6, atol=1e-6 * float(reduced.max()))
+    data = view_data(problem.motion_without_poses(state), x, state.motion, 100.0)
+    ratio = np.array([-3.0, -2.0])
+    found = data.integrated(ratio)
+    torch.testing.assert_close(found.data.K, reduced, rtol=1e-6, atol=1e-6 * float(reduced.max()))
+    # Chi² at any x is that of residuals whose covariance contains the motions.
+    each = problem.motion_without_poses(state)
+    there = x + 1e-3 * torch.randn(len(x), generator=torch.Generator().manual_seed(3), dtype=F64) / scale
+    spread = torch.exp(torch.from_numpy(ratio)).repeat_interleave(6)
+    chi2 = logdet = 0.0
+    for rows, motion in zip(each, state.motion, strict=True):
+        still = rows[-1] - motion @ rows[:MOTION] + (there - x) @ rows[MOTION:-1]
+        mixed = (rows[:MOTION] * spread[:, None]).T
+        covariance = torch.eye(len(still), dtype=F64) + mixed @ mixed.T
+        chi2 += float(still @ torch.linalg.solve(covariance, still))
+        logdet += float(torch.logdet(covariance))
+    form = found.data
+    value = form.c - 2.0 * float(form.g @ there) + float(there @ form.K @ there)
+    # The form's terms are 1e5 times its value.
+    assert value == pytest.approx(chi2, rel=1e-6)
+    assert found.log_determinant == pytest.approx(logdet, rel=1e-9)
+    own = torch.stack(
+        [
+            rows[MOTION:-1]
+            @ torch.linalg.solve(
+                torch.eye(rows.shape[1], dtype=F64)
+                + (rows[:MOTION] * spread[:, None]).T @ (rows[:MOTION] * spread[:, None]),
+                rows[-1] - motion @ rows[:MOTION],
+            )
+            for rows, motion in zip(each, state.motion, strict=True)
+        ]
+    )
+    torch.testing.assert_close(data.scores(ratio), own, rtol=1e-6, atol=1e-8 * float(data.score.abs().max()))
+
+
+def linear_views() -> tuple[ViewData, object]:
+    """Views of a Gaussian linear model whose motions are drawn with known deviations."""
+    generator = torch.Generator().manual_seed(7)
+    form = HybridForm(shape=0.6, radius=1.1, modes=ZernikeModes(radial=5, decentered=2, astigmatic=1, other=0))
+    families = prior_families(form, 800.0, board_modes(BOARD.points), SIZE, 0.6)
+    deviation = families.deviation(typical_hyperprior(form.modes).mean)
+    views, residuals, size = 30, 80, len(deviation)
+    lens = torch.randn(views, size, residuals, generator=generator, dtype=F64) / deviation[:, None]
+    motion = 1e3 * torch.randn(views, MOTION, residuals, generator=generator, dtype=F64)
+    x = deviation * torch.randn(size, generator=generator, dtype=F64)
+    moves = torch.tensor([2e-3, 5e-4], dtype=F64).repeat_interleave(6)
+    m = moves * torch.randn(views, MOTION, generator=generator, dtype=F64)
+    error = torch.einsum("s,vsr->vr", x, lens) + torch.einsum("vm,vmr->vr", m, motion)
+    error = -error + 0.3 * torch.randn(views, residuals, generator=generator, dtype=F64)
+    rows = torch.cat([motion, lens, error[:, None]], 1)
+    return view_data(rows, torch.zeros(size, dtype=F64), torch.zeros(views, MOTION, dtype=F64), views * residuals), (
+        families, form.modes,
+    )  # fmt: skip
+
+
+def test_deviations_of_motions_by_evidence() -> None:
+    """They come back as they were drawn; and the evidence is a maximum, which its slopes must have led to."""
+    data, (families, modes) = linear_views()
+    prior = typical_hyperprior(modes)
+    start = np.full(2, math.log(MEDIAN / 0.3))
+    best = maximize_evidence(data, families, prior.mean, 0.2, prior, start)
+    found = np.exp(best.log_ratio) * math.sqrt(best.variance)
+    # 180 numbers each know their deviation to 5 %.
+    assert found == pytest.approx([2e-3, 5e-4], rel=0.2)
+    assert best.variance == pytest.approx(0.09, rel=0.1)
+
+    def value(h: Tensor, ratio: np.ndarray, variance: float) -> float:
+        integrated = data.integrated(ratio)
+        K, g, c, freedom = integrated.data
+        d = families.deviation(h)
+        A = K * d[:, None] * d / variance + torch.eye(len(d), dtype=F64)
+        b = d * g / variance
+        z, w = (h - prior.mean) / prior.sd, (np.log(np.exp(ratio) * math.sqrt(variance) / MEDIAN)) / SPREAD
+        fit = c / variance - float(b @ torch.linalg.solve(A, b))
+        inner = freedom * math.log(variance) + fit + float(torch.logdet(A)) + integrated.log_determinant
+        return 0.5 * (inner + float(z @ z) + float(w @ w))
+
+    assert best.loss == pytest.approx(value(best.h, best.log_ratio, best.variance), rel=1e-9)
+    for k in range(2):
+        for sign in (-0.1, 0.1):
+            step = np.zeros(2)
+            step[k] = sign
+            assert value(best.h, best.log_ratio + step, best.variance) > best.loss
+    assert value(best.h, best.log_ratio, 1.1 * best.variance) > best.loss
+    assert value(best.h, best.log_ratio, best.variance / 1.1) > best.loss
+
+
+def test_motion_is_found_and_taken_out() -> None:
+    """Its deviation as drawn, the noise, and a lens that a fit of still views does not find."""
+    found, still = fitted(2e-3), fitted(2e-3, motion=False)
+    assert found.motion_sigma is not None
+    # Twelve views: 72 numbers each.
+    assert found.motion_sigma == pytest.approx((2e-3, 2e-3), rel=0.45)
+    assert found.sigma == pytest.approx(NOISE, rel=0.15)
+    assert found.rms == pytest.approx(NOISE * math.sqrt(2.0), rel=0.15)
+    assert off(found.camera) < 0.5 * off(still.camera)
+    assert still.sigma > 2.0 * NOISE
+    # Residuals of corners that are given again are those of the fit.
+    torch.testing.assert_close(found.residuals_of(capture(2e-3)), found.residuals, rtol=0, atol=1e-9)
+
+
+def test_nothing_moves_on_a_stand() -> None:
+    found = fitted(0.0)
+    assert found.readout is None
+    assert found.motion_sigma is None
+    assert found.state.motion.numel() == 0
+    still = fitted(0.0, motion=False)
+    # Another way to the same minimum.
+    sigma = still.covariance.diagonal().sqrt()[[0, 2, 3]]
+    moved = (found.camera.params - still.camera.params)[[0, 2, 3]].abs() / sigma
+    assert float(moved.max()) < 0.1
+
+
+def test_a_picture_that_was_turned_is_read_by_columns() -> None:
+    pixels = capture(2e-3)
+    turned = torch.stack([SIZE[1] - 1.0 - pixels[..., 1], pixels[..., 0]], -1)
+    found = fit_hybrid(BOARD.points, turned, SIZE[::-1], modes=MODES)
+    assert found.readout is not None
+    assert found.readout.columns
+    assert not fitted(2e-3).readout.columns  # type: ignore[union-attr]
+    assert found.sigma == pytest.approx(fitted(2e-3).sigma, rel=1e-3)
+
+
+@pytest.mark.parametrize("aspect", [0.75, 1.02])
+def test_a_stretched_picture(aspect: float) -> None:
+    """Rows of an image that was resized."""
+    pixels = capture(0.0).clone()
+    pixels[..., 1] = (pixels[..., 1] + 0.5) * aspect - 0.5
+    found = fit_hybrid(BOARD.points, pixels, (SIZE[0], round(SIZE[1] * aspect)), modes=MODES)
+    fx, fy, _, cy = found.camera.params[:4].tolist()
+    assert not found.square
+    covariance = found.covariance[:2, :2]
+    slope = torch.tensor([-fy / fx**2, 1.0 / fx], dtype=F64)
+    sigma = math.sqrt(float(slope @ covariance @ slope))
+    assert sigma < 2e-3
+    assert abs(fy / fx - aspect) < 4.0 * sigma
+    assert cy == pytest.approx((476 + 0.5) * aspect - 0.5, abs=3.0)
+
+
+def test_square_pixels_stay_square() -> None:
+    for found in (fitted(0.0), fitted(2e-3)):
+        assert found.square
+        assert torch.equal(found.camera.params[0], found.camera.params[1])
+        assert torch.equal(found.covariance[0], found.covariance[1])
+
+
+def test_unknowns_of_two_focal_lengths() -> None:
+    problem, state = moving_problem(False)
+    own = unknown_values(state.params, False)
+    assert own[0] == state.params[0]
+    assert own[-1] == state.params[1]
+    torch.testing.assert_close(problem.unknowns.expand(own), state.params[list(problem.unknowns.indices)])
+    # A robust weight of zero leaves a corner out; motions keep their prior.
+    weights = torch.ones(4, BOARD.corners, dtype=F64)
+    weights[0] = 0.0
+    moved = problem.with_weights(weights).rows(state)
+    assert float(moved[0].abs().max()) == 0.0
+    result = minimize(problem.with_weights(0.0 * weights), state, LMOptions(max_iterations=3))
+    assert float(result.state[4].abs().max()) < 1e-9
+
+
+def test_limits_of_motions() -> None:
+    data, (families, modes) = linear_views()
+    prior = typical_hyperprior(modes)
+    wild = ViewData(data.still, data.own * 1e-6, data.cross * 1e-3, data.score, data.residual * 1e-3)
+    best = maximize_evidence(wild, families, prior.mean, 0.09, prior, np.full(2, math.log(MEDIAN / 0.3)))
+    # Motions a thousand times as large come to the limit, which refers to the noise before.
+    assert float((np.exp(best.log_ratio) * 0.3).max()) <= LARGEST * (1 + 1e-9)
+    assert float((np.exp(best.log_ratio) * 0.3).min()) >= SMALLEST * (1 - 1e-9)
+    assert isinstance(wild.still, Quadratic)
