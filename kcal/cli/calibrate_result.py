@@ -30,8 +30,8 @@ def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose:
             f"{brief.worst:.3f} px at worst; no board reached {100 * brief.unreached:.0f} % of it"
         )
     if result.hybrid is not None:
-        (f, _, cx, cy), (sf, sx, sy) = result.camera.params[:4].tolist(), (result.sigma[n] for n in ("fx", "cx", "cy"))
-        out.print(f"focal length {f:.3f} ± {sf:.3f} px; principal point {cx:.2f} ± {sx:.2f}, {cy:.2f} ± {sy:.2f} px")
+        (cx, cy), (sx, sy) = result.camera.center.tolist(), (result.sigma[name] for name in ("cx", "cy"))
+        out.print(f"focal length {brief.focal}; principal point {cx:.2f} ± {sx:.2f}, {cy:.2f} ± {sy:.2f} px")
     if brief.pupil is not None and brief.pupil_sigma is not None:
         out.print(f"entrance pupil: {1e3 * brief.pupil:+z.2f} ± {1e3 * brief.pupil_sigma:.2f} mm at the image's corner")
     if (board := result.measured_board) is not None and bool(board.amplitudes.any()):
@@ -72,10 +72,17 @@ def calibration_numbers(result: CameraCalibrationResult) -> dict[str, Any]:
         converged=result.status.name,
         sigma_px={"center": brief.center, "border": brief.border, "worst": brief.worst},
         unreached=brief.unreached,
+        focal_px=None if brief.focal is None else brief.focal.value.tolist(),
+        focal_sigma_px=None if brief.focal is None else _numbers(brief.focal.sigma.tolist()),
         parameters=dict(zip(result.camera.names, result.camera.params.tolist(), strict=True)),
         sigma=result.sigma,
         advice=result.advice,
     )
+
+
+def _numbers(values: list[float]) -> list[float | None]:
+    """As JSON has them: None for NaN."""
+    return [value if value == value else None for value in values]
 
 
 def _parameters(result: CameraCalibrationResult) -> list[list[str]]:

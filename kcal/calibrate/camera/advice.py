@@ -18,7 +18,7 @@ _FEW_VIEWS = 10
 _LARGE_SHARE = 0.1
 # Rolls within ±25° more than double σ of the principal point; rolls up to 90° are nearly as good as any.
 ROLL_SPAN = 60.0
-_STEEP = 20.0
+STEEP = 20.0
 
 
 def reached(observations: Observations, columns: int, rows: int) -> Tensor:
@@ -61,7 +61,7 @@ def what_to_photograph(observations: Observations, camera: Camera, rotation: Ten
     """
     rotation = rotation[rotation.isfinite().all(-1).all(-1)]
     advice = []
-    if int((board_tilts(rotation) > _STEEP).sum()) < 4:
+    if int((board_tilts(rotation) > STEEP).sum()) < 4:
         advice.append("tilt the board by 30 to 45 degrees in different directions: tilts determine the focal length")
     if (span := roll_span(rotation)) < ROLL_SPAN:
         advice.append(

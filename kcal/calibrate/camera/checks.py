@@ -18,6 +18,28 @@ _MINIMUM_CORNERS = 6
 _MINIMUM_WIDTH = 0.5
 
 
+def unusable_views(board_points: Tensor, pixels: Tensor) -> dict[int, str]:
+    """Views whose corners do not determine the board's pose: index -> why.
+
+    Args:
+        board_points: (N, 3) meters.
+        pixels: (V, N, 2), NaN where not seen.
+    """
+    seen = torch.isfinite(pixels).all(-1).sum(-1)
+    spread = spread_out(board_points, pixels)
+    centered = torch.nan_to_num(pixels - pixels.nanmean(1, keepdim=True))
+    width = torch.linalg.svdvals(centered)[:, 1] / seen.clamp_min(1).sqrt() if len(pixels) else seen.double()
+    found: dict[int, str] = {}
+    for i in range(len(pixels)):
+        if int(seen[i]) < _MINIMUM_CORNERS:
+            found[i] = f"it has {int(seen[i])} corners, and at least {_MINIMUM_CORNERS} are needed"
+        elif not bool(spread[i]):
+            found[i] = "all its corners, or all but one, lie on one line, which leaves the board's pose open"
+        elif float(width[i]) < _MINIMUM_WIDTH:
+            found[i] = "its corners coincide, or the board is seen edge-on"
+    return found
+
+
 def check_views(board_points: Tensor, pixels: Tensor, names: Sequence[str], parameters: int, *, fewest: int) -> None:
     """Refuse views that cannot determine a camera, or a view that does not determine its pose.
 
@@ -32,36 +54,24 @@ def check_views(board_points: Tensor, pixels: Tensor, names: Sequence[str], para
         DegenerateError: too few views, poses or corners.
         InputError: a view with too few corners, or with corners on a line or in one place.
     """
-    seen = torch.isfinite(pixels).all(-1).sum(-1)
     if len(pixels) < fewest:
         raise DegenerateError(
             f"{len(pixels)} view(s) of the board: at least {fewest} at different tilts are needed, 10 to 40 are good"
         )
-    poses = len(pixels) - len(repeated_poses(pixels))
-    if poses < fewest:
+    repeated = repeated_poses(pixels)
+    if (poses := len(pixels) - len(repeated)) < fewest:
+        pairs = ", ".join(f"{names[i]} like {names[k]}" for i, k in list(repeated.items())[:5])
         raise DegenerateError(
-            f"{len(pixels)} views show the board in {poses} pose(s) only, the others are too similar: at least "
-            f"{fewest} at different tilts are needed, 10 to 40 are good; move and tilt the board between views"
+            f"{len(pixels)} views show the board in {poses} pose(s) only, the others are too similar ({pairs}"
+            f"{', ...' if len(repeated) > 5 else ''}): at least {fewest} at different tilts are needed, 10 to 40 are "
+            "good; move and tilt the board between views"
         )
-    poor = (seen < _MINIMUM_CORNERS).nonzero()[:, 0].tolist()
-    if poor:
-        raise InputError(
-            f"view {names[poor[0]]!r} has {int(seen[poor[0]])} corners; at least {_MINIMUM_CORNERS} are needed: remove "
-            "the view"
-        )
-    on_line = (~spread_out(board_points, pixels)).nonzero()[:, 0].tolist()
-    if on_line:
-        raise InputError(
-            f"view {names[on_line[0]]!r}: all its corners, or all but one, lie on one line, which leaves the board's "
-            "pose open; remove the view"
-        )
-    centered = torch.nan_to_num(pixels - pixels.nanmean(1, keepdim=True))
-    width = torch.linalg.svdvals(centered)[:, 1] / seen.sqrt()
-    thin = (width < _MINIMUM_WIDTH).nonzero()[:, 0].tolist()
-    if thin:
-        raise InputError(f"view {names[thin[0]]!r}: its corners coincide or the board is seen edge-on; remove the view")
+    for i, why in unusable_views(board_points, pixels).items():
+        raise InputError(f"view {names[i]!r}: {why}; remove the view")
+    seen = int(torch.isfinite(pixels).all(-1).sum())
     unknowns = parameters + 6 * len(pixels)
-    if 2 * int(seen.sum()) <= unknowns:
+    if 2 * seen <= unknowns:
         raise DegenerateError(
-            f"{int(seen.sum())} corners cannot determine {unknowns} parameters: add views or choose a smaller model"
+            f"{seen} corners in {len(pixels)} views cannot determine {unknowns} parameters: add views that show more "
+            "of the board, or choose a smaller model"
         )

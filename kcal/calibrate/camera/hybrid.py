@@ -17,6 +17,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera.advice import what_to_photograph
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
+from kcal.calibrate.camera.determined import check_directions
 from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection
 from kcal.calibrate.camera.outliers import (
     check_share,
@@ -27,7 +28,7 @@ from kcal.calibrate.camera.outliers import (
     views_beyond,
 )
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
-from kcal.calibrate.camera.warnings import check_focal, general_warnings, hybrid_warnings, outlier_warnings
+from kcal.calibrate.camera.warnings import general_warnings, hybrid_warnings, outlier_warnings
 from kcal.calibrate.lensfit.evidence import ANALOG, SQUARE
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.search.model_ladder import Progress
@@ -145,7 +146,7 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
     """The result of a fit, with its warnings.
 
     Raises:
-        DegenerateError: the focal length is hardly determined.
+        DegenerateError: the views hardly determine where the camera sees what they show.
     """
     camera, covariance = fit.camera, fit.covariance
     per_view = fit.residuals.square().sum(-1).nanmean(-1).sqrt()
@@ -153,7 +154,15 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
     sigma: dict[str, float | None] = {
         name: float(value) for name, value in zip(camera.names, spread, strict=True) if name != "skew"
     }
-    check_focal({name: float(spread[i]) for i, name in enumerate(("fx", "fy"))}, camera.params)
+    check_directions(
+        camera.params,
+        camera.model,
+        fit.board_points @ fit.state.rotation.transpose(-1, -2) + fit.state.translation[:, None],
+        fit.residuals.isfinite().all(-1),
+        covariance,
+        fit.state.rotation,
+        observations.names,
+    )
     status = SolverStatus.CONVERGED if fit.converged else SolverStatus.ITERATION_LIMIT
     used = [i for i in range(len(per_view)) if not math.isnan(float(per_view[i]))]
     return CameraCalibrationResult(

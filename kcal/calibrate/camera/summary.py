@@ -9,6 +9,7 @@ import torch
 
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.lens.paraxial import ParaxialFocal, paraxial_focal
 from kcal.lens.pupil import pupil_depth
 from kcal.lens.uncertainty import image_sigma
 
@@ -26,6 +27,7 @@ class CalibrationSummary:
         pupil: meters by which the entrance pupil of the image's farthest corner lies before that of its middle; None
             without a hybrid lens.
         pupil_sigma: its standard deviation.
+        focal: the focal lengths on the optical axis, with their standard deviations.
 
     Example:
         >>> CalibrationSummary(center=0.05, border=0.2, worst=0.5, unreached=0.1).pupil is None
@@ -38,6 +40,7 @@ class CalibrationSummary:
     unreached: float
     pupil: float | None = None
     pupil_sigma: float | None = None
+    focal: ParaxialFocal | None = None
 
 
 def summarize(result: CameraCalibrationResult) -> CalibrationSummary:
@@ -76,6 +79,7 @@ def summarize(result: CameraCalibrationResult) -> CalibrationSummary:
         unreached=unreached_share(result.observations),
         pupil=pupil,
         pupil_sigma=pupil_sigma,
+        focal=paraxial_focal(camera),
     )
 
 

@@ -25,6 +25,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.difference import CameraDifference, camera_difference
+from kcal.lens.paraxial import paraxial_focal
 from kcal.solve.lm import LMOptions
 
 # Views that each half must have: fewer often do not determine a camera.
@@ -160,7 +161,7 @@ def examine(
 
 
 def _reference_options(result: CameraCalibrationResult, options: CalibrationOptions) -> CalibrationOptions:
-    fx, fy = result.camera.focal.tolist()
+    fx, fy = paraxial_focal(result.camera).value.tolist()
     # Pixels of a parametric camera may be anything; a hybrid one must be told that they are not square.
     return CalibrationOptions(
         weighted=options.weighted,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -13,12 +12,9 @@ from kcal.calibrate.bundle.priors import GaussianPrior, Term
 from kcal.calibrate.camera.outliers import corners_beyond
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.calibrate.search.model_ladder import Minimum
-from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
 from kcal.solve.result import SolverStatus
 
-# A less certain focal length is no calibration: 5 % of range at every distance.
-_MAX_FOCAL_SIGMA = 0.05
 # Another solution with a χ² higher by less than this cannot be excluded: 14 parameters more gain as much by chance.
 _CLOSE_RIVAL = 25.0
 # Mean square of the differences from priors, in their standard deviations, beyond which the data contradict them.
@@ -32,23 +28,6 @@ _FAR_CENTER = 3.0
 NO_ERROR_BARS = (
     "no error bars: σ cannot be computed, because a corner lies where the lens model folds; choose a smaller model"
 )
-
-
-def check_focal(sigma: Mapping[str, float], parameters: Tensor) -> None:
-    """Raise `DegenerateError` where the focal length is hardly determined: that is no calibration.
-
-    Args:
-        sigma: standard deviations of the free parameters by name, infinite where not determined; NaN counts as that.
-        parameters: (5 + P,).
-    """
-    shares = [sigma.get(name, 0.0) / float(parameters[i]) for i, name in enumerate(("fx", "fy"))]
-    worst = max(math.inf if math.isnan(share) else share for share in shares)
-    if not worst <= _MAX_FOCAL_SIGMA:
-        known = "not at all" if math.isinf(worst) else f"only to ±{100 * worst:.1f} %"
-        raise DegenerateError(
-            f"the views determine the focal length {known}: they are parallel to the image or too similar; add views "
-            "with the board tilted by 30 to 45 degrees in different directions, or choose a smaller model"
-        )
 
 
 def prior_warnings(terms: Sequence[Term], state: BoardState, noise: float) -> list[str]:
