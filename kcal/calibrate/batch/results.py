@@ -140,6 +140,8 @@ class Results:
         self._pieces: list[list[Detected | None]] = [[None] * len(job.images) for job in jobs]
         self._digests: list[list[str]] = [[""] * len(job.images) for job in jobs]
         self._views: dict[int, Observations] = {}
+        # What was done about images of several sizes.
+        self._notes: dict[int, str] = {}
         self._calibrated: dict[int, Calibrated] = {}
 
     def tasks(self, advance: Callable[[str], None]) -> Iterator[Task]:
@@ -190,7 +192,7 @@ class Results:
         if len(pieces) < len(job.images):
             return []
         try:
-            seen = observations_of(job, pieces, self._digests[number], self.options.refine)
+            seen, self._notes[number] = observations_of(job, pieces, self._digests[number], self.options.refine)
         except KcalError as error:
             self._finish(number, Calibrated(error=str(error)))
             return []
@@ -272,7 +274,7 @@ class Results:
             failures=len(job.images) - views,
             width=seen.image_size[0] if seen is not None else None,
             height=seen.image_size[1] if seen is not None else None,
-            warnings="; ".join(result.warnings),
+            warnings="; ".join(filter(None, (self._notes.get(number), *result.warnings))),
             error=result.error,
         )
         if camera is None or camera.calibration is None:
