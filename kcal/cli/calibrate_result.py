@@ -21,7 +21,9 @@ def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose:
     model = "hybrid" if result.hybrid is not None else str(result.camera.model)
     out.print(f"{record.views} views, {record.points} corners, {width}x{height} px, model {model}")
     out.print(distances_text(result))
-    fitted = f"; noise {result.noise:.4f} px along an axis; {result.status.message} ({result.iterations} steps)"
+    # Warnings explain the others.
+    ended = "converged" if result.status.name == "CONVERGED" else result.status.message
+    fitted = f"; noise {result.noise:.4f} px along an axis; {ended} ({result.iterations} steps)"
     out.print(f"RMS [bold]{result.rms:.4f} px[/]{fitted}")
     brief = summarize(result)
     if brief.worst == brief.worst:

@@ -18,8 +18,29 @@ _MINIMUM_CORNERS = 6
 _MINIMUM_WIDTH = 0.5
 
 
+def mirrored_views(board_points: Tensor, pixels: Tensor) -> Tensor:
+    """(V,) whether the corners run the other way round, as on a board seen in a mirror.
+
+    Args:
+        board_points: (N, 3) meters.
+        pixels: (V, N, 2), NaN where not seen.
+
+    Example:
+        >>> points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]).double()
+        >>> mirrored_views(points, torch.stack([points[:, :2], -points[:, :2], points[:, :2].flip(1)])).tolist()
+        [False, False, True]
+    """
+    flipped = []
+    for view in pixels:
+        seen = view.isfinite().all(-1)
+        rows = torch.cat([board_points[seen, :2], torch.ones(int(seen.sum()), 1, dtype=torch.float64)], 1)
+        affine = torch.linalg.lstsq(rows, view[seen], driver="gelsd").solution[:2]
+        flipped.append(float(torch.linalg.det(affine)) < 0)
+    return torch.tensor(flipped, dtype=torch.bool)
+
+
 def unusable_views(board_points: Tensor, pixels: Tensor) -> dict[int, str]:
-    """Views whose corners do not determine the board's pose: index -> why.
+    """Views whose corners do not determine the board's pose, or run the other way than in most: index -> why.
 
     Args:
         board_points: (N, 3) meters.
@@ -37,7 +58,12 @@ def unusable_views(board_points: Tensor, pixels: Tensor) -> dict[int, str]:
             found[i] = "all its corners, or all but one, lie on one line, which leaves the board's pose open"
         elif float(width[i]) < _MINIMUM_WIDTH:
             found[i] = "its corners coincide, or the board is seen edge-on"
-    return found
+    usable = [i for i in range(len(pixels)) if i not in found]
+    mirrored = mirrored_views(board_points, pixels[usable]) if usable else torch.zeros(0, dtype=torch.bool)
+    if 2 * int(mirrored.sum()) < len(usable):
+        why = "it shows the board mirrored: the image is flipped, or its corners are in another order"
+        found |= {i: why for i, flipped in zip(usable, mirrored.tolist(), strict=True) if flipped}
+    return dict(sorted(found.items()))
 
 
 def check_views(board_points: Tensor, pixels: Tensor, names: Sequence[str], parameters: int, *, fewest: int) -> None:

@@ -96,9 +96,10 @@ def check_directions(
     most = int(tilts.argmax())
     name = names[used[most]] if names else f"view {used[most]}"
     smaller = "" if model.hybrid else ", or choose a smaller model"
+    tilted = int((tilts > STEEP).sum())
     raise DegenerateError(
         f"the views determine the focal length {known}, measured over the part of the image that they show: the "
-        f"board is tilted by more than {STEEP:.0f}° in {int((tilts > STEEP).sum())} of {len(used)} views (most, by "
-        f"{float(tilts[most]):.0f}°, in {name}), or the views are too similar; add views with the board tilted by 30 "
-        f"to 45 degrees to the left, right, top and bottom{smaller}"
+        f"board is tilted by more than {STEEP:.0f}° in {tilted} of {len(used)} views (by {float(tilts[most]):.0f}° at "
+        f"most, in {name}), or the views are too similar; add views with the board tilted by 30 to 45 degrees to the "
+        f"left, right, top and bottom{smaller}"
     )

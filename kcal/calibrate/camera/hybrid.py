@@ -15,7 +15,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import what_to_photograph
+from kcal.calibrate.camera.advice import roll_warnings, what_to_photograph
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
 from kcal.calibrate.camera.determined import check_directions
 from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection
@@ -27,6 +27,7 @@ from kcal.calibrate.camera.outliers import (
     view_rms,
     views_beyond,
 )
+from kcal.calibrate.camera.pupil_check import pupil_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
 from kcal.calibrate.camera.warnings import general_warnings, hybrid_warnings, outlier_warnings
 from kcal.calibrate.lensfit.evidence import ANALOG, SQUARE
@@ -185,6 +186,8 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
         warnings=(
             *general_warnings([observations.names[i] for i in used], camera, fit.rms, per_view[used], (), status),
             *hybrid_warnings(fit),
+            *pupil_warnings(camera, covariance),
+            *(roll_warnings(fit.state.rotation) if options.board == "printed" else ()),
             *outlier_warnings(observations.names, fit.residuals),
         ),
     )
