@@ -75,14 +75,14 @@ def calibration_numbers(result: CameraCalibrationResult) -> dict[str, Any]:
         sigma_px={"center": brief.center, "border": brief.border, "worst": brief.worst},
         unreached=brief.unreached,
         focal_px=None if brief.focal is None else brief.focal.value.tolist(),
-        focal_sigma_px=None if brief.focal is None else _numbers(brief.focal.sigma.tolist()),
+        focal_sigma_px=None if brief.focal is None else _without_nan(brief.focal.sigma.tolist()),
         parameters=dict(zip(result.camera.names, result.camera.params.tolist(), strict=True)),
         sigma=result.sigma,
         advice=result.advice,
     )
 
 
-def _numbers(values: list[float]) -> list[float | None]:
+def _without_nan(values: list[float]) -> list[float | None]:
     """As JSON has them: None for NaN."""
     return [value if value == value else None for value in values]
 

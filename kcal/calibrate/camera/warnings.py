@@ -80,8 +80,8 @@ def hybrid_warnings(fit: HybridFit) -> list[str]:
     found = []
     if fit.tempering > REPEATING:
         found.append(
-            f"residuals repeat within views (tempering {fit.tempering:.1f}, where noise alone gives 1): blur, motion or a "
-            "board that flexes; error bars are widened for it; use a stiff board, a stand and a short exposure"
+            f"residuals repeat within views (tempering {fit.tempering:.1f}, where noise alone gives 1): blur, motion "
+            "or a board that flexes; error bars are widened for it; use a stiff board, a stand and a short exposure"
         )
     off = (fit.state.params[2:4] - fit.families.mean[1:3]).norm() / fit.families.log_unit[1].exp()
     if float(off) > _FAR_CENTER:
