@@ -32,6 +32,10 @@ class ParaxialFocal(NamedTuple):
         value: (2,) pixels per radian.
         sigma: (2,) standard deviations; NaN where the camera's calibration does not tell.
         covariance: (2, 2) px²; NaN likewise.
+
+    Example:
+        >>> str(ParaxialFocal(torch.tensor([800.0, 800.0]), torch.ones(2), torch.ones(2, 2)))
+        '800.000 ± 1.000 px'
     """
 
     value: Tensor

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.closed_form import spread_out
+from kcal.calibrate.bundle.closed_form import homographies, spread_out
 from kcal.calibrate.camera.repeats import repeated_poses
 from kcal.errors import DegenerateError, InputError
 
@@ -16,6 +17,8 @@ MINIMUM_VIEWS = 3
 _MINIMUM_CORNERS = 6
 # RMS distance in pixels of a view's corners from the best line, below which they do not span a plane.
 _MINIMUM_WIDTH = 0.5
+# Views that are named where none fits, and how many times farther off a plane than the typical one they are.
+_WORST, _BENT = 3, 3.0
 
 
 def mirrored_views(board_points: Tensor, pixels: Tensor) -> Tensor:
@@ -64,6 +67,32 @@ def unusable_views(board_points: Tensor, pixels: Tensor) -> dict[int, str]:
         why = "it shows the board mirrored: the image is flipped, or its corners are in another order"
         found |= {i: why for i, flipped in zip(usable, mirrored.tolist(), strict=True) if flipped}
     return dict(sorted(found.items()))
+
+
+def least_planar(board_points: Tensor, pixels: Tensor, names: Sequence[str]) -> str:
+    """Which views look least like any flat board, in words: where no lens fits, these are the first to look at.
+
+    Args:
+        board_points: (N, 3) meters.
+        pixels: (V, N, 2), NaN where not seen.
+        names: of the views.
+
+    Example:
+        >>> points = torch.cartesian_prod(torch.arange(3.0), torch.arange(3.0), torch.zeros(1)).double()
+        >>> mixed = points[[4, 1, 2, 3, 0, 5, 6, 7, 8]]
+        >>> views = 100 * torch.stack([points, 2 * points, mixed])[..., :2]
+        >>> least_planar(points, views, ["a", "b", "c"])
+        'c (its corners are 59 px off a flat board)'
+    """
+    homography = homographies(board_points, pixels)
+    flat = torch.cat([board_points[:, :2], torch.ones_like(board_points[:, :1])], 1)
+    seen = flat @ homography.mT
+    off = (seen[..., :2] / seen[..., 2:] - pixels).square().sum(-1).nanmean(-1).sqrt().nan_to_num(nan=math.inf)
+    worst = off.argsort(descending=True)[:_WORST].tolist()
+    # A lens bends boards, too, but those of all views.
+    typical = float(off.median())
+    named = [i for i in worst if float(off[i]) > _BENT * typical] or worst[:1]
+    return ", ".join(f"{names[i]} (its corners are {float(off[i]):.0f} px off a flat board)" for i in named)
 
 
 def check_views(board_points: Tensor, pixels: Tensor, names: Sequence[str], parameters: int, *, fewest: int) -> None:

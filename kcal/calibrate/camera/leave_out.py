@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import torch
 
-from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
+from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views, least_planar
 from kcal.calibrate.camera.hybrid import calibrate_hybrid
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.outliers import corners_beyond, views_beyond
@@ -59,10 +59,14 @@ def calibrate_what_fits(
     listed = listed_views(observations, wrong)
     few = len(wrong) <= max(1.0, _FEW * len(observations.views))
     if not wrong or not few or len(observations.views) - len(wrong) < MINIMUM_VIEWS:
-        which = f"{len(wrong)} of {len(observations.views)} views do not fit the others: {listed}. " if wrong else ""
+        which = (
+            f"{len(wrong)} of {len(observations.views)} views do not fit the others: {listed}"
+            if wrong
+            else f"Look first at {least_planar(observations.board.points, observations.pixels(), observations.names)}"
+        )
         raise InputError(
-            f"no lens shows all corners where they are. {which}Look at the images: do all show this board, not "
-            "mirrored, and are all from this camera at this zoom? Remove those that do not"
+            f"no lens shows all corners where they are. {which}. Do all images show this board, not mirrored, and are "
+            "all from this camera at this zoom? Remove those that do not, and detect again"
         ) from failure
     progress(f"without {len(wrong)} views that no lens fits")
     kept = [i for i in range(len(observations.views)) if i not in wrong]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera import leave_out
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.camera.checks import least_planar
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.errors import DegenerateError, InputError
 
@@ -90,7 +91,7 @@ def test_an_arithmetic_failure_is_an_error_of_the_views(monkeypatch: pytest.Monk
         raise ZeroDivisionError
 
     monkeypatch.setattr(leave_out, "calibrate_hybrid", divided)
-    with pytest.raises(InputError, match="no lens shows all corners where they are"):
+    with pytest.raises(InputError, match=r"no lens shows all corners where they are\. Look first at v0\d \("):
         calibrate_camera(observe(corners()[:6]))
 
 
@@ -113,3 +114,19 @@ def test_copies_among_what_is_left() -> None:
     assert math.isnan(float(found.per_view_rms[4]))
     assert math.isnan(float(found.per_view_rms[6]))
     assert found.camera.calibration is not None
+
+
+@pytest.mark.parametrize("model", ["opencv5", "hybrid"])
+def test_views_without_a_board_at_all(model: str) -> None:
+    """Corners anywhere: whatever is refused names the views to look at."""
+    pixels = 400.0 * torch.rand(6, BOARD.corners, 2, generator=torch.Generator().manual_seed(1)).double()
+    with pytest.raises((InputError, DegenerateError), match=r"v0\d"):
+        calibrate_camera(observe(pixels), CalibrationOptions(model=model))
+
+
+def test_which_views_look_least_like_a_board() -> None:
+    pixels = shuffled(corners(), [4])
+    assert least_planar(BOARD.points, pixels, [str(i) for i in range(VIEWS)]).startswith("4 (its corners are ")
+    assert "," not in least_planar(BOARD.points, pixels, [str(i) for i in range(VIEWS)])
+    both = least_planar(BOARD.points, shuffled(corners(), [4, 9]), [str(i) for i in range(VIEWS)])
+    assert {text.strip().split(" ")[0] for text in both.split(",")} == {"4", "9"}
