@@ -106,6 +106,8 @@ from kcal.lens.modules import Unproject as Unproject
 from kcal.lens.mounting import Mounting as Mounting
 from kcal.lens.mounting import Origin as Origin
 from kcal.lens.network_modes import NetworkModes as NetworkModes
+from kcal.lens.paraxial import ParaxialFocal as ParaxialFocal
+from kcal.lens.paraxial import paraxial_focal as paraxial_focal
 from kcal.lens.pinhole import new_pinhole as new_pinhole
 from kcal.lens.rig import RigCovariance as RigCovariance
 from kcal.lens.rig import StereoRig as StereoRig

@@ -86,7 +86,7 @@ def batch_command(
     except KeyboardInterrupt:
         err.print("interrupted; what is finished is kept: run the same command to continue")
         raise typer.Exit(130) from None
-    heads = ["camera", "views", "RMS px", "fx", "± σ", "cx", "cy", "model", "note"]
+    heads = ["camera", "views", "RMS px", "focal px", "± σ", "cx", "cy", "model", "note"]
     print_table([heads, *map(_cells, report.rows)], left=(0, 7, 8))
     out.print(f"{report.reused} of {report.total} pieces of work were there already", markup=False)
     print_wrote(report.summary)
@@ -100,7 +100,7 @@ def batch_command(
 def _cells(row: SummaryRow) -> list[str]:
     numbers = ["", "", "", "", ""]
     if row.rms is not None:
-        spread = "" if row.sigma_fx is None else f"{row.sigma_fx:.3f}"
-        numbers = [f"{row.rms:.4f}", f"{row.fx:.3f}", spread, f"{row.cx:.3f}", f"{row.cy:.3f}"]
+        spread = "" if row.sigma_focal is None else f"{row.sigma_focal:.3f}"
+        numbers = [f"{row.rms:.4f}", f"{row.focal:.3f}", spread, f"{row.cx:.3f}", f"{row.cy:.3f}"]
     note = f"failed: {row.error}" if row.error else row.warnings
     return [row.camera, f"{row.views} of {row.images}", *numbers, row.model, note]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 from rich.markup import escape
@@ -13,6 +14,9 @@ from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_writable, make_folder
+
+if TYPE_CHECKING:
+    from kcal.corners.board import Board
 
 _PARAMETRIC, _USE = "Options of parametric models", "May it be used?"
 
@@ -94,7 +98,10 @@ def calibrate_command(
     ] = None,
     fov: Annotated[
         float | None,
-        typer.Option(metavar="DEG", help="Rough horizontal field of view to start from, instead of --focal."),
+        typer.Option(
+            metavar="DEG",
+            help="Rough horizontal field of view to start from, instead of --focal; a fisheye may have 180 and more.",
+        ),
     ] = None,
     board_warp: Annotated[
         bool,
@@ -215,11 +222,14 @@ def calibrate_command(
     )
     sets = [Observations.load(place.observations) for place in places]
     with steps("calibrating", None) as advance:
-        outcomes = (
-            calibrate_cameras(sets, options, advance, one_type=one_type)
-            if len(sets) > 1
-            else [calibrate_camera(sets[0], options, advance)]
-        )
+        try:
+            outcomes = (
+                calibrate_cameras(sets, options, advance, one_type=one_type)
+                if len(sets) > 1
+                else [calibrate_camera(sets[0], options, advance)]
+            )
+        except DegenerateError as error:
+            raise DegenerateError(f"{error}. {more_views(sets[0].board, places[0].observations)}") from error
     failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
     usable = True
     figures: dict[str, dict[str, Any]] = {}
@@ -227,7 +237,9 @@ def calibrate_command(
         if len(places) > 1:
             out.print(f"[bold]{escape(place.name)}[/]")
         if isinstance(result, KcalError):
-            warn(f"{place.name}: {result}")
+            seen = sets[places.index(place)]
+            more = f". {more_views(seen.board, place.observations)}" if isinstance(result, DegenerateError) else ""
+            warn(f"{place.name}: {result}{more}")
             continue
         result.save(place.output, name=place.name, source=place.observations.name, temperature=temperature)
         if place.picture is not None:
@@ -249,6 +261,21 @@ def calibrate_command(
         raise DegenerateError(f"{len(failed)} of {len(places)} cameras failed: {', '.join(failed)}")
     if not usable:
         raise typer.Exit(NO)
+
+
+def more_views(board: Board, observations: Path) -> str:
+    """The command that adds views to an observations file.
+
+    Example:
+        >>> from kcal.corners.board import Board
+        >>> more_views(Board(columns=9, rows=6, square=0.025), Path("left.obs.json"))
+        'To add views: kcal capture camera:0 --board 9x6 --square 25mm -o left.obs.json'
+    """
+    size = f"{board.columns}x{board.rows}"
+    if board.dictionary is not None and board.marker is not None:
+        size = f"charuco:{size}:{board.dictionary}:{1e3 * board.marker:g}mm"
+    path = shlex.quote(str(observations))
+    return f"To add views: kcal capture camera:0 --board {size} --square {1e3 * board.square:g}mm -o {path}"
 
 
 class _CameraFiles(NamedTuple):

@@ -21,7 +21,9 @@ def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose:
     model = "hybrid" if result.hybrid is not None else str(result.camera.model)
     out.print(f"{record.views} views, {record.points} corners, {width}x{height} px, model {model}")
     out.print(distances_text(result))
-    fitted = f"; noise {result.noise:.4f} px along an axis; {result.status.message} ({result.iterations} steps)"
+    # Warnings explain the others.
+    ended = "converged" if result.status.name == "CONVERGED" else result.status.message
+    fitted = f"; noise {result.noise:.4f} px along an axis; {ended} ({result.iterations} steps)"
     out.print(f"RMS [bold]{result.rms:.4f} px[/]{fitted}")
     brief = summarize(result)
     if brief.worst == brief.worst:
@@ -30,8 +32,8 @@ def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose:
             f"{brief.worst:.3f} px at worst; no board reached {100 * brief.unreached:.0f} % of it"
         )
     if result.hybrid is not None:
-        (f, _, cx, cy), (sf, sx, sy) = result.camera.params[:4].tolist(), (result.sigma[n] for n in ("fx", "cx", "cy"))
-        out.print(f"focal length {f:.3f} ± {sf:.3f} px; principal point {cx:.2f} ± {sx:.2f}, {cy:.2f} ± {sy:.2f} px")
+        (cx, cy), (sx, sy) = result.camera.center.tolist(), (result.sigma[name] for name in ("cx", "cy"))
+        out.print(f"focal length {brief.focal}; principal point {cx:.2f} ± {sx:.2f}, {cy:.2f} ± {sy:.2f} px")
     if brief.pupil is not None and brief.pupil_sigma is not None:
         out.print(f"entrance pupil: {1e3 * brief.pupil:+z.2f} ± {1e3 * brief.pupil_sigma:.2f} mm at the image's corner")
     if (board := result.measured_board) is not None and bool(board.amplitudes.any()):
@@ -72,10 +74,17 @@ def calibration_numbers(result: CameraCalibrationResult) -> dict[str, Any]:
         converged=result.status.name,
         sigma_px={"center": brief.center, "border": brief.border, "worst": brief.worst},
         unreached=brief.unreached,
+        focal_px=None if brief.focal is None else brief.focal.value.tolist(),
+        focal_sigma_px=None if brief.focal is None else _without_nan(brief.focal.sigma.tolist()),
         parameters=dict(zip(result.camera.names, result.camera.params.tolist(), strict=True)),
         sigma=result.sigma,
         advice=result.advice,
     )
+
+
+def _without_nan(values: list[float]) -> list[float | None]:
+    """As JSON has them: None for NaN."""
+    return [value if value == value else None for value in values]
 
 
 def _parameters(result: CameraCalibrationResult) -> list[list[str]]:

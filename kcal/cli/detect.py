@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from kcal.cli.board_options import BoardSize, Refine, RefineMethod, SquareSide
-from kcal.cli.console import err, out, steps, tell
+from kcal.cli.console import err, out, steps, tell, warn
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable
 
@@ -78,6 +78,7 @@ def detect_command(
     from kcal.sources import is_stream, source_name
 
     turned: list[Path] = []
+    notes: list[str] = []
     streams = [source_name(image) for image in images if is_stream(image)]
     if streams and len(images) > 1:
         raise InputError(f"{streams[0]}: a stream is searched alone, without other images")
@@ -99,7 +100,9 @@ def detect_command(
         paths = expand_images(images)
         check_writable(output, *paths)
         with steps("detecting", len(paths)) as advance:
-            observations = detect_images(paths, board, refine.value, progress=advance, time_limit=time_limit)
+            observations = detect_images(
+                paths, board, refine.value, progress=advance, time_limit=time_limit, note=notes.append
+            )
         turned = turned_images([path for path in paths if os.path.isfile(path)])
         source = f"of {len(paths)} images"
     observations.save(output)
@@ -117,6 +120,8 @@ def detect_command(
     out.print(f"{escape(str(output))}: board found in {found} {source} of {width}x{height} px")
     wide, high = (1e3 * board.square * (count - 1) for count in (board.columns, board.rows))
     out.print(f"board {board}: {wide:g} x {high:g} mm from the first corner to the last")
+    for text in notes:
+        warn(text)
     if turned:
         out.print(f"note: {len(turned)} images have an EXIF rotation, which kcal ignores")
     if unseen:

@@ -74,9 +74,11 @@ def _temperature(camera: Camera) -> float | None:
 
 
 def _history(camera: Camera) -> str:
-    """Model and, if the file tells, when the camera was calibrated."""
+    """Model, focal length and, if the file tells, when the camera was calibrated."""
+    from kcal.lens.paraxial import paraxial_focal
+
     record = camera.calibration.record if camera.calibration else None
     when = f", {record.created:%Y-%m-%d %H:%M}, RMS {record.rms:.3f} px from {record.views} views" if record else ""
     if record and record.temperature is not None:
         when += f", at {record.temperature:g} °C"
-    return f"{camera.model}{when}"
+    return f"{camera.model}, focal length {paraxial_focal(camera)}{when}"

@@ -80,6 +80,10 @@ def _show_camera(camera: Camera) -> None:
         )
         if record.temperature is not None:
             out.print(f"at {record.temperature:g} °C")
+    from kcal.lens.paraxial import paraxial_focal
+
+    hybrid = ", on its axis; fx and fy below are parameters of the base projection alone" if camera.model.hybrid else ""
+    out.print(f"focal length {paraxial_focal(camera)}{hybrid}", markup=False)
     sigma = _sigmas(camera)
     values = camera.params.detach().tolist()
     rows = [["parameter", "value", "sigma"]]

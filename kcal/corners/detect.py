@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +25,7 @@ from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.order import canonical_order
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
+from kcal.corners.sizes import common_size, rescaled, resized_alike
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 
@@ -136,11 +138,13 @@ def detect_images(
     refine: Refinement = "erf",
     progress: Callable[[str], None] | None = None,
     time_limit: float | None = None,
+    note: Callable[[str], object] = warnings.warn,
 ) -> Observations:
     """Find the board in the images of one camera.
 
     An image that cannot be read or shows no board becomes a `Failure` with its reason. The others become views, named
-    by their file names (with folders where two files share one).
+    by their file names (with folders where two files share one). Corners in images that were resized alike are scaled
+    to the size that most images have (`kcal.corners.sizes`).
 
     Args:
         paths: image files, for example from `kcal.corners.images.expand_images`.
@@ -149,9 +153,10 @@ def detect_images(
         progress: called with each image's name when it is done.
         time_limit: seconds after which an image becomes a failure; no limit by default. See
             `kcal.corners.limited.Limited`.
+        note: called with what was done about images of several sizes; a Python warning by default.
 
     Raises:
-        InputError: no images, images of two sizes, or no board in any image.
+        InputError: no images, images that were cropped or rotated, or no board in any image.
 
     Example:
         >>> import tempfile
@@ -170,7 +175,7 @@ def detect_images(
     names = unique_names(files)
     views: list[View] = []
     failures: list[Failure] = []
-    size: tuple[int, int] | None = None
+    sizes: list[tuple[int, int] | None] = []
     with Limited(time_limit) as limited:
         for name, file in zip(names, files, strict=True):
             try:
@@ -178,10 +183,13 @@ def detect_images(
                 image = decode_gray(data, file)
             except FileError as error:
                 failures.append(Failure(name=name, reason=str(error).removeprefix(f"{file}: ")))
+                sizes.append(None)
             else:
-                size = size or _size(image)
-                if _size(image) != size:
-                    raise InputError(_sizes_differ(files, names))
+                sizes.append(_size(image))
+                first_size = next(size for size in sizes if size)
+                if _size(image) != first_size and not resized_alike(_size(image), first_size):
+                    # Named at once, not after the search of all images.
+                    common_size(names, [_size_of(file) for file in files])
                 try:
                     found = limited(detect_board, image, board, refine)
                 except TookTooLongError as error:
@@ -193,10 +201,17 @@ def detect_images(
                     views.append(view_of(found, name, image=str(file), sha256=digest))
             if progress is not None:
                 progress(name)
-    if size is None or not views:
+    if not views:
         first = f"{failures[0].name}: {failures[0].reason}"
         raise InputError(f"no board in any of {len(files)} images ({first}){_hint(files, board)}")
-    return Observations(board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures))
+    common = common_size(names, sizes)
+    if common.note:
+        note(common.note)
+        scales = {names[i]: scale for i, scale in common.scales.items()}
+        views = [rescaled(view, scales[view.name]) if view.name in scales else view for view in views]
+    return Observations(
+        board=board, image_size=common.size, refinement=refine, views=tuple(views), failures=tuple(failures)
+    )
 
 
 def limit_threads(count: int) -> None:
@@ -302,18 +317,11 @@ def _size(image: Gray) -> tuple[int, int]:
     return image.shape[1], image.shape[0]
 
 
-def _sizes_differ(files: list[Path], names: list[str]) -> str:
-    by_size: dict[tuple[int, int], list[str]] = {}
-    for name, file in zip(names, files, strict=True):
-        try:
-            by_size.setdefault(_size(decode_gray(read_bytes(file), file)), []).append(name)
-        except FileError:
-            continue
-    groups = []
-    for (width, height), group in sorted(by_size.items(), key=lambda item: -len(item[1])):
-        shown = ", ".join(group[:3]) + (f" and {len(group) - 3} more" if len(group) > 3 else "")
-        groups.append(f"{width}x{height} ({shown})")
-    return f"images of different sizes: {'; '.join(groups)}; give the images of one camera at one resolution"
+def _size_of(file: Path) -> tuple[int, int] | None:
+    try:
+        return _size(decode_gray(read_bytes(file), file))
+    except FileError:
+        return None
 
 
 def _hint(files: list[Path], board: Board) -> str:

@@ -12,6 +12,7 @@ from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.trust import Examination, examine
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.lens.camera import Camera
+from kcal.lens.paraxial import paraxial_focal
 from kcal.lens.uncertainty import image_sigma
 from kcal.locate.ranges import BEARING_SIGMAS
 from kcal.report.model_findings import FAULTS, model_findings
@@ -156,7 +157,7 @@ def _camera_answer(
     camera: Camera, requirement: Requirement, sigma: float, beyond: float, baseline: float, mark_sigma: float
 ) -> RangeAnswer:
     """The range of a target by two such cameras: Z² / (f B) for each pixel of disparity, which both cameras spoil."""
-    slope = math.sqrt(2.0) * requirement.distance**2 / (float(camera.focal.detach().mean()) * baseline)
+    slope = math.sqrt(2.0) * requirement.distance**2 / (paraxial_focal(camera).mean[0] * baseline)
     parts = {"marks": slope * mark_sigma, "lenses": slope * sigma, "faults of the calibration": slope * beyond}
     total = math.hypot(*parts.values())
     return RangeAnswer(requirement=requirement, parts=parts, ranged=total * BEARING_SIGMAS <= requirement.distance)

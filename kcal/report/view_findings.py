@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.advice import ROLL_SPAN, board_tilts, reached, roll_span, unreached_share
+from kcal.calibrate.camera.checks import mirrored_views
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.trust import seen_pixels
 from kcal.corners.observations import Observations
@@ -53,34 +54,8 @@ def view_findings(result: CameraCalibrationResult, noise: float | None = None) -
     return [finding for finding in found if finding is not None]
 
 
-def mirrored(pixels: Tensor, observations: Observations) -> Tensor:
-    """(V,) whether the corners run the other way round, as on a board seen in a mirror.
-
-    Args:
-        pixels: (V, N, 2), NaN where not seen.
-        observations: whose board they are of.
-
-    Example:
-        >>> from kcal.corners.board import Board
-        >>> from kcal.corners.observations import View
-        >>> board = Board(columns=2, rows=2, square=0.1)
-        >>> views = (View(name="a", pixels=((9.0, 0.0), (0.0, 0.0), (9.0, 9.0), (0.0, 9.0))),)
-        >>> seen = Observations(board=board, image_size=(10, 10), views=views)
-        >>> mirrored(seen.pixels(), seen).tolist()
-        [True]
-    """
-    points = observations.board.points[:, :2]
-    flipped = []
-    for view in pixels:
-        seen = view.isfinite().all(-1)
-        rows = torch.cat([points[seen], torch.ones(int(seen.sum()), 1, dtype=torch.float64)], 1)
-        affine = torch.linalg.lstsq(rows, view[seen], driver="gelsd").solution[:2]
-        flipped.append(float(torch.linalg.det(affine)) < 0)
-    return torch.tensor(flipped)
-
-
 def _order_finding(pixels: Tensor, observations: Observations) -> Finding | None:
-    wrong = int(mirrored(pixels, observations).sum())
+    wrong = int(mirrored_views(observations.board.points, pixels).sum())
     if not wrong:
         return None
     some = "all views show" if wrong == len(pixels) else f"{wrong} of {len(pixels)} views show"

@@ -198,8 +198,8 @@ def test_two_sizes_name_the_images(pictures, tmp_path):
     with pytest.raises(InputError) as caught:
         detect_images([folder / "a.png", tmp_path / "words.png", tmp_path / "odd.png", folder / "b.png"], SMALL)
     assert str(caught.value) == (
-        "images of different sizes: 240x200 (a.png, b.png); 240x198 (odd.png); "
-        "give the images of one camera at one resolution"
+        "images of different sizes: 240x200 (a.png, b.png); 240x198 (odd.png); some were cropped: "
+        "take the originals, or run kcal detect on those of each size apart, as on a camera of its own"
     )
 
 

@@ -141,7 +141,7 @@ def test_boards_parallel_to_the_image_are_named(clean: CameraCalibrationResult, 
     assert "tilt the board" in verdict.next_step
 
 
-@pytest.mark.parametrize("some", [slice(None), slice(0, 5)], ids=["all", "some"])
+@pytest.mark.parametrize("some", [slice(None), slice(0, VIEWS - 3)], ids=["all", "most"])
 def test_mirrored_views_are_named(clean: CameraCalibrationResult, examination: Examination, some: slice) -> None:
     pixels = clean.observations.pixels().unflatten(1, (BOARD.rows, BOARD.columns))
     pixels[some] = pixels[some].flip(2)
@@ -149,6 +149,16 @@ def test_mirrored_views_are_named(clean: CameraCalibrationResult, examination: E
     verdict = camera_verdict(result, OPTIONS, examination=examination)
     assert verdict.stops[0].name == "mirrored"
     assert not verdict.usable
+
+
+def test_a_few_mirrored_views_are_left_out_and_named(clean: CameraCalibrationResult, examination: Examination) -> None:
+    pixels = clean.observations.pixels().unflatten(1, (BOARD.rows, BOARD.columns))
+    pixels[:2] = pixels[:2].flip(2)
+    result = calibrate_camera(observed(pixels.flatten(1, 2)), OPTIONS)
+    verdict = camera_verdict(result, OPTIONS, examination=examination)
+    (named,) = [finding.text for finding in verdict.findings if "mirrored" in finding.text]
+    assert all(name in named for name in result.observations.names[:2])
+    assert not any(finding.name == "mirrored" for finding in verdict.findings)
 
 
 def test_blur_is_named_by_noise_and_by_what_corners_say(poses: tuple[Tensor, Tensor]) -> None:

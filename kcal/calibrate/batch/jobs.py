@@ -26,6 +26,7 @@ from kcal.corners.detect import detect_board, view_of
 from kcal.corners.images import decode_gray, expand_images, unique_names
 from kcal.corners.observations import Failure, Observations, PackedCovariance, Pixel, View
 from kcal.corners.refine import Refinement
+from kcal.corners.sizes import common_size, rescaled
 from kcal.errors import FileError, InputError, KcalError
 from kcal.files import read_bytes
 from kcal.io.camera_file import CameraFile
@@ -184,34 +185,35 @@ def detect_image(path: str, board: Board, options: BatchOptions) -> Detected:
         return Detected(size=size, pixels=view.pixels, covariance=view.covariance)
 
 
-def observations_of(job: CameraJob, pieces: list[Detected], digests: list[str], refine: Refinement) -> Observations:
-    """Put the pieces of one camera's images together.
+def observations_of(
+    job: CameraJob, pieces: list[Detected], digests: list[str], refine: Refinement
+) -> tuple[Observations, str]:
+    """Put the pieces of one camera's images together; also what was done about images of several sizes.
 
     Raises:
-        InputError: images of several sizes, or no board in any.
+        InputError: images that were cropped or rotated, or no board in any.
     """
     assert job.board is not None
     names = unique_names(list(job.images))
-    sizes = [piece.size for piece in pieces if piece.size is not None]
-    different = sorted(set(sizes))
-    if len(different) > 1:
-        shown = ", ".join(f"{sizes.count(size)} of {size[0]}x{size[1]}" for size in different)
-        raise InputError(f"images of different sizes: {shown}; give the images of one camera at one resolution")
     views, failures = [], []
-    for name, path, piece, digest in zip(names, job.images, pieces, digests, strict=True):
+    common = common_size(names, [piece.size for piece in pieces]) if any(piece.size for piece in pieces) else None
+    for i, (name, path, piece, digest) in enumerate(zip(names, job.images, pieces, digests, strict=True)):
         if piece.pixels is None:
             failures.append(Failure(name=name, reason=piece.reason))
             continue
-        views.append(View(name=name, pixels=piece.pixels, covariance=piece.covariance, image=str(path), sha256=digest))
-    if not views:
+        view = View(name=name, pixels=piece.pixels, covariance=piece.covariance, image=str(path), sha256=digest)
+        assert common is not None
+        views.append(rescaled(view, common.scales[i]) if i in common.scales else view)
+    if not views or common is None:
         raise InputError(f"no board in any of {len(pieces)} images ({failures[0].name}: {failures[0].reason})")
-    return Observations(
+    seen = Observations(
         board=job.board,
-        image_size=different[0],
+        image_size=common.size,
         refinement=refine,
         views=tuple(views),
         failures=tuple(failures),
     )
+    return seen, common.note
 
 
 def calibration_options(model: str, options: BatchOptions) -> CalibrationOptions:

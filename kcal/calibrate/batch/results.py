@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -31,6 +32,7 @@ from kcal.calibrate.camera.sharing import ALONE, sharing
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, KcalError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
+from kcal.lens.paraxial import paraxial_focal
 from kcal.native_file import NativeFile
 from kcal.strict_json import MOST_BYTES, read_json
 from kcal.texts import csv_line
@@ -39,7 +41,11 @@ Piece = TypeVar("Piece", bound=NativeFile)
 
 
 class SummaryRow(NamedTuple):
-    """One camera in the table; `failures` counts images without a board."""
+    """One camera in the table.
+
+    `failures` counts images without a board. `focal` is the focal length on the optical axis, the mean of both axes;
+    fx and fy are parameters of the lens model.
+    """
 
     camera: str
     status: str
@@ -55,6 +61,8 @@ class SummaryRow(NamedTuple):
     cx: float | None = None
     cy: float | None = None
     sigma_fx: float | None = None
+    focal: float | None = None
+    sigma_focal: float | None = None
     warnings: str = ""
     error: str = ""
 
@@ -132,6 +140,8 @@ class Results:
         self._pieces: list[list[Detected | None]] = [[None] * len(job.images) for job in jobs]
         self._digests: list[list[str]] = [[""] * len(job.images) for job in jobs]
         self._views: dict[int, Observations] = {}
+        # What was done about images of several sizes.
+        self._notes: dict[int, str] = {}
         self._calibrated: dict[int, Calibrated] = {}
 
     def tasks(self, advance: Callable[[str], None]) -> Iterator[Task]:
@@ -182,7 +192,7 @@ class Results:
         if len(pieces) < len(job.images):
             return []
         try:
-            seen = observations_of(job, pieces, self._digests[number], self.options.refine)
+            seen, self._notes[number] = observations_of(job, pieces, self._digests[number], self.options.refine)
         except KcalError as error:
             self._finish(number, Calibrated(error=str(error)))
             return []
@@ -264,12 +274,15 @@ class Results:
             failures=len(job.images) - views,
             width=seen.image_size[0] if seen is not None else None,
             height=seen.image_size[1] if seen is not None else None,
-            warnings="; ".join(result.warnings),
+            warnings="; ".join(filter(None, (self._notes.get(number), *result.warnings))),
             error=result.error,
         )
         if camera is None or camera.calibration is None:
             return row
+        focal, sigma_focal = paraxial_focal(camera.camera()).mean
         return row._replace(
+            focal=focal,
+            sigma_focal=None if math.isnan(sigma_focal) else sigma_focal,
             rms=camera.calibration.rms,
             fx=camera.intrinsics.fx,
             fy=camera.intrinsics.fy,

@@ -14,11 +14,15 @@ from kcal.lens.camera import Camera
 _RASTER = 160
 # A calibration from fewer views leaves σ of the focal length above one part in a thousand with 0.1 px of noise.
 _FEW_VIEWS = 10
+# Names of more parts of the image than this are not read.
+_MANY_PARTS = 3
 # In a share of the image that is larger than this no board was seen: worth a picture.
 _LARGE_SHARE = 0.1
 # Rolls within ±25° more than double σ of the principal point; rolls up to 90° are nearly as good as any.
 ROLL_SPAN = 60.0
-_STEEP = 20.0
+STEEP = 20.0
+# Boards that are rolled by less than this about one direction leave aspect, print and principal point confounded.
+_UPRIGHT = 20.0
 
 
 def reached(observations: Observations, columns: int, rows: int) -> Tensor:
@@ -61,16 +65,16 @@ def what_to_photograph(observations: Observations, camera: Camera, rotation: Ten
     """
     rotation = rotation[rotation.isfinite().all(-1).all(-1)]
     advice = []
-    if int((board_tilts(rotation) > _STEEP).sum()) < 4:
+    if int((board_tilts(rotation) > STEEP).sum()) < 4:
         advice.append("tilt the board by 30 to 45 degrees in different directions: tilts determine the focal length")
     if (span := roll_span(rotation)) < ROLL_SPAN:
         advice.append(
-            f"roll the board by 90 degrees in some views (so far within {span:.0f} degrees): otherwise the principal "
-            "point and the print of the board cannot be told apart"
+            f"roll the board by 90 degrees in a third of the views (so far within {span:.0f} degrees): rolls tell the "
+            "principal point from the print of the board"
         )
     place = _emptiest(_raster(observations))
     if place:
-        advice.append(f"show the board in the {place} of the image: what no board reached rests on the prior alone")
+        advice.append(f"show the board in the {place} of the image: where no board was, the lens is extrapolated")
     if len(rotation) < _FEW_VIEWS:
         advice.append(f"take more views: {len(rotation)} are few, 20 to 40 are good")
     return tuple(advice)
@@ -109,6 +113,31 @@ def roll_span(rotation: Tensor) -> float:
     return 360.0 - float(gaps.max()) if len(gaps) else 0.0
 
 
+def roll_warnings(rotation: Tensor) -> list[str]:
+    """A warning where every view shows the board the same way up, or upside down.
+
+    The height of the image's pixels over their width, the same ratio of the board's squares, and the principal point
+    then do nearly the same to all views.
+
+    Args:
+        rotation: (V, 3, 3) cam_from_board; NaN for views that were left out.
+
+    Example:
+        >>> roll_warnings(torch.eye(3).expand(12, 3, 3))[0][:57]
+        'all 12 views show the board upright (rolled by at most 0°'
+    """
+    rolls = board_rolls(rotation[rotation.isfinite().all(-1).all(-1)])
+    for middle, held in ((0.0, "upright"), (90.0, "on its side")):
+        away = ((rolls - middle + 90.0) % 180.0 - 90.0).abs()
+        if len(away) and float(away.max()) <= _UPRIGHT:
+            return [
+                f"all {len(rolls)} views show the board {held} (rolled by at most {float(away.max()):.0f}°): pixels "
+                "that are not square, a stretched print and a shifted principal point look alike in such views; turn "
+                "the board or the camera by 90° for a third of the views"
+            ]
+    return []
+
+
 def _emptiest(seen: Tensor) -> str:
     """The name of the corner or side of the image that boards reached least; empty where all of them were reached."""
     rows, columns = seen.shape
@@ -122,4 +151,6 @@ def _emptiest(seen: Tensor) -> str:
         return ""
     worst = max(names.values())
     poor = [name for name, share in names.items() if share > max(0.5, 0.9 * worst)]
+    if len(poor) > _MANY_PARTS:
+        return "corners and along the sides" if "middle" not in poor else "middle, the corners and along the sides"
     return ", ".join(poor) if poor else max(names, key=lambda name: names[name])

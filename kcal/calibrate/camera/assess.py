@@ -12,12 +12,12 @@ from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.covariance import Uncertainty, noise_variance, uncertainty_of
 from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.priors import GaussianPrior
+from kcal.calibrate.camera.determined import check_directions
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.solve import Solution
 from kcal.calibrate.camera.warnings import (
     NO_ERROR_BARS,
-    check_focal,
     general_warnings,
     outlier_warnings,
     prior_warnings,
@@ -34,7 +34,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
     """The result of a calibration, from its solution.
 
     Raises:
-        DegenerateError: the focal length is hardly determined.
+        DegenerateError: the views hardly determine where the camera sees what they show.
     """
     problem, solved = solution.problem, solution.result
     state = problem.tidy(solved.state)
@@ -49,13 +49,23 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
     free = problem.free
     slot = {camera.names[i]: k for i, k in zip(free.indices, free.slots, strict=True)}
     unknowns = [" = ".join(name for name in slot if slot[name] == k) for k in range(len(free))]
+    spread = _by_parameter(uncertainty, free, len(camera.names))
     sigma = {name: float(uncertainty.sigma[k]) if bool(uncertainty.determined[k]) else None for name, k in slot.items()}
     fixed = tuple(name for name in camera.names if name in solution.views.constraints.fixed)
     sigma = {name: sigma.get(name) for name in camera.names if name in slot or name in fixed}
     status = SolverStatus(int(solved.status))
     doubts = []
     if uncertainty.computed:
-        check_focal({name: float(uncertainty.sigma[k]) for name, k in slot.items()}, state.parameters)
+        open_focal = any(not bool(uncertainty.determined[slot[name]]) for name in ("fx", "fy") if name in slot)
+        check_directions(
+            state.parameters,
+            problem.model,
+            problem.points(state)[1].transpose(-1, -2),
+            problem.seen,
+            torch.full_like(spread, torch.inf) if open_focal else spread,
+            state.rotation,
+            observations.names,
+        )
         lost = [name for name, known in zip(unknowns, uncertainty.determined.tolist(), strict=False) if not known]
     else:
         # Unknown is not the same as undetermined by the views.
@@ -79,7 +89,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
         led_by_prior=_led_by_prior(solution, camera.names, slot, uncertainty),
         status=status,
         iterations=solution.spent,
-        covariance=_by_parameter(uncertainty, free, len(camera.names)),
+        covariance=spread,
         information=information,
         warnings=(
             *general_warnings(observations.names, camera, rms, per_view, lost, status),

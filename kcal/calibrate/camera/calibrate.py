@@ -10,7 +10,8 @@ import torch
 
 from kcal.calibrate.bundle.batching import together
 from kcal.calibrate.camera.assess import assess
-from kcal.calibrate.camera.hybrid import calibrate_hybrid
+from kcal.calibrate.camera.checks import MINIMUM_VIEWS, unusable_views
+from kcal.calibrate.camera.leave_out import calibrate_what_fits, listed_views, without_views
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.outliers import solve_without_outliers
 from kcal.calibrate.camera.repeats import copied_views, copy_warnings, pose_warnings
@@ -19,7 +20,7 @@ from kcal.calibrate.camera.sharing import ALONE, sharing
 from kcal.calibrate.camera.solve import solve
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
-from kcal.errors import InputError, KcalError
+from kcal.errors import DegenerateError, InputError, KcalError
 
 __all__ = ["CalibrationOptions", "CameraCalibrationResult", "calibrate_camera", "calibrate_cameras"]
 
@@ -43,8 +44,9 @@ def calibrate_camera(
     found and solved again.
 
     Args:
-        observations: the views of one camera. Copies of other views, compressed again or not, are left out with a
-            warning.
+        observations: the views of one camera. Left out with a warning that names them are copies of other views,
+            compressed again or not, views whose corners do not determine the board's pose, and with the hybrid lens a
+            few views that no lens fits.
         options: see `CalibrationOptions`.
         progress: called with what has just been finished.
 
@@ -80,6 +82,14 @@ def calibrate_camera(
     if options.camera is not None and not options.free:
         # Each view is for itself.
         return _calibrate(observations, options, progress)
+    if unusable := unusable_views(observations.board.points, observations.pixels()):
+        kept = [name for i, name in enumerate(observations.names) if i not in unusable]
+        if len(kept) < MINIMUM_VIEWS:
+            raise DegenerateError(
+                f"{len(kept)} view(s) of the board can be used, and at least {MINIMUM_VIEWS} at different tilts are "
+                f"needed, 10 to 40 are good; of no use: {listed_views(observations, unusable)}"
+            )
+        return without_views(calibrate_camera(observations.subset(kept), options, progress), observations, unusable)
     pixels, copied = observations.pixels(), copied_views(observations.pixels(), 0.0)
     result = _calibrate(_without_copies(observations, copied), options, progress)
     if (nearly := copied_views(pixels, result.noise)) != copied:
@@ -118,7 +128,7 @@ def _complete(
 
 def _calibrate(observations: Observations, options: CalibrationOptions, progress: Progress) -> CameraCalibrationResult:
     if options.hybrid:
-        return calibrate_hybrid(observations, options, progress)
+        return calibrate_what_fits(observations, options, progress)
     if options.reject is None:
         return assess(observations, solve(observations, options, progress), options)
     kept = solve_without_outliers(observations, options, options.reject, progress)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.covariance import uncertainty_of
-from kcal.calibrate.camera.warnings import check_focal
+from kcal.calibrate.camera.determined import check_directions
 from kcal.errors import DegenerateError
 from kcal.lens.projection import parameter_names
 from kcal.solve.implicit import Curvature, curvature
@@ -61,7 +62,11 @@ def exact_minimum(problem: BoardProblem, state: BoardState) -> tuple[BoardState,
                 f"the views do not determine {', '.join(dict.fromkeys(lost))}, and the solution has no derivatives: "
                 "fix parameters, choose a smaller model, add views or priors"
             )
-        check_focal({name: float(known.sigma[k]) for k, group in enumerate(groups) for name in group}, state.parameters)
+        slots, places = torch.tensor(problem.free.slots), torch.tensor(problem.free.indices)
+        spread = state.parameters.new_zeros(2 * (len(state.parameters),))
+        spread[places[:, None], places] = known.covariance[slots[:, None], slots]
+        points = problem.points(state)[1].transpose(-1, -2)
+        check_directions(state.parameters, problem.model, points, problem.seen, spread, state.rotation)
     return state, found
 
 

@@ -15,8 +15,10 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import what_to_photograph
+from kcal.calibrate.camera.advice import roll_warnings, what_to_photograph
+from kcal.calibrate.camera.capture_warnings import motion_warnings, pixel_warnings
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
+from kcal.calibrate.camera.determined import check_directions
 from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection
 from kcal.calibrate.camera.outliers import (
     check_share,
@@ -26,8 +28,9 @@ from kcal.calibrate.camera.outliers import (
     view_rms,
     views_beyond,
 )
+from kcal.calibrate.camera.pupil_check import pupil_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
-from kcal.calibrate.camera.warnings import check_focal, general_warnings, hybrid_warnings, outlier_warnings
+from kcal.calibrate.camera.warnings import general_warnings, hybrid_warnings, outlier_warnings
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
@@ -144,7 +147,7 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
     """The result of a fit, with its warnings.
 
     Raises:
-        DegenerateError: the focal length is hardly determined.
+        DegenerateError: the views hardly determine where the camera sees what they show.
     """
     camera, covariance = fit.camera, fit.covariance
     per_view = fit.residuals.square().sum(-1).nanmean(-1).sqrt()
@@ -152,7 +155,15 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
     sigma: dict[str, float | None] = {
         name: float(value) for name, value in zip(camera.names, spread, strict=True) if name != "skew"
     }
-    check_focal({name: float(spread[i]) for i, name in enumerate(("fx", "fy"))}, camera.params)
+    check_directions(
+        camera.params,
+        camera.model,
+        fit.board_points @ fit.state.rotation.transpose(-1, -2) + fit.state.translation[:, None],
+        fit.residuals.isfinite().all(-1),
+        covariance,
+        fit.state.rotation,
+        observations.names,
+    )
     status = SolverStatus.CONVERGED if fit.converged else SolverStatus.ITERATION_LIMIT
     used = [i for i in range(len(per_view)) if not math.isnan(float(per_view[i]))]
     return CameraCalibrationResult(
@@ -175,6 +186,10 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
         warnings=(
             *general_warnings([observations.names[i] for i in used], camera, fit.rms, per_view[used], (), status),
             *hybrid_warnings(fit),
+            *motion_warnings(fit),
+            *pixel_warnings(fit),
+            *pupil_warnings(camera, covariance),
+            *(roll_warnings(fit.state.rotation) if options.board == "printed" else ()),
             *outlier_warnings(observations.names, fit.residuals),
         ),
     )

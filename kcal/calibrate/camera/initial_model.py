@@ -16,6 +16,7 @@ from kcal.calibrate.bundle.closed_form import (
 )
 from kcal.calibrate.bundle.poses import poses_under, unflip
 from kcal.calibrate.bundle.views import CameraViews
+from kcal.calibrate.camera.checks import least_planar
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -28,7 +29,7 @@ _SUSPICIOUS_RMS = 2.0
 
 
 def first_model(
-    views: CameraViews, model: LensModel, focal: float | None, solver: LMOptions
+    views: CameraViews, model: LensModel, focal: float | None, solver: LMOptions, names: Sequence[str]
 ) -> tuple[BoardState, BoardState, int]:
     """Solve the first model from closed forms.
 
@@ -37,6 +38,7 @@ def first_model(
         model: the first model.
         focal: a focal length to try first, or None.
         solver: options.
+        names: of the views, for the message.
 
     Returns:
         the solution, the initial state without distortion, and the trial steps spent.
@@ -74,7 +76,10 @@ def first_model(
         if best is not None and (2.0 * best[0] / views.corner_count) ** 0.5 < _SUSPICIOUS_RMS:
             break
     if best is None:
-        raise InputError("no initial values explain the corners: are all views of this board and from this camera?")
+        raise InputError(
+            "no initial values explain the corners. Look first at "
+            f"{least_planar(views.board_points, views.pixels, names)}: remove what is not this board and this camera"
+        )
     return best[1], best[2], spent
 
 
@@ -86,5 +91,8 @@ def known_model(camera: Camera, views: CameraViews, names: Sequence[str]) -> Boa
     state, _ = poses_under(camera, views, LMOptions(max_iterations=30))
     poor = state.translation.isnan().any(-1).nonzero()[:, 0].tolist()
     if poor:
-        raise InputError(f"view {names[poor[0]]!r}: the known camera gives too few of its corners a ray")
+        raise InputError(
+            f"view {names[poor[0]]!r}: the known camera gives too few of its corners a ray; remove the view, or "
+            "calibrate without a known camera"
+        )
     return state

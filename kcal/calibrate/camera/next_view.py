@@ -19,6 +19,7 @@ from kcal.calibrate.lensfit.board_modes import board_modes
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
+from kcal.lens.paraxial import paraxial_focal
 from kcal.lens.pose import rotation_from_vector, step_rows
 from kcal.lens.projection import project_components
 from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
@@ -96,7 +97,7 @@ def possible_views(camera: Camera, board: Board) -> BoardViews:
         columns = {"left": margin, "": 0.5 * width, "right": width - margin}
         places = list(itertools.product(rows.items(), columns.items()))
         rays, valid = camera.unproject(torch.tensor([[u, v] for (_, v), (_, u) in places], dtype=torch.float64))
-        distance = extent * float(camera.focal.min()) / (fill * side)
+        distance = extent * float(paraxial_focal(camera).value.min()) / (fill * side)
         size = "near" if fill == _FILLS[-1] else "far"
         for ((up, _), (across, _)), ray in zip(_kept(places, valid), rays[valid], strict=True):
             place = " ".join(filter(None, (up, across))) or "middle"

@@ -16,6 +16,8 @@ from kcal.solve.lm import LMOptions
 from kcal.solve.robust import RobustLoss
 
 HYBRID = "hybrid"
+# Degrees across the image from which lenses are nearer to an equidistant image than to a perspective one.
+_WIDE = 90.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,7 +58,9 @@ class CalibrationOptions:
             them. None, the default: every corner counts, and a warning reports outliers. A calibration that quietly
             selects its data has an RMS that cannot be compared with others, and outliers are often the model's fault.
         focal: roughly known focal length in pixels (from EXIF or the field of view), tried first as a start, or None.
-        field_of_view: likewise as the image's horizontal field of view in degrees, below 180.
+        field_of_view: likewise as the image's horizontal field of view in degrees: below 180 for a perspective lens
+            model, below 360 for the hybrid lens and a fisheye. From 90 degrees on, these two begin with an equidistant
+            image, of focal length width / angle.
         fixed: parameters held at a value, by name; None as the value means the image's center for cx and cy, and 0 for
             skew and coefficients.
         tied: groups of names whose values are kept equal, as (("fx", "fy"),).
@@ -97,8 +101,13 @@ class CalibrationOptions:
     def __post_init__(self) -> None:
         if self.focal is not None and not 0 < self.focal < float("inf"):
             raise InputError(f"CalibrationOptions: focal must be positive pixels, got {self.focal}")
-        if self.field_of_view is not None and not 0 < self.field_of_view < 180:
-            raise InputError(f"CalibrationOptions: field_of_view must be in (0, 180) degrees, got {self.field_of_view}")
+        if self.field_of_view is not None and not 0 < self.field_of_view < 360:
+            raise InputError(f"CalibrationOptions: field_of_view must be in (0, 360) degrees, got {self.field_of_view}")
+        if self.field_of_view is not None and self.field_of_view >= 180 and not (self.hybrid or self.lens.fisheye):
+            raise InputError(
+                f"CalibrationOptions: field_of_view is {self.field_of_view:g} degrees, and the lens model {self.lens} "
+                "has less than 180; use the hybrid lens (leave the model out) or fisheye4"
+            )
         if self.focal is not None and self.field_of_view is not None:
             raise InputError("CalibrationOptions: focal and field_of_view are alternatives; give one")
         if self.weak_prior is not None and not 0 < self.weak_prior < float("inf"):
@@ -156,4 +165,7 @@ class CalibrationOptions:
         """The focal length to begin with, if one is given."""
         if self.field_of_view is None:
             return self.focal
-        return 0.5 * size[0] / math.tan(0.5 * math.radians(self.field_of_view))
+        angle = math.radians(self.field_of_view)
+        if self.field_of_view >= _WIDE and (self.hybrid or self.lens.fisheye):
+            return size[0] / angle
+        return 0.5 * size[0] / math.tan(0.5 * angle)

@@ -240,6 +240,6 @@ def check_share(gone: int, total: int, views: Sequence[RejectedView], limit: flo
     raise InputError(
         f"{gone} of {total} corners ({100 * gone / total:.0f} %)"
         + (f", with the whole views {names}," if views else "")
-        + f" do not agree with the rest, more than the {100 * limit:.0f} % that may be left out. Check the board, its "
-        "size, the corners' order, the lens model, and these images"
+        + f" do not agree with the rest, more than the {100 * limit:.0f} % that may be left out (--reject-limit). "
+        "Check the board, its size, the corners' order, the lens model, and these images"
     )

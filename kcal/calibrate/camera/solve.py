@@ -14,7 +14,7 @@ from kcal.calibrate.bundle.poses import unflip
 from kcal.calibrate.bundle.priors import Term
 from kcal.calibrate.bundle.views import CameraViews
 from kcal.calibrate.bundle.weights import whitening
-from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
+from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views, least_planar
 from kcal.calibrate.camera.initial_model import first_model, known_model
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.search.direct_solve import solve_directly
@@ -106,7 +106,7 @@ def solve_corners(
     if options.camera is None:
         models = [lens for lens in nested_models(model) if constraints.allows(lens)]
         rough = _ROUGH if weak_prior is not None and len(models) > 1 else solver
-        first, undistorted, spent = first_model(views, models[0], options.start_focal(size), rough)
+        first, undistorted, spent = first_model(views, models[0], options.start_focal(size), rough, names)
     else:
         models = [model]
         first = undistorted = known_model(options.camera, views, names)
@@ -126,7 +126,9 @@ def solve_corners(
     result = minimum.result
     if result.status == SolverStatus.BAD_START:
         raise InputError(
-            "the lens cannot show all corners where they are: are all views of this board and this camera?"
+            f"the lens {model} cannot show all corners where they are. Look first at "
+            f"{least_planar(board_points, pixels, names)}: remove what is not this board and this camera, or leave the "
+            "model out (the default lens leaves wrong views out)"
         )
     problem = views.lens_problem(model, terms=minimum.terms)
     if len(models) > 1:

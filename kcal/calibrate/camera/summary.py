@@ -8,8 +8,9 @@ import math
 import torch
 
 from kcal.calibrate.camera.advice import unreached_share
+from kcal.calibrate.camera.pupil_check import corner_pupil
 from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.lens.pupil import pupil_depth
+from kcal.lens.paraxial import ParaxialFocal, paraxial_focal
 from kcal.lens.uncertainty import image_sigma
 
 
@@ -26,6 +27,7 @@ class CalibrationSummary:
         pupil: meters by which the entrance pupil of the image's farthest corner lies before that of its middle; None
             without a hybrid lens.
         pupil_sigma: its standard deviation.
+        focal: the focal lengths on the optical axis, with their standard deviations.
 
     Example:
         >>> CalibrationSummary(center=0.05, border=0.2, worst=0.5, unreached=0.1).pupil is None
@@ -38,6 +40,7 @@ class CalibrationSummary:
     unreached: float
     pupil: float | None = None
     pupil_sigma: float | None = None
+    focal: ParaxialFocal | None = None
 
 
 def summarize(result: CameraCalibrationResult) -> CalibrationSummary:
@@ -68,28 +71,16 @@ def summarize(result: CameraCalibrationResult) -> CalibrationSummary:
         edge = torch.cat([sigma[0], sigma[-1], sigma[1:-1, 0], sigma[1:-1, -1]])
         center, border = float(sigma[rows // 2, columns // 2]), float(edge.nanmedian())
         worst = float(sigma[sigma.isfinite()].max())
-    pupil, pupil_sigma = _pupil(result)
+    pupil = corner_pupil(camera, result.covariance)
     return CalibrationSummary(
         center=center,
         border=border,
         worst=worst,
         unreached=unreached_share(result.observations),
-        pupil=pupil,
-        pupil_sigma=pupil_sigma,
+        pupil=None if pupil is None else pupil.depth,
+        pupil_sigma=None if pupil is None else pupil.sigma,
+        focal=paraxial_focal(camera),
     )
-
-
-def _pupil(result: CameraCalibrationResult) -> tuple[float | None, float | None]:
-    camera = result.camera
-    if not camera.model.hybrid:
-        return None, None
-    rays, valid = camera.unproject(camera.grid(17, 13).reshape(-1, 2))
-    angle = torch.acos(rays[valid][:, 2].clamp(-1.0, 1.0)).max()
-    place = [camera.names.index(name) for name in ("pupil1", "pupil2")]
-    slope = torch.stack([angle**2, angle**4])
-    depth = pupil_depth(angle[None] ** 2, camera.params.detach()[5:])
-    variance = slope @ result.covariance[place][:, place] @ slope
-    return float(depth[0]), math.sqrt(float(variance))
 
 
 def distances_text(result: CameraCalibrationResult) -> str:

@@ -26,6 +26,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.difference import CameraDifference, camera_difference
+from kcal.lens.paraxial import paraxial_focal
 from kcal.solve.lm import LMOptions
 
 # Views that each half must have: fewer often do not determine a camera.
@@ -160,7 +161,10 @@ def examine(
 
 def _reference_options(result: CameraCalibrationResult, options: CalibrationOptions) -> CalibrationOptions:
     return CalibrationOptions(
-        weighted=options.weighted, reject=options.reject, focal=float(result.camera.focal[0]), motion=options.motion
+        weighted=options.weighted,
+        reject=options.reject,
+        focal=float(paraxial_focal(result.camera).value[0]),
+        motion=options.motion,
     )
 
 

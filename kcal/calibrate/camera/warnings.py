@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -13,12 +12,9 @@ from kcal.calibrate.bundle.priors import GaussianPrior, Term
 from kcal.calibrate.camera.outliers import corners_beyond
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.calibrate.search.model_ladder import Minimum
-from kcal.errors import DegenerateError
 from kcal.lens.camera import Camera
 from kcal.solve.result import SolverStatus
 
-# A less certain focal length is no calibration: 5 % of range at every distance.
-_MAX_FOCAL_SIGMA = 0.05
 # Another solution with a χ² higher by less than this cannot be excluded: 14 parameters more gain as much by chance.
 _CLOSE_RIVAL = 25.0
 # Mean square of the differences from priors, in their standard deviations, beyond which the data contradict them.
@@ -32,23 +28,6 @@ _FAR_CENTER = 3.0
 NO_ERROR_BARS = (
     "no error bars: σ cannot be computed, because a corner lies where the lens model folds; choose a smaller model"
 )
-
-
-def check_focal(sigma: Mapping[str, float], parameters: Tensor) -> None:
-    """Raise `DegenerateError` where the focal length is hardly determined: that is no calibration.
-
-    Args:
-        sigma: standard deviations of the free parameters by name, infinite where not determined; NaN counts as that.
-        parameters: (5 + P,).
-    """
-    shares = [sigma.get(name, 0.0) / float(parameters[i]) for i, name in enumerate(("fx", "fy"))]
-    worst = max(math.inf if math.isnan(share) else share for share in shares)
-    if not worst <= _MAX_FOCAL_SIGMA:
-        known = "not at all" if math.isinf(worst) else f"only to ±{100 * worst:.1f} %"
-        raise DegenerateError(
-            f"the views determine the focal length {known}: they are parallel to the image or too similar; add views "
-            "with the board tilted by 30 to 45 degrees in different directions, or choose a smaller model"
-        )
 
 
 def prior_warnings(terms: Sequence[Term], state: BoardState, noise: float) -> list[str]:
@@ -101,15 +80,15 @@ def hybrid_warnings(fit: HybridFit) -> list[str]:
     found = []
     if fit.tempering > REPEATING:
         found.append(
-            f"residuals repeat within views (tempering {fit.tempering:.1f}): blur, motion or a board that flexes; "
-            "error bars are widened for it"
+            f"residuals repeat within views (tempering {fit.tempering:.1f}, where noise alone gives 1): blur, motion "
+            "or a board that flexes; error bars are widened for it; use a stiff board, a stand and a short exposure"
         )
     off = (fit.state.params[2:4] - fit.families.mean[1:3]).norm() / fit.families.log_unit[1].exp()
     if float(off) > _FAR_CENTER:
         cx, cy = (float(value) for value in fit.state.params[2:4])
         found.append(
-            f"the principal point ({cx:.0f}, {cy:.0f}) is far from the middle of the image: is the image cropped, or "
-            "are the views too similar?"
+            f"the principal point ({cx:.0f}, {cy:.0f}) is far from the middle of the image: give images that are not "
+            "cropped, and turn the board by 90 degrees in a third of the views"
         )
     return found
 
@@ -127,8 +106,8 @@ def outlier_warnings(names: Sequence[str], residuals: Tensor) -> list[str]:
     view, corner = divmod(int(length.argmax()), length.shape[1])
     return [
         f"{count} of {int(residuals.isfinite().all(-1).sum())} corners are farther off than noise explains, corner "
-        f"{corner} of view {names[view]} by {float(length.max()):.2f} px: check them, choose a richer model, or "
-        "leave them out (reject)"
+        f"{corner} of view {names[view]} by {float(length.max()):.2f} px: look at them, and leave wrong ones out "
+        "(--reject); a parametric lens may need a richer model"
     ]
 
 
@@ -146,10 +125,15 @@ def general_warnings(
         status: of the solver.
     """
     found = []
+    hybrid = camera.model.hybrid is not None
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
-        found.append(f"the solver {status.message}")
+        rest = ": the camera may be farther off than its error bars say; add views, and see which of them fit worst"
+        found.append(f"the solver {status.message}{rest if hybrid else ''}")
     if rms > 1.0:
-        found.append(f"RMS {rms:.2f} px is high: corners, board or lens model do not fit each other")
+        found.append(
+            f"RMS {rms:.2f} px is high: corners, board and lens model do not fit each other; check the board's size, "
+            "and look at the views that fit worst"
+        )
     typical = float(per_view.median())
     for i in (per_view > max(3.0 * typical, 0.1)).nonzero()[:, 0].tolist():
         found.append(f"view {names[i]}: RMS {float(per_view[i]):.2f} px is high, {typical:.2f} px is typical; check it")
@@ -158,8 +142,14 @@ def general_warnings(
     if not bool(camera.covers_image()):
         _, valid = camera.unproject(camera.grid(33, 25))
         share = 100.0 * float((~valid).double().mean())
-        found.append(
-            f"the lens model folds inside the image: {share:.0f} % of it has no ray; choose a smaller model, or add "
-            "views with corners there"
-        )
+        if hybrid:
+            found.append(
+                f"{share:.0f} % of the image has no ray: no board was there, and the lens found from the rest ends "
+                "before; if the lens shows anything there, add views with the board in these parts"
+            )
+        else:
+            found.append(
+                f"the lens model folds inside the image: {share:.0f} % of it has no ray; choose a smaller model, or "
+                "add views with corners there"
+            )
     return found

@@ -14,8 +14,9 @@ from kcal.calibrate.bundle.covariance import Covariance, covariance, projection_
 from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.camera import assess
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.warnings import check_focal
+from kcal.calibrate.camera.determined import check_directions
 from kcal.errors import DegenerateError, InputError
+from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.projection import project_components
 from kcal.solve.lm import LMOptions, minimize
@@ -188,9 +189,14 @@ class TestWhatCannotBeComputed:
         assert bool(found.sigma.isinf().all())
 
     def test_the_focal_length_counts_as_unknown(self) -> None:
-        parameters = torch.tensor([500.0, 500.0], dtype=torch.float64)
-        with pytest.raises(DegenerateError, match="not at all"):
-            check_focal({"fx": 1.0, "fy": math.nan}, parameters)
+        parameters = torch.tensor([500.0, 500.0, 320.0, 240.0, 0.0], dtype=torch.float64)
+        rotation, translation = motions(camera("pinhole"), 4, 3)
+        points = BOARD.points @ rotation.mT + translation[:, None]
+        seen = torch.ones(points.shape[:2], dtype=torch.bool)
+        for unknown in (math.nan, math.inf):
+            spread = torch.diag(torch.tensor([1.0, unknown, 1.0, 1.0, 0.0], dtype=torch.float64))
+            with pytest.raises(DegenerateError, match="not at all"):
+                check_directions(parameters, LensModel(), points, seen, spread, rotation)
 
     def test_the_calibration_is_returned_without_error_bars(self, monkeypatch: pytest.MonkeyPatch) -> None:
         poses = motions(camera(), 8, 3)

@@ -116,6 +116,19 @@ def test_a_field_of_view_is_a_start() -> None:
     assert values(hinted) == pytest.approx(values(plain), rel=1e-5, abs=1e-6)
 
 
+@pytest.mark.parametrize("model", ["hybrid", "fisheye4"])
+def test_a_wide_field_of_view_begins_equidistant(model: str) -> None:
+    """A perspective image has none of 180 degrees; below 90 degrees it is as good a start."""
+    for degrees in (90.0, 150.0, 180.0, 230.0):
+        options = CalibrationOptions(model=model, field_of_view=degrees)
+        assert options.start_focal(SIZE) == pytest.approx(SIZE[0] / math.radians(degrees))
+    narrow = CalibrationOptions(model=model, field_of_view=60.0).start_focal(SIZE)
+    assert narrow == pytest.approx(0.5 * SIZE[0] / math.tan(math.radians(30.0)))
+    assert CalibrationOptions(model="opencv5", field_of_view=150.0).start_focal(SIZE) == pytest.approx(
+        0.5 * SIZE[0] / math.tan(math.radians(75.0))
+    )
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -130,7 +143,8 @@ def test_a_field_of_view_is_a_start() -> None:
         ({"priors": {"fx": (3.0, 0.0)}}, "positive standard deviation"),
         ({"tied": (("fx",),)}, "two parameters"),
         ({"tied": (("fx", "fy"), ("fy", "cx"))}, "fy is tied twice"),
-        ({"field_of_view": 180.0}, "field_of_view must be"),
+        ({"field_of_view": 180.0}, "opencv5 has less than 180; use the hybrid lens"),
+        ({"field_of_view": 360.0, "model": "hybrid"}, "field_of_view must be"),
         ({"field_of_view": 60.0, "focal": 500.0}, "give one"),
     ],
 )

@@ -1,0 +1,58 @@
+"""Warnings about how views were taken: motion while rows were read, and images that were stretched."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from kcal.calibrate.lensfit.hybrid_fit import HybridFit
+from kcal.calibrate.lensfit.readout import LARGEST
+
+# A motion is worth a stand if it moves corners by so many standard deviations of their noise.
+_FELT = 5.0
+# A share of the largest motion, from which it is at its limit.
+_LIMIT = 0.9
+
+
+def motion_warnings(fit: HybridFit) -> list[str]:
+    """A warning where the camera or the board moved while an image was read, with how much that moved corners."""
+    if fit.motion_sigma is None or fit.readout is None:
+        return []
+    first, second = fit.motion_sigma
+    if max(first, second) > _LIMIT * LARGEST:
+        return [
+            "while an image is read, views move by more than any hand does: these motions stand for something else "
+            "(wrong corners, a board that flexes, a cropped or stabilized video); look at the views that fit worst, "
+            "and photograph a stiff board on a stand"
+        ]
+    lines = "column" if fit.readout.columns else "row"
+    # From the first line to the last; the second order covers a quarter of that, as it is the same at both ends.
+    moved = float(fit.camera.params[0]) * math.hypot(first, 0.25 * second)
+    if moved < _FELT * fit.sigma:
+        return []
+    return [
+        f"the camera or the board moved while {lines}s were read (rolling shutter), by some {moved:.1f} px from the "
+        f"first {lines} to the last: this is taken out, and error bars allow for it; put both on a stand, or take the "
+        "still moments of a video, for smaller error bars"
+    ]
+
+
+def aspect_of(fit: HybridFit) -> tuple[float, float]:
+    """f_y / f_x of the base projection, and its standard deviation."""
+    fx, fy = fit.camera.params[:2].tolist()
+    slope = torch.zeros(len(fit.camera.params), dtype=torch.float64)
+    slope[0], slope[1] = -fy / fx**2, 1.0 / fx
+    return fy / fx, float(slope @ fit.covariance @ slope) ** 0.5
+
+
+def pixel_warnings(fit: HybridFit) -> list[str]:
+    """A warning where pixels are not square."""
+    if fit.square:
+        return []
+    aspect, sigma = aspect_of(fit)
+    return [
+        f"pixels are not square: f_y / f_x = {aspect:.4f} ± {sigma:.4f}; was the image or video resized, or taken in "
+        "an anamorphic mode? The camera is right for images of this size and shape only: photograph boards and targets "
+        "in the same mode"
+    ]

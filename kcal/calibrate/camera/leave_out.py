@@ -1,0 +1,147 @@
+"""Calibrate without views that no lens fits, before refusing all of them; and name them.
+
+One image of another board, of another camera, or with corners in a wrong order can leave no lens that shows all
+corners. A fit with bounded weights tells which views these are. A few are left out, with a warning; if they are many,
+nobody knows which ones are wrong.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import torch
+
+from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views, least_planar
+from kcal.calibrate.camera.hybrid import calibrate_hybrid
+from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.outliers import corners_beyond, views_beyond
+from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedView
+from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
+from kcal.calibrate.search.model_ladder import Progress
+from kcal.corners.observations import Observations
+from kcal.errors import DegenerateError, InputError
+
+# Views that contradict each other wholly leave a fit without a number to go on with.
+_FAILED = (InputError, ArithmeticError, torch.linalg.LinAlgError)
+# Largest share of the views that is left out without being asked.
+_FEW = 0.2
+# Names and reasons in one message, at most.
+_SHOWN = 5
+# The unknowns that the views alone must determine: focal length, principal point, shape of the base projection.
+_UNKNOWNS = 4
+
+
+def calibrate_what_fits(
+    observations: Observations, options: CalibrationOptions, progress: Progress
+) -> CameraCalibrationResult:
+    """As `kcal.calibrate.camera.hybrid.calibrate_hybrid`, but a few views that no lens fits are left out.
+
+    Raises:
+        DegenerateError: as `calibrate_hybrid`, with the names of the views.
+        InputError: more than a fifth of the views do not fit; the message names them.
+    """
+    # What these refuse, leaving out views does not mend.
+    check_views(observations.board.points, observations.pixels(), observations.names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
+    try:
+        return calibrate_hybrid(observations, options, progress)
+    except _FAILED as error:
+        if options.reject is not None:
+            raise
+        failure = error
+    except DegenerateError as error:
+        if any(name in str(error) for name in observations.names):
+            raise
+        raise DegenerateError(f"{error}; the views are {_few_names(observations.names)}") from error
+    if (given := options.start_focal(observations.image_size)) is not None:
+        return _without_start(observations, options, given, failure, progress)
+    wrong = _wrong_views(observations, options)
+    listed = listed_views(observations, wrong)
+    few = len(wrong) <= max(1.0, _FEW * len(observations.views))
+    if not wrong or not few or len(observations.views) - len(wrong) < MINIMUM_VIEWS:
+        which = (
+            f"{len(wrong)} of {len(observations.views)} views do not fit the others: {listed}"
+            if wrong
+            else f"Look first at {least_planar(observations.board.points, observations.pixels(), observations.names)}"
+        )
+        raise InputError(
+            f"no lens shows all corners where they are. {which}. Do all images show this board, not mirrored, and are "
+            "all from this camera at this zoom? Remove those that do not, and detect again"
+        ) from failure
+    progress(f"without {len(wrong)} views that no lens fits")
+    kept = [i for i in range(len(observations.views)) if i not in wrong]
+    used = observations.subset([observations.names[i] for i in kept])
+    try:
+        result = calibrate_hybrid(used, options, progress)
+    except _FAILED as error:
+        raise InputError(f"without {len(wrong)} views that no lens fits ({listed}): {error}") from failure
+    return without_views(result, observations, wrong)
+
+
+def _without_start(
+    observations: Observations, options: CalibrationOptions, given: float, failure: Exception, progress: Progress
+) -> CameraCalibrationResult:
+    """Again, as if no focal length had been given."""
+    progress("again without the focal length that was given")
+    try:
+        result = calibrate_what_fits(
+            observations, dataclasses.replace(options, focal=None, field_of_view=None), progress
+        )
+    except InputError:
+        raise failure from None
+    note = (
+        f"no lens with the focal length that was given for the start ({given:.4g} px) shows the corners: it was not "
+        "used; leave it out, or correct it"
+    )
+    return dataclasses.replace(result, warnings=(note, *result.warnings))
+
+
+def _wrong_views(observations: Observations, options: CalibrationOptions) -> dict[int, str]:
+    """Views that do not fit, by a fit in which few wrong corners count little: index -> why."""
+    pixels, board = observations.pixels(), observations.board.points
+    try:
+        fit = fit_hybrid(board, pixels, observations.image_size, board=options.board, robust=True)
+    except (*_FAILED, DegenerateError):
+        return {}
+    residuals = fit.residuals_of(pixels)
+    seen = torch.isfinite(pixels).all(-1)
+    missing = (seen & ~torch.isfinite(residuals).all(-1)).sum(-1)
+    found = views_beyond(board, residuals, pixels, corners_beyond(residuals))
+    for i in missing.nonzero()[:, 0].tolist():
+        found[i] = f"the lens that fits the others cannot show {int(missing[i])} of its {int(seen[i].sum())} corners"
+    return dict(sorted(found.items()))
+
+
+def _few_names(names: Sequence[str]) -> str:
+    more = len(names) - _SHOWN
+    return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+def listed_views(observations: Observations, wrong: Mapping[int, str]) -> str:
+    """Names of views with their reasons, a few of them."""
+    shown = [f"{observations.names[i]} ({why})" for i, why in list(wrong.items())[:_SHOWN]]
+    more = len(wrong) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+
+
+def without_views(
+    result: CameraCalibrationResult, observations: Observations, wrong: Mapping[int, str]
+) -> CameraCalibrationResult:
+    """A result without some views as one for all `observations`, with a warning that names them."""
+    if not wrong:
+        return result
+    kept = [i for i in range(len(observations.views)) if i not in wrong]
+    counts = torch.isfinite(observations.pixels()).all(-1).sum(-1).tolist()
+    left_out = tuple(
+        RejectedView(view=observations.names[i], corners=counts[i], residual=float("nan"), reason=why)
+        for i, why in wrong.items()
+    )
+    note = (
+        f"{len(wrong)} of {len(observations.views)} views were left out: {listed_views(observations, wrong)}; look at "
+        "these images, and remove or retake them"
+    )
+    return dataclasses.replace(
+        result.among(kept, observations),
+        warnings=(note, *result.warnings),
+        rejected_views=(*result.rejected_views, *left_out),
+    )
