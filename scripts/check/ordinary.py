@@ -16,7 +16,9 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import statistics
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -30,6 +32,7 @@ from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
 from scripts.shared.held_out import Projection, held_out
+from scripts.shared.mrcal_camera import splined_camera
 from scripts.shared.page import table, write_section
 from scripts.shared.peer_lenses import fisheye, opencv
 from scripts.shared.real_captures import RealCapture, data_folder, load, names
@@ -52,6 +55,8 @@ def judged(name: str, cache: Path) -> Record:
         "opencv8": lambda half: opencv(half.seen, 8),
         "fisheye": lambda half: fisheye(half.seen),
     }
+    if "KCAL_MRCAL" in os.environ:
+        fitters["mrcal"] = lambda half: splined_camera(half.seen, half.weight)
     if kcal is not None:
         record["held"]["kcal"] = _held_out(kcal, halves)
         between = camera_difference(kcal[0], kcal[1])
@@ -59,7 +64,7 @@ def judged(name: str, cache: Path) -> Record:
     for model, fit in fitters.items():
         try:
             record["held"][model] = _held_out([fit(half) for half in halves], halves)
-        except (KcalError, cv2.error, RuntimeError) as error:
+        except (KcalError, cv2.error, subprocess.SubprocessError) as error:
             record["held"][model] = {"failed": str(error)[-300:]}
     return record
 
