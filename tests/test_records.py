@@ -67,7 +67,7 @@ def test_mrcals_spline_projects_as_mrcal_does() -> None:
     x, y = torch.meshgrid(torch.arange(11.0), torch.arange(8.0), indexing="xy")
     control = torch.stack([0.02 * (x - 5.0), 0.03 * (y - 3.5) + 0.1], -1)  # x: 0.02 a knot
     found = {"intrinsics": [500, 400, 320, 240, *control.flatten().tolist()], "knots": [-1.0, -0.8]}
-    camera = SplinedCamera(found, (640, 480))
+    camera = SplinedCamera(found, (640, 480), (11, 8))
     rays = torch.tensor([[0.1, 0.2, 1.0], [-0.4, 0.3, 1.0], [0, 0, 2.0]]).double()
     u = 2 * rays[:, :2] / (rays.norm(dim=-1) + rays[:, 2])[:, None]
     shifted = u + torch.stack([0.1 * u[:, 0], 0.15 * u[:, 1] + 0.1], -1)

@@ -5,7 +5,8 @@
 The stages are those of mrcal-calibrate-cameras: a stereographic seed from a rough focal length, its refinement, the
 lens with mrcal's regularization, and with the board's warp. Prints one line of JSON: seconds of all that (process CPU
 and wall), the lens with its name, and sum(w² |r|²) with its count over held-out views, whose poses alone are solved
-again. The splines cover FIELD_OF_VIEW degrees, 170 if it is left out.
+again. The splines cover FIELD_OF_VIEW degrees, 170 if it is left out. If it is given, the focal length and the middle
+of the image are held as they are: a narrow lens does not determine them as a stereographic one, and they run away.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def main() -> None:
         observations=seen,
         object_spacing=square,
     )
-    for free in (False, True):
+    for free in (False,) if len(sys.argv) > 3 else (False, True):
         mrcal.optimize(
             intrinsics, extrinsics, frames, None, seen, index, None, None, "LENSMODEL_STEREOGRAPHIC",
             do_optimize_intrinsics_core=free, do_optimize_intrinsics_distortions=False,

@@ -162,6 +162,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    cv2.setNumThreads(1)  # sums in one order, so that a run can be repeated
     wanted = arguments.captures or names(data_folder())
     records = finish(arguments.out, [(name,) for name in wanted], lambda name: judged(name, arguments.cache), line)
     order = {name: place for place, name in enumerate(wanted)}

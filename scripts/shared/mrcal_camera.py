@@ -15,10 +15,12 @@ import torch
 from torch import Tensor
 
 from kcal.corners.observations import Observations
+from scripts.shared.held_out import held_out
 from scripts.shared.mrcal_spline import splined
 from scripts.shared.peer_lenses import fisheye
 
-KNOTS = 11, 8  # of the spline that predicts held-out views of the wide lens best
+KNOTS = 8, 6
+_STARTS = 1.0, 0.8, 1.25  # times the rough focal length: mrcal's first poses may be tilted the wrong way
 _MARGIN = 1.5  # of the field of view: knots must reach beyond the image, whose center mrcal moves
 _STEPS = 100
 
@@ -75,7 +77,7 @@ def _cubic(x: Tensor) -> tuple[Tensor, ...]:
 
 
 def splined_camera(seen: Observations, weight: Tensor) -> SplinedCamera:
-    """Fit mrcal's spline to all views, started and dimensioned by OpenCV's fisheye.
+    """Fit mrcal's spline to all views, started and dimensioned by OpenCV's fisheye: the best of three fits.
 
     Raises:
         subprocess.SubprocessError: mrcal failed.
@@ -87,8 +89,12 @@ def splined_camera(seen: Observations, weight: Tensor) -> SplinedCamera:
     rays, valid = rough.unproject(sides)
     field = math.degrees(math.acos(max(-1.0, float(torch.linalg.vecdot(rays[0], rays[1])))))
     field = min(170, math.ceil(_MARGIN * field)) if bool(valid.all()) else 170
-    found = splined(
-        f"SPLINED{KNOTS[0]}x{KNOTS[1]}", seen.pixels().numpy(), weight.numpy(), np.zeros(0, dtype=np.int64),
-        size=seen.image_size, board=seen.board, focal=float(rough.focal.detach()[0]), field_of_view=field, timeout=300,
-    )  # fmt: skip
-    return SplinedCamera(found, seen.image_size)
+    cameras = []
+    for factor in _STARTS:
+        found = splined(
+            f"SPLINED{KNOTS[0]}x{KNOTS[1]}", seen.pixels().numpy(), weight.numpy(), np.zeros(0, dtype=np.int64),
+            size=seen.image_size, board=seen.board, focal=factor * float(rough.focal.detach()[0]), field_of_view=field,
+            timeout=300,
+        )  # fmt: skip
+        cameras.append(SplinedCamera(found, seen.image_size))
+    return min(cameras, key=lambda camera: held_out(camera, seen.board.points, seen.pixels(), weight).still)
