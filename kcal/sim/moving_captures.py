@@ -70,7 +70,7 @@ class Hands:
             raise InputError(f"Hands: most_blur must be positive pixels, got {self.most_blur}")
 
 
-class Motion(NamedTuple):
+class HandMotion(NamedTuple):
     """How one thing moves about a moment: turn (radians) and shift (meters), six axes.
 
     Attributes:
@@ -90,14 +90,14 @@ class Motion(NamedTuple):
 
         Example:
             >>> still = torch.zeros(1, 6, dtype=torch.float64)
-            >>> Motion(torch.ones(6, dtype=torch.float64), still, still + 1.0, still).at(torch.tensor(0.5))[0].item()
+            >>> HandMotion(torch.ones(6, dtype=torch.float64), still, still + 1.0, still).at(torch.tensor(0.5))[0].item()
             0.5
         """
         circular = 2.0 * math.pi * self.frequency
         waves = torch.sin(circular * times[..., None, None] + self.phase) - torch.sin(self.phase)
         return self.drift * times[..., None] + (self.swing / circular * waves).sum(-2)
 
-    def slowed(self, factor: float) -> Motion:
+    def slowed(self, factor: float) -> HandMotion:
         """The same with all rates multiplied by a factor."""
         return self._replace(drift=factor * self.drift, swing=factor * self.swing)
 
@@ -205,7 +205,7 @@ def _moving_view(
     return pixels, blur
 
 
-def draw_motion(turning: float, speed: float, tremor: tuple[float, float], generator: torch.Generator) -> Motion:
+def draw_motion(turning: float, speed: float, tremor: tuple[float, float], generator: torch.Generator) -> HandMotion:
     """Draw a motion whose rates have given standard deviations, half of their variance from tremor.
 
     Args:
@@ -217,7 +217,7 @@ def draw_motion(turning: float, speed: float, tremor: tuple[float, float], gener
     size = torch.tensor([turning] * 3 + [speed] * 3, dtype=torch.float64)
     normal = torch.randn((1 + _TREMORS, 6), dtype=torch.float64, generator=generator)
     even = torch.rand((2, _TREMORS, 6), dtype=torch.float64, generator=generator)
-    return Motion(
+    return HandMotion(
         drift=math.sqrt(0.5) * size * normal[0],
         # A sinusoid of random phase has half the variance of its largest value.
         swing=size * normal[1:] / math.sqrt(_TREMORS),
@@ -227,7 +227,7 @@ def draw_motion(turning: float, speed: float, tremor: tuple[float, float], gener
 
 
 def rolling_corners(
-    lens: LensLike, points: Tensor, motion: Motion, middle: Tensor, readout: float, exposure: float
+    lens: LensLike, points: Tensor, motion: HandMotion, middle: Tensor, readout: float, exposure: float
 ) -> tuple[Tensor, Tensor]:
     """Find where points appear that move while a camera reads its rows.
 

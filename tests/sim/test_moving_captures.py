@@ -11,7 +11,7 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.sim.board import BoardPose, project_board
 from kcal.sim.captures import PAPER_BOARD
-from kcal.sim.moving_captures import Hands, Motion, draw_motion, moving_capture, noise_root, rolling_corners
+from kcal.sim.moving_captures import Hands, HandMotion, draw_motion, moving_capture, noise_root, rolling_corners
 from kcal.sim.poses import sample_board_poses
 
 PINHOLE = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
@@ -20,10 +20,10 @@ READOUT, EXPOSURE = 0.02, 0.01
 POSES = sample_board_poses(PINHOLE, PAPER_BOARD, 6, torch.Generator().manual_seed(4), fill=(0.25, 0.8))
 
 
-def steady(*rates: float) -> Motion:
+def steady(*rates: float) -> HandMotion:
     """Constant rates of turn and shift."""
     zero = torch.zeros(1, 6, dtype=torch.float64)
-    return Motion(torch.tensor(rates, dtype=torch.float64), zero, zero + 1.0, zero)
+    return HandMotion(torch.tensor(rates, dtype=torch.float64), zero, zero + 1.0, zero)
 
 
 def test_a_shift_along_the_rows_shears_the_image() -> None:
@@ -57,7 +57,7 @@ def test_things_turn_about_their_middle() -> None:
 def test_what_is_detected_is_the_mean_over_the_exposure() -> None:
     zero, one = torch.zeros(1, 6).double(), torch.zeros(1, 6).double()
     one[0, 3] = 1.0
-    swing = Motion(zero[0], one, zero + 5.0, zero + math.pi / 2)
+    swing = HandMotion(zero[0], one, zero + 5.0, zero + math.pi / 2)
     pixels, _ = rolling_corners(PINHOLE, POINTS[:1], swing, zero[0, :3], READOUT, 0.04)
     circular = 2 * math.pi * 5
     shift = (
