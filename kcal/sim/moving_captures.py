@@ -90,7 +90,8 @@ class HandMotion(NamedTuple):
 
         Example:
             >>> still = torch.zeros(1, 6, dtype=torch.float64)
-            >>> HandMotion(torch.ones(6, dtype=torch.float64), still, still + 1.0, still).at(torch.tensor(0.5))[0].item()
+            >>> steady = HandMotion(torch.ones(6, dtype=torch.float64), still, still + 1.0, still)
+            >>> steady.at(torch.tensor(0.5))[0].item()
             0.5
         """
         circular = 2.0 * math.pi * self.frequency
