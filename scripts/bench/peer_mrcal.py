@@ -1,10 +1,12 @@
 """mrcal's splined lens on one training set, for comparison; runs in an interpreter that has mrcal, without kcal.
 
-    /usr/bin/python3 scripts/bench/peer_mrcal.py problem.npz SPLINED13x9
+    /usr/bin/python3 scripts/bench/peer_mrcal.py problem.npz SPLINED13x9 [FIELD_OF_VIEW]
 
 The stages are those of mrcal-calibrate-cameras: a stereographic seed from a rough focal length, its refinement, the
 lens with mrcal's regularization, and with the board's warp. Prints one line of JSON: seconds of all that (process CPU
-and wall) and sum(w² |r|²) with its count over held-out views, whose poses alone are solved again.
+and wall), the lens with its name, and sum(w² |r|²) with its count over held-out views, whose poses alone are solved
+again. The splines cover FIELD_OF_VIEW degrees, 170 if it is left out. If it is given, the focal length and the middle
+of the image are held as they are: a narrow lens does not determine them as a stereographic one, and they run away.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ def main() -> None:
         size, (columns, rows) = data["image_size"].astype(np.int32)[None], data["board_size"].tolist()
         square, focal = float(data["square_m"]), float(data["focal"])
     nx, ny = sys.argv[2].removeprefix("SPLINED").split("x")
-    lens = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={nx}_Ny={ny}_fov_x_deg=170"
+    field = sys.argv[3] if len(sys.argv) > 3 else "170"
+    lens = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={nx}_Ny={ny}_fov_x_deg={field}"
     common = {"imagersizes": size, "calibration_object_spacing": square, "do_apply_outlier_rejection": False}
     seen, index = arrays(corners[train], weight[train], (rows, columns))
 
@@ -46,7 +49,7 @@ def main() -> None:
         observations=seen,
         object_spacing=square,
     )
-    for free in (False, True):
+    for free in (False,) if len(sys.argv) > 3 else (False, True):
         mrcal.optimize(
             intrinsics, extrinsics, frames, None, seen, index, None, None, "LENSMODEL_STEREOGRAPHIC",
             do_optimize_intrinsics_core=free, do_optimize_intrinsics_distortions=False,
@@ -66,7 +69,12 @@ def main() -> None:
     optimize(frames, seen, index, {"do_optimize_calobject_warp": False, "do_apply_regularization": True})
     common["calobject_warp"] = warp
     optimize(frames, seen, index, {"do_optimize_calobject_warp": True, "do_apply_regularization": True})
-    out = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
+    out: dict[str, Any] = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
+    out |= {
+        "lens": lens,
+        "intrinsics": intrinsics[0].tolist(),
+        "knots": mrcal.knots_for_splined_models(lens)[0].tolist(),
+    }
 
     if len(held):
         seen, index = arrays(corners[held], weight[held], (rows, columns))

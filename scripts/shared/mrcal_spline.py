@@ -23,9 +23,10 @@ def splined(
     size: tuple[int, int],
     board: Board,
     focal: float,
+    field_of_view: int | None = None,
     timeout: float | None = None,
 ) -> dict[str, Any]:
-    """Fit a spline to all views but those held out: seconds, and w² |r|² of the latter with its count.
+    """Fit a spline to all views but those held out: seconds, the lens, and w² |r|² of the latter with its count.
 
     Args:
         lens: for example SPLINED11x8.
@@ -35,11 +36,14 @@ def splined(
         size: of the image.
         board: of the corners.
         focal: about the focal length, pixels.
+        field_of_view: degrees that the splines cover along x, around the given focal length; None: 170, around the
+            focal length that mrcal finds.
         timeout: seconds.
 
     Raises:
         subprocess.SubprocessError: mrcal failed, or took longer.
     """
+    field = [] if field_of_view is None else [str(field_of_view)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "problem.npz")
         np.savez(
@@ -54,7 +58,7 @@ def splined(
             focal=focal,
         )
         done = subprocess.run(
-            [os.environ["KCAL_MRCAL"], "scripts/bench/peer_mrcal.py", str(path), lens],
+            [os.environ["KCAL_MRCAL"], "scripts/bench/peer_mrcal.py", str(path), lens, *field],
             capture_output=True, text=True, timeout=timeout, check=True,
         )  # fmt: skip
     found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])

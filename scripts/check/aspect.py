@@ -1,0 +1,103 @@
+"""Is it said that pixels are not square, where they are and where they are not?
+
+    python -m scripts.check.aspect --out FILE --seeds 0-999                  # square pixels: false alarms
+    python -m scripts.check.aspect --out FILE --seeds 0-199 --stretch 1.01   # rows longer or shorter by 1 %, in turn
+    python -m scripts.check.aspect --out FILE [OTHER ...] --write            # the table of docs/measured/ordinary.md
+
+Captures that FILE has are not made again. Truth: traced lenses in turn and printed boards, as in
+`scripts.check.handheld`; 8 to 20 views, 0.05 to 0.2 px of noise; boards upright (within 2 degrees) in half of the
+captures, turned by up to 90 degrees in the others; a quarter of the captures by hand. A camera is said to have pixels
+that are not square if a warning of its calibration contains "pixels are not square".
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from pathlib import Path
+
+import torch
+
+from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal.errors import KcalError
+from scripts.shared.page import table, write_section
+from scripts.shared.records import Record, finish, read, seeds
+from scripts.shared.simulated import simulated
+from scripts.shared.timing import show
+
+PAGE = "ordinary.md"
+SAID = "pixels are not square"
+VIEWS, NOISE, UPRIGHT, ROLLED = (8, 20), (0.05, 0.2), math.radians(2.0), math.radians(90.0)
+
+
+def judged(stretch: float, seed: int) -> Record:
+    """One capture: what it was, and what was said."""
+    draw = torch.rand(2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed + 40_000)).tolist()
+    views = VIEWS[0] + int(draw[0] * (VIEWS[1] - VIEWS[0] + 1))
+    sigma = NOISE[0] * (NOISE[1] / NOISE[0]) ** draw[1]
+    # Lenses and what is held go round with 3 and 6; 2 and 8 mix all with all.
+    upright, by_hand = seed % 2 == 0, seed // 2 % 4 == 0
+    factor = stretch if seed // 8 % 2 == 0 else 1.0 / stretch
+    case = simulated(seed, views, sigma, by_hand, max_roll=UPRIGHT if upright else ROLLED, stretch=factor)
+    record: Record = {"views": views, "sigma": sigma, "upright": upright, "hand": by_hand, "factor": factor}
+    start = time.process_time()
+    try:
+        result = calibrate_camera(case.seen)
+    except KcalError as refusal:
+        return record | {"refused": str(refusal)}
+    focal = result.camera.focal.tolist()
+    said = [text for text in result.warnings if SAID in text]
+    return record | {"said": said, "aspect": focal[1] / focal[0], "cpu_s": time.process_time() - start}
+
+
+def line(record: Record) -> str:
+    """One line to print."""
+    if "refused" in record:
+        return f"refused: {record['refused'][:90]}"
+    return f"true {record['factor']:.4f}, found {record['aspect']:.4f}, {record['said'] or 'nothing said'}"
+
+
+def lines(records: list[Record]) -> list[str]:
+    """A row for each stretch and kind of capture."""
+    rows = []
+    for stretch in sorted({record["key"][0] for record in records}):
+        own = [record for record in records if record["key"][0] == stretch]
+        kinds = {
+            "all": own,
+            "upright": [r for r in own if r["upright"]],
+            "turned": [r for r in own if not r["upright"]],
+            "by hand": [r for r in own if r["hand"]],
+            "on a stand": [r for r in own if not r["hand"]],
+        }
+        for name, part in kinds.items():
+            known = [record for record in part if "refused" not in record]
+            said = [record for record in known if record["said"]]
+            off = [abs(record["aspect"] / record["factor"] - 1.0) for record in said]
+            rows.append(
+                [
+                    f"{stretch:g}", name, len(part), len(part) - len(known), len(said),
+                    f"{100 * len(said) / len(known):.1f} %" if known else "–", f"{max(off):.4f}" if off else "–",
+                ]
+            )  # fmt: skip
+    head = ["stretch", "captures", "number", "refused", "said not to be square", "share", "largest error of f_y/f_x"]
+    return table(head, rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", nargs="+", type=Path, required=True, help="JSON lines; the first is written to")
+    parser.add_argument("--seeds", type=seeds, help="for example 0-999")
+    parser.add_argument("--stretch", type=float, default=1.0, help="of the rows, or its inverse, in turn")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    if arguments.seeds is not None:
+        finish(arguments.out[0], [(arguments.stretch, seed) for seed in arguments.seeds], judged, line)
+    text = show(lines(read(arguments.out)))
+    if arguments.write:
+        write_section(PAGE, "aspect", "\n".join(text))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,176 @@
+"""The default camera on captures that people really have: halves against halves, beside OpenCV and mrcal.
+
+    KCAL_DATA=DATA python -m scripts.check.ordinary --out FILE          # all captures; those that FILE has are kept
+    KCAL_DATA=DATA python -m scripts.check.ordinary --out FILE ch1280 other.obs.json
+    KCAL_DATA=DATA python -m scripts.check.ordinary --out FILE --write  # the table of docs/measured/ordinary.md
+    KCAL_MRCAL=/usr/bin/python3 ...                                     # mrcal's spline, too
+
+Each camera is fitted to every other view of a capture (in natural order of their names) and judged on the others, both
+ways. Held out: RMS in pixels over both halves, `scripts.shared.held_out`: as seen, with poses and board refitted, and
+with each view's own motion during the readout refitted as well. *Lost* are seen corners that a camera has no image of;
+they are not in its RMS. Halves: `camera_difference` between both halves'
+cameras; a ratio of 1 is what their error bars state, p is the chance of more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import torch
+
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.errors import KcalError
+from kcal.lens.camera import Camera
+from kcal.lens.difference import camera_difference
+from scripts.shared.held_out import Projection, held_out
+from scripts.shared.mrcal_camera import splined_camera
+from scripts.shared.page import table, write_section
+from scripts.shared.peer_lenses import fisheye, opencv
+from scripts.shared.real_captures import RealCapture, data_folder, load, names
+from scripts.shared.records import Record, finish
+from scripts.shared.timing import show
+
+PAGE = "ordinary.md"
+MODELS = ("kcal", "opencv5", "opencv8", "fisheye", "mrcal")
+LEAST_P, RATIOS, WORST = 0.01, (0.5, 1.2), 1.04
+
+
+def judged(name: str, cache: Path) -> Record:
+    """Both halves of one capture, by all models."""
+    capture = load(name, data_folder(), cache)
+    halves = capture.half(0), capture.half(1)
+    record: Record = {"views": [len(half.seen.views) for half in halves], "held": {}}
+    kcal = _defaults(halves, record)
+    fitters: dict[str, Callable[[RealCapture], Projection]] = {
+        "opencv5": lambda half: opencv(half.seen, 5),
+        "opencv8": lambda half: opencv(half.seen, 8),
+        "fisheye": lambda half: fisheye(half.seen),
+    }
+    if "KCAL_MRCAL" in os.environ:
+        fitters["mrcal"] = lambda half: splined_camera(half.seen, half.weight)
+    if kcal is not None:
+        record["held"]["kcal"] = _held_out(kcal, halves)
+        between = camera_difference(kcal[0], kcal[1])
+        record |= {"ratio": between.ratio, "p": between.probability, "shift": between.rms}
+    for model, fit in fitters.items():
+        try:
+            record["held"][model] = _held_out([fit(half) for half in halves], halves)
+        except (KcalError, cv2.error, subprocess.SubprocessError) as error:
+            record["held"][model] = {"failed": str(error)[-300:]}
+    return record
+
+
+def _defaults(halves: tuple[RealCapture, RealCapture], record: Record) -> list[Camera] | None:
+    """The default camera of each half; None, and why in the record, if one is refused."""
+    cameras: list[Camera] = []
+    record |= {"refused": [], "warnings": [], "noise": [], "cpu_s": []}
+    for half in halves:
+        start = time.process_time()
+        try:
+            result = calibrate_camera(half.seen, CalibrationOptions())
+        except KcalError as error:
+            record["refused"].append(str(error))
+            continue
+        record["cpu_s"].append(time.process_time() - start)
+        record["warnings"].append(list(result.warnings))
+        record["noise"].append(result.noise)
+        cameras.append(result.camera)
+    return cameras if len(cameras) == len(halves) else None
+
+
+def _held_out(cameras: Sequence[Projection], halves: tuple[RealCapture, RealCapture]) -> Record:
+    """RMS of each half's camera on the other half, both together, and how many corners it has no image of."""
+    found = [
+        held_out(camera, half.seen.board.points, half.seen.pixels(), half.weight)
+        for camera, half in zip(cameras, reversed(halves), strict=True)
+    ]
+    count, lost = sum(one.corners for one in found), sum(one.lost for one in found)
+    rms = {key: math.sqrt(sum(getattr(one, key) for one in found) / max(1, count - lost)) for key in ("still", "moved")}
+    return {**rms, "lost": lost, "corners": count}
+
+
+def over_best(record: Record) -> dict[str, float]:
+    """Held-out RMS of kcal over that of the best other, by kind; a camera without an image of a corner errs by ∞."""
+    held = record["held"]
+    if "kcal" not in held:
+        return {}
+    whole = {model: one for model, one in held.items() if one.get("lost") == 0}
+    others = [one for model, one in whole.items() if model != "kcal"]
+    infinite = {"still": math.inf, "moved": math.inf}
+    own, best = whole.get("kcal", infinite), {key: min((one[key] for one in others), default=None) for key in infinite}
+    return {key: own[key] / value if value is not None else math.nan for key, value in best.items()}
+
+
+def shown(held: Record | None) -> str:
+    """A model's cell."""
+    if held is None:
+        return "–"
+    if "failed" in held:
+        return "failed"
+    lost = f", {held['lost']} lost" if held["lost"] else ""
+    return f"{held['still']:.4f} / {held['moved']:.4f}{lost}"
+
+
+def lines(records: list[Record]) -> list[str]:
+    """The page's table, and how the aims fare."""
+    rows = []
+    for record in records:
+        cells = [shown(record["held"].get(model)) for model in MODELS]
+        between = f"{record['ratio']:.2f} ({record['p']:.2g})" if "ratio" in record else "refused"
+        over = " / ".join(f"{value:.2f}" for value in over_best(record).values()) or "–"
+        views = "+".join(map(str, record["views"]))
+        rows.append([Path(record["key"][0]).name.removesuffix(".obs.json"), views, between, *cells, over])
+    known = [record for record in records if "ratio" in record]
+    worst = max((value for record in known for value in over_best(record).values() if value == value), default=math.nan)
+    head = ["capture", "views", "halves: ratio (p)", *MODELS, "kcal / best other"]
+    out = [*table(head, rows), ""]
+    if known:
+        out += [
+            f"Of {len(records)} captures, {len(records) - len(known)} have a half that kcal refuses. Of the others, "
+            f"{sum(record['p'] >= LEAST_P for record in known)} have p ≥ {LEAST_P}; the smallest is "
+            f"{min(record['p'] for record in known):.2g}. Mean ratio "
+            f"{statistics.fmean(record['ratio'] for record in known):.2f} (aim: {RATIOS[0]} to {RATIOS[1]}). "
+            f"Held out, kcal errs by at most {worst:.2f} times the best other (aim: {WORST}).",
+            "",
+        ]
+    refusals = [f"`{record['key'][0]}`: {reason}" for record in records for reason in record["refused"]]
+    return [*out, *(["Refused:", "", *(f"- {reason}" for reason in refusals)] if refusals else [])]
+
+
+def line(record: Record) -> str:
+    """One line to print."""
+    between = f"ratio {record['ratio']:.2f} p {record['p']:.2g}" if "ratio" in record else f"{record['refused']}"
+    held = ", ".join(f"{model} {shown(one)}" for model, one in record["held"].items())
+    return f"{record['views']} {between}; {held}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", nargs="*", help="names, or observations files; all if left out")
+    parser.add_argument("--out", type=Path, required=True, help="JSON lines of finished captures")
+    cache = Path(tempfile.gettempdir(), "kcal-ordinary-corners")
+    parser.add_argument("--cache", type=Path, default=cache, help="folder of corners found in images")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)  # sums in one order, so that a run can be repeated
+    wanted = arguments.captures or names(data_folder())
+    records = finish(arguments.out, [(name,) for name in wanted], lambda name: judged(name, arguments.cache), line)
+    order = {name: place for place, name in enumerate(wanted)}
+    records = sorted((r for r in records if r["key"][0] in order), key=lambda r: order[r["key"][0]])
+    section = show(lines(records))
+    if arguments.write:
+        write_section(PAGE, "real", "\n".join(section))
+
+
+if __name__ == "__main__":
+    main()

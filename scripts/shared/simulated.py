@@ -1,0 +1,150 @@
+"""Simulated captures by hand and on a stand, as observations files, and how a calibrated camera fares against them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.camera.advice import reached
+from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.errors import KcalError
+from kcal.lens.camera import Camera
+from kcal.lens.uncertainty import pixel_covariance
+from kcal.sim.board import PrintedBoard
+from kcal.sim.captures import drawn_lens
+from kcal.sim.infinity import error_at_infinity
+from kcal.sim.moving_captures import Hands, MovingCapture, moving_capture
+from kcal.sim.poses import PoseOptions, sample_board_poses
+from kcal.sim.truth import TruthLens
+from scripts.shared.records import Record
+
+BOARD = Board(columns=7, rows=6, square=0.05)
+LENSES = ("webcam", "machine-vision", "surveillance")
+FILL = 0.25, 0.8  # of the image by the board
+# Squared distance that a normal vector of two components exceeds once in twenty times.
+CHI2 = -2.0 * math.log(0.05)
+
+
+class Simulated(NamedTuple):
+    """One capture: the true lens, what was seen, and the truth about it."""
+
+    lens: TruthLens
+    seen: Observations
+    truth: MovingCapture
+
+
+def simulated(
+    seed: int, views: int, sigma: float, by_hand: bool, *, max_roll: float = math.radians(25.0), stretch: float = 1.0
+) -> Simulated:
+    """Draw a lens, a printed board and views of it; lens and what is held follow from the seed in turn.
+
+    Args:
+        seed: of everything; the same seed has the same lens, board and poses by hand and on a stand.
+        views: how many.
+        sigma: noise of sharp corners, pixels.
+        by_hand: whether the camera or the board is held by hand.
+        max_roll: largest turn of the boards about their normals, radians.
+        stretch: factor by which the images' rows were stretched; 1 leaves pixels square.
+    """
+    lens = drawn_lens(LENSES[seed % len(LENSES)], 1.0, seed, wander=1.0)
+    hands = Hands(holds="camera" if seed // len(LENSES) % 2 else "board") if by_hand else None
+    generator, options = torch.Generator().manual_seed(1000 + seed), PoseOptions(max_roll=max_roll)
+    poses = sample_board_poses(quick(lens), BOARD, views, generator, fill=FILL, options=options)
+    board = PrintedBoard(BOARD.columns, BOARD.rows, BOARD.square, seed)
+    truth = moving_capture(lens, poses, sigma=sigma, seed=1000 + seed, hands=hands, board=board)
+    seen = truth.pixels.isfinite().all(-1) & lens.inside(truth.pixels.nan_to_num(nan=-9.0))
+    pixels = torch.where(seen[..., None], truth.pixels, torch.nan)
+    return Simulated(lens, stretched(pixels, truth.covariance, lens.size, stretch), truth)
+
+
+def quick(lens: TruthLens) -> Camera:
+    """The lens within some pixels, as a camera that draws poses a hundred times as fast."""
+    width, height = lens.size
+    x, y = (torch.linspace(0, extent - 1, 15, dtype=torch.float64) for extent in (width, height))
+    pixels = torch.cartesian_prod(x, y)
+    center = torch.tensor([0.5 * (width - 1), 0.5 * (height - 1)], dtype=torch.float64)
+    rays, _ = lens.unproject(pixels)
+    theta = torch.atan2(rays[:, :2].norm(dim=-1), rays[:, 2])
+    powers = torch.stack([theta ** (2 * k + 1) for k in range(5)], -1)
+    found = torch.linalg.lstsq(powers, (pixels - center).norm(dim=-1, keepdim=True)).solution[:, 0]
+    focal, coefficients = float(found[0]), (found[1:] / found[0]).tolist()
+    return Camera.build(
+        focal=(focal, focal), center=tuple(center.tolist()), size=lens.size, coefficients=coefficients, model="fisheye4"
+    )
+
+
+def stretched(pixels: Tensor, covariance: Tensor, size: tuple[int, int], factor: float) -> Observations:
+    """Corners (V, N, 2), NaN where not seen, and covariances of an image whose rows are stretched by a factor."""
+    scale = torch.tensor([1.0, factor], dtype=torch.float64)
+    height = round(size[1] * factor)
+    # The edge of the image stays where it is, half a pixel before the first center.
+    corners = ((pixels + 0.5) * scale - 0.5).tolist()
+    spread = (covariance * scale[:, None] * scale).flatten(-2)[..., [0, 1, 3]].tolist()
+    views = []
+    for name, (own, own_spread) in enumerate(zip(corners, spread, strict=True)):
+        good = [u == u for u, _ in own]
+        views.append(
+            View(
+                name=f"{name:03d}",
+                pixels=tuple((u, v) if ok else None for (u, v), ok in zip(own, good, strict=True)),
+                covariance=tuple((a, b, c) if ok else None for (a, b, c), ok in zip(own_spread, good, strict=True)),
+            )
+        )
+    return Observations(board=BOARD, image_size=(size[0], height), views=tuple(views))
+
+
+def default_options(still: bool) -> CalibrationOptions:
+    """No option set; or, if asked for, that the camera did not move.
+
+    Raises:
+        SystemExit: this version of kcal cannot switch motion off.
+    """
+    if not still:
+        return CalibrationOptions()
+    if "motion" not in {field.name for field in dataclasses.fields(CalibrationOptions)}:
+        raise SystemExit("--still: this version of kcal has no term for motion that could be switched off")
+    return CalibrationOptions(motion=False)  # type: ignore[call-arg, unused-ignore]
+
+
+def against_truth(case: Simulated, options: CalibrationOptions) -> Record:
+    """Calibrate, and compare with the true lens all over the image, at infinity."""
+    try:
+        result = calibrate_camera(case.seen, options)
+        error = error_at_infinity(result.camera, case.lens)
+    except KcalError as refusal:
+        return {"refused": str(refusal)}
+    return told(result) | figures(result, case, error.pixels, error.errors) | {"rms": error.rms, "valid": error.valid}
+
+
+def told(result: CameraCalibrationResult) -> Record:
+    """What a result says of itself."""
+    return {
+        "noise": result.noise,
+        "warnings": list(result.warnings),
+        "tempering": None if result.hybrid is None else result.hybrid.tempering,
+    }
+
+
+def figures(result: CameraCalibrationResult, case: Simulated, pixels: Tensor, errors: Tensor) -> Record:
+    """Shares of the image (rows, columns, 2) in which the truth is in the 95 % ellipse, and the RMS that σ predicts."""
+    rows, columns = pixels.shape[:2]
+    covariance = pixel_covariance(result.camera, pixels.reshape(-1, 2))
+    off = errors.reshape(-1, 2)
+    good = off.isfinite().all(-1) & covariance.isfinite().all(-1).all(-1)
+    eye = torch.eye(2, dtype=torch.float64)
+    distance = (off * torch.linalg.solve(torch.where(good[:, None, None], covariance, eye), off)).sum(-1)
+    inside = (distance < CHI2)[good]
+    within = reached(case.seen, columns, rows).reshape(-1)[good]
+    return {
+        "inside": float(inside[within].double().mean()),
+        "beyond": float(inside[~within].double().mean()),
+        "everywhere": float(inside.double().mean()),
+        "predicted": float(covariance[good].diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt()),
+    }
