@@ -15,8 +15,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from kcal.corners.aprilgrid import find_aprilgrid
 from kcal.corners.board import Board
-from kcal.corners.charuco import MIN_CORNERS, enough, find_charuco, free_side
+from kcal.corners.charuco import enough, find_charuco, free_side
+from kcal.corners.circles import find_circles, refine_circles, wrong_size
 from kcal.corners.grid import MIN_SHARPNESS, grid_trouble, local_side, sharpness
 from kcal.corners.images import Gray, decode_gray, to_8bit, unique_names
 from kcal.corners.limited import Limited, TookTooLongError
@@ -24,6 +26,7 @@ from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.order import canonical_order
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
+from kcal.corners.seen_instead import has_own_markers, seen_circles, seen_markers
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 
@@ -51,15 +54,18 @@ class Detection(NamedTuple):
         pixels: (corners, 2) float64 in the board's order, NaN where not seen; None if no board was found.
         reason: why none was found.
         covariance: (corners, 2, 2) px², if the refinement estimates it.
+        legacy: of a ChArUco board, whether its numbering is that of OpenCV before 4.6; None where it makes no
+            difference.
     """
 
     pixels: Tensor | None
     reason: str = ""
     covariance: Tensor | None = None
+    legacy: bool | None = None
 
 
 def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detection:
-    """Find the inner corners of a checkerboard, or the visible ones of a ChArUco board.
+    """Find the inner corners of a checkerboard, the visible ones of a ChArUco board or an AprilGrid, or circles.
 
     OpenCV's `findChessboardCorners` searches first; where it fails, `findChessboardCornersSB` (A. Duda and U. Frese,
     BMVC 2018). Images above 1200 px are searched at a reduced size and refined in steps of two. The grid found must
@@ -68,8 +74,8 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
 
     Args:
         image: (H, W) uint8 or uint16.
-        board: at least 3 inner corners each way, all of them in the image unless it is a ChArUco board.
-        refine: see `kcal.corners.refine.refine_corners`.
+        board: at least 3 points each way, all of them in the image unless it has markers.
+        refine: see `kcal.corners.refine.refine_corners`; `erf` of circles is `kcal.corners.circles.refine_circles`.
 
     Returns:
         The corners, or None with a reason that a person can act on.
@@ -89,12 +95,13 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
     """
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"image: (H, W) uint8 or uint16 is needed, got {image.shape} {image.dtype}")
-    if min(board.columns, board.rows) < 3:
-        raise InputError(
-            f"board {board.columns}x{board.rows}: at least 3 inner corners in each direction are needed for detection"
-        )
+    if min(board.columns, board.rows) < 3 and board.pattern != "aprilgrid":
+        what = "inner corners" if board.pattern == "checkerboard" else "circles"
+        raise InputError(f"board {board.columns}x{board.rows}: at least 3 {what} in each direction are needed for detection")
     if refine not in get_args(Refinement):
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
+    if board.pattern != "checkerboard":
+        return _detect_tags(image, board, refine) if board.pattern == "aprilgrid" else _detect_circles(image, board, refine)
     if board.dictionary is not None:
         return _detect_charuco(image, board, refine)
     pixels, factor, reason = _find_in_order(to_8bit(image), board)
@@ -113,13 +120,38 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
 
 
 def _detect_charuco(image: Gray, board: Board, refine: Refinement) -> Detection:
-    pixels = find_charuco(to_8bit(image), board)
+    pixels, reason, legacy = find_charuco(to_8bit(image), board)
     if pixels is None:
-        return Detection(None, f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on one line")
+        return Detection(None, reason)
     seen = torch.isfinite(pixels).all(-1)
     refined = refine_corners(image, pixels, free_side(pixels, board), refine, (board.columns, board.rows))
     if not enough(refined.pixels, board):
         return Detection(None, _too_few(refined, int(seen.sum())))
+    return Detection(refined.pixels, covariance=refined.covariance, legacy=legacy)
+
+
+def _detect_tags(image: Gray, board: Board, refine: Refinement) -> Detection:
+    found = find_aprilgrid(to_8bit(image), board)
+    if found.pixels is None:
+        return Detection(None, found.reason)
+    seen = torch.isfinite(found.pixels).all(-1)
+    refined = refine_corners(image, found.pixels, torch.where(seen, found.side, 1.0), refine)
+    if not enough(refined.pixels, board):
+        lacking = (refined.status == CornerStatus.NO_SADDLE).sum() > 0.5 * seen.sum()
+        more = "; the small squares between the tags are needed, as Kalibr draws them" if lacking else ""
+        return Detection(None, _too_few(refined, int(seen.sum())) + more)
+    return Detection(refined.pixels, covariance=refined.covariance)
+
+
+def _detect_circles(image: Gray, board: Board, refine: Refinement) -> Detection:
+    if refine not in ("erf", "none"):
+        raise InputError(f"refine {refine!r}: circles are fitted at their edges (erf), or left as OpenCV finds them (none)")
+    found = find_circles(to_8bit(image), board)
+    if found.pixels is None or refine == "none":
+        return Detection(found.pixels, found.reason)
+    refined, radius = refine_circles(image, found.pixels, board, found.radius)
+    if (reason := wrong_size(board, radius)) or int((refined.status == CornerStatus.GOOD).sum()) < MIN_GOOD * board.corners:
+        return Detection(None, reason or _too_few(refined, board.corners))
     return Detection(refined.pixels, covariance=refined.covariance)
 
 
@@ -171,6 +203,7 @@ def detect_images(
     views: list[View] = []
     failures: list[Failure] = []
     size: tuple[int, int] | None = None
+    numberings: dict[bool, str] = {}
     with Limited(time_limit) as limited:
         for name, file in zip(names, files, strict=True):
             try:
@@ -189,6 +222,8 @@ def detect_images(
                 if found.pixels is None:
                     failures.append(Failure(name=name, reason=found.reason))
                 else:
+                    if found.legacy is not None:
+                        numberings.setdefault(found.legacy, name)
                     digest = hashlib.sha256(data).hexdigest()
                     views.append(view_of(found, name, image=str(file), sha256=digest))
             if progress is not None:
@@ -196,6 +231,11 @@ def detect_images(
     if size is None or not views:
         first = f"{failures[0].name}: {failures[0].reason}"
         raise InputError(f"no board in any of {len(files)} images ({first}){_hint(files, board)}")
+    if len(numberings) == 2:
+        raise InputError(
+            f"two ChArUco boards: {numberings[True]} shows the numbering of OpenCV before 4.6, {numberings[False]} that "
+            "of today; detect the images of each board apart"
+        )
     return Observations(board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures))
 
 
@@ -318,17 +358,21 @@ def _sizes_differ(files: list[Path], names: list[str]) -> str:
 
 def _hint(files: list[Path], board: Board) -> str:
     """Which board the first images show, if they show another one."""
-    if board.dictionary is not None:
-        return ""
     for file in files[:3]:
         try:
             image = to_8bit(decode_gray(read_bytes(file), file))
         except FileError:
             continue
-        found = seen_size(_reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
-        if found is None or found == (max(board.columns, board.rows), min(board.columns, board.rows)):
+        small = to_8bit(_reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
+        if other := seen_markers(small, board) or seen_circles(small, board):
+            return f"; {other}"
+        found = None if has_own_markers(small, board) else seen_size(small)
+        own = (max(board.columns, board.rows), min(board.columns, board.rows))
+        if found is None:
             continue
-        squares = found == (max(board.columns, board.rows) - 1, min(board.columns, board.rows) - 1)
+        if found == own and board.pattern == "checkerboard" and board.dictionary is None:
+            continue
+        squares = found == (own[0] - 1, own[1] - 1) and board.pattern == "checkerboard"
         advice = "count inner corners, not squares" if squares else f"give --board {found[0]}x{found[1]}"
         return f"; a board of {found[0]}x{found[1]} was found: {advice}"
     return ""
