@@ -22,7 +22,7 @@ from kcal.corners.board import Board
 from kcal.corners.board_text import DICTIONARIES
 from kcal.corners.erf_fit import SHARE
 from kcal.corners.grid import as_grid, local_side
-from kcal.corners.layout import agreeing
+from kcal.corners.layout import inliers
 from kcal.errors import InputError
 
 MIN_CORNERS = 6
@@ -39,7 +39,8 @@ class FoundCharuco(NamedTuple):
     Args:
         pixels: (corners, 2) in the board's order, NaN where not seen; None if too few are.
         reason: why.
-        legacy: whether the numbering is that of OpenCV before 4.6; None where both are the same or too little is seen.
+        legacy: whether the numbering is that of OpenCV before 4.6; None where both are the same or too little is seen
+            to tell.
     """
 
     pixels: Tensor | None
@@ -47,54 +48,65 @@ class FoundCharuco(NamedTuple):
     legacy: bool | None = None
 
 
-def find_charuco(image: npt.NDArray[np.uint8], board: Board) -> FoundCharuco:
+def find_charuco(
+    image: npt.NDArray[np.uint8], board: Board, legacy: bool | None = None
+) -> FoundCharuco:
     """The corners of a ChArUco board.
 
     At least 6 corners are needed, two each on two rows and on two columns, so that they determine a pose.
 
+    Args:
+        image: (H, W).
+        board: with markers.
+        legacy: the numbering to assume where the image does not tell; None is that of today.
+
     Raises:
         InputError: the board has no markers.
     """
-    plain = cv2.aruco.CharucoDetector(_opencv_board(board))
-    _, _, markers, numbers = plain.detectBoard(image)
-    own = [] if numbers is None else [number for number in numbers.reshape(-1).tolist() if _is_own(number, board)]
+    _, _, markers, numbers = cv2.aruco.CharucoDetector(_opencv_board(board)).detectBoard(image)
+    found = [] if numbers is None else numbers.reshape(-1).tolist()
+    seen = [(n, m.reshape(4, 2)) for n, m in zip(found, markers if found else (), strict=True) if _is_own(n, board)]
+    own = [number for number, _ in seen]
     twice = sorted({number for number in own if own.count(number) > 1})
     if twice:
         return FoundCharuco(
             None, f"marker {twice[0]} is seen twice: two boards need different numbers (:idFIRST), or hide one of them"
         )
-    legacy: bool | None = None
-    detector = plain
+    told: bool | None = None
     if board.rows % 2 and len(own) >= _MIN_MARKERS:
-        seen = np.stack([m.reshape(4, 2) for m, n in zip(markers, numbers.reshape(-1), strict=True) if n in own])
-        counts = []
-        for old in (False, True):
-            corners = _opencv_board(board, legacy=old).getObjPoints()
-            placed = np.stack([np.asarray(corners[number - board.first])[:, :2] for number in own])
-            counts.append(agreeing(placed, seen, _TOLERANCE * board.square))
-        if max(counts) < _MIN_MARKERS:
+        today, before = (_agreeing(dict(seen), board, old) for old in (False, True))
+        if max(len(today), len(before)) < _MIN_MARKERS:
             return FoundCharuco(
                 None, "the markers do not lie as on this board: check its columns, rows, dictionary and first number"
             )
-        legacy = counts[1] > counts[0]
-        if min(counts) > max(counts) / 2 and min(counts) >= _MIN_MARKERS:
+        if min(len(today - before), len(before - today)) >= _MIN_MARKERS:
             return FoundCharuco(
-                None, f"{counts[0]} markers lie as on boards of today, {counts[1]} as on those of OpenCV before 4.6"
+                None,
+                f"{len(today - before)} markers lie as on boards of today only, {len(before - today)} as on those of "
+                "OpenCV before 4.6 only: two boards; hide one",
             )
-        if legacy:
-            detector = cv2.aruco.CharucoDetector(_opencv_board(board, legacy=True))
+        # Markers in the middle of some boards lie alike in both but for a shift.
+        told = None if len(today) == len(before) else len(before) > len(today)
+    detector = cv2.aruco.CharucoDetector(_opencv_board(board, bool(legacy if told is None else told)))
     corners, ids, _, _ = detector.detectBoard(image)
     pixels = torch.full((board.corners, 2), float("nan"), dtype=torch.float64)
     if ids is not None and len(ids):
         places = torch.from_numpy(np.asarray(ids, np.int64).reshape(-1))
         pixels[places] = torch.from_numpy(np.asarray(corners, np.float64).reshape(-1, 2))
     if enough(pixels, board):
-        return FoundCharuco(pixels, legacy=legacy)
+        return FoundCharuco(pixels, legacy=told)
     reason = f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on one line"
-    others = sorted(set() if numbers is None else set(numbers.reshape(-1).tolist()) - set(own))
-    if others and not own:
-        reason += f"; markers {others[0]} to {others[-1]} of {board.dictionary} are another board's"
+    if found and not own:
+        reason += f"; markers {min(found)} to {max(found)} of {board.dictionary} are another board's"
     return FoundCharuco(None, reason)
+
+
+def _agreeing(seen: dict[int, npt.NDArray[np.float32]], board: Board, legacy: bool) -> set[int]:
+    """Numbers of the markers that lie as one of the two numberings has them."""
+    corners = _opencv_board(board, legacy).getObjPoints()
+    placed = np.stack([np.asarray(corners[number - board.first])[:, :2] for number in seen])
+    good = inliers(placed, np.stack(list(seen.values())), _TOLERANCE * board.square)
+    return {number for number, fits in zip(seen, good.tolist(), strict=True) if fits}
 
 
 def enough(pixels: Tensor, board: Board) -> bool:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_MOST_DEGREE = 4  # of the polynomial that follows the lens
+_MOST_DEGREE = 5  # of the polynomial that follows the lens
 _POINTS_PER_TERM = 2
 
 
@@ -24,11 +24,16 @@ class LocalMaps(NamedTuple):
     second: Tensor
 
 
-def local_maps(points: Tensor, pixels: Tensor) -> LocalMaps:
-    """Derivatives of the map that brings points of the board (N, 2) to pixels (N, 2); all finite.
+def local_maps(points: Tensor, pixels: Tensor, known: Tensor | None = None) -> LocalMaps:
+    """Derivatives, at points of the board (N, 2), of the map that brings them to pixels (N, 2).
 
     Those of the homography of all points, which perspective follows exactly, and of a polynomial through what the
     homography leaves, which is the lens.
+
+    Args:
+        points: meters.
+        pixels: finite where known.
+        known: (N,) which of them determine the map; all if not given.
 
     Example:
         >>> axis = torch.arange(5, dtype=torch.float64)
@@ -37,7 +42,8 @@ def local_maps(points: Tensor, pixels: Tensor) -> LocalMaps:
         >>> [round(value, 3) + 0.0 for value in maps.second[0].flatten().tolist()]  # x: -2 x 10 x 0.1; y: -10 x 0.1
         [-2.0, 0.0, 0.0, 0.0, 0.0, -1.0, -1.0, 0.0]
     """
-    h = homography(points, pixels)
+    known = torch.ones(len(points), dtype=torch.bool) if known is None else known
+    h = homography(points[known], pixels[known])
     there = torch.nn.functional.pad(points, (0, 1), value=1.0) @ h.T
     seen = there[:, :2] / there[:, 2:]
     # (a q + b) / (c q + d): J = (A - p cᵀ) / w, K = -(J_i c_j + J_j c_i) / w.
@@ -46,9 +52,9 @@ def local_maps(points: Tensor, pixels: Tensor) -> LocalMaps:
     second = -(first[:, :, :, None] * slope + first[:, :, None, :] * slope[:, None]) / there[:, 2, None, None, None]
     low, high = points.amin(0), points.amax(0)
     scale = 2.0 / (high - low).clamp_min(1e-12)
-    terms = [(i, j) for degree in range(_degree(len(points)) + 1) for i in range(degree + 1) for j in [degree - i]]
+    terms = [(i, j) for degree in range(_degree(int(known.sum())) + 1) for i in range(degree + 1) for j in [degree - i]]
     values = _monomials((points - low) * scale - 1.0, terms)
-    found = torch.linalg.lstsq(values[0], pixels - seen, driver="gelsd").solution  # (terms, 2)
+    found = torch.linalg.lstsq(values[0][known], (pixels - seen)[known], driver="gelsd").solution  # (terms, 2)
     by_x, by_y, xx, xy, yy = (value @ found for value in values[1:])
     first = first + torch.stack([by_x, by_y], -1) * scale
     second = second + torch.stack([xx, xy, xy, yy], -1).unflatten(-1, (2, 2)) * scale[:, None] * scale

@@ -30,6 +30,7 @@ _MOST_BLUR = 0.5  # of the radius
 _MOST_MISFIT = 0.2  # RMS residual over the contrast: above, something covers the circle
 _MOST_MOVE = 0.5  # radii from OpenCV's center
 _SIZE_RATIO = 1.25  # of the circles' diameter as seen to that of the board's text
+_LEAST_KNOWN = 6  # circles: fewer good ones do not tell how the others are shifted, and no board is found
 _LATTICE = 0.3  # of a distance: how near a blob beside the grid must be to where its next circle would be
 
 
@@ -104,9 +105,13 @@ def refine_circles(image: Gray, pixels: Tensor, board: Board, radius: float) -> 
         center = torch.where(usable[:, None], found.center, center)
         shape = torch.where(usable[:, None, None], found.shape, shape)
         radius = float((torch.linalg.det(shape) * torch.linalg.det(first)).rsqrt()[usable].median())
-    maps = local_maps(points, center)
+    refined = _refined(image, pixels, found)
+    good = refined.status == CornerStatus.GOOD
+    if int(good.sum()) < _LEAST_KNOWN:
+        return refined, radius
+    maps = local_maps(points, found.center, good)
     shift = center_shift(maps, 0.5 * board.diameter if board.diameter is not None else radius)
-    return _refined(image, pixels, found, found.center - shift), radius
+    return refined._replace(pixels=refined.pixels - shift), radius
 
 
 def wrong_size(board: Board, radius: float) -> str:
@@ -225,7 +230,7 @@ def _symmetric(matrix: Tensor) -> Tensor:
     return vectors @ torch.diag_embed(values.clamp_min(1e-18).sqrt()) @ vectors.mT
 
 
-def _refined(image: Gray, start: Tensor, found: Ellipses, pixels: Tensor) -> Refined:
+def _refined(image: Gray, start: Tensor, found: Ellipses) -> Refined:
     height, width = image.shape
     size = torch.linalg.det(found.shape).clamp_min(1e-12).rsqrt()
     half = torch.linalg.vector_norm(torch.linalg.inv(found.shape), dim=-1) + found.blur[:, None]
@@ -233,10 +238,10 @@ def _refined(image: Gray, start: Tensor, found: Ellipses, pixels: Tensor) -> Ref
     inside = ((found.center >= half) & (found.center <= limit - half)).all(-1)
     alike = found.contrast.sign() == found.contrast.median().sign()
     result, status = with_status(
-        pixels,
+        found.center,
         (
             (CornerStatus.OUTSIDE, inside),
-            (CornerStatus.NO_SADDLE, alike & torch.isfinite(pixels).all(-1)),
+            (CornerStatus.NO_SADDLE, alike & torch.isfinite(found.center).all(-1)),
             (CornerStatus.OCCLUDED, found.misfit <= _MOST_MISFIT),
             (CornerStatus.BLURRED, found.blur <= _MOST_BLUR * size),
             (CornerStatus.MOVED, (found.center - start).norm(dim=-1) <= _MOST_MOVE * size),

@@ -119,15 +119,15 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
     return Detection(refined.pixels, covariance=refined.covariance)
 
 
-def _detect_charuco(image: Gray, board: Board, refine: Refinement) -> Detection:
-    pixels, reason, legacy = find_charuco(to_8bit(image), board)
+def _detect_charuco(image: Gray, board: Board, refine: Refinement, legacy: bool | None = None) -> Detection:
+    pixels, reason, told = find_charuco(to_8bit(image), board, legacy)
     if pixels is None:
         return Detection(None, reason)
     seen = torch.isfinite(pixels).all(-1)
     refined = refine_corners(image, pixels, free_side(pixels, board), refine, (board.columns, board.rows))
     if not enough(refined.pixels, board):
         return Detection(None, _too_few(refined, int(seen.sum())))
-    return Detection(refined.pixels, covariance=refined.covariance, legacy=legacy)
+    return Detection(refined.pixels, covariance=refined.covariance, legacy=told)
 
 
 def _detect_tags(image: Gray, board: Board, refine: Refinement) -> Detection:
@@ -203,7 +203,7 @@ def detect_images(
     views: list[View] = []
     failures: list[Failure] = []
     size: tuple[int, int] | None = None
-    numberings: dict[bool, str] = {}
+    numberings: dict[bool | None, list[str]] = {}
     with Limited(time_limit) as limited:
         for name, file in zip(names, files, strict=True):
             try:
@@ -222,8 +222,7 @@ def detect_images(
                 if found.pixels is None:
                     failures.append(Failure(name=name, reason=found.reason))
                 else:
-                    if found.legacy is not None:
-                        numberings.setdefault(found.legacy, name)
+                    numberings.setdefault(found.legacy, []).append(name)
                     digest = hashlib.sha256(data).hexdigest()
                     views.append(view_of(found, name, image=str(file), sha256=digest))
             if progress is not None:
@@ -231,12 +230,34 @@ def detect_images(
     if size is None or not views:
         first = f"{failures[0].name}: {failures[0].reason}"
         raise InputError(f"no board in any of {len(files)} images ({first}){_hint(files, board)}")
-    if len(numberings) == 2:
-        raise InputError(
-            f"two ChArUco boards: {numberings[True]} shows the numbering of OpenCV before 4.6, {numberings[False]} that "
-            "of today; detect the images of each board apart"
-        )
+    if True in numberings:
+        views = _renumbered(views, numberings, board, refine)
     return Observations(board=board, image_size=size, refinement=refine, views=tuple(views), failures=tuple(failures))
+
+
+def _renumbered(
+    views: Sequence[View], numberings: dict[bool | None, list[str]], board: Board, refine: Refinement
+) -> list[View]:
+    """Views of a ChArUco board of the old numbering: images that do not tell it are read anew, as the others tell.
+
+    Raises:
+        InputError: some images tell the numbering of today.
+    """
+    if False in numberings:
+        raise InputError(
+            f"two ChArUco boards: {numberings[True][0]} shows the numbering of OpenCV before 4.6, "
+            f"{numberings[False][0]} that of today; detect the images of each board apart"
+        )
+    unclear, out = set(numberings.get(None, ())), []
+    for view in views:
+        if view.name in unclear and view.image is not None:
+            image = decode_gray(read_bytes(Path(view.image)), view.image)
+            found = _detect_charuco(image, board, refine, legacy=True)
+            if found.pixels is not None:
+                out.append(view_of(found, view.name, image=view.image, sha256=view.sha256))
+            continue
+        out.append(view)
+    return out
 
 
 def limit_threads(count: int) -> None:
@@ -364,9 +385,14 @@ def _hint(files: list[Path], board: Board) -> str:
         except FileError:
             continue
         small = to_8bit(_reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
-        if other := seen_markers(small, board) or seen_circles(small, board):
+        other: str | None = seen_markers(small, board)
+        if not other:
+            if has_own_markers(small, board):
+                continue
+            other = seen_circles(small, board)
+        if other:
             return f"; {other}"
-        found = None if has_own_markers(small, board) else seen_size(small)
+        found = None if other == "" else seen_size(small)
         own = (max(board.columns, board.rows), min(board.columns, board.rows))
         if found is None:
             continue

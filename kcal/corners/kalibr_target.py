@@ -58,15 +58,15 @@ def target_fields(path: str | Path) -> dict[str, Any]:
         columns, rows = 2 * count("tagCols"), 2 * count("tagRows")
         gap = number("tagSpacing") * size
         return {"pattern": "aprilgrid", "columns": columns, "rows": rows, "square": size, "gap": gap}
+    if kind not in ("checkerboard", "circlegrid"):
+        raise FileError(f"{path}: target_type {kind!r:.40}: kcal reads aprilgrid, checkerboard and circlegrid")
     grid = {"columns": count("targetCols"), "rows": count("targetRows")}
     if kind == "checkerboard":
         across, down = number("colSpacingMeters"), number("rowSpacingMeters")
         if abs(across - down) > 1e-9:
             raise FileError(f"{path}: rowSpacingMeters {down:g} and colSpacingMeters {across:g}: squares are needed")
         return grid | {"square": across}
-    if kind == "circlegrid":
-        asymmetric = content.get("asymmetricGrid")
-        if not isinstance(asymmetric, bool):
-            raise FileError(f"{path}: asymmetricGrid must be true or false, it is {asymmetric!r:.40}")
-        return {"pattern": "asymmetric" if asymmetric else "circles"} | grid | {"square": number("spacingMeters")}
-    raise FileError(f"{path}: target_type {kind!r:.40}: kcal reads aprilgrid, checkerboard and circlegrid")
+    asymmetric = content.get("asymmetricGrid")
+    if not isinstance(asymmetric, bool):
+        raise FileError(f"{path}: asymmetricGrid must be true or false, it is {asymmetric!r:.40}")
+    return {"pattern": "asymmetric" if asymmetric else "circles"} | grid | {"square": number("spacingMeters")}

@@ -47,12 +47,19 @@ def seen_markers(image: npt.NDArray[np.uint8], board: Board) -> str:
     return ""
 
 
-def seen_circles(image: npt.NDArray[np.uint8], board: Board) -> str:
-    """Whether an image shows circles that the board does not have; empty if it shows none."""
-    count = 0 if board.pattern in ("circles", "asymmetric") else _alike(image)
+def seen_circles(image: npt.NDArray[np.uint8], board: Board) -> str | None:
+    """What to say of a grid of circles in an image; None if there is none, empty if it may be the board's own."""
+    count = _alike(image)
     if count < _MIN_CIRCLES:
+        return None
+    if board.pattern not in ("circles", "asymmetric"):
+        return f"some {count} circles were found: give --board circles:COLUMNSxROWS or asymmetric:COLUMNSxROWS"
+    if count == board.corners:
         return ""
-    return f"some {count} circles were found: give --board circles:COLUMNSxROWS or asymmetric:COLUMNSxROWS"
+    return (
+        f"some {count} circles were found, the board has {board.corners}: check its columns and rows, and whether they "
+        "are asymmetric"
+    )
 
 
 def has_own_markers(image: npt.NDArray[np.uint8], board: Board) -> bool:
