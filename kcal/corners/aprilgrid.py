@@ -110,17 +110,20 @@ def _most_tags(
     border, tags, others = best
     if image.size <= _MOST_ENLARGED and len(tags) < board.markers:
         # OpenCV reads tags of 20 px and less in an image twice as large only.
-        large, more = _read_tags(cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), board, border)
-        tags |= {n: [(corners + 0.5) / 2 - 0.5 for corners in found] for n, found in large.items() if n not in tags}
+        # More wrong bits are corrected there: a tag that is read wrongly does not lie where it should.
+        double = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        large, more = _read_tags(double, board, border, correction=1.0)
+        tags |= {n: [(found[0] + 0.5) / 2 - 0.5] for n, found in large.items() if n not in tags and len(found) == 1}
         others += more
     return border, tags, others
 
 
 def _read_tags(
-    image: npt.NDArray[np.uint8], board: Board, border: int
+    image: npt.NDArray[np.uint8], board: Board, border: int, correction: float = 0.6
 ) -> tuple[dict[int, list[npt.NDArray[np.float64]]], list[int]]:
     options = cv2.aruco.DetectorParameters()
-    options.markerBorderBits = border
+    options.markerBorderBits, options.errorCorrectionRate = border, correction
+    options.perspectiveRemovePixelPerCell = 8
     found, numbers, _ = cv2.aruco.ArucoDetector(opencv_dictionary(TAGS), options).detectMarkers(image)
     tags: dict[int, list[npt.NDArray[np.float64]]] = {}
     others: list[int] = []

@@ -30,6 +30,7 @@ _FREE_SHARE = 0.85  # of the distance from a corner to the nearest marker; the r
 # Of a square: distance of a marker's corner from the homography of all of them. Wide lenses stay below in the middle
 # of the image, markers of the other numbering are a square off.
 _TOLERANCE = 0.35
+_MOST = 0.7  # of the markers: if so many lie as on one board or the other, the image shows both
 _MIN_MARKERS = 3  # that agree on one numbering; two of them fit any
 
 
@@ -75,11 +76,8 @@ def find_charuco(
     told: bool | None = None
     if board.rows % 2 and len(own) >= _MIN_MARKERS:
         today, before = (_agreeing(dict(seen), board, old) for old in (False, True))
-        if max(len(today), len(before)) < _MIN_MARKERS:
-            return FoundCharuco(
-                None, "the markers do not lie as on this board: check its columns, rows, dictionary and first number"
-            )
-        if min(len(today - before), len(before - today)) >= _MIN_MARKERS:
+        several = min(len(today - before), len(before - today)) >= _MIN_MARKERS
+        if several and len(today | before) >= _MOST * len(own):
             return FoundCharuco(
                 None,
                 f"{len(today - before)} markers lie as on boards of today only, {len(before - today)} as on those of "
@@ -96,7 +94,9 @@ def find_charuco(
     if enough(pixels, board):
         return FoundCharuco(pixels, legacy=told)
     reason = f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on one line"
-    if found and not own:
+    if len(own) >= _MIN_MARKERS and all(2 * len(_agreeing(dict(seen), board, old)) < len(own) for old in (False, True)):
+        reason = "the markers do not lie as on this board: check its columns, rows, dictionary and first number"
+    elif found and not own:
         reason += f"; markers {min(found)} to {max(found)} of {board.dictionary} are another board's"
     return FoundCharuco(None, reason)
 

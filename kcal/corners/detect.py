@@ -137,7 +137,8 @@ def _detect_tags(image: Gray, board: Board, refine: Refinement) -> Detection:
     seen = torch.isfinite(found.pixels).all(-1)
     refined = refine_corners(image, found.pixels, torch.where(seen, found.side, 1.0), refine)
     if not enough(refined.pixels, board):
-        lacking = (refined.status == CornerStatus.NO_SADDLE).sum() > 0.5 * seen.sum()
+        none = (CornerStatus.NO_SADDLE, CornerStatus.MOVED, CornerStatus.NOT_CONVERGED, CornerStatus.OCCLUDED)
+        lacking = sum(int((refined.status == status).sum()) for status in none) > 0.5 * int(seen.sum())
         more = "; the small squares between the tags are needed, as Kalibr draws them" if lacking else ""
         return Detection(None, _too_few(refined, int(seen.sum())) + more)
     return Detection(refined.pixels, covariance=refined.covariance)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-_TRIES = 200
+_TRIES = 60  # pairs; nearly all of a board's markers agree, or hardly any
 
 
 def agreeing(placed: npt.NDArray[np.floating], seen: npt.NDArray[np.floating], tolerance: float) -> int:
