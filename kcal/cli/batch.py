@@ -27,7 +27,9 @@ def batch_command(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results; made if it is missing.")],
     size: Annotated[
         str | None,
-        typer.Option("--board", metavar="BOARD", help="As for `kcal detect`: 9x6, circles:7x6, ...", show_default=False),
+        typer.Option(
+            "--board", metavar="BOARD", help="As for `kcal detect`: 9x6, circles:7x6, ...", show_default=False
+        ),
     ] = None,
     square: Annotated[
         str | None,

@@ -66,7 +66,11 @@ def print_command(
     write_atomic(output, to_svg(sheet.drawing) if suffix == ".svg" else to_pdf(sheet.drawing))
     out.print(f"{output}: {pattern}, page {sheet.drawing.width:g}x{sheet.drawing.height:g} mm")
     if sheet.quiet < 1:
-        white = f"{sheet.quiet:.1f} squares" if pattern.pattern == "checkerboard" else f"{sheet.quiet * sheet.margin:.0f} mm"
+        white = (
+            f"{sheet.quiet:.1f} squares"
+            if pattern.pattern == "checkerboard"
+            else f"{sheet.quiet * sheet.margin:.0f} mm"
+        )
         out.print(f"note: only {white} of white around the board; keep the background light")
     if not pattern.unambiguous:
         out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")

@@ -111,7 +111,7 @@ def _most_tags(
     if image.size <= _MOST_ENLARGED and len(tags) < board.markers:
         # OpenCV reads tags of 20 px and less in an image twice as large only.
         # More wrong bits are corrected there: a tag that is read wrongly does not lie where it should.
-        double = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        double = np.asarray(cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), np.uint8)
         large, more = _read_tags(double, board, border, correction=1.0)
         tags |= {n: [(found[0] + 0.5) / 2 - 0.5] for n, found in large.items() if n not in tags and len(found) == 1}
         others += more
@@ -127,7 +127,7 @@ def _read_tags(
     found, numbers, _ = cv2.aruco.ArucoDetector(opencv_dictionary(TAGS), options).detectMarkers(image)
     tags: dict[int, list[npt.NDArray[np.float64]]] = {}
     others: list[int] = []
-    for corners, number in zip(found, [] if numbers is None else numbers.reshape(-1).tolist(), strict=True):
+    for corners, number in zip(found, [] if numbers is None else map(int, numbers.reshape(-1)), strict=True):
         if board.first <= number < board.first + board.markers:
             tags.setdefault(number, []).append(np.asarray(corners, np.float64).reshape(4, 2))
         else:
@@ -158,9 +158,7 @@ def _agreement(seen: dict[int, npt.NDArray[np.float64]], board: Board, turn: int
     return agreeing(placed, np.stack(list(seen.values())), _TOLERANCE * board.square)
 
 
-def _in_place(
-    seen: dict[int, npt.NDArray[np.float64]], board: Board, turn: int
-) -> dict[int, npt.NDArray[np.float64]]:
+def _in_place(seen: dict[int, npt.NDArray[np.float64]], board: Board, turn: int) -> dict[int, npt.NDArray[np.float64]]:
     """Those tags that lie where the tags next to them put them."""
     points = board.points[:, :2].numpy()
     kept = {}
@@ -179,6 +177,8 @@ def _in_place(
         if np.linalg.norm(there - own, axis=1).mean() > _TOLERANCE * board.square:
             continue
         # OpenCV finds tags too small by up to 4 px at each corner; their neighbors correct that.
-        both = board_homography(np.concatenate([placed, own[None]]).reshape(-1, 2), np.append(around, corners).reshape(-1, 2))
+        both = board_homography(
+            np.concatenate([placed, own[None]]).reshape(-1, 2), np.append(around, corners).reshape(-1, 2)
+        )
         kept[number] = corners if both is None else cv2.perspectiveTransform(own[None], np.linalg.inv(both))[0]
     return kept

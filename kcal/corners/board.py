@@ -19,6 +19,7 @@ TAGS = "apriltag_36h11"  # the dictionary of an AprilGrid
 _LATER = {"pattern": "checkerboard", "gap": None, "diameter": None, "first": 0}
 _TARGET_FILES = (".yaml", ".yml")
 
+
 class Board(pydantic.BaseModel):
     """A checkerboard, a grid of circles or an AprilGrid, described by its points in rows and columns.
 
@@ -218,9 +219,7 @@ class Board(pydantic.BaseModel):
     @property
     def record(self) -> BoardRecord:
         """What a calibration keeps of the board: where its points are."""
-        return BoardRecord(
-            columns=self.columns, rows=self.rows, square=self.square, pattern=self.pattern, gap=self.gap
-        )
+        return BoardRecord(columns=self.columns, rows=self.rows, square=self.square, pattern=self.pattern, gap=self.gap)
 
     @classmethod
     def of(cls, record: BoardRecord) -> Board:

@@ -49,9 +49,7 @@ class FoundCharuco(NamedTuple):
     legacy: bool | None = None
 
 
-def find_charuco(
-    image: npt.NDArray[np.uint8], board: Board, legacy: bool | None = None
-) -> FoundCharuco:
+def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None = None) -> FoundCharuco:
     """The corners of a ChArUco board.
 
     At least 6 corners are needed, two each on two rows and on two columns, so that they determine a pose.
@@ -65,8 +63,9 @@ def find_charuco(
         InputError: the board has no markers.
     """
     _, _, markers, numbers = cv2.aruco.CharucoDetector(_opencv_board(board)).detectBoard(image)
-    found = [] if numbers is None else numbers.reshape(-1).tolist()
-    seen = [(n, m.reshape(4, 2)) for n, m in zip(found, markers if found else (), strict=True) if _is_own(n, board)]
+    found = [] if numbers is None else [int(number) for number in numbers.reshape(-1).tolist()]
+    corners = [np.asarray(marker, np.float64).reshape(4, 2) for marker in markers] if found else []
+    seen = [(n, c) for n, c in zip(found, corners, strict=True) if _is_own(n, board)]
     own = [number for number, _ in seen]
     twice = sorted({number for number in own if own.count(number) > 1})
     if twice:
@@ -86,11 +85,11 @@ def find_charuco(
         # Markers in the middle of some boards lie alike in both but for a shift.
         told = None if len(today) == len(before) else len(before) > len(today)
     detector = cv2.aruco.CharucoDetector(_opencv_board(board, bool(legacy if told is None else told)))
-    corners, ids, _, _ = detector.detectBoard(image)
+    places, ids, _, _ = detector.detectBoard(image)
     pixels = torch.full((board.corners, 2), float("nan"), dtype=torch.float64)
     if ids is not None and len(ids):
-        places = torch.from_numpy(np.asarray(ids, np.int64).reshape(-1))
-        pixels[places] = torch.from_numpy(np.asarray(corners, np.float64).reshape(-1, 2))
+        order = torch.from_numpy(np.asarray(ids, np.int64).reshape(-1))
+        pixels[order] = torch.from_numpy(np.asarray(places, np.float64).reshape(-1, 2))
     if enough(pixels, board):
         return FoundCharuco(pixels, legacy=told)
     reason = f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on one line"
@@ -101,7 +100,7 @@ def find_charuco(
     return FoundCharuco(None, reason)
 
 
-def _agreeing(seen: dict[int, npt.NDArray[np.float32]], board: Board, legacy: bool) -> set[int]:
+def _agreeing(seen: dict[int, npt.NDArray[np.float64]], board: Board, legacy: bool) -> set[int]:
     """Numbers of the markers that lie as one of the two numberings has them."""
     corners = _opencv_board(board, legacy).getObjPoints()
     placed = np.stack([np.asarray(corners[number - board.first])[:, :2] for number in seen])

@@ -122,8 +122,8 @@ def wrong_size(board: Board, radius: float) -> str:
     if 1.0 / _SIZE_RATIO < ratio < _SIZE_RATIO:
         return ""
     return (
-        f"the circles are {2e3 * radius:.3g} mm wide where their distance is {1e3 * board.square:g} mm, the board's are "
-        f"{1e3 * board.diameter:g} mm: check distance and diameter"
+        f"the circles are {2e3 * radius:.3g} mm wide where their distance is {1e3 * board.square:g} mm, "
+        f"the board's are {1e3 * board.diameter:g} mm: check distance and diameter"
     )
 
 
@@ -183,7 +183,7 @@ def round_blobs(image: npt.NDArray[np.uint8], circularity: float = 0.0) -> list[
 
 def _detector(pixels: int, circularity: float = 0.0) -> cv2.SimpleBlobDetector:
     """Blobs of any size and tilt: OpenCV's own settings lose circles that are small, large, near or seen from aside."""
-    options = cv2.SimpleBlobDetector_Params()
+    options = cv2.SimpleBlobDetector.Params()
     options.minThreshold, options.maxThreshold, options.thresholdStep = 20, 235, 10
     options.minDistBetweenBlobs = 4
     options.filterByArea, options.minArea, options.maxArea = True, 12, 0.05 * pixels
@@ -219,9 +219,7 @@ def _goes_on(blobs: Tensor, pixels: Tensor, board: Board) -> bool:
     up, down = (grid[1], grid[-2]) if board.pattern == "asymmetric" else (grid[0], grid[-1])
     rows = 2.0 if board.pattern == "asymmetric" else 1.0
     beside += [up - torch.tensor([0.0, rows]), down + torch.tensor([0.0, rows])]
-    return any(
-        float((torch.cdist(side.double(), seen).amin(1) < _LATTICE).double().mean()) > 0.5 for side in beside
-    )
+    return any(float((torch.cdist(side.double(), seen).amin(1) < _LATTICE).double().mean()) > 0.5 for side in beside)
 
 
 def _symmetric(matrix: Tensor) -> Tensor:

@@ -97,11 +97,17 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
         raise InputError(f"image: (H, W) uint8 or uint16 is needed, got {image.shape} {image.dtype}")
     if min(board.columns, board.rows) < 3 and board.pattern != "aprilgrid":
         what = "inner corners" if board.pattern == "checkerboard" else "circles"
-        raise InputError(f"board {board.columns}x{board.rows}: at least 3 {what} in each direction are needed for detection")
+        raise InputError(
+            f"board {board.columns}x{board.rows}: at least 3 {what} in each direction are needed for detection"
+        )
     if refine not in get_args(Refinement):
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
     if board.pattern != "checkerboard":
-        return _detect_tags(image, board, refine) if board.pattern == "aprilgrid" else _detect_circles(image, board, refine)
+        return (
+            _detect_tags(image, board, refine)
+            if board.pattern == "aprilgrid"
+            else _detect_circles(image, board, refine)
+        )
     if board.dictionary is not None:
         return _detect_charuco(image, board, refine)
     pixels, factor, reason = _find_in_order(to_8bit(image), board)
@@ -146,12 +152,16 @@ def _detect_tags(image: Gray, board: Board, refine: Refinement) -> Detection:
 
 def _detect_circles(image: Gray, board: Board, refine: Refinement) -> Detection:
     if refine not in ("erf", "none"):
-        raise InputError(f"refine {refine!r}: circles are fitted at their edges (erf), or left as OpenCV finds them (none)")
+        raise InputError(
+            f"refine {refine!r}: circles are fitted at their edges (erf), or left as OpenCV finds them (none)"
+        )
     found = find_circles(to_8bit(image), board)
     if found.pixels is None or refine == "none":
         return Detection(found.pixels, found.reason)
     refined, radius = refine_circles(image, found.pixels, board, found.radius)
-    if (reason := wrong_size(board, radius)) or int((refined.status == CornerStatus.GOOD).sum()) < MIN_GOOD * board.corners:
+    if (reason := wrong_size(board, radius)) or int(
+        (refined.status == CornerStatus.GOOD).sum()
+    ) < MIN_GOOD * board.corners:
         return Detection(None, reason or _too_few(refined, board.corners))
     return Detection(refined.pixels, covariance=refined.covariance)
 

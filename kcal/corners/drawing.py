@@ -111,7 +111,9 @@ def to_pdf(drawing: Drawing) -> bytes:
     for r in drawing.rectangles:
         corner = f"{_decimal(r.x * _POINT)} {flip(r.y + r.height)}"
         content.append(f"{corner} {_decimal(r.width * _POINT)} {_decimal(r.height * _POINT)} re")
-    content += [_pdf_circle(c.x * _POINT, (drawing.height - c.y) * _POINT, c.diameter * _POINT) for c in drawing.circles]
+    content += [
+        _pdf_circle(c.x * _POINT, (drawing.height - c.y) * _POINT, c.diameter * _POINT) for c in drawing.circles
+    ]
     content.append("f" if drawing.rectangles or drawing.circles else "")
     for t in drawing.texts:
         content.append(

@@ -1,8 +1,8 @@
 """Fit the edge of a blurred dark or light ellipse: its center with covariance, its shape, its blur.
 
-Light is `out + (in - out) Φ(-d / blur)` plus a ramp, with d the distance from the ellipse |B (p - c)| = 1 to first order,
-(ρ² - ρ) / |B B (p - c)| with ρ = |B (p - c)| and B symmetric. A small batched Levenberg-Marquardt estimates the ten
-parameters of all ellipses at once from the pixels around each.
+Light is `out + (in - out) Φ(-d / blur)` plus a ramp, with d the distance from the ellipse |B (p - c)| = 1 to first
+order, (ρ² - ρ) / |B B (p - c)| with ρ = |B (p - c)| and B symmetric. A small batched Levenberg-Marquardt estimates the
+ten parameters of all ellipses at once from the pixels around each.
 """
 
 from __future__ import annotations
@@ -45,9 +45,7 @@ class Ellipses(NamedTuple):
     converged: Tensor
 
 
-def fit_ellipses(
-    image: npt.NDArray[np.generic], center: Tensor, shape: Tensor, reach: Tensor
-) -> Ellipses:
+def fit_ellipses(image: npt.NDArray[np.generic], center: Tensor, shape: Tensor, reach: Tensor) -> Ellipses:
     """Fit one ellipse near each start.
 
     Args:
@@ -69,9 +67,7 @@ def fit_ellipses(
     p[:, 2], p[:, 3], p[:, 4] = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
     rho = torch.linalg.vector_norm(torch.einsum("mij,mkj->mki", shape, where), dim=-1)
     inside, outside = weight * (rho < 0.7), weight * (rho > 1.25)
-    dark, light = (
-        (share * levels).sum(-1) / share.sum(-1).clamp_min(1e-9) for share in (inside, outside)
-    )
+    dark, light = ((share * levels).sum(-1) / share.sum(-1).clamp_min(1e-9) for share in (inside, outside))
     p[:, 5], p[:, 6], p[:, 7] = light, dark - light, 0.8
     # Lengths are in units of the radius, for the normal equations.
     size = torch.linalg.det(shape).clamp_min(1e-12).rsqrt()
@@ -81,7 +77,9 @@ def fit_ellipses(
     done = torch.zeros(len(p), dtype=torch.bool)
     for _ in range(_STEPS):
         diagonal = normal.diagonal(dim1=-2, dim2=-1)
-        damped = normal + torch.diag_embed(lam[:, None] * diagonal + 1e-9 * diagonal.amax(-1, keepdim=True).clamp_min(1e-30))
+        damped = normal + torch.diag_embed(
+            lam[:, None] * diagonal + 1e-9 * diagonal.amax(-1, keepdim=True).clamp_min(1e-30)
+        )
         move = -torch.linalg.solve_ex(damped, gradient[..., None])[0][..., 0]
         move[:, :2] *= (0.3 * size / move[:, :2].norm(dim=-1).clamp_min(1e-12)).clamp_max(1.0)[:, None]
         trial = p + move

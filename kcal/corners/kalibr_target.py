@@ -14,7 +14,7 @@ _MOST_BYTES = 1 << 20
 
 
 def target_fields(path: str | Path) -> dict[str, Any]:
-    """The fields of `kcal.corners.board.Board` that a target file of Kalibr describes.
+    r"""The fields of `kcal.corners.board.Board` that a target file of Kalibr describes.
 
     `aprilgrid` (`tagCols`, `tagRows`, `tagSize`, `tagSpacing`), `checkerboard` (`targetCols`, `targetRows`,
     `rowSpacingMeters`, `colSpacingMeters`) and `circlegrid` (`targetCols`, `targetRows`, `spacingMeters`,
@@ -25,7 +25,7 @@ def target_fields(path: str | Path) -> dict[str, Any]:
 
     Example:
         >>> import tempfile
-        >>> text = "target_type: aprilgrid\\ntagCols: 6\\ntagRows: 4\\ntagSize: 0.08\\ntagSpacing: 0.25"
+        >>> text = "target_type: aprilgrid\ntagCols: 6\ntagRows: 4\ntagSize: 0.08\ntagSpacing: 0.25"
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = Path(folder, "april.yaml")
         ...     _ = path.write_text(text)

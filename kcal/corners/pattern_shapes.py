@@ -76,7 +76,7 @@ def _circles(board: Board) -> PatternShapes:
 
 
 def _aprilgrid(board: Board) -> PatternShapes:
-    """Tags, and squares as wide as the gap that touch their corners: there four quadrants meet, as on a checkerboard."""
+    """Tags, and squares as wide as the gap that touch their corners, so that four quadrants meet there."""
     assert board.gap is not None
     side, gap = 1000 * board.square, 1000 * board.gap
     across, down = board.columns // 2, board.rows // 2

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from kcal.corners.board import Board
 from kcal.corners.drawing import Drawing, Rectangle, Text, to_pdf, to_svg
-from kcal.errors import InputError
 from kcal.corners.pattern_shapes import CIRCLE_SHARE, PatternShapes, pattern_shapes
+from kcal.errors import InputError
 from kcal.files import write_atomic
 
 # Millimeters, upright; ISO 216 and the North American sizes.

@@ -37,7 +37,7 @@ def seen_markers(image: npt.NDArray[np.uint8], board: Board) -> str:
     """
     name, border, numbers = _most_markers(image)
     if numbers:
-        own = name == board.dictionary and border == 1 or name == TAGS and board.pattern == "aprilgrid"
+        own = (name == board.dictionary and border == 1) or (name == TAGS and board.pattern == "aprilgrid")
         if own and any(board.first <= number < board.first + board.markers for number in numbers):
             return ""  # it may be this board, and the image's own reason says what is wrong
         found = f"markers {numbers[0]} to {numbers[-1]} of dictionary {name} were found"
@@ -87,7 +87,7 @@ def _read(image: npt.NDArray[np.uint8], name: str, border: int) -> list[int]:
     options = cv2.aruco.DetectorParameters()
     options.markerBorderBits = border
     _, numbers, _ = cv2.aruco.ArucoDetector(opencv_dictionary(name), options).detectMarkers(image)
-    return [] if numbers is None else sorted(set(numbers.reshape(-1).tolist()))
+    return [] if numbers is None else sorted({int(number) for number in numbers.reshape(-1).tolist()})
 
 
 def _smallest(family: str, highest: int) -> str:

@@ -21,9 +21,7 @@ class Sides(NamedTuple):
     spread: float
 
 
-def triangulated_sides(
-    rig: StereoRig, columns: int, rows: int, pixels: Tensor, points: Tensor | None = None
-) -> Sides:
+def triangulated_sides(rig: StereoRig, columns: int, rows: int, pixels: Tensor, points: Tensor | None = None) -> Sides:
     """Triangulate every corner of boards seen by both cameras and measure the sides of the squares.
 
     Args:

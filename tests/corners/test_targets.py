@@ -76,7 +76,10 @@ def test_tags_are_those_of_the_apriltag_library():
     for number, code in enumerate((0xD5D628584, 0xD97F18B49, 0xDD280910E)):
         cells = tag_cells(number)
         assert cells.shape == (10, 10)
-        assert cells[:2].all() and cells[-2:].all() and cells[:, :2].all() and cells[:, -2:].all()
+        assert cells[:2].all()
+        assert cells[-2:].all()
+        assert cells[:, :2].all()
+        assert cells[:, -2:].all()
         bits = [not cells[2 + i, 2 + j] for i in range(6) for j in range(6)]
         assert sum(bit << (35 - place) for place, bit in enumerate(bits)) == code
 
@@ -166,7 +169,7 @@ class TestKalibrFiles:
         circles = "target_type: circlegrid\ntargetCols: 4\ntargetRows: 11\nspacingMeters: 0.02\nasymmetricGrid: "
         assert self.parse(tmp_path, circles + "True") == Board.parse("asymmetric:4x11", "20mm")
         assert self.parse(tmp_path, circles + "False") == Board.parse("circles:4x11", "20mm")
-        with pytest.raises(FileError, match="colSpacingMeters 0.05: squares are needed"):
+        with pytest.raises(FileError, match=r"colSpacingMeters 0\.05: squares are needed"):
             self.parse(tmp_path, checks + "0.05\n")
 
     @pytest.mark.parametrize(
@@ -201,9 +204,13 @@ def test_everything_is_on_the_page(text):
     page = sheet.drawing
     for circle in page.circles:
         r = circle.diameter / 2
-        assert r <= circle.x <= page.width - r and r <= circle.y <= page.height - r
+        assert r <= circle.x <= page.width - r
+        assert r <= circle.y <= page.height - r
     for r in page.rectangles:
-        assert 0 <= r.x and r.x + r.width <= page.width and 0 <= r.y and r.y + r.height <= page.height
+        assert r.x >= 0
+        assert r.x + r.width <= page.width
+        assert r.y >= 0
+        assert r.y + r.height <= page.height
     # Every point of the board is on the page, and black and white meet there or a circle is around it.
     points = 1000 * board.points[:, :2] + torch.tensor(sheet.origin, dtype=torch.float64)
     if page.circles:
