@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -15,18 +14,17 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kcal.corners.aprilgrid import find_aprilgrid
 from kcal.corners.board import Board
-from kcal.corners.charuco import enough, find_charuco, free_side
-from kcal.corners.circles import find_circles, refine_circles, wrong_size
+from kcal.corners.detect_targets import detect_charuco, detect_target
+from kcal.corners.detection import Detection, too_few
 from kcal.corners.grid import MIN_SHARPNESS, grid_trouble, local_side, sharpness
 from kcal.corners.images import Gray, decode_gray, to_8bit, unique_names
 from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.order import canonical_order
 from kcal.corners.refine import Refinement, refine_corners
-from kcal.corners.saddle import CornerStatus, Refined
-from kcal.corners.seen_instead import has_own_markers, seen_circles, seen_markers
+from kcal.corners.saddle import CornerStatus
+from kcal.corners.seen_instead import seen_instead
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 
@@ -36,32 +34,6 @@ MIN_GOOD = 0.5  # share of the corners that must be refined successfully
 
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTOR = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-_STATUS_TEXTS = {
-    CornerStatus.OUTSIDE: "too near the image's edge",
-    CornerStatus.NO_SADDLE: "not a corner",
-    CornerStatus.MOVED: "moved too far",
-    CornerStatus.NOT_CONVERGED: "did not converge",
-    CornerStatus.SATURATED: "over- or underexposed",
-    CornerStatus.OCCLUDED: "covered or glaring",
-    CornerStatus.BLURRED: "too blurred",
-}
-
-
-class Detection(NamedTuple):
-    """What was found of a board in an image.
-
-    Args:
-        pixels: (corners, 2) float64 in the board's order, NaN where not seen; None if no board was found.
-        reason: why none was found.
-        covariance: (corners, 2, 2) px², if the refinement estimates it.
-        legacy: of a ChArUco board, whether its numbering is that of OpenCV before 4.6; None where it makes no
-            difference.
-    """
-
-    pixels: Tensor | None
-    reason: str = ""
-    covariance: Tensor | None = None
-    legacy: bool | None = None
 
 
 def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detection:
@@ -102,14 +74,8 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
         )
     if refine not in get_args(Refinement):
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
-    if board.pattern != "checkerboard":
-        return (
-            _detect_tags(image, board, refine)
-            if board.pattern == "aprilgrid"
-            else _detect_circles(image, board, refine)
-        )
-    if board.dictionary is not None:
-        return _detect_charuco(image, board, refine)
+    if board.pattern != "checkerboard" or board.dictionary is not None:
+        return detect_target(image, board, refine)
     pixels, factor, reason = _find_in_order(to_8bit(image), board)
     if pixels is None:
         return Detection(None, reason)
@@ -121,56 +87,8 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
     refined = refine_corners(image, pixels, side, refine, (board.columns, board.rows))
     good = int((refined.status == CornerStatus.GOOD).sum())
     if good < MIN_GOOD * board.corners:
-        return Detection(None, _too_few(refined, board.corners))
+        return Detection(None, too_few(refined, board.corners))
     return Detection(refined.pixels, covariance=refined.covariance)
-
-
-def _detect_charuco(image: Gray, board: Board, refine: Refinement, legacy: bool | None = None) -> Detection:
-    pixels, reason, told = find_charuco(to_8bit(image), board, legacy)
-    if pixels is None:
-        return Detection(None, reason)
-    seen = torch.isfinite(pixels).all(-1)
-    refined = refine_corners(image, pixels, free_side(pixels, board), refine, (board.columns, board.rows))
-    if not enough(refined.pixels, board):
-        return Detection(None, _too_few(refined, int(seen.sum())))
-    return Detection(refined.pixels, covariance=refined.covariance, legacy=told)
-
-
-def _detect_tags(image: Gray, board: Board, refine: Refinement) -> Detection:
-    found = find_aprilgrid(to_8bit(image), board)
-    if found.pixels is None:
-        return Detection(None, found.reason)
-    seen = torch.isfinite(found.pixels).all(-1)
-    refined = refine_corners(image, found.pixels, torch.where(seen, found.side, 1.0), refine)
-    if not enough(refined.pixels, board):
-        none = (CornerStatus.NO_SADDLE, CornerStatus.MOVED, CornerStatus.NOT_CONVERGED, CornerStatus.OCCLUDED)
-        lacking = sum(int((refined.status == status).sum()) for status in none) > 0.5 * int(seen.sum())
-        more = "; the small squares between the tags are needed, as Kalibr draws them" if lacking else ""
-        return Detection(None, _too_few(refined, int(seen.sum())) + more)
-    return Detection(refined.pixels, covariance=refined.covariance)
-
-
-def _detect_circles(image: Gray, board: Board, refine: Refinement) -> Detection:
-    if refine not in ("erf", "none"):
-        raise InputError(
-            f"refine {refine!r}: circles are fitted at their edges (erf), or left as OpenCV finds them (none)"
-        )
-    found = find_circles(to_8bit(image), board)
-    if found.pixels is None or refine == "none":
-        return Detection(found.pixels, found.reason)
-    refined, radius = refine_circles(image, found.pixels, board, found.radius)
-    if (reason := wrong_size(board, radius)) or int(
-        (refined.status == CornerStatus.GOOD).sum()
-    ) < MIN_GOOD * board.corners:
-        return Detection(None, reason or _too_few(refined, board.corners))
-    return Detection(refined.pixels, covariance=refined.covariance)
-
-
-def _too_few(refined: Refined, found: int) -> str:
-    good = int((refined.status == CornerStatus.GOOD).sum())
-    counts = Counter(refined.status.tolist())
-    why = ", ".join(f"{counts[code]} {text}" for code, text in _STATUS_TEXTS.items() if counts[code])
-    return f"only {good} of {found} corners could be refined ({why})"
 
 
 def detect_images(
@@ -263,7 +181,7 @@ def _renumbered(
     for view in views:
         if view.name in unclear and view.image is not None:
             image = decode_gray(read_bytes(Path(view.image)), view.image)
-            found = _detect_charuco(image, board, refine, legacy=True)
+            found = detect_charuco(image, board, refine, legacy=True)
             if found.pixels is not None:
                 out.append(view_of(found, view.name, image=view.image, sha256=view.sha256))
             continue
@@ -396,22 +314,8 @@ def _hint(files: list[Path], board: Board) -> str:
         except FileError:
             continue
         small = to_8bit(_reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
-        other: str | None = seen_markers(small, board)
-        if not other:
-            if has_own_markers(small, board):
-                continue
-            other = seen_circles(small, board)
-        if other:
+        if other := seen_instead(small, board, seen_size):
             return f"; {other}"
-        found = None if other == "" else seen_size(small)
-        own = (max(board.columns, board.rows), min(board.columns, board.rows))
-        if found is None:
-            continue
-        if found == own and board.pattern == "checkerboard" and board.dictionary is None:
-            continue
-        squares = found == (own[0] - 1, own[1] - 1) and board.pattern == "checkerboard"
-        advice = "count inner corners, not squares" if squares else f"give --board {found[0]}x{found[1]}"
-        return f"; a board of {found[0]}x{found[1]} was found: {advice}"
     return ""
 
 

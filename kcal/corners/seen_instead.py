@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +24,35 @@ _MIN_MARKERS = 4  # fewer are found in pictures without any: markers of 16 cells
 _MIN_CIRCLES = 12
 _ROUND = 0.83  # 4 pi area / perimeter²: squares have 0.79, circles seen from 45 degrees 0.94
 _SIZES = (0.6, 1.6)  # of the median: sizes of circles of one grid, seen from aside
+
+
+def seen_instead(
+    image: npt.NDArray[np.uint8],
+    board: Board,
+    seen_size: Callable[[npt.NDArray[np.uint8]], tuple[int, int] | None],
+) -> str:
+    """Which board an image shows that is not the one asked for; empty if it shows none.
+
+    Args:
+        image: (H, W).
+        board: that was asked for.
+        seen_size: `kcal.corners.detect.seen_size`.
+    """
+    if markers := seen_markers(image, board):
+        return markers
+    if has_own_markers(image, board):
+        return ""
+    circles = seen_circles(image, board)
+    if circles is not None:
+        return circles
+    found = seen_size(image)
+    own = (max(board.columns, board.rows), min(board.columns, board.rows))
+    plain = board.pattern == "checkerboard"
+    if found is None or (found == own and plain and board.dictionary is None):
+        return ""
+    squares = found == (own[0] - 1, own[1] - 1) and plain
+    advice = "count inner corners, not squares" if squares else f"give --board {found[0]}x{found[1]}"
+    return f"a board of {found[0]}x{found[1]} was found: {advice}"
 
 
 def seen_markers(image: npt.NDArray[np.uint8], board: Board) -> str:
