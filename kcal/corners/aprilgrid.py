@@ -89,7 +89,7 @@ def find_aprilgrid(image: npt.NDArray[np.uint8], board: Board) -> FoundTags:
     side = nothing.clone()
     share = _FREE_SHARE / SHARE * min(math.sqrt(2.0) * border / (_CELLS + 2 * border), board.gap / board.square)
     for number, corners in placed.items():
-        places = _places(number, board, turn)
+        places = _tag_places(number, board, turn)
         edge = float(np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1).min())
         pixels[places] = torch.from_numpy(_nearer(image, corners, edge))
         side[places] = share * edge
@@ -144,7 +144,7 @@ def _nearer(image: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64], edge
     return np.where(near, moved, corners)
 
 
-def _places(number: int, board: Board, turn: int) -> list[int]:
+def _tag_places(number: int, board: Board, turn: int) -> list[int]:
     """Where on the board the four corners of a tag are, as OpenCV gives them: clockwise from the tag's left upper."""
     row, column = divmod(number - board.first, board.columns // 2)
     first = 2 * row * board.columns + 2 * column  # the lower left
@@ -154,7 +154,7 @@ def _places(number: int, board: Board, turn: int) -> list[int]:
 
 def _agreement(seen: dict[int, npt.NDArray[np.float64]], board: Board, turn: int) -> int:
     points = board.points[:, :2].numpy()
-    placed = np.stack([points[_places(number, board, turn)] for number in seen])
+    placed = np.stack([points[_tag_places(number, board, turn)] for number in seen])
     return agreeing(placed, np.stack(list(seen.values())), _TOLERANCE * board.square)
 
 
@@ -167,8 +167,8 @@ def _in_place(seen: dict[int, npt.NDArray[np.float64]], board: Board, turn: int)
             (other for other in seen if other != number),
             key=lambda other: float(np.linalg.norm(seen[other].mean(0) - corners.mean(0))),
         )[:_NEIGHBORS]
-        own = points[_places(number, board, turn)]
-        placed = np.stack([points[_places(other, board, turn)] for other in near])
+        own = points[_tag_places(number, board, turn)]
+        placed = np.stack([points[_tag_places(other, board, turn)] for other in near])
         around = np.stack([seen[other] for other in near])
         board_from_image = board_homography(placed.reshape(-1, 2), around.reshape(-1, 2))
         if board_from_image is None:

@@ -61,9 +61,9 @@ def board_fields(text: str, square: str) -> dict[str, Any]:
         if more:
             raise InputError(form)
     elif kind == "charuco":
-        fields |= _charuco(more, side, form)
+        fields |= _charuco_fields(more, side, form)
     elif kind == "aprilgrid":
-        fields |= {"pattern": "aprilgrid"} | _aprilgrid(more, side, form)
+        fields |= {"pattern": "aprilgrid"} | _april_fields(more, side, form)
     else:
         if len(more) > 1:
             raise InputError(form)
@@ -71,7 +71,7 @@ def board_fields(text: str, square: str) -> dict[str, Any]:
     return fields
 
 
-def _charuco(parts: list[str], side: float, form: str) -> dict[str, Any]:
+def _charuco_fields(parts: list[str], side: float, form: str) -> dict[str, Any]:
     fields: dict[str, Any] = {}
     for part in parts:
         name = part.strip().lower().removeprefix("dict_")
@@ -89,7 +89,7 @@ def _charuco(parts: list[str], side: float, form: str) -> dict[str, Any]:
     return {"dictionary": _DEFAULT_DICTIONARY, "marker": _MARKER_SHARE * side} | fields
 
 
-def _aprilgrid(parts: list[str], side: float, form: str) -> dict[str, Any]:
+def _april_fields(parts: list[str], side: float, form: str) -> dict[str, Any]:
     fields: dict[str, Any] = {}
     for part in parts:
         if (first := _first_id(part)) is not None:

@@ -74,7 +74,7 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
         )
     told: bool | None = None
     if board.rows % 2 and len(own) >= _MIN_MARKERS:
-        today, before = (_agreeing(dict(seen), board, old) for old in (False, True))
+        today, before = (_fitting_markers(dict(seen), board, old) for old in (False, True))
         several = min(len(today - before), len(before - today)) >= _MIN_MARKERS
         if several and len(today | before) >= _MOST * len(own):
             return FoundCharuco(
@@ -93,14 +93,15 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
     if enough(pixels, board):
         return FoundCharuco(pixels, legacy=told)
     reason = f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on one line"
-    if len(own) >= _MIN_MARKERS and all(2 * len(_agreeing(dict(seen), board, old)) < len(own) for old in (False, True)):
+    fitting = [_fitting_markers(dict(seen), board, old) for old in (False, True)] if seen else []
+    if len(own) >= _MIN_MARKERS and 2 * max(map(len, fitting)) < len(own):
         reason = "the markers do not lie as on this board: check its columns, rows, dictionary and first number"
     elif found and not own:
         reason += f"; markers {min(found)} to {max(found)} of {board.dictionary} are another board's"
     return FoundCharuco(None, reason)
 
 
-def _agreeing(seen: dict[int, npt.NDArray[np.float64]], board: Board, legacy: bool) -> set[int]:
+def _fitting_markers(seen: dict[int, npt.NDArray[np.float64]], board: Board, legacy: bool) -> set[int]:
     """Numbers of the markers that lie as one of the two numberings has them."""
     corners = _opencv_board(board, legacy).getObjPoints()
     placed = np.stack([np.asarray(corners[number - board.first])[:, :2] for number in seen])

@@ -53,7 +53,7 @@ def local_maps(points: Tensor, pixels: Tensor, known: Tensor | None = None) -> L
     low, high = points.amin(0), points.amax(0)
     scale = 2.0 / (high - low).clamp_min(1e-12)
     terms = [(i, j) for degree in range(_degree(int(known.sum())) + 1) for i in range(degree + 1) for j in [degree - i]]
-    values = _monomials((points - low) * scale - 1.0, terms)
+    values = _term_values((points - low) * scale - 1.0, terms)
     found = torch.linalg.lstsq(values[0][known], (pixels - seen)[known], driver="gelsd").solution  # (terms, 2)
     by_x, by_y, xx, xy, yy = (value @ found for value in values[1:])
     first = first + torch.stack([by_x, by_y], -1) * scale
@@ -83,7 +83,7 @@ def _degree(points: int) -> int:
     return max((d for d in degrees if _POINTS_PER_TERM * (d + 1) * (d + 2) // 2 <= points), default=0)
 
 
-def _monomials(at: Tensor, terms: list[tuple[int, int]]) -> list[Tensor]:
+def _term_values(at: Tensor, terms: list[tuple[int, int]]) -> list[Tensor]:
     """Values, first (x, y) and second derivatives (xx, xy, yy) of x^i y^j at (N, 2): each (N, terms)."""
     x, y = at.unbind(-1)
 

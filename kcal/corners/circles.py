@@ -105,7 +105,7 @@ def refine_circles(image: Gray, pixels: Tensor, board: Board, radius: float) -> 
         center = torch.where(usable[:, None], found.center, center)
         shape = torch.where(usable[:, None, None], found.shape, shape)
         radius = float((torch.linalg.det(shape) * torch.linalg.det(first)).rsqrt()[usable].median())
-    refined = _refined(image, pixels, found)
+    refined = _with_statuses(image, pixels, found)
     good = refined.status == CornerStatus.GOOD
     if int(good.sum()) < _LEAST_KNOWN:
         return refined, radius
@@ -228,7 +228,7 @@ def _symmetric(matrix: Tensor) -> Tensor:
     return vectors @ torch.diag_embed(values.clamp_min(1e-18).sqrt()) @ vectors.mT
 
 
-def _refined(image: Gray, start: Tensor, found: Ellipses) -> Refined:
+def _with_statuses(image: Gray, start: Tensor, found: Ellipses) -> Refined:
     height, width = image.shape
     size = torch.linalg.det(found.shape).clamp_min(1e-12).rsqrt()
     half = torch.linalg.vector_norm(torch.linalg.inv(found.shape), dim=-1) + found.blur[:, None]

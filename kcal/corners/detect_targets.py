@@ -31,6 +31,7 @@ def detect_target(image: Gray, board: Board, refine: Refinement) -> Detection:
 
 
 def detect_charuco(image: Gray, board: Board, refine: Refinement, legacy: bool | None = None) -> Detection:
+    """Find the visible corners of a ChArUco board; `legacy` is the numbering where the image does not tell it."""
     pixels, reason, told = find_charuco(to_8bit(image), board, legacy)
     if pixels is None:
         return Detection(None, reason)

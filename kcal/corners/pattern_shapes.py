@@ -45,11 +45,11 @@ def pattern_shapes(board: Board) -> PatternShapes:
         (130.0, (5.0, 5.0), 42)
     """
     if board.pattern == "aprilgrid":
-        return _aprilgrid(board)
-    return _checkerboard(board) if board.pattern == "checkerboard" else _circles(board)
+        return _april_shapes(board)
+    return _square_shapes(board) if board.pattern == "checkerboard" else _circle_shapes(board)
 
 
-def _checkerboard(board: Board) -> PatternShapes:
+def _square_shapes(board: Board) -> PatternShapes:
     square = board.square * 1000
     shapes = [
         Rectangle(x=column * square, y=row * square, width=square, height=square)
@@ -61,12 +61,14 @@ def _checkerboard(board: Board) -> PatternShapes:
         side = board.marker * 1000
         light = [(r, c) for r in range(board.rows + 1) for c in range(board.columns + 1) if (r + c) % 2 == 1]
         for (row, column), cells in zip(light, marker_cells(board), strict=True):
-            shapes += _cells(column * square + (square - side) / 2, row * square + (square - side) / 2, side, cells)
+            shapes += _marker_shapes(
+                column * square + (square - side) / 2, row * square + (square - side) / 2, side, cells
+            )
     width, height = (board.columns + 1) * square, (board.rows + 1) * square
     return PatternShapes(width, height, square, (square, square), tuple(shapes))
 
 
-def _circles(board: Board) -> PatternShapes:
+def _circle_shapes(board: Board) -> PatternShapes:
     diameter = 1000 * (board.diameter or CIRCLE_SHARE * board.spacing)
     width, height = (1000 * side + diameter for side in board.extent)
     places = (1000 * board.points[:, :2] + diameter / 2).tolist()
@@ -75,7 +77,7 @@ def _circles(board: Board) -> PatternShapes:
     return PatternShapes(width, height, margin, (diameter / 2, diameter / 2), circles=circles)
 
 
-def _aprilgrid(board: Board) -> PatternShapes:
+def _april_shapes(board: Board) -> PatternShapes:
     """Tags, and squares as wide as the gap that touch their corners, so that four quadrants meet there."""
     assert board.gap is not None
     side, gap = 1000 * board.square, 1000 * board.gap
@@ -89,7 +91,9 @@ def _aprilgrid(board: Board) -> PatternShapes:
     ]
     for number in range(board.markers):
         row, column = divmod(number, across)  # rows of tags count upward
-        shapes += _cells(gap + column * pitch, gap + (down - 1 - row) * pitch, side, tag_cells(board.first + number))
+        shapes += _marker_shapes(
+            gap + column * pitch, gap + (down - 1 - row) * pitch, side, tag_cells(board.first + number)
+        )
     return PatternShapes(width, height, gap, (gap, height - gap), tuple(shapes))
 
 
@@ -104,7 +108,7 @@ def tag_cells(number: int) -> npt.NDArray[np.bool_]:
     return np.asarray(upright == 0)
 
 
-def _cells(x: float, y: float, side: float, cells: npt.NDArray[np.bool_]) -> list[Rectangle]:
+def _marker_shapes(x: float, y: float, side: float, cells: npt.NDArray[np.bool_]) -> list[Rectangle]:
     """The black cells of a marker, each run along a row as one rectangle."""
     cell = side / len(cells)
     shapes = []

@@ -80,7 +80,7 @@ def seen_markers(image: npt.NDArray[np.uint8], board: Board) -> str:
 
 def seen_circles(image: npt.NDArray[np.uint8], board: Board) -> str | None:
     """What to say of a grid of circles in an image; None if there is none, empty if it may be the board's own."""
-    count = _alike(image)
+    count = _like_sized(image)
     if count < _MIN_CIRCLES:
         return None
     if board.pattern not in ("circles", "asymmetric"):
@@ -128,7 +128,7 @@ def _smallest(family: str, highest: int) -> str:
     return min((name for name in sizes if DICTIONARIES[name] > highest), key=DICTIONARIES.__getitem__, default=family)
 
 
-def _alike(image: npt.NDArray[np.uint8]) -> int:
+def _like_sized(image: npt.NDArray[np.uint8]) -> int:
     """How many round spots of like size are seen, dark or light; a checkerboard has as many of both."""
     counts = []
     for picture in (image, 255 - image):
