@@ -1,14 +1,17 @@
 """What boards are: texts, target files of Kalibr, where their points lie, and what files keep of them."""
 
 import json
+import re
 
 import cv2
+import numpy as np
 import pytest
 import torch
 
 from kcal.corners.board import Board
 from kcal.corners.board_text import DICTIONARIES
 from kcal.corners.charuco import opencv_dictionary
+from kcal.corners.drawing import Circle, Drawing, to_pdf, to_svg
 from kcal.corners.observations import Observations, View
 from kcal.corners.pattern_shapes import pattern_shapes, tag_cells
 from kcal.corners.print_board import board_sheet
@@ -226,3 +229,22 @@ def test_everything_is_on_the_page(text):
     assert torch.allclose(Board.parse(again, "20mm").points, board.points)
     with pytest.raises(InputError, match="does not fit A5"):
         board_sheet(Board.parse(text, "60mm"), "A5")
+
+
+def test_drawn_circles_are_round():
+    """The curves of the PDF and the arcs of the SVG, evaluated."""
+    page = Drawing(width=50, height=40, title="t", rectangles=(), circles=(Circle(x=20, y=15, diameter=12),))
+    text = to_pdf(page).decode("latin-1")
+    point = 72 / 25.4
+    stream = re.search(r"stream\n(.*?)\nendstream", text, re.DOTALL).group(1)
+    numbers = [float(number) for number in re.findall(r"-?[\d.]+", re.search(r"\n([\d.].* m .* c)", stream).group(1))]
+    ends = np.array(numbers).reshape(-1, 2) / point - [20, 40 - 15]
+    assert len(ends) == 13
+    for start in range(0, 12, 3):
+        a, b, c, d = ends[start : start + 4]
+        t = np.linspace(0, 1, 21)[:, None]
+        curve = (1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * b + 3 * (1 - t) * t**2 * c + t**3 * d
+        assert np.linalg.norm(curve, axis=1) == pytest.approx(np.full(21, 6.0), abs=0.003)
+    assert ends[-1] == pytest.approx(ends[0], abs=1e-3)
+    assert ends[3] == pytest.approx([0, 6], abs=1e-3)
+    assert "M14 15a6 6 0 1 0 12 0a6 6 0 1 0 -12 0z" in to_svg(page)
