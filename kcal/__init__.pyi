@@ -51,9 +51,9 @@ from kcal.calibrate.rig.sources import Landmarks as Landmarks
 from kcal.calibrate.rig.sources import MeasuredPosition as MeasuredPosition
 from kcal.calibrate.rig.sources import RigData as RigData
 from kcal.corners.board import Board as Board
-from kcal.corners.detect import Detection as Detection
 from kcal.corners.detect import detect_board as detect_board
 from kcal.corners.detect import detect_images as detect_images
+from kcal.corners.detection import Detection as Detection
 from kcal.corners.foreign_corners import import_corners as import_corners
 from kcal.corners.images import expand_images as expand_images
 from kcal.corners.images import read_gray as read_gray

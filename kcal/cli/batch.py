@@ -26,7 +26,10 @@ def batch_command(
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results; made if it is missing.")],
     size: Annotated[
-        str | None, typer.Option("--board", metavar="CxR", help="Inner corners, columns by rows.", show_default=False)
+        str | None,
+        typer.Option(
+            "--board", metavar="BOARD", help="As for `kcal detect`: 9x6, circles:7x6, ...", show_default=False
+        ),
     ] = None,
     square: Annotated[
         str | None,
@@ -73,9 +76,9 @@ def batch_command(
     from kcal.corners.board import Board
     from kcal.lens.model import LensModel
 
-    if (size is None) != (square is None):
+    if size is None and square is not None:
         raise InputError("--board and --square belong together: give both")
-    board = Board.parse(size, square) if size is not None and square is not None else None
+    board = None if size is None else Board.parse(size, square)
     if model != "hybrid":
         LensModel.named(model)
     jobs = read_jobs(cameras, board, model)

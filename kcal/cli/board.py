@@ -23,8 +23,8 @@ app = typer.Typer(
 @with_json
 def print_command(
     size: BoardSize,
-    square: SquareSide,
     output: Annotated[Path, typer.Option("-o", "--output", help="File to write, .svg or .pdf.")],
+    square: SquareSide = None,
     page: Annotated[
         str,
         typer.Option(
@@ -34,7 +34,7 @@ def print_command(
         ),
     ] = "auto",
 ) -> None:
-    """Draw a checkerboard or a ChArUco board to print at true scale.
+    """Draw a board to print at true scale: checkerboard, ChArUco board, circles or AprilGrid.
 
     Print it at 100 % ("actual size"), check the printed ruler, and glue the board to something flat and stiff. Choose
     one odd and one even number (9x6, 7x6): such a board looks different when it is turned by 180°.
@@ -48,6 +48,10 @@ def print_command(
     `kcal board --board charuco:9x6 --square 25mm --page A4 -o charuco.pdf`
 
     `kcal board --board 7x6 --square 50mm --page A2 -o board.svg`
+
+    `kcal board --board aprilgrid:6x6 --square 25mm --page A4 -o april.pdf`
+
+    `kcal board --board asymmetric:4x11 --square 20mm --page A4 -o circles.pdf`
     """
     from kcal.corners.board import Board
     from kcal.corners.drawing import to_pdf, to_svg
@@ -62,9 +66,14 @@ def print_command(
     write_atomic(output, to_svg(sheet.drawing) if suffix == ".svg" else to_pdf(sheet.drawing))
     out.print(f"{output}: {pattern}, page {sheet.drawing.width:g}x{sheet.drawing.height:g} mm")
     if sheet.quiet < 1:
-        out.print(f"note: only {sheet.quiet:.1f} squares of white around the board; keep the background light")
+        white = (
+            f"{sheet.quiet:.1f} squares"
+            if pattern.pattern == "checkerboard"
+            else f"{sheet.quiet * sheet.margin:.0f} mm"
+        )
+        out.print(f"note: only {white} of white around the board; keep the background light")
     if not pattern.unambiguous:
-        out.print("note: this board looks the same turned by 180°; for stereo use one odd and one even number")
+        out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
 
 
 @app.command("measure")

@@ -27,8 +27,8 @@ def capture_command(
         str, typer.Argument(help="camera:0, a stream (rtsp://...), a video, or a folder into which images come.")
     ],
     size: BoardSize,
-    square: SquareSide,
     output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write, or to continue.")],
+    square: SquareSide = None,
     until: Annotated[
         float,
         typer.Option(metavar="PX", help="Stop when far directions are known to this σ, on average over the image."),

@@ -26,8 +26,8 @@ def detect_command(
         ),
     ],
     size: BoardSize,
-    square: SquareSide,
     output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write.")],
+    square: SquareSide = None,
     refine: RefineMethod = Refine.erf,
     gallery: Annotated[
         Path | None, typer.Option(help="PNG file to write: the views with their corners, worst first.")
@@ -118,8 +118,8 @@ def detect_command(
     found, unseen = len(observations.views), sum(view.pixels.count(None) for view in observations.views)
     tell(views=found, failures={failure.name: failure.reason for failure in observations.failures})
     out.print(f"{escape(str(output))}: board found in {found} {source} of {width}x{height} px")
-    wide, high = (1e3 * board.square * (count - 1) for count in (board.columns, board.rows))
-    out.print(f"board {board}: {wide:g} x {high:g} mm from the first corner to the last")
+    wide, high = (1e3 * side for side in board.extent)
+    out.print(f"board {board}: {wide:g} x {high:g} mm from the first point to the last")
     for text in notes:
         warn(text)
     if turned:
@@ -129,4 +129,4 @@ def detect_command(
     for failure in observations.failures:
         out.print(f"  [yellow]failed[/] {escape(failure.name)}: {escape(failure.reason)}")
     if not board.unambiguous:
-        out.print("note: this board looks the same turned by 180°; for stereo use one odd and one even number")
+        out.print(f"note: this board looks the same turned by 180°; for stereo {board.stereo_advice}")

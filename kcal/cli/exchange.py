@@ -182,7 +182,7 @@ def _import_corners(
     from kcal.corners.board import Board
     from kcal.corners.foreign_corners import import_corners
 
-    if square is None or len(sources) != 1:
+    if len(sources) != 1:
         raise InputError("corners are read from one file, with --board and --square")
     seen = import_corners(sources[0], Board.parse(board, square), size)
     seen.save(output)

@@ -203,10 +203,12 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
     if boards is not None:
         lines.append(f"{len(result.pairs)} of {len(boards.names)} pairs used, {unpaired} views without partner")
         if result.pairs:
-            side, spread = triangulated_sides(rig, boards.board.columns, boards.board.rows, result.pixels)
+            board = boards.board
+            side, spread = triangulated_sides(rig, board.columns, board.rows, result.pixels, board.points)
+            true = float((board.points[1] - board.points[0]).norm())
+            what = {"checkerboard": "squares", "aprilgrid": "tags"}.get(board.pattern, "distances of circles")
             lines.append(
-                f"triangulated squares: {1e3 * side:.4f} mm ± {1e3 * spread:.4f} mm, the board's are "
-                f"{1e3 * boards.board.square:.4f} mm"
+                f"triangulated {what}: {1e3 * side:.4f} mm ± {1e3 * spread:.4f} mm, the board's are {1e3 * true:.4f} mm"
             )
     if result.board_warp is not None:
         x, y = (1e3 * result.board_warp).tolist()

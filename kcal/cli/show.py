@@ -72,10 +72,9 @@ def _show_camera(camera: Camera) -> None:
     out.print(f"{camera.size[0]}x{camera.size[1]} px, {camera.model}, valid in {share}", markup=False)
     record = known.record if known else None
     if record:
-        board = f"{record.board.columns}x{record.board.rows} corners of {1e3 * record.board.square:g} mm"
         out.print(
             f"calibrated {record.created:%Y-%m-%d %H:%M %Z} by kcal {record.kcal_version}: RMS {record.rms:.4f} px, "
-            f"{record.views} views, {record.points} corners, board {board}, {len(record.excluded)} left out",
+            f"{record.views} views, {record.points} corners, board {record.board}, {len(record.excluded)} left out",
             markup=False,
         )
         if record.temperature is not None:

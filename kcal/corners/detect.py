@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -17,14 +16,16 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.charuco import MIN_CORNERS, enough, find_charuco, free_side
+from kcal.corners.detect_targets import detect_charuco, detect_target
+from kcal.corners.detection import Detection, too_few
 from kcal.corners.grid import MIN_SHARPNESS, grid_trouble, local_side, sharpness
 from kcal.corners.images import Gray, decode_gray, to_8bit, unique_names
 from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.order import canonical_order
 from kcal.corners.refine import Refinement, refine_corners
-from kcal.corners.saddle import CornerStatus, Refined
+from kcal.corners.saddle import CornerStatus
+from kcal.corners.seen_instead import seen_instead
 from kcal.corners.sizes import common_size, rescaled, resized_alike
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
@@ -35,33 +36,10 @@ MIN_GOOD = 0.5  # share of the corners that must be refined successfully
 
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTOR = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-_STATUS_TEXTS = {
-    CornerStatus.OUTSIDE: "too near the image's edge",
-    CornerStatus.NO_SADDLE: "not a corner",
-    CornerStatus.MOVED: "moved too far",
-    CornerStatus.NOT_CONVERGED: "did not converge",
-    CornerStatus.SATURATED: "over- or underexposed",
-    CornerStatus.OCCLUDED: "covered or glaring",
-    CornerStatus.BLURRED: "too blurred",
-}
-
-
-class Detection(NamedTuple):
-    """What was found of a board in an image.
-
-    Args:
-        pixels: (corners, 2) float64 in the board's order, NaN where not seen; None if no board was found.
-        reason: why none was found.
-        covariance: (corners, 2, 2) px², if the refinement estimates it.
-    """
-
-    pixels: Tensor | None
-    reason: str = ""
-    covariance: Tensor | None = None
 
 
 def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detection:
-    """Find the inner corners of a checkerboard, or the visible ones of a ChArUco board.
+    """Find the inner corners of a checkerboard, the visible ones of a ChArUco board or an AprilGrid, or circles.
 
     OpenCV's `findChessboardCorners` searches first; where it fails, `findChessboardCornersSB` (A. Duda and U. Frese,
     BMVC 2018). Images above 1200 px are searched at a reduced size and refined in steps of two. The grid found must
@@ -70,8 +48,8 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
 
     Args:
         image: (H, W) uint8 or uint16.
-        board: at least 3 inner corners each way, all of them in the image unless it is a ChArUco board.
-        refine: see `kcal.corners.refine.refine_corners`.
+        board: at least 3 points each way, all of them in the image unless it has markers.
+        refine: see `kcal.corners.refine.refine_corners`; `erf` of circles is `kcal.corners.circles.refine_circles`.
 
     Returns:
         The corners, or None with a reason that a person can act on.
@@ -91,14 +69,15 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
     """
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"image: (H, W) uint8 or uint16 is needed, got {image.shape} {image.dtype}")
-    if min(board.columns, board.rows) < 3:
+    if min(board.columns, board.rows) < 3 and board.pattern != "aprilgrid":
+        what = "inner corners" if board.pattern == "checkerboard" else "circles"
         raise InputError(
-            f"board {board.columns}x{board.rows}: at least 3 inner corners in each direction are needed for detection"
+            f"board {board.columns}x{board.rows}: at least 3 {what} in each direction are needed for detection"
         )
     if refine not in get_args(Refinement):
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
-    if board.dictionary is not None:
-        return _detect_charuco(image, board, refine)
+    if board.pattern != "checkerboard" or board.dictionary is not None:
+        return detect_target(image, board, refine)
     pixels, factor, reason = _find_in_order(to_8bit(image), board)
     if pixels is None:
         return Detection(None, reason)
@@ -110,26 +89,8 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
     refined = refine_corners(image, pixels, side, refine, (board.columns, board.rows))
     good = int((refined.status == CornerStatus.GOOD).sum())
     if good < MIN_GOOD * board.corners:
-        return Detection(None, _too_few(refined, board.corners))
+        return Detection(None, too_few(refined, board.corners))
     return Detection(refined.pixels, covariance=refined.covariance)
-
-
-def _detect_charuco(image: Gray, board: Board, refine: Refinement) -> Detection:
-    pixels = find_charuco(to_8bit(image), board)
-    if pixels is None:
-        return Detection(None, f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on one line")
-    seen = torch.isfinite(pixels).all(-1)
-    refined = refine_corners(image, pixels, free_side(pixels, board), refine, (board.columns, board.rows))
-    if not enough(refined.pixels, board):
-        return Detection(None, _too_few(refined, int(seen.sum())))
-    return Detection(refined.pixels, covariance=refined.covariance)
-
-
-def _too_few(refined: Refined, found: int) -> str:
-    good = int((refined.status == CornerStatus.GOOD).sum())
-    counts = Counter(refined.status.tolist())
-    why = ", ".join(f"{counts[code]} {text}" for code, text in _STATUS_TEXTS.items() if counts[code])
-    return f"only {good} of {found} corners could be refined ({why})"
 
 
 def detect_images(
@@ -176,6 +137,7 @@ def detect_images(
     views: list[View] = []
     failures: list[Failure] = []
     sizes: list[tuple[int, int] | None] = []
+    numberings: dict[bool | None, list[str]] = {}
     with Limited(time_limit) as limited:
         for name, file in zip(names, files, strict=True):
             try:
@@ -197,6 +159,7 @@ def detect_images(
                 if found.pixels is None:
                     failures.append(Failure(name=name, reason=found.reason))
                 else:
+                    numberings.setdefault(found.legacy, []).append(name)
                     digest = hashlib.sha256(data).hexdigest()
                     views.append(view_of(found, name, image=str(file), sha256=digest))
             if progress is not None:
@@ -204,6 +167,8 @@ def detect_images(
     if not views:
         first = f"{failures[0].name}: {failures[0].reason}"
         raise InputError(f"no board in any of {len(files)} images ({first}){_hint(files, board)}")
+    if True in numberings:
+        views = _renumbered(views, numberings, board, refine)
     common = common_size(names, sizes)
     if common.note:
         note(common.note)
@@ -212,6 +177,31 @@ def detect_images(
     return Observations(
         board=board, image_size=common.size, refinement=refine, views=tuple(views), failures=tuple(failures)
     )
+
+
+def _renumbered(
+    views: Sequence[View], numberings: dict[bool | None, list[str]], board: Board, refine: Refinement
+) -> list[View]:
+    """Views of a ChArUco board of the old numbering: images that do not tell it are read anew, as the others tell.
+
+    Raises:
+        InputError: some images tell the numbering of today.
+    """
+    if False in numberings:
+        raise InputError(
+            f"two ChArUco boards: {numberings[True][0]} shows the numbering of OpenCV before 4.6, "
+            f"{numberings[False][0]} that of today; detect the images of each board apart"
+        )
+    unclear, out = set(numberings.get(None, ())), []
+    for view in views:
+        if view.name in unclear and view.image is not None:
+            image = decode_gray(read_bytes(Path(view.image)), view.image)
+            found = detect_charuco(image, board, refine, legacy=True)
+            if found.pixels is not None:
+                out.append(view_of(found, view.name, image=view.image, sha256=view.sha256))
+            continue
+        out.append(view)
+    return out
 
 
 def limit_threads(count: int) -> None:
@@ -326,19 +316,14 @@ def _size_of(file: Path) -> tuple[int, int] | None:
 
 def _hint(files: list[Path], board: Board) -> str:
     """Which board the first images show, if they show another one."""
-    if board.dictionary is not None:
-        return ""
     for file in files[:3]:
         try:
             image = to_8bit(decode_gray(read_bytes(file), file))
         except FileError:
             continue
-        found = seen_size(_reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
-        if found is None or found == (max(board.columns, board.rows), min(board.columns, board.rows)):
-            continue
-        squares = found == (max(board.columns, board.rows) - 1, min(board.columns, board.rows) - 1)
-        advice = "count inner corners, not squares" if squares else f"give --board {found[0]}x{found[1]}"
-        return f"; a board of {found[0]}x{found[1]} was found: {advice}"
+        small = to_8bit(_reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
+        if other := seen_instead(small, board, seen_size):
+            return f"; {other}"
     return ""
 
 

@@ -5,12 +5,14 @@ The files contain no dates or tool names, so that the same board always gives th
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from xml.sax.saxutils import escape
 
 from kcal.errors import InputError
 
 _POINT = 72 / 25.4  # PDF points in a millimeter
+_BEZIER = 0.5522847498  # 4 (√2 - 1) / 3: a cubic with this handle is closest to a quarter of a unit circle
 _FONTS = "Helvetica, Arial, sans-serif"
 
 
@@ -22,6 +24,15 @@ class Rectangle:
     y: float
     width: float
     height: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Circle:
+    """A filled black circle; its center in millimeters from the page's top left corner."""
+
+    x: float
+    y: float
+    diameter: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +54,7 @@ class Drawing:
     title: str
     rectangles: tuple[Rectangle, ...]
     texts: tuple[Text, ...] = ()
+    circles: tuple[Circle, ...] = ()
 
 
 def to_svg(drawing: Drawing) -> str:
@@ -57,6 +69,12 @@ def to_svg(drawing: Drawing) -> str:
     path = "".join(
         f"M{_decimal(r.x)} {_decimal(r.y)}h{_decimal(r.width)}v{_decimal(r.height)}h{_decimal(-r.width)}z"
         for r in drawing.rectangles
+    )
+    path += "".join(
+        f"M{_decimal(c.x - c.diameter / 2)} {_decimal(c.y)}"
+        + f"a{_decimal(c.diameter / 2)} {_decimal(c.diameter / 2)} 0 1 0 {_decimal(c.diameter)} 0"
+        + f"a{_decimal(c.diameter / 2)} {_decimal(c.diameter / 2)} 0 1 0 {_decimal(-c.diameter)} 0z"
+        for c in drawing.circles
     )
     texts = "".join(
         f'<text x="{_decimal(t.x)}" y="{_decimal(t.y)}" font-size="{_decimal(t.size)}">{escape(t.text)}</text>\n'
@@ -93,7 +111,10 @@ def to_pdf(drawing: Drawing) -> bytes:
     for r in drawing.rectangles:
         corner = f"{_decimal(r.x * _POINT)} {flip(r.y + r.height)}"
         content.append(f"{corner} {_decimal(r.width * _POINT)} {_decimal(r.height * _POINT)} re")
-    content.append("f" if drawing.rectangles else "")
+    content += [
+        _pdf_circle(c.x * _POINT, (drawing.height - c.y) * _POINT, c.diameter * _POINT) for c in drawing.circles
+    ]
+    content.append("f" if drawing.rectangles or drawing.circles else "")
     for t in drawing.texts:
         content.append(
             f"BT /F1 {_decimal(t.size * _POINT)} Tf {_decimal(t.x * _POINT)} {flip(t.y)} Td ({_literal(t.text)}) Tj ET"
@@ -120,6 +141,18 @@ def to_pdf(drawing: Drawing) -> bytes:
         b"xref\n0 %d\n0000000000 65535 f \n%strailer\n<< /Size %d /Root 1 0 R /Info 6 0 R >>\nstartxref\n%d\n%%%%EOF\n"
         % (count, table, count, len(data))
     )
+
+
+def _pdf_circle(x: float, y: float, diameter: float) -> str:
+    """Four cubic curves, which differ from the circle by 0.03 % of its radius."""
+    r, k = diameter / 2, _BEZIER * diameter / 2
+    ends = [(r, 0.0), (0.0, r), (-r, 0.0), (0.0, -r), (r, 0.0)]
+    parts = [f"{_decimal(x + r)} {_decimal(y)} m"]
+    for (a, b), (c, d) in itertools.pairwise(ends):
+        # Along the tangent of each end: a point (a, b) of the circle has the tangent (-b, a).
+        first, second = (a - b * k / r, b + a * k / r), (c + d * k / r, d - c * k / r)
+        parts.append(" ".join(f"{_decimal(x + u)} {_decimal(y + v)}" for u, v in (first, second, (c, d))) + " c")
+    return " ".join(parts)
 
 
 def _decimal(value: float) -> str:

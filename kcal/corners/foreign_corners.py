@@ -57,6 +57,10 @@ def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] |
         (('a.png',), (3.0, 3.0))
     """
     path = Path(path)
+    if board.pattern != "checkerboard" and path.suffix.lower() == ".mat":
+        raise InputError(
+            f"{path}: points of {board} are not read from MATLAB's files; give a .csv with image,corner,u,v"
+        )
     readers: dict[str, Callable[[Path, Board], tuple[dict[str, list[Corner]], tuple[int, int] | None]]] = {
         ".vnl": _from_vnl, ".csv": _from_csv, ".yml": _from_opencv, ".yaml": _from_opencv, ".xml": _from_opencv,
         ".mat": _from_matlab,

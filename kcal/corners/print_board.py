@@ -1,14 +1,14 @@
-"""Lay out checkerboards on pages, to print at true scale."""
+"""Lay out boards on pages, to print at true scale."""
 
 from __future__ import annotations
 
-import itertools
+import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
 from kcal.corners.board import Board
-from kcal.corners.charuco import marker_cells
 from kcal.corners.drawing import Drawing, Rectangle, Text, to_pdf, to_svg
+from kcal.corners.pattern_shapes import CIRCLE_SHARE, PatternShapes, pattern_shapes
 from kcal.errors import InputError
 from kcal.files import write_atomic
 
@@ -34,11 +34,22 @@ _LETTER_WIDTH = 0.6  # mean width of a letter in text heights
 
 
 class Sheet(NamedTuple):
-    """A board on a page: the `drawing`, the page's name, and the narrowest white margin of the board in squares."""
+    """A board on a page.
+
+    Args:
+        drawing: the page.
+        page: its name.
+        quiet: the narrowest white margin around the board as a share of what detectors need, which is one square of a
+            checkerboard.
+        margin: what they need, millimeters.
+        origin: where the origin of `Board.points` lies, millimeters from the page's left upper corner.
+    """
 
     drawing: Drawing
     page: str
     quiet: float
+    margin: float
+    origin: tuple[float, float]
 
 
 def board_sheet(board: Board, page: str = "auto") -> Sheet:
@@ -59,87 +70,81 @@ def board_sheet(board: Board, page: str = "auto") -> Sheet:
         >>> sheet.drawing.width, sheet.drawing.height, len(sheet.drawing.rectangles) > 35
         (297.0, 210.0, True)
     """
-    square = board.square * 1000
-    wide, high = (board.columns + 1) * square, (board.rows + 1) * square
-    name, (page_wide, page_high) = _page(board, page, wide, high)
-    left, top = _margins(board, page_wide, page_high)
-    squares = tuple(
-        Rectangle(x=left + column * square, y=top + row * square, width=square, height=square)
-        for row in range(board.rows + 1)
-        for column in range(board.columns + 1)
-        if (row + column) % 2 == 0
-    )
-    if board.dictionary is not None:
-        squares += _markers(board, left, top)
+    pattern = pattern_shapes(board)
+    name, (page_wide, page_high) = _page(board, pattern, page)
+    left, top = _margins(board, pattern, page_wide, page_high)
     ruler, texts = _foot(board, page_wide, page_high)
     drawing = Drawing(
-        width=page_wide, height=page_high, title=f"Board {board}", rectangles=squares + ruler, texts=texts
+        width=page_wide,
+        height=page_high,
+        title=f"Board {board}",
+        rectangles=tuple(dataclasses.replace(r, x=left + r.x, y=top + r.y) for r in pattern.rectangles) + ruler,
+        circles=tuple(dataclasses.replace(c, x=left + c.x, y=top + c.y) for c in pattern.circles),
+        texts=texts,
     )
-    return Sheet(drawing, name, min(left, top) / square)
+    origin = (left + pattern.origin[0], top + pattern.origin[1])
+    return Sheet(drawing, name, min(left, top) / pattern.margin, pattern.margin, origin)
 
 
-def _markers(board: Board, left: float, top: float) -> tuple[Rectangle, ...]:
-    """The black cells of the markers in the light squares, each run along a row as one rectangle."""
-    assert board.marker is not None
-    square, side = board.square * 1000, board.marker * 1000
-    light = [(r, c) for r in range(board.rows + 1) for c in range(board.columns + 1) if (r + c) % 2 == 1]
-    shapes = []
-    for (row, column), cells in zip(light, marker_cells(board), strict=True):
-        cell = side / len(cells)
-        x, y = left + column * square + (square - side) / 2, top + row * square + (square - side) / 2
-        for i, line in enumerate(cells.tolist()):
-            begin = 0
-            for black, run in itertools.groupby(line):
-                length = len(list(run))
-                if black:
-                    shapes.append(Rectangle(x=x + begin * cell, y=y + i * cell, width=length * cell, height=cell))
-                begin += length
-    return tuple(shapes)
-
-
-def _page(board: Board, page: str, wide: float, high: float) -> tuple[str, tuple[float, float]]:
-    square = board.square * 1000
+def _page(board: Board, pattern: PatternShapes, page: str) -> tuple[str, tuple[float, float]]:
+    wide, high = pattern.width, pattern.height
     if page.lower() == "auto":
-        margin = max(square, EDGE)
+        margin = max(pattern.margin, EDGE)
         page_wide = max(wide + 2 * margin, RULER + 2 * EDGE)
         return "auto", (page_wide, high + 2 * margin + _foot_height(board, page_wide))
     names = {name.lower(): name for name in PAGES}
     if page.lower() not in names:
         raise InputError(f"page {page!r}: choose one of auto, {', '.join(PAGES)}")
     name = names[page.lower()]
-    size = _better_way(board, PAGES[name])
+    size = _better_way(board, pattern, PAGES[name])
     if size is None:
-        fitting = [other for other, paper in PAGES.items() if _better_way(board, paper) is not None]
+        fitting = [other for other, paper in PAGES.items() if _better_way(board, pattern, paper) is not None]
         smallest = min(fitting, key=lambda other: PAGES[other][0] * PAGES[other][1], default=None)
         advice = f"{smallest} would do" if smallest else "use auto or smaller squares"
         width, height = PAGES[name]
         raise InputError(
-            f"a board of {board.columns + 1}x{board.rows + 1} squares of {square:g} mm is {wide:g}x{high:g} mm and "
+            f"a board of {_size_text(board)} is {wide:g}x{high:g} mm and "
             f"does not fit {name} ({width:g}x{height:g} mm) with its margins and ruler; {advice}"
         )
     return name, size
 
 
-def _margins(board: Board, page_wide: float, page_high: float) -> tuple[float, float]:
+def _margins(board: Board, pattern: PatternShapes, page_wide: float, page_high: float) -> tuple[float, float]:
     """White left and right of the board, and above it as well as between it and the foot."""
-    square = board.square * 1000
-    left = (page_wide - (board.columns + 1) * square) / 2
-    return left, (page_high - _foot_height(board, page_wide) - (board.rows + 1) * square) / 2
+    left = (page_wide - pattern.width) / 2
+    return left, (page_high - _foot_height(board, page_wide) - pattern.height) / 2
 
 
-def _better_way(board: Board, paper: tuple[float, float]) -> tuple[float, float] | None:
+def _better_way(board: Board, pattern: PatternShapes, paper: tuple[float, float]) -> tuple[float, float] | None:
     """The page upright or across, whichever leaves more white, or None where the board fits neither way."""
-    ways = [(min(_margins(board, *size)), size) for size in (paper, paper[::-1]) if size[0] >= RULER + 2 * EDGE]
+    ways = [
+        (min(_margins(board, pattern, *size)), size) for size in (paper, paper[::-1]) if size[0] >= RULER + 2 * EDGE
+    ]
     best, size = max(ways)
     return size if best >= EDGE else None
 
 
+def _size_text(board: Board) -> str:
+    if board.pattern == "checkerboard":
+        return f"{board.columns + 1}x{board.rows + 1} squares of {board.square * 1000:g} mm"
+    return str(board.record)
+
+
 def _captions(board: Board) -> tuple[str, str]:
     turned = "" if board.unambiguous else " Looks the same turned by 180 degrees: not for stereo."
-    size = f"{board.columns}x{board.rows} (inner corners), {board.square * 1000:g} mm squares."
-    if board.marker is not None:
-        markers = f"{board.dictionary}:{board.marker * 1000:g}mm"
-        size = f"charuco:{board.columns}x{board.rows}:{markers}, {board.square * 1000:g} mm squares."
+    length = f"{board.square * 1000:g} mm"
+    counts = f"{board.columns}x{board.rows}"
+    first = f":id{board.first}" if board.first else ""
+    if board.gap is not None:
+        size = f"aprilgrid:{board.columns // 2}x{board.rows // 2}:{board.gap * 1000:g}mm{first}, {length} tags."
+    elif board.pattern != "checkerboard":
+        diameter = 1000 * (board.diameter or CIRCLE_SHARE * board.spacing)
+        what = "rows " if board.pattern == "asymmetric" else ""
+        size = f"{board.pattern}:{counts}:{diameter:.4g}mm, {what}{length} apart."
+    elif board.marker is not None:
+        size = f"charuco:{counts}:{board.dictionary}:{board.marker * 1000:g}mm{first}, {length} squares."
+    else:
+        size = f"{counts} (inner corners), {length} squares."
     return "Print at 100 %; the ruler is 100 mm long.", f"kcal board {size}{turned}"
 
 

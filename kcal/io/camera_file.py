@@ -139,6 +139,16 @@ class CameraFile(NativeFile):
                 raise ValueError(f"information: {unknown[0]} is unknown; the lens model has {_listed(names)}")
         return value
 
+    @pydantic.field_serializer("calibration", mode="wrap")
+    def _as_before(
+        self, value: CalibrationRecord | None, handler: pydantic.SerializerFunctionWrapHandler
+    ) -> dict[str, Any] | None:
+        """Leave out what checkerboards do not need, so that files of them stay as they were."""
+        content: dict[str, Any] | None = handler(value)
+        if content is not None and content["board"]["pattern"] == "checkerboard":
+            del content["board"]["pattern"], content["board"]["gap"]
+        return content
+
     def covariance_matrix(self) -> torch.Tensor | None:
         """(5 + P, 5 + P) in the order of `Camera.names`, zero for what is exact; None if the file has none."""
         if self.information is not None:

@@ -41,15 +41,41 @@ class Exclusion:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BoardRecord:
-    """The board as plain fields: inner corners, and the side of a square in meters."""
+    """The board as plain fields.
+
+    Args:
+        columns: points in a row: inner corners, circles, or twice the tags.
+        rows: points in a column.
+        square: meters, the side of a square or of a tag, or the distance of circles.
+        pattern: `checkerboard` (ChArUco boards as well), `circles`, `asymmetric` or `aprilgrid`.
+        gap: meters from tag to tag, of an `aprilgrid`.
+
+    Example:
+        >>> print(BoardRecord(columns=9, rows=6, square=0.025))
+        9x6 inner corners, 25 mm squares
+    """
 
     columns: int
     rows: int
     square: float
+    pattern: Literal["checkerboard", "circles", "asymmetric", "aprilgrid"] = "checkerboard"
+    gap: float | None = None
 
     def __post_init__(self) -> None:
         if not (self.columns > 0 and self.rows > 0 and self.square > 0):
-            raise InputError(f"board: columns, rows and square must be positive, got {self}")
+            raise InputError(f"board: columns, rows and square must be positive, got {self!r}")
+        if (self.gap is not None and self.gap > 0) != (self.pattern == "aprilgrid"):
+            raise InputError(f"board: an aprilgrid, and only this, has a gap that is positive, got {self!r}")
+
+    def __str__(self) -> str:
+        length = f"{self.square * 1000:g} mm"
+        if self.gap is not None:
+            return f"{self.columns // 2}x{self.rows // 2} tags of {length}, {self.gap * 1000:g} mm apart"
+        if self.pattern == "circles":
+            return f"{self.columns}x{self.rows} circles, {length} apart"
+        if self.pattern == "asymmetric":
+            return f"{self.columns}x{self.rows} asymmetric circles, rows {length} apart"
+        return f"{self.columns}x{self.rows} inner corners, {length} squares"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

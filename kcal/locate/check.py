@@ -21,7 +21,7 @@ class Sides(NamedTuple):
     spread: float
 
 
-def triangulated_sides(rig: StereoRig, columns: int, rows: int, pixels: Tensor) -> Sides:
+def triangulated_sides(rig: StereoRig, columns: int, rows: int, pixels: Tensor, points: Tensor | None = None) -> Sides:
     """Triangulate every corner of boards seen by both cameras and measure the sides of the squares.
 
     Args:
@@ -29,6 +29,8 @@ def triangulated_sides(rig: StereoRig, columns: int, rows: int, pixels: Tensor) 
         columns: inner corners in a row.
         rows: inner corners in a column.
         pixels: (P, 2, columns * rows, 2) corners of P pairs, left and right, row by row; NaN where not seen.
+        points: (columns * rows, 3) of a board whose sides differ, such as an AprilGrid: each side then counts as that
+            of its first two points, if it has the right length. All sides are alike if not given.
 
     Returns:
         Mean and standard deviation over all sides whose two corners were seen by both cameras.
@@ -49,13 +51,23 @@ def triangulated_sides(rig: StereoRig, columns: int, rows: int, pixels: Tensor) 
     pixels = as_points("pixels", pixels, 2)
     if pixels.ndim != 4 or pixels.shape[1:3] != (2, columns * rows):
         raise InputError(f"pixels: shape (P, 2, {columns * rows}, 2) is needed, got {tuple(pixels.shape)}")
+    known = None if points is None else as_points("points", points, 3)
+    if known is not None and known.shape != (columns * rows, 3):
+        raise InputError(f"points: shape ({columns * rows}, 3) is needed, got {tuple(known.shape)}")
     located = Triangulate(rig)(pixels[:, 0], pixels[:, 1])
     points = torch.where((located.status == PositionStatus.OK)[..., None], located.points, torch.nan)
-    grid = points.unflatten(1, (rows, columns))
-    along_rows = (grid[:, :, 1:] - grid[:, :, :-1]).reshape(-1, 3)
-    along_columns = (grid[:, 1:] - grid[:, :-1]).reshape(-1, 3)
-    sides = torch.linalg.vector_norm(torch.cat([along_rows, along_columns]), dim=-1)
+    sides = _grid_sides(points, columns, rows)
+    if known is not None:
+        ordered = _grid_sides(known[None], columns, rows)
+        sides = sides / ordered * ordered[:, :1]
     sides = sides[torch.isfinite(sides)]
     if len(sides) < 2:
         raise DegenerateError("no side of a square could be triangulated")
     return Sides(float(sides.mean()), float(sides.std()))
+
+
+def _grid_sides(points: Tensor, columns: int, rows: int) -> Tensor:
+    """Distances (P, S) of neighbors along rows, then along columns, of points (P, rows * columns, 3)."""
+    grid = points.unflatten(1, (rows, columns))
+    steps = [(grid[:, :, 1:] - grid[:, :, :-1]).flatten(1, 2), (grid[:, 1:] - grid[:, :-1]).flatten(1, 2)]
+    return torch.linalg.vector_norm(torch.cat(steps, 1), dim=-1)

@@ -133,7 +133,7 @@ def _short(value: float) -> str:
 
 def diagonal_rows(located: Located, board: Board) -> list[list[str]]:
     """The board's diagonal, known and located, for each pair of points named "NAME first" and "NAME last"."""
-    true = board.square * math.hypot(board.columns - 1, board.rows - 1)
+    true = math.dist(board.points[0].tolist(), board.points[-1].tolist())
     rows = [["pair", "range m", "true mm", "estimated mm", "error mm"]]
     ends = {position.name: position for position in located.positions}
     for name in sorted({name.rsplit(" ", 1)[0] for name in ends}):

@@ -113,7 +113,7 @@ def camera_tables(camera: Camera, result: CameraCalibrationResult | None = None)
             ["views, corners", f"{record.views}, {record.points}; {len(record.excluded)} left out"],
             ["RMS", f"{record.rms:.4f} px"],
             ["noise of a corner", "" if record.noise is None else f"{record.noise:.4f} px along an axis"],
-            ["board", f"{record.board.columns}x{record.board.rows} corners, {1e3 * record.board.square:g} mm squares"],
+            ["board", f"{record.board}"],
         ]
     if result is not None:
         facts.append(["solver", result.status.message])

@@ -44,7 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     code, text = kcal(*words, "--temperature", 21.5)
     assert code == 0
     # Centimeters in place of millimeters show here.
-    assert "board 7 x 6 corners, 50 mm squares: 300 x 250 mm; nearest view 0.4" in text
+    assert "board 7x6 inner corners, 50 mm squares: 300 x 250 mm; nearest view 0.4" in text
     return here
 
 

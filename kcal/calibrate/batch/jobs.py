@@ -131,7 +131,10 @@ def _job(source: Path, row: dict[str, str], board: Board | None, model: str) -> 
     name = row["camera"]
     try:
         if row.get("board") or row.get("square"):
-            board = Board.parse(row.get("board", ""), row.get("square", ""))
+            kind = row.get("board", "")
+            if source.is_file() and Path(kind).suffix.lower() in (".yaml", ".yml"):
+                kind = str(source.parent / kind)
+            board = Board.parse(kind, row.get("square", ""))
         images = expand_images([source.parent / row["images"] if source.is_file() else row["images"]])
     except KcalError as error:
         return CameraJob(name=name, error=str(error))

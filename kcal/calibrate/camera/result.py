@@ -16,7 +16,7 @@ from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.corners.observations import Observations
 from kcal.io.camera_file import CameraFile, camera_to_file, provenance
-from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, Exclusion
+from kcal.lens.calibration import CalibrationRecord, CameraCalibration, Exclusion
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.solve.result import SolverStatus
@@ -158,7 +158,7 @@ class CameraCalibrationResult:
             points=int(self.residuals[..., 0].isfinite().sum()),
             per_view_rms=used,
             excluded=self.excluded,
-            board=BoardRecord(columns=board.columns, rows=board.rows, square=board.square),
+            board=board.record,
             board_warp=None if warp is None else (float(warp[0]), float(warp[1])),
             stop_reason=self.status.message,
             iterations=self.iterations,

@@ -93,9 +93,9 @@ def distances_text(result: CameraCalibrationResult) -> str:
     middle = (result.cam_from_board_rotation @ board.points.mean(0)) + far
     distance = middle.norm(dim=-1)
     distance = distance[distance.isfinite()]
-    width, height = (1e3 * board.square * (count - 1) for count in (board.columns, board.rows))
+    width, height = (1e3 * side for side in board.extent)
     return (
-        f"board {board.columns} x {board.rows} corners, {1e3 * board.square:g} mm squares: {width:g} x {height:g} mm; "
+        f"board {board.record}: {width:g} x {height:g} mm; "
         f"nearest view {_distance_text(float(distance.min()))}, farthest {_distance_text(float(distance.max()))}"
     )
 

@@ -26,9 +26,7 @@ _MOST_ROUNDS = 30
 
 def quarter_turns(board: Board) -> tuple[int, ...]:
     """The quarter turns after which a board's pattern looks as before, beginning with none."""
-    if board.unambiguous:
-        return (0,)
-    return (0, 1, 2, 3) if board.columns == board.rows and board.rows % 2 == 0 else (0, 2)
+    return board.quarter_turns
 
 
 def turned_corners(values: Tensor, board: Board, turns: Tensor) -> Tensor:

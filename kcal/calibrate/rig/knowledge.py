@@ -20,7 +20,6 @@ from kcal.calibrate.lensfit.board_prior import BoardMessage, message_from_rows, 
 from kcal.calibrate.lensfit.evidence import BOARD, typical_hyperprior
 from kcal.calibrate.rig.unknowns import SharedUnknowns, held
 from kcal.corners.board import Board
-from kcal.lens.calibration import BoardRecord
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation, triangular, unit_scale, whitened
 from kcal.lens.projection import project_components
@@ -58,18 +57,13 @@ def gathered(cameras: Sequence[Camera], known: Sequence[CameraInformation | None
         record = None if camera.calibration is None else camera.calibration.record
         if own is None or not own.board_size or record is None:
             continue
-        saw = _board_of(record.board)
-        board = board or saw
-        if saw != board:
+        board = board or Board.of(record.board)
+        if record.board != board.record:
             continue
         turned = own if first is None else _agreeing(first, own, board)
         if turned is not None:
             first, sharing[number], out[number] = first or own, True, turned
     return Knowledge(tuple(out), tuple(sharing))
-
-
-def _board_of(record: BoardRecord) -> Board:
-    return Board(columns=record.columns, rows=record.rows, square=record.square)
 
 
 def _agreeing(first: CameraInformation, other: CameraInformation, board: Board) -> CameraInformation | None:

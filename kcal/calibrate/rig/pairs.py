@@ -16,7 +16,6 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
-from kcal.lens.calibration import BoardRecord
 from kcal.lens.camera import Camera
 from kcal.strict_json import MOST_BYTES
 
@@ -124,10 +123,9 @@ def _deviation(cameras: Sequence[Camera], board: Board) -> Tensor | None:
     what follows the first camera's deviation better counts.
     """
     found: list[Tensor] = []
-    same = BoardRecord(columns=board.columns, rows=board.rows, square=board.square)
     for camera in cameras:
         record = None if camera.calibration is None else camera.calibration.record
-        if record is None or record.board_deviation is None or record.board != same:
+        if record is None or record.board_deviation is None or record.board != board.record:
             continue
         own = torch.tensor(record.board_deviation, dtype=torch.float64)
         turned = own.flip(0) * torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)

@@ -1,0 +1,45 @@
+"""What the search for a board in one image gives."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import NamedTuple
+
+from torch import Tensor
+
+from kcal.corners.saddle import CornerStatus, Refined
+
+_STATUS_TEXTS = {
+    CornerStatus.OUTSIDE: "too near the image's edge",
+    CornerStatus.NO_SADDLE: "not a corner",
+    CornerStatus.MOVED: "moved too far",
+    CornerStatus.NOT_CONVERGED: "did not converge",
+    CornerStatus.SATURATED: "over- or underexposed",
+    CornerStatus.OCCLUDED: "covered or glaring",
+    CornerStatus.BLURRED: "too blurred",
+}
+
+
+class Detection(NamedTuple):
+    """What was found of a board in an image.
+
+    Args:
+        pixels: (corners, 2) float64 in the board's order, NaN where not seen; None if no board was found.
+        reason: why none was found.
+        covariance: (corners, 2, 2) px², if the refinement estimates it.
+        legacy: of a ChArUco board, whether its numbering is that of OpenCV before 4.6; None where it makes no
+            difference.
+    """
+
+    pixels: Tensor | None
+    reason: str = ""
+    covariance: Tensor | None = None
+    legacy: bool | None = None
+
+
+def too_few(refined: Refined, found: int) -> str:
+    """Why too few of the points found could be refined."""
+    good = int((refined.status == CornerStatus.GOOD).sum())
+    counts = Counter(refined.status.tolist())
+    why = ", ".join(f"{counts[code]} {text}" for code, text in _STATUS_TEXTS.items() if counts[code])
+    return f"only {good} of {found} corners could be refined ({why})"

@@ -1,0 +1,108 @@
+"""Photographs of printed boards of any pattern, with their true points: the page of `kcal board` through a camera."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+
+from kcal.corners.print_board import board_sheet
+from kcal.lens.pose import rotation_from_vector
+
+DARK, LIGHT = 40.0, 210.0
+_FINE = 4  # rays a pixel and axis
+_RAYS: dict = {}  # of the last camera
+
+
+class Paper:
+    """A board's page as shares of black, exact on each cell of a fine grid."""
+
+    def __init__(self, board, cell_mm=0.1, page="auto"):
+        sheet = board_sheet(board, page)
+        self.board, self.cell = board, cell_mm
+        self.origin = np.array(sheet.origin)
+        width, height = (round(side / cell_mm) for side in (sheet.drawing.width, sheet.drawing.height))
+        black = np.zeros((height, width), np.float32)
+        for r in sheet.drawing.rectangles:
+            add(black, r.x / cell_mm, r.y / cell_mm, r.width / cell_mm, r.height / cell_mm)
+        for c in sheet.drawing.circles:
+            add_circle(black, c.x / cell_mm, c.y / cell_mm, c.diameter / cell_mm / 2)
+        self.light = 1.0 - black.clip(0, 1)
+
+    def shoot(self, camera, rotation, translation, blur=0.7, noise=1.5, seed=0, supersample=_FINE):
+        """An image (H, W) uint8 and the true points (N, 2)."""
+        width, height = camera.size
+        fine = light_of([(self, rotation, translation)], camera, supersample)
+        return expose(fine, width, height, blur, noise, seed, supersample), points_of(
+            self.board, camera, rotation, translation
+        )
+
+
+def light_of(scenes, camera, supersample=_FINE):
+    """Light on a grid of `supersample` rays a pixel and axis; papers lie before a dark gray wall, later ones on top."""
+    width, height = camera.size
+    axis = [(np.arange(side * supersample) + 0.5) / supersample - 0.5 for side in (width, height)]
+    u, v = np.meshgrid(*axis)
+    key = (camera.fingerprint, supersample)
+    if key not in _RAYS:
+        _RAYS.clear()
+        _RAYS[key] = camera.unproject(torch.from_numpy(np.stack([u, v], -1)))[0].numpy()
+    rays = _RAYS[key]
+    fine = np.full(u.shape, 0.3, np.float32)
+    for paper, rotation, translation in scenes:
+        R, t = rotation.numpy(), translation.numpy()
+        inside = rays @ R
+        center = -R.T @ t
+        with np.errstate(divide="ignore", invalid="ignore"):
+            hit = center[:2] + inside[..., :2] * (-center[2] / inside[..., 2])[..., None]
+        where = ((1000 * hit + paper.origin) / paper.cell - 0.5).astype(np.float32)
+        # The page is averaged over the distance of two rays, so that they miss no edge.
+        pitch = float(np.nanmedian(np.linalg.norm(np.diff(where, axis=1), axis=-1)))
+        light = cv2.GaussianBlur(paper.light, (0, 0), max(0.5 * pitch, 0.3), borderType=cv2.BORDER_REPLICATE)
+        sample = cv2.remap(light, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderValue=-1.0)
+        fine = np.where(np.isfinite(sample) & (sample >= 0) & (inside[..., 2] > 0), sample, fine)
+    return fine
+
+
+def expose(fine, width, height, blur=0.7, noise=1.5, seed=0, supersample=_FINE):
+    fine = cv2.GaussianBlur(fine.astype(np.float32), (0, 0), blur * supersample) if blur else fine
+    image = fine.reshape(height, supersample, width, supersample).mean((1, 3))
+    image = DARK + (LIGHT - DARK) * image + noise * np.random.default_rng(seed).standard_normal((height, width))
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def points_of(board, camera, rotation, translation):
+    return camera.project(board.points @ rotation.T + translation)[0]
+
+
+def pose(board, tilt, distance, shift=(0.0, 0.0)):
+    """The board's middle at `distance` before the camera, turned by a rotation vector."""
+    rotation = rotation_from_vector(torch.tensor(tilt, dtype=torch.float64))
+    middle = 0.5 * (board.points.amin(0) + board.points.amax(0))
+    place = torch.tensor([*shift, distance], dtype=torch.float64)
+    return rotation, place - rotation @ middle
+
+
+def errors(pixels, truth):
+    """RMS and largest error of the points that were found, and how many there are."""
+    distance = (pixels - truth).norm(dim=-1)
+    distance = distance[distance.isfinite()]
+    return float(distance.square().mean().sqrt()), float(distance.max()), len(distance)
+
+
+def add(black, x, y, width, height):
+    """Add a rectangle by the share of each cell that it covers."""
+    rows, columns = (
+        np.clip(np.minimum(np.arange(size) + 1, begin + length) - np.maximum(np.arange(size), begin), 0, 1)
+        for size, begin, length in ((black.shape[0], y, height), (black.shape[1], x, width))
+    )
+    i, j = np.flatnonzero(rows), np.flatnonzero(columns)
+    black[np.ix_(i, j)] += np.outer(rows[i], columns[j]).astype(np.float32)
+
+
+def add_circle(black, x, y, radius, parts=16):
+    top, left = int(y - radius) - 1, int(x - radius) - 1
+    size = int(2 * radius) + 4
+    axis = (np.arange(size * parts) + 0.5) / parts
+    inside = (axis[None] + left - x) ** 2 + (axis[:, None] + top - y) ** 2 < radius**2
+    black[top : top + size, left : left + size] += inside.reshape(size, parts, size, parts).mean((1, 3))
