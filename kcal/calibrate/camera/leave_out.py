@@ -26,6 +26,8 @@ from kcal.errors import DegenerateError, InputError
 _FAILED = (InputError, ArithmeticError, torch.linalg.LinAlgError)
 # Largest share of the views that is left out without being asked.
 _FEW = 0.2
+# In warnings about what was not used: they concern the views, not the fit, and stay with another fit of the same views.
+_LEFT_OUT, _START = "views were left out:", "was given for the start"
 # Names and reasons in one message, at most.
 _SHOWN = 5
 # The unknowns that the views alone must determine: focal length, principal point, shape of the base projection.
@@ -90,7 +92,7 @@ def _without_start(
     except InputError:
         raise failure from None
     note = (
-        f"no lens with the focal length that was given for the start ({given:.4g} px) shows the corners: it was not "
+        f"no lens with the focal length that {_START} ({given:.4g} px) shows the corners: it was not "
         "used; leave it out, or correct it"
     )
     return dataclasses.replace(result, warnings=(note, *result.warnings))
@@ -110,6 +112,11 @@ def _wrong_views(observations: Observations, options: CalibrationOptions) -> dic
     for i in missing.nonzero()[:, 0].tolist():
         found[i] = f"the lens that fits the others cannot show {int(missing[i])} of its {int(seen[i].sum())} corners"
     return dict(sorted(found.items()))
+
+
+def lasting_warnings(result: CameraCalibrationResult) -> tuple[str, ...]:
+    """Those of a result's warnings that hold for another fit of the same views, too: what was not used."""
+    return tuple(text for text in result.warnings if _LEFT_OUT in text or _START in text)
 
 
 def _few_names(names: Sequence[str]) -> str:
@@ -137,7 +144,7 @@ def without_views(
         for i, why in wrong.items()
     )
     note = (
-        f"{len(wrong)} of {len(observations.views)} views were left out: {listed_views(observations, wrong)}; look at "
+        f"{len(wrong)} of {len(observations.views)} {_LEFT_OUT} {listed_views(observations, wrong)}; look at "
         "these images, and remove or retake them"
     )
     return dataclasses.replace(

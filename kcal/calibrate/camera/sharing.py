@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.hybrid import hybrid_result
+from kcal.calibrate.camera.leave_out import lasting_warnings
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.repeats import copied_views, copy_warnings, pose_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult, SharedBoard
@@ -79,7 +80,7 @@ def sharing(
         repeats = (*copy_warnings(before.observations.names, copied), *pose_warnings(pixels[used[i]]))
         found[i] = dataclasses.replace(
             after,
-            warnings=(*after.warnings, *repeats),
+            warnings=(*lasting_warnings(before), *after.warnings, *repeats),
             rejected_corners=before.rejected_corners,
             rejected_views=before.rejected_views,
             shared_board=shared,

@@ -9,6 +9,7 @@ import time
 from concurrent.futures import Future
 
 import cv2
+import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -109,6 +110,8 @@ class TestResults:
             )
         assert rows[0].rms == pytest.approx(0.02, abs=0.02)
         assert rows[0].fx == pytest.approx(300, rel=0.01)
+        assert rows[0].focal == pytest.approx(0.5 * (rows[0].fx + rows[0].fy), rel=1e-12)
+        assert 0 < rows[0].sigma_focal < 2 * rows[0].sigma_fx
 
     def test_nothing_is_done_twice(self, folder, tmp_path):
         first, _ = run(folder, tmp_path / "out")
@@ -231,6 +234,24 @@ class TestSharing:
         for row in results.rows():
             assert "calibrated alone, without what other cameras tell of the board: out of memory" in row.warnings
             assert row.rms is not None
+
+
+def test_images_that_were_resized_are_scaled_and_it_is_said(folder, images, tmp_path):
+    """In the table's warnings; one that was cropped stays with its camera as an error."""
+    small = cv2.imdecode(np.frombuffer(images["east"][0], np.uint8), cv2.IMREAD_GRAYSCALE)
+    half = cv2.resize(small, (small.shape[1] // 2, small.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(folder / "east" / "half.png"), cv2.resize(small, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC))
+    rows, _ = run(folder, tmp_path / "out")
+    height, width = small.shape
+    assert f"scaled to {width}x{height} px of most images: half.png from {2 * width}x{2 * height}" in rows[0].warnings
+    seen = Observations.load(tmp_path / "out" / "east.obs.json")
+    assert seen.image_size == (width, height)
+    first, again = seen.names.index("0.png"), seen.names.index("half.png")
+    assert float((seen.pixels()[first] - seen.pixels()[again]).norm(dim=-1).max()) < 0.2
+    cv2.imwrite(str(folder / "east" / "half.png"), half[:-10])
+    rows, _ = run(folder, tmp_path / "out")
+    assert "some were cropped" in rows[0].error
+    assert rows[1].error == ""
 
 
 class TestJobs:

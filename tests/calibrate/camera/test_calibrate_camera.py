@@ -305,7 +305,8 @@ class TestDegenerate:
             pixels[3, count:] = torch.nan
             found = solve(pixels)
             assert _left_out(found) == {"v03": f"it has {count} corners, and at least 6 are needed"}
-            torch.testing.assert_close(found.camera.params, alone.camera.params, rtol=0, atol=0)
+            # The same minimization; where memory lies decides the order of its sums.
+            torch.testing.assert_close(found.camera.params, alone.camera.params, rtol=1e-7, atol=1e-9)
             assert found.per_view_rms.isnan().tolist() == [False, False, False, True, False]
 
     @pytest.mark.parametrize("seen", [range(7), range(8), range(0, 42, 7), range(0, 41, 8)])
