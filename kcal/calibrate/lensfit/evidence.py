@@ -168,25 +168,54 @@ class Quadratic(NamedTuple):
     freedom: float
 
 
+class _Root(NamedTuple):
+    """The same without squares: chi²(x) = |rows x - target|² + rest.
+
+    Attributes:
+        rows: (R, S).
+        target: (R,).
+        rest: number.
+    """
+
+    rows: Tensor
+    target: Tensor
+    rest: float
+
+
+def _root(data: Quadratic) -> _Root:
+    # In units of the diagonal, below which nothing but rounding is left of directions that the data do not determine.
+    scale = data.K.diagonal().clamp_min(1e-300).rsqrt()
+    values, vectors = torch.linalg.eigh(data.K * scale[:, None] * scale)
+    kept = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
+    root, vectors = values[kept].sqrt(), vectors[:, kept]
+    target = vectors.T @ (scale * data.g) / root
+    return _Root((vectors * root).T / scale, target, max(data.c - float(target @ target), 0.0))
+
+
 def negative_log_evidence(data: Quadratic, families: PriorFamilies, v: np.ndarray) -> tuple[float, np.ndarray]:
     """The negative logarithm of the evidence of v = (h, ln σ²), (H + 1,), and its gradient."""
-    K, g, c, freedom = data.K.numpy(), data.g.numpy(), data.c, data.freedom
-    here, log_variance = torch.from_numpy(v[:-1]), v[-1]
-    s2 = math.exp(log_variance)
-    d = families.deviation(here).numpy()
-    A = torch.from_numpy(K * d[:, None] * d / s2)
-    A.diagonal().add_(1.0)
-    root, info = torch.linalg.cholesky_ex(A)
-    if int(info):
-        return math.inf, np.zeros_like(v)
-    inverse = torch.linalg.solve_triangular(root, torch.eye(len(g), dtype=A.dtype), upper=False).numpy()
-    y = inverse.T @ (inverse @ (d * g / s2))
-    kept = (inverse**2).sum(0)
-    x = d * y
-    rss = c - 2 * g @ x + x @ (K @ x)
-    value = 0.5 * (freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
-    by_h = families.slopes(here).numpy() @ (0.5 * (1 - y * y - kept))
-    return value, np.append(by_h, 0.5 * (freedom - (len(g) - kept.sum()) - rss / s2))
+    return _negative_log_evidence(_root(data), data.freedom, families, v)
+
+
+def _negative_log_evidence(
+    data: _Root, freedom: float, families: PriorFamilies, v: np.ndarray
+) -> tuple[float, np.ndarray]:
+    here, s = torch.from_numpy(v[:-1]), math.exp(0.5 * v[-1])
+    d = families.deviation(here) / s
+    size = len(d)
+    # Rows of data and priors, and the last column their target. Never squared: amplitudes may be so wide, or so close
+    # to zero, that a factor of the normal matrix would be rounding.
+    stacked = torch.zeros(len(data.rows) + size, size + 1, dtype=d.dtype)
+    stacked[: len(data.rows), :-1], stacked[: len(data.rows), -1] = data.rows * d, data.target / s
+    stacked[len(data.rows) :].fill_diagonal_(1.0)
+    triangle = torch.linalg.qr(stacked, mode="r")[1]
+    root, corner = triangle[:size, :size], float(triangle[size, size])
+    inverse = torch.linalg.solve_triangular(root, torch.eye(size, dtype=d.dtype), upper=True)
+    y2, kept = (inverse @ triangle[:size, -1]).square(), inverse.square().sum(1)
+    chi2 = corner**2 - float(y2.sum()) + data.rest / s**2
+    value = 0.5 * (freedom * v[-1] + corner**2 + data.rest / s**2) + float(root.diagonal().abs().log().sum())
+    by_h = (families.slopes(here) @ (0.5 * (1.0 - y2 - kept))).numpy()
+    return value, np.append(by_h, 0.5 * (freedom - (size - float(kept.sum())) - chi2))
 
 
 def maximize_evidence(
@@ -206,17 +235,12 @@ def maximize_evidence(
         hyperprior: of h; the typical one of the default field if not given.
     """
     mean, sd = (part.numpy() for part in hyperprior or typical_hyperprior())
-
-    values: list[float] = []
+    root = _root(data)
 
     def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = negative_log_evidence(data, families, v)
-        if not math.isfinite(value):
-            # Priors are far too wide for this precision: worse than any trial before, so that a shorter step follows.
-            return max(values, default=1e30) + 1.0, slope
+        value, slope = _negative_log_evidence(root, data.freedom, families, v)
         z = (v[:-1] - mean) / sd
-        values.append(value + 0.5 * float(z @ z))
-        return values[-1], slope + np.append(z / sd, 0.0)
+        return value + 0.5 * float(z @ z), slope + np.append(z / sd, 0.0)
 
     start = np.append(h.numpy(), math.log(variance))
     # The last bound is open: where all are closed, L-BFGS-B makes its first trial at the bounds.
