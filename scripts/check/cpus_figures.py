@@ -166,6 +166,39 @@ def compare_positions(one: dict[str, Any], other: dict[str, Any]) -> dict[str, A
     return {"of σ": float(away.norm(dim=(-1, -2)).max()), "σ": float(sigma.abs().max())}
 
 
+Row = tuple[list[float], list[float], str, str]
+
+
+def compare(first: Path, others: dict[str, Path]) -> dict[str, Row]:
+    """For each stage: differences / σ, differences of σ, the setting with the largest one, and statuses that differ."""
+    told = {name: json.loads((place / "told.json").read_text()) for name, place in {"": first, **others}.items()}
+    found: dict[str, dict[str, dict[str, Any]]] = {"corners": {}}
+    statuses: dict[str, set[str]] = {}
+    for name, place in others.items():
+        found["corners"][name] = compare_corners(first, place)
+        for here, record in told[name]["cameras"].items():
+            base = told[""]["cameras"][here]
+            statuses.setdefault(here, set()).update((base["status"], record["status"]))
+            if all((folder / f"{here}.json").exists() for folder in (first, place)):
+                found.setdefault(here, {})[name] = compare_cameras(first / f"{here}.json", place / f"{here}.json")
+            else:
+                found.setdefault(here, {})
+        for here, record in told[name]["positions"].items():
+            found.setdefault(here, {})[name] = compare_positions(told[""]["positions"][here], record)
+    rows: dict[str, Row] = {}
+    for here, by_name in found.items():
+        worst = max(by_name, key=lambda name: by_name[name]["of σ"], default="")
+        note = statuses.get(here, set())
+        refused = all(status.startswith("refused") for status in note) and bool(note)
+        rows[here] = (
+            [one["of σ"] for one in by_name.values()],
+            [one["σ"] for one in by_name.values() if "σ" in one],
+            worst,
+            "refused" if refused else ", ".join(sorted(note)) if len(note) > 1 else "",
+        )
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
