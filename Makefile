@@ -1,5 +1,6 @@
 # make demo   the whole chain on a simulated site; results in demo-output/
 # make test   linters, type check and all tests
+# make test-cpus  the tests as other makes of CPU round: six times as long
 # make check  linters and type check only
 # make docs   the documentation site, in site/; it opens without a server and can be searched offline
 #
@@ -16,7 +17,7 @@ export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := demo
-.PHONY: demo test check docs clean
+.PHONY: demo test test-cpus check docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/kcal demo --output $(OUT)
@@ -33,6 +34,9 @@ test: export OMP_NUM_THREADS = 1
 test: export OPENBLAS_NUM_THREADS = 1
 test: check
 	$(BIN)/python -m pytest -n 2 kcal tests
+
+test-cpus: $(VENV)/.installed-dev
+	$(BIN)/python -m scripts.check.cpus
 
 # The release of MkDocs is pinned, so its announcements of other programs are switched off.
 docs: $(VENV)/.installed-docs

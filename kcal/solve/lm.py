@@ -26,6 +26,8 @@ _LOWEST_DAMPING, _HIGHEST_DAMPING = 1e-14, 1e10
 _LITTLE_DAMPING = 1e-3
 # Trial steps over which `LMOptions.flatness` is judged.
 _PATIENCE = 20
+# The same where little is predicted either.
+_LONG_PATIENCE = 100
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -36,7 +38,8 @@ class LMOptions:
         max_iterations: maximum number of trial steps, rejected ones included.
         tolerance: stop when the next step is predicted to lower the cost by less than this fraction. 1e-12 of the
             cost is 5e-13 of the RMS.
-        flatness: stop when 20 steps together have lowered the cost by less than this fraction; 0: never.
+        flatness: stop when 20 steps together have lowered the cost by less than this fraction although more was
+            predicted, or 100 steps in any case; 0: never.
         initial_damping: λ at the start, in units of the scaled normal matrix, whose diagonal is one.
         residual_floor: a root-mean-square residual below this counts as zero.
     """
@@ -169,9 +172,22 @@ def _minimize(problem: Problem[S], start: S, options: LMOptions, callback: Callb
             status = np.where(at_minimum, int(SolverStatus.CONVERGED), status)
             status = np.where(stalled & ~at_minimum, int(SolverStatus.STALLED), status)
         if options.flatness and trial >= _PATIENCE:
-            before = history[-1 - _PATIENCE]
-            slow = (before if whole is None else before[whole.index]) - cost <= options.flatness * cost
-            status = np.where((status == 0) & slow, int(SolverStatus.FLAT), status)
+            lately, long_since = (
+                history[-1 - steps] if trial >= steps else np.full_like(history[0], np.inf)
+                for steps in (_PATIENCE, _LONG_PATIENCE)
+            )
+            if whole is not None:
+                lately, long_since = lately[whole.index], long_since[whole.index]
+            little = (status == 0) & (lately - cost <= options.flatness * cost)
+            if little.any():
+                # Close to a minimum steps gain little, too, and its status must not depend on which comes first, the
+                # last of these steps or convergence. What is predicted is less there by orders of magnitude.
+                left, damped = predicted, damping > _LITTLE_DAMPING
+                if (little & damped).any():
+                    _, free = linear.step(on_device(np.full_like(damping, _LITTLE_DAMPING)))
+                    left = np.where(damped, on_host(free), predicted)
+                slow = ~(left <= options.flatness * cost) | (long_since - cost <= options.flatness * cost)
+                status = np.where(little & slow, int(SolverStatus.FLAT), status)
         if callback is not None and callback(trial, on_device(history[-1])):
             status = np.where(status == 0, int(SolverStatus.INTERRUPTED), status)
         if (accept & (status == 0)).any():

@@ -225,20 +225,6 @@ class TestCallback:
         assert result.status.tolist() == [SolverStatus.EXACT, SolverStatus.INTERRUPTED]
 
 
-def test_a_flat_valley_is_left_and_called_so() -> None:
-    """x² only halves x at each step, beside a residual that nothing lowers."""
-
-    def valley(x: Tensor) -> Tensor:
-        return torch.stack([x[0] ** 2, 1e-3 + 0.0 * x[0]])
-
-    left = LevenbergMarquardt(valley, LMOptions(tolerance=0.0, flatness=0.5))(vector(3.0))
-    assert int(left.status) == SolverStatus.FLAT
-    assert not bool(left.converged)
-    # The first step after twenty that gained less than half of what is left.
-    assert float(left.history[-21]) <= 1.5 * float(left.cost) < float(left.history[-22])
-    assert int(LevenbergMarquardt(valley, LMOptions(tolerance=0.0))(vector(3.0)).status) != SolverStatus.FLAT
-
-
 class Scripted:
     """A problem whose costs and promised decreases are given; it notes the damping of each step."""
 
@@ -261,6 +247,26 @@ class Scripted:
 
     def cost(self, state: tuple[Tensor]) -> Tensor:
         return vector(self.trials[len(self.dampings) - 1][0])[0]
+
+
+def scripted(trials: list[tuple[float, float]]) -> tuple[SolverStatus, int]:
+    """Status and trial steps of a problem that begins at a cost of one."""
+    start = (torch.zeros(()).double(),)
+    found = minimize(Scripted(1.0, trials), start, LMOptions(flatness=1e-6, residual_floor=0.0))  # type: ignore[arg-type,type-var]
+    return SolverStatus(int(found.status)), int(found.iterations)
+
+
+@pytest.mark.parametrize("steps", [17, 19, 20, 21, 23, 80])
+def test_a_minimum_that_is_reached_slowly_is_one(steps: int) -> None:
+    """Twenty steps gain little, and convergence comes some steps before or after the twentieth: the same status."""
+    trials = [(1.0 - 1e-9 * k, 1e-9) for k in range(1, steps)]
+    assert scripted([*trials, (1.0, 1e-13)]) == (SolverStatus.CONVERGED, steps)
+
+
+def test_a_flat_valley_is_left_and_called_so() -> None:
+    """Twenty steps gain little of the much that each promises, or a hundred little of little."""
+    assert scripted([(1.0 - 1e-9 * k, 5e-6) for k in range(1, 200)]) == (SolverStatus.FLAT, 20)
+    assert scripted([(1.0 - 1e-9 * k, 1e-9) for k in range(1, 200)]) == (SolverStatus.FLAT, 100)
 
 
 def test_damping_follows_the_gain_ratio() -> None:

@@ -52,6 +52,11 @@ def calibrate_what_fits(
             raise
         failure = error
     except DegenerateError as error:
+        # Wrong views can leave the others open, too.
+        if options.reject is None and options.start_focal(observations.image_size) is None:
+            wrong = _wrong_views(observations, options)
+            if wrong and _few(wrong, observations):
+                return _without(observations, options, wrong, error, progress)
         if any(name in str(error) for name in observations.names):
             raise
         raise DegenerateError(f"{error}; the views are {_few_names(observations.names)}") from error
@@ -59,8 +64,7 @@ def calibrate_what_fits(
         return _without_start(observations, options, given, failure, progress)
     wrong = _wrong_views(observations, options)
     listed = listed_views(observations, wrong)
-    few = len(wrong) <= max(1.0, _FEW * len(observations.views))
-    if not wrong or not few or len(observations.views) - len(wrong) < MINIMUM_VIEWS:
+    if not wrong or not _few(wrong, observations):
         which = (
             f"{len(wrong)} of {len(observations.views)} views do not fit the others: {listed}"
             if wrong
@@ -70,12 +74,30 @@ def calibrate_what_fits(
             f"no lens shows all corners where they are. {which}. Do all images show this board, not mirrored, and are "
             "all from this camera at this zoom? Remove those that do not, and detect again"
         ) from failure
+    return _without(observations, options, wrong, failure, progress)
+
+
+def _few(wrong: Mapping[int, str], observations: Observations) -> bool:
+    """Whether views are few enough to go on without them."""
+    count = len(observations.views)
+    return len(wrong) <= max(1.0, _FEW * count) and count - len(wrong) >= MINIMUM_VIEWS
+
+
+def _without(
+    observations: Observations,
+    options: CalibrationOptions,
+    wrong: Mapping[int, str],
+    failure: Exception,
+    progress: Progress,
+) -> CameraCalibrationResult:
+    """Without views that do not fit."""
     progress(f"without {len(wrong)} views that no lens fits")
     kept = [i for i in range(len(observations.views)) if i not in wrong]
     used = observations.subset([observations.names[i] for i in kept])
     try:
         result = calibrate_hybrid(used, options, progress)
     except _FAILED as error:
+        listed = listed_views(observations, wrong)
         raise InputError(f"without {len(wrong)} views that no lens fits ({listed}): {error}") from failure
     return without_views(result, observations, wrong)
 

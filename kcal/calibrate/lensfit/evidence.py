@@ -170,10 +170,52 @@ def typical_hyperprior(modes: FieldModes | None = None) -> Hyperprior:
     )
 
 
+class _Root(NamedTuple):
+    """The same without squares: chi²(x) = |rows x - target|² + rest.
+
+    Attributes:
+        rows: (R, S).
+        target: (R,).
+        rest: number.
+    """
+
+    rows: Tensor
+    target: Tensor
+    rest: float
+
+
+def _root(data: Quadratic) -> _Root:
+    # In units of the diagonal, below which nothing but rounding is left of directions that the data do not determine.
+    scale = data.K.diagonal().clamp_min(1e-300).rsqrt()
+    values, vectors = torch.linalg.eigh(data.K * scale[:, None] * scale)
+    kept = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
+    root, vectors = values[kept].sqrt(), vectors[:, kept]
+    target = vectors.T @ (scale * data.g) / root
+    return _Root((vectors * root).T / scale, target, max(data.c - float(target @ target), 0.0))
+
+
 def negative_log_evidence(data: Quadratic, families: PriorFamilies, v: np.ndarray) -> tuple[float, np.ndarray]:
     """The negative logarithm of the evidence of v = (h, ln σ²), (H + 1,), and its gradient."""
-    found = _evidence(data, families, v[:-1], v[-1])
-    return (math.inf, np.zeros_like(v)) if found is None else (found.value, np.append(found.by_h, found.by_noise))
+    return _still_evidence(_root(data), data.freedom, families, v)
+
+
+def _still_evidence(data: _Root, freedom: float, families: PriorFamilies, v: np.ndarray) -> tuple[float, np.ndarray]:
+    here, s = torch.from_numpy(v[:-1]), math.exp(0.5 * v[-1])
+    d = families.deviation(here) / s
+    size = len(d)
+    # Rows of data and priors, and the last column their target. Never squared: amplitudes may be so wide, or so close
+    # to zero, that a factor of the normal matrix would be rounding.
+    stacked = torch.zeros(len(data.rows) + size, size + 1, dtype=d.dtype)
+    stacked[: len(data.rows), :-1], stacked[: len(data.rows), -1] = data.rows * d, data.target / s
+    stacked[len(data.rows) :].fill_diagonal_(1.0)
+    triangle = torch.linalg.qr(stacked, mode="r")[1]
+    root, corner = triangle[:size, :size], float(triangle[size, size])
+    inverse = torch.linalg.solve_triangular(root, torch.eye(size, dtype=d.dtype), upper=True)
+    y2, kept = (inverse @ triangle[:size, -1]).square(), inverse.square().sum(1)
+    chi2 = corner**2 - float(y2.sum()) + data.rest / s**2
+    value = 0.5 * (freedom * v[-1] + corner**2 + data.rest / s**2) + float(root.diagonal().abs().log().sum())
+    by_h = (families.slopes(here) @ (0.5 * (1.0 - y2 - kept))).numpy()
+    return value, np.append(by_h, 0.5 * (freedom - (size - float(kept.sum())) - chi2))
 
 
 class _Evidence(NamedTuple):
@@ -250,30 +292,28 @@ def maximize_evidence(
     moving = isinstance(data, ViewData)
     ratios = np.zeros(0) if not moving or log_ratio is None else log_ratio
     count = len(mean)
-    still = (data.still if isinstance(data, ViewData) else data).tempered(tempering)
+    root = None if isinstance(data, ViewData) else _root(data.tempered(tempering))
 
     values: list[float] = []
 
     def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
         here, ratio, log_variance = v[:count], v[count:-1], v[-1]
-        if isinstance(data, ViewData):
-            integrated = data.integrated(ratio)
-            found = _evidence(integrated.data.tempered(tempering), families, here, log_variance)
-        else:
-            found = _evidence(still, families, here, log_variance)
+        z = (here - mean) / sd
+        if not isinstance(data, ViewData):
+            assert root is not None
+            value, slope = _still_evidence(root, data.freedom / tempering, families, v)
+            return value + 0.5 * float(z @ z), slope + np.append(z / sd, 0.0)
+        integrated = data.integrated(ratio)
+        found = _evidence(integrated.data.tempered(tempering), families, here, log_variance)
         if found is None:
             # Priors are far too wide for this precision: worse than any trial before, so that a shorter step follows.
             return max(values, default=1e30) + 1.0, np.zeros_like(v)
-        z = (here - mean) / sd
-        value, by_noise, by_ratio = found.value + 0.5 * float(z @ z), found.by_noise, np.zeros(0)
-        if isinstance(data, ViewData):
-            # The prior of the motions' amplitudes is about these, not about their ratios to the noise.
-            w = (ratio + 0.5 * log_variance - math.log(MEDIAN)) / SPREAD
-            value += 0.5 * (integrated.log_determinant / tempering + float(w @ w))
-            by_ratio = integrated.slopes(found.x, found.factor, math.exp(log_variance), tempering) + w / SPREAD
-            by_noise += 0.5 * float(w.sum()) / SPREAD
-        values.append(value)
-        return value, np.concatenate([found.by_h + z / sd, by_ratio, [by_noise]])
+        # The prior of the motions' amplitudes is about these, not about their ratios to the noise.
+        w = (ratio + 0.5 * log_variance - math.log(MEDIAN)) / SPREAD
+        values.append(found.value + 0.5 * (float(z @ z) + integrated.log_determinant / tempering + float(w @ w)))
+        by_ratio = integrated.slopes(found.x, found.factor, math.exp(log_variance), tempering) + w / SPREAD
+        by_noise = found.by_noise + 0.5 * float(w.sum()) / SPREAD
+        return values[-1], np.concatenate([found.by_h + z / sd, by_ratio, [by_noise]])
 
     log_variance = math.log(variance)
     start = np.concatenate([h.numpy(), ratios, [log_variance]])
@@ -288,7 +328,8 @@ def maximize_evidence(
         jac=True,
         method="L-BFGS-B",
         bounds=bounds,
-        options={"maxiter": 80, "ftol": 1e-8, "gtol": 2e-2},
+        # To the maximum, not to wherever rounding lets the steps become small: 1e-2 of ln amplitude is 5e-3 sigma.
+        options={"maxiter": 200, "ftol": 1e-12, "gtol": 1e-4, "maxcor": 20},
     )
     at = found.x
     return Maximum(torch.from_numpy(at[:count].copy()), at[count:-1].copy(), math.exp(at[-1]), float(found.fun))

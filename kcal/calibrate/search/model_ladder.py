@@ -58,6 +58,8 @@ _BARRIER = 0.3
 _INTERMEDIATE = LMOptions(max_iterations=100, tolerance=1e-7, flatness=2e-5, initial_damping=1e-6)
 # Squared residuals of the barrier, in units of the noise, from which on a lens counts as held back by it.
 _AT_BARRIER = 0.1
+# Of the cost: a solve that ends higher by less than this has not left its start.
+_SAME = 1e-10
 # Where starts with nearly canceling terms have their bump, as a fraction of the largest observed r².
 _BUMPS = (0.1, 0.25, 0.5)
 Progress = Callable[[str], None]
@@ -320,18 +322,20 @@ def _solve_within_barrier(
     """Solve to convergence within a barrier: around the corners seen, or around the image where that is not enough.
 
     The best of the solutions and the start is chosen, with a penalty on folds in the image. The cost without the
-    barrier never rises: where the barrier would push the start back, the start is the result.
+    barrier does not rise: where the barrier would push the start back, the start is the result.
     """
     plain = views.lens_problem(model)
     limit, before = views.fold_penalty(start, model), float(plain.cost(start))
     fold_cost = _fold_cost(before, plain.residual_count)
+    # Where a solve ends at its start's minimum, rounding must not decide that the lens was held back at the start.
+    held = before * (1.0 + _SAME)
     ends: list[tuple[float, Result[BoardState], tuple[Term, ...]]] = []
     for radius in (views.seen_radius(start), views.regular_radius(start, model)):
         terms = barriers(views, start, model, radius)
         problem = views.lens_problem(model, terms=terms)
         result = minimize(problem, start, options)
         penalty, cost = views.fold_penalty(result.state, model), float(plain.cost(result.state))
-        if penalty > limit or cost <= before:
+        if penalty > limit or cost <= held:
             ends.append((cost + fold_cost * penalty, result, terms))
         if penalty <= limit:
             break
@@ -348,7 +352,7 @@ def _solve_within_barrier(
         result = _held_at(result, state)
         ends.append((float(plain.cost(state)) + fold_cost * limit, result, terms))
     fallback = _held_at(result, start)
-    ends.append((before + fold_cost * limit, fallback, terms))
+    ends.append((held + fold_cost * limit, fallback, terms))
     _, result, terms = min((end for end in ends if math.isfinite(end[0]) or end[1] is fallback), key=lambda end: end[0])
     return dataclasses.replace(result, cost=plain.cost(result.state)), terms
 

@@ -25,6 +25,8 @@ _LENGTHS = (30.0, 12.0, 5.0, 2.0)
 _ROUNDS = 3
 # Of the cost: a smaller gain ends the search, because a solver may stop that far from its minimum.
 _GAIN = 1e-5
+# Of the cost: by less than this the searches end above and below the same minimum, as rounding has it.
+_SAME = 1e-9
 # Eigenvalues of the scaled information below this are rounding errors, which would give endless lengths.
 _LOWEST = 1e-14
 _SEARCH = LMOptions(max_iterations=100, tolerance=1e-9, flatness=1e-5, initial_damping=1e-5)
@@ -53,7 +55,7 @@ def restart(
         spent += int(found.iterations.max())
         before = float(result.cost)
         order = torch.argsort(torch.nan_to_num(found.cost, nan=math.inf)).tolist()
-        lower = (pick(found.state, i) for i in order if float(found.cost[i]) < before)
+        lower = (pick(found.state, i) for i in order if float(found.cost[i]) < (1.0 - _SAME) * before)
         best = next((state for state in lower if accepts(state)), None)
         if best is None:
             break

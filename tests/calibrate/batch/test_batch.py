@@ -364,7 +364,9 @@ def test_command_line(folder, tmp_path, monkeypatch):
     assert again.exit_code == 0
     # Of each camera, four images, the calibration alone, and that with what both share.
     assert "12 of 12 pieces of work were there already" in again.output
-    assert "give both" in str(kcal("batch", folder, "--board", "6x5", "-o", tmp_path / "out").exception)
+    assert "give the side of its squares" in str(
+        kcal("batch", folder, "--board", "6x5", "-o", tmp_path / "out").exception
+    )
     assert "model" in str(kcal("batch", folder, *WHAT, "--model", "best", "-o", tmp_path / "out").exception)
     assert not (tmp_path / "none").exists()
 

