@@ -15,6 +15,7 @@ from kcal.errors import InputError
 MAX_BEND = 0.25  # of a square: distance of a corner from its neighbors' homography; a wrong grid is off by 1
 MAX_RATIO = 1.7  # of one square's side to the next along a row; perspective reaches it only 3 squares from the board
 MIN_ALTERNATING = 0.9  # share of neighboring squares that must alternate; glare may spoil a few
+MIN_OUTER = 0.35  # of the contrast on the inner side of an outer line: true lines have 0.55 to 1.1, false ones up to 0.1
 GOES_ON = 0.75  # of the contrast across a corner: the board's outer edge has half of it, another row all
 _FOUR_COLORS = 0.5  # of a corner's contrast, in the middle between two: a skipped corner has all of it, an edge none
 MIN_SHARPNESS = 0.58  # see `sharpness`: a blur of 0.22 of the square's side
@@ -107,7 +108,8 @@ def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, r
     * Every square must have the same orientation.
     * Every block of up to 3 x 3 corners must fit a homography; a single one for the board would refuse wide lenses.
     * Sides must change slowly along rows and columns; a homography alone would accept a skipped row.
-    * Dark and light squares must alternate, must not go on outside, and no corners may lie between those of the grid.
+    * Dark and light squares must alternate, also outside the outer corners, must not go on farther, and no corners may
+      lie between those of the grid.
     """
     grid = as_grid(pixels, columns, rows)
     if not bool(torch.isfinite(grid).all()):
@@ -122,6 +124,8 @@ def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, r
         return "the grid found is uneven: not the board, or another number of corners"
     if first_square_dark(image, pixels, columns, rows)[1] < MIN_ALTERNATING:
         return "the squares of the grid found do not alternate between dark and light"
+    if false_sides(image, pixels, columns, rows).any():
+        return f"the outer line of {columns}x{rows} corners lies on the board's edge: the board has fewer inner corners"
     if goes_on(image, pixels, columns, rows):
         return f"the squares go on beyond {columns}x{rows}: the board has more inner corners than that"
     if skips(image, pixels, columns, rows):
@@ -139,6 +143,38 @@ def goes_on(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: 
     grid = as_grid(pixels, columns, rows)
     sides = (grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0))
     return any(_goes_on_above(image, side) for side in sides if len(side) >= 3)
+
+
+def false_sides(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> Tensor:
+    """Which sides of the grid are no lines of corners: top, bottom, left and right, (4,) bool.
+
+    Asked for 9x6, OpenCV's sector detector takes the paper's edge of an 8x6 board for a ninth column where the ground
+    is dark. Outside such a line squares do not alternate. A side that glare hides, or the image cuts, counts as true.
+    """
+    grid = as_grid(pixels, columns, rows)
+    sides = (grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0))
+    return torch.tensor([_alternates_less_outside(image, side) for side in sides])
+
+
+def _alternates_less_outside(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
+    along = torch.gradient(grid, dim=1)[0][0]
+    out = 2 * grid[0] - 3 * grid[1] + grid[2]  # the next step outward, as perspective continues
+    inner, outer = (_step_along(image, grid[0], along, down) for down in (grid[1] - grid[0], out))
+    limit = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)
+    end = grid[0] + 0.5 * out
+    usable = ((end >= 0) & (end <= limit)).all(-1)
+    usable &= inner.abs() > 0.3 * _step_along(image, grid[1], along, grid[2] - grid[1]).abs().median()
+    if 2 * int(usable.sum()) < len(usable):
+        return False
+    return float((-outer / inner)[usable].median()) < MIN_OUTER
+
+
+def _step_along(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
+    """How much lighter squares are after each of `places` (N, 2) than before it, on the side of `down`; (N,)."""
+    share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
+    places, along, down = places[:, None], along[:, None], down[:, None]
+    after, before = (_levels(image, places + share * (sign * along + down)).mean(-1) for sign in (1.0, -1.0))
+    return after - before
 
 
 def skips(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> bool:
