@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple, get_args
 
@@ -17,22 +16,18 @@ from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.corners.charuco import MIN_CORNERS, enough, find_charuco, free_side
-from kcal.corners.grid import MIN_SHARPNESS, grid_trouble, local_side, sharpness
+from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness, without_false_sides
 from kcal.corners.images import Gray, decode_gray, to_8bit, unique_names
 from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
-from kcal.corners.order import canonical_order
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
+from kcal.corners.search import SEARCH_SIDES, find_board, largest_grid, reduce, refine_through_sizes
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 
-SEARCH_SIDES = (1200, 2400)  # pixels: longer sides of the searched image, small first
-MIN_REFINED_SIDE = 8.0  # pixels: smaller squares in a reduced image are not refined there
 MIN_GOOD = 0.5  # share of the corners that must be refined successfully
 
-_CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-_SECTOR = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 _STATUS_TEXTS = {
     CornerStatus.OUTSIDE: "too near the image's edge",
     CornerStatus.NO_SADDLE: "not a corner",
@@ -51,11 +46,13 @@ class Detection(NamedTuple):
         pixels: (corners, 2) float64 in the board's order, NaN where not seen; None if no board was found.
         reason: why none was found.
         covariance: (corners, 2, 2) px², if the refinement estimates it.
+        rejected: (N, 2) corners that were found where no board was, if any; NaN for those that were not.
     """
 
     pixels: Tensor | None
     reason: str = ""
     covariance: Tensor | None = None
+    rejected: Tensor | None = None
 
 
 def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detection:
@@ -97,18 +94,21 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
     if board.dictionary is not None:
         return _detect_charuco(image, board, refine)
-    pixels, factor, reason = _find_in_order(to_8bit(image), board)
+    found = find_board(to_8bit(image), board)
+    pixels = found.pixels
     if pixels is None:
-        return Detection(None, reason)
+        return Detection(None, found.reason, rejected=found.rejected)
     if refine != "none":
-        pixels = _refine_through_sizes(image, pixels, board, factor)
+        pixels = refine_through_sizes(image, pixels, board, found.factor)
     if sharpness(image, pixels, board.columns, board.rows) < MIN_SHARPNESS:
-        return Detection(None, "too blurred: edges are nearly as wide as the squares; focus, hold still or move closer")
+        blurred = "too blurred: edges are nearly as wide as the squares; focus, hold still or move closer"
+        return Detection(None, blurred, rejected=pixels)
     side = local_side(pixels, board.columns, board.rows)
     refined = refine_corners(image, pixels, side, refine, (board.columns, board.rows))
+    seen = int(torch.isfinite(pixels).all(-1).sum())
     good = int((refined.status == CornerStatus.GOOD).sum())
-    if good < MIN_GOOD * board.corners:
-        return Detection(None, _too_few(refined, board.corners))
+    if good < max(MIN_GOOD * seen, min(MIN_CORNERS, board.corners)):
+        return Detection(None, _too_few(refined, seen), rejected=pixels)
     return Detection(refined.pixels, covariance=refined.covariance)
 
 
@@ -221,83 +221,6 @@ def view_of(found: Detection, name: str, image: str | None = None, sha256: str |
     return View(name=name, pixels=pixels, covariance=spread, image=image, sha256=sha256)
 
 
-def _find_in_order(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor | None, float, str]:
-    """Corners to about a pixel of the searched size, the factor by which that is smaller, and why none were found."""
-    reason = f"no board of {board.columns}x{board.rows} inner corners found"
-    tried: set[float] = set()
-    for longest in SEARCH_SIDES:
-        factor = max(1.0, max(image.shape) / longest)
-        if factor in tried:
-            break
-        tried.add(factor)
-        small, scale = _reduced(image, factor, _size(image))
-        for find in (_find_classic, _find_sector):
-            corners = find(small, board)
-            if corners is None:
-                continue
-            trouble = grid_trouble(small, corners, board.columns, board.rows)
-            if trouble is None:
-                ordered = canonical_order(small, corners, board)
-                return _scaled(ordered, scale), factor, ""
-            reason = trouble
-    return None, 1.0, reason
-
-
-def _find_classic(image: Gray, board: Board) -> Tensor | None:
-    found, corners = cv2.findChessboardCorners(image, (board.columns, board.rows), flags=_CLASSIC)
-    return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
-
-
-def _find_sector(image: Gray, board: Board) -> Tensor | None:
-    # OpenCV's random numbers have one state per thread. In a new thread the same image always gives the same corners,
-    # and the caller's state does not change.
-    with ThreadPoolExecutor(1) as fresh:
-        found, corners = fresh.submit(
-            cv2.findChessboardCornersSB, image, (board.columns, board.rows), flags=_SECTOR
-        ).result()
-    return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
-
-
-def _refine_through_sizes(image: Gray, pixels: Tensor, board: Board, factor: float) -> Tensor:
-    """Refine corners found on an image `factor` times smaller until refinement at full size can start from them.
-
-    The first steps use images four and two times smaller still: where OpenCV's own refinement failed, it leaves single
-    corners 3 px off, too far for full size. Squares too small for refinement are left as they are.
-    """
-    factors = []
-    factor = 4 * factor
-    while factor > 1:
-        factors.append(factor)
-        factor = factor / 2
-    # Each is reduced from the one twice as large, because reducing the largest image takes the time.
-    steps, source = [], image
-    for factor in reversed(factors):
-        source, scale = _reduced(source, factor, _size(image))
-        steps.append((source, scale))
-    for small, scale in reversed(steps):
-        start = (pixels + 0.5) / scale - 0.5
-        side = local_side(start, board.columns, board.rows)
-        refined = refine_corners(small, start, side, "saddle")
-        good = ((refined.status == CornerStatus.GOOD) & (side >= MIN_REFINED_SIDE))[:, None]
-        pixels = _scaled(torch.where(good, refined.pixels, start), scale)
-    return pixels
-
-
-def _reduced(image: Gray, factor: float, whole: tuple[int, int]) -> tuple[Gray, Tensor]:
-    """An image of the original size `whole` made `factor` times smaller by averaging, and the exact scale back."""
-    width, height = whole
-    if factor <= 1:
-        return image, torch.ones(2, dtype=torch.float64)
-    size = round(width / factor), round(height / factor)
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(image.dtype, copy=False)
-    return small, torch.tensor([width / size[0], height / size[1]], dtype=torch.float64)
-
-
-def _scaled(pixels: Tensor, scale: Tensor) -> Tensor:
-    """Convert pixels of a reduced image to the original's: edges coincide at -0.5, not centers of the first pixels."""
-    return (pixels + 0.5) * scale - 0.5
-
-
 def _size(image: Gray) -> tuple[int, int]:
     return image.shape[1], image.shape[0]
 
@@ -325,7 +248,7 @@ def _hint(files: list[Path], board: Board) -> str:
             image = to_8bit(decode_gray(read_bytes(file), file))
         except FileError:
             continue
-        found = seen_size(_reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
+        found = seen_size(reduce(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
         if found is None or found == (max(board.columns, board.rows), min(board.columns, board.rows)):
             continue
         squares = found == (max(board.columns, board.rows) - 1, min(board.columns, board.rows) - 1)
@@ -343,9 +266,7 @@ def seen_size(image: Gray) -> tuple[int, int] | None:
         >>> seen_size(np.where(on & ((x // 40 + y // 40) % 2 == 0), 40, 220).astype(np.uint8))
         (5, 3)
     """
-    # In a new thread the same image always gives the same corners, as in `_find_sector`.
-    with ThreadPoolExecutor(1) as fresh:
-        found, _, meta = fresh.submit(
-            cv2.findChessboardCornersSBWithMeta, image, (3, 3), _SECTOR | cv2.CALIB_CB_LARGER
-        ).result()
-    return (max(meta.shape), min(meta.shape)) if found else None
+    grid = largest_grid(image)
+    if grid is not None:
+        grid = without_false_sides(image, grid)
+    return None if grid is None else (max(grid.shape[:2]), min(grid.shape[:2]))

@@ -31,8 +31,9 @@ Refinement = Literal["erf", "saddle", "opencv", "skimage", "none"]
 SECOND_BLUR = 0.12  # of the square side: blur above which the erf fit is repeated from its own corners
 # Edges are jagged where the camera sharpened them, or its pixels do not resolve them: the fits of more than this share of
 # the corners do not converge, or find less blur (px) than pixels (0.29) and any lens leave. Jagged edges are blurred by
-# `SMOOTHING` px before the fit.
+# `SMOOTHING` px before the fit, unless squares are so small that this blur would matter.
 MAX_UNSETTLED, MIN_BLUR, SMOOTHING = 0.02, 0.36, 0.8
+MIN_SMOOTHED_SIDE = 10.0
 _OPENCV_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
 
@@ -126,7 +127,7 @@ def _erf(
 
     fit = fitted(found.pixels)
     assert fit.blur is not None
-    if _is_jagged(fit, settled[:, 0]):
+    if float(side[torch.isfinite(side)].median()) >= MIN_SMOOTHED_SIDE and _is_jagged(fit, settled[:, 0]):
         saturated = fit.status == CornerStatus.SATURATED
         light = torch.from_numpy(cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING))
         fit = fitted(found.pixels)
