@@ -36,7 +36,7 @@ class Part(NamedTuple):
         pixels: (corners, 2), NaN outside the part; None if there is none.
         reason: why.
         rejected: (N, 2) corners found.
-        other: whether they are all of another board.
+        other: whether they are certainly those of another board.
     """
 
     pixels: Tensor | None
@@ -85,7 +85,7 @@ def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> Part:
     if all(ends) and (max(high, wide), min(high, wide)) != (longer, shorter):
         return Part(None, f"a board of {size} inner corners was found, not {asked}: give --board {size}", seen, True)
     if max(high, wide) > longer or min(high, wide) > shorter:
-        return Part(None, f"a grid of {size} inner corners was found, larger than {asked}", seen)
+        return Part(None, f"a grid of {size} inner corners was found, larger than {asked}", seen, True)
     places = _places(image, grid, ends, board)
     if not places:
         return Part(None, f"a grid of {size} inner corners was found, which is no part of {asked}", seen)

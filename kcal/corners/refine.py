@@ -31,9 +31,8 @@ Refinement = Literal["erf", "saddle", "opencv", "skimage", "none"]
 SECOND_BLUR = 0.12  # of the square side: blur above which the erf fit is repeated from its own corners
 # Edges are jagged where the camera sharpened them, or its pixels do not resolve them: the fits of more than this share of
 # the corners do not converge, or find less blur (px) than pixels (0.29) and any lens leave. Jagged edges are blurred by
-# `SMOOTHING` px before the fit, unless squares are so small that this blur would matter.
+# `SMOOTHING` px before the fit, unless squares are so small that this costs corners.
 MAX_UNSETTLED, MIN_BLUR, SMOOTHING = 0.02, 0.36, 0.8
-MIN_SMOOTHED_SIDE = 10.0
 _OPENCV_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
 
@@ -127,11 +126,14 @@ def _erf(
 
     fit = fitted(found.pixels)
     assert fit.blur is not None
-    if float(side[torch.isfinite(side)].median()) >= MIN_SMOOTHED_SIDE and _is_jagged(fit, settled[:, 0]):
-        saturated = fit.status == CornerStatus.SATURATED
+    if _is_jagged(fit, settled[:, 0]):
+        jagged, sharp = fit, light
         light = torch.from_numpy(cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING))
         fit = fitted(found.pixels)
+        saturated = jagged.status == CornerStatus.SATURATED
         fit = fit._replace(status=torch.where(saturated, int(CornerStatus.SATURATED), fit.status))
+        if int((fit.status == CornerStatus.GOOD).sum()) < int((jagged.status == CornerStatus.GOOD).sum()):
+            fit, light = jagged, sharp
     assert fit.blur is not None
     if grid is not None and bool((settled[:, 0] & (fit.blur > SECOND_BLUR * side)).any()):
         # There a corner depends on where its neighbors are, and errors of the saddle would pass between them.

@@ -1,4 +1,5 @@
 import os
+import re
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ from board_render import homography, render
 
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, detect_images
+from kcal.corners.grid import grid_trouble
 from kcal.corners.images import read_gray
 from kcal.corners.observations import Observations
 from kcal.corners.search import find_sector
@@ -102,11 +104,14 @@ def test_a_part_of_a_real_board_is_not_the_board(stereo, columns, rows):
 
 
 def test_no_view_of_a_board_is_taken_for_a_small_board(stereo):
-    """Asked for 5x4, OpenCV finds every other row of the 9x6 board in left05.jpg."""
-    path = next(path for path in stereo if path.name == "left05.jpg")
-    found = detect_board(read_gray(path), Board(columns=5, rows=4, square=0.025))
+    """Asked for 5x4, a detector of OpenCV finds every other row of the 9x6 board in left05.jpg."""
+    image = read_gray(next(path for path in stereo if path.name == "left05.jpg"))
+    found = detect_board(image, Board(columns=5, rows=4, square=0.025))
     assert found.pixels is None
-    assert found.reason.startswith("lines of corners lie between those of 5x4")
+    assert re.match("a (board|grid) of 9x6 inner corners was found", found.reason)
+    grid = detect_board(image, BOARD).pixels.reshape(6, 9, 2)
+    every_other = grid[:5:2, ::2].reshape(-1, 2)
+    assert "lie between those of 5x3" in grid_trouble(image, every_other, 5, 3)
 
 
 def test_another_size_is_told(tmp_path):
