@@ -39,6 +39,17 @@ _STATUS_TEXTS = {
 }
 
 
+_CURES = {
+    CornerStatus.OUTSIDE: "keep the whole board in the image",
+    CornerStatus.NO_SADDLE: "hold still and focus",
+    CornerStatus.MOVED: "hold still and focus",
+    CornerStatus.NOT_CONVERGED: "hold still, focus, and switch off the camera's sharpening",
+    CornerStatus.SATURATED: "expose less",
+    CornerStatus.OCCLUDED: "light more evenly, and keep hands off the squares",
+    CornerStatus.BLURRED: "focus, hold still or move closer",
+}
+
+
 class Detection(NamedTuple):
     """What was found of a board in an image.
 
@@ -127,7 +138,9 @@ def _too_few(refined: Refined, found: int) -> str:
     good = int((refined.status == CornerStatus.GOOD).sum())
     counts = Counter(refined.status.tolist())
     why = ", ".join(f"{counts[code]} {text}" for code, text in _STATUS_TEXTS.items() if counts[code])
-    return f"only {good} of {found} corners could be refined ({why})"
+    worst = max(_CURES, key=lambda code: counts[code])
+    cure = f"; {_CURES[worst]}" if counts[worst] else ""
+    return f"only {good} of {found} corners could be refined ({why}){cure}"
 
 
 def detect_images(
@@ -136,6 +149,7 @@ def detect_images(
     refine: Refinement = "erf",
     progress: Callable[[str], None] | None = None,
     time_limit: float | None = None,
+    on_failure: Callable[[str, Path, Detection], None] | None = None,
 ) -> Observations:
     """Find the board in the images of one camera.
 
@@ -149,6 +163,8 @@ def detect_images(
         progress: called with each image's name when it is done.
         time_limit: seconds after which an image becomes a failure; no limit by default. See
             `kcal.corners.limited.Limited`.
+        on_failure: called with the name, path and detection of each readable image that shows no board, for example to
+            draw why (`kcal.report.gallery.FailedImage`).
 
     Raises:
         InputError: no images, images of two sizes, or no board in any image.
@@ -188,6 +204,8 @@ def detect_images(
                     found = Detection(None, str(error))
                 if found.pixels is None:
                     failures.append(Failure(name=name, reason=found.reason))
+                    if on_failure is not None:
+                        on_failure(name, file, found)
                 else:
                     digest = hashlib.sha256(data).hexdigest()
                     views.append(view_of(found, name, image=str(file), sha256=digest))

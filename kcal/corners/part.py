@@ -93,7 +93,7 @@ def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> Part:
     if len(places) > _symmetries(board) or not (top or bottom) or not (left or right):
         where = _hidden_sides(image, grid, ends)
         return Part(
-            None, f"{len(seen)} of {board.corners} corners found, but not which ones: {where}; show whole sides", seen
+            None, f"{len(seen)} of {board.corners} corners found, but not which ones: {where}; show two sides that meet", seen
         )
     return Part(max(places, key=uprightness).reshape(-1, 2))
 
