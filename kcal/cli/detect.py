@@ -30,7 +30,10 @@ def detect_command(
     output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write.")],
     refine: RefineMethod = Refine.erf,
     gallery: Annotated[
-        Path | None, typer.Option(help="PNG file to write: images that failed and why, then the views with their corners, worst first.")
+        Path | None,
+        typer.Option(
+            help="PNG file to write: images that failed and why, then the views with their corners, worst first."
+        ),
     ] = None,
     coverage: Annotated[
         Path | None, typer.Option(help="PNG file to write: where in the image corners were seen.")

@@ -10,7 +10,6 @@ from typing import NamedTuple, get_args
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 

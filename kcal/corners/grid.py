@@ -15,7 +15,9 @@ from kcal.errors import InputError
 MAX_BEND = 0.25  # of a square: distance of a corner from its neighbors' homography; a wrong grid is off by 1
 MAX_RATIO = 1.7  # of one square's side to the next along a row; perspective reaches it only 3 squares from the board
 MIN_ALTERNATING = 0.9  # share of neighboring squares that must alternate; glare may spoil a few
-MIN_OUTER = 0.35  # of the contrast on the inner side of an outer line: true lines have 0.55 to 1.1, false ones up to 0.1
+MIN_OUTER = (
+    0.35  # of the contrast on the inner side of an outer line: true lines have 0.55 to 1.1, false ones up to 0.1
+)
 GOES_ON = 0.75  # of the contrast across a corner: the board's outer edge has half of it, another row all
 _FOUR_COLORS = 0.5  # of a corner's contrast, in the middle between two: a skipped corner has all of it, an edge none
 MIN_SHARPNESS = 0.58  # see `sharpness`: a blur of 0.22 of the square's side

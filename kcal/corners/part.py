@@ -29,6 +29,7 @@ MIN_END, MIN_END_SHARE = 3, 0.8  # corners that must show the board's end on one
 OUTER_SQUARE = 0.5  # of its contrast at the corner that the outer square must have up to the board's end
 SIDES = ("top", "bottom", "left", "right")  # of a grid
 
+
 class Part(NamedTuple):
     """A part of a board, or why there is none.
 
@@ -93,7 +94,9 @@ def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> Part:
     if len(places) > _symmetries(board) or not (top or bottom) or not (left or right):
         where = _hidden_sides(image, grid, ends)
         return Part(
-            None, f"{len(seen)} of {board.corners} corners found, but not which ones: {where}; show two sides that meet", seen
+            None,
+            f"{len(seen)} of {board.corners} corners found, but not which ones: {where}; show two sides that meet",
+            seen,
         )
     return Part(max(places, key=uprightness).reshape(-1, 2))
 

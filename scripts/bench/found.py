@@ -90,7 +90,7 @@ def score(find: Detector, images: Iterable[Picture], board: Board) -> str:
             continue
         error = torch.linalg.vector_norm(pixels - truth, dim=-1)
         seen = torch.isfinite(pixels).all(-1)
-        if bool((error[seen].nan_to_num(math.inf).median() > FALSE)):
+        if bool(error[seen].nan_to_num(math.inf).median() > FALSE):
             false += 1
         else:
             squares.append(error[torch.isfinite(error)].square())
@@ -133,8 +133,17 @@ def main() -> None:
         cells = [score(find, some, BOARD) for find in DETECTORS.values()]
         rows.append(" | ".join([f"{kind.__name__} (none is right)", *cells]))
         print(rows[-1], flush=True)
-    text = ["## Found", "", f"Rendered, {arguments.images} images of each kind, one thread: found rightly, RMS per axis,"]
-    text += ["CPU seconds an image. `python -m scripts.bench.found --write`", "", *head, *(f"| {row} |" for row in rows)]
+    text = [
+        "## Found",
+        "",
+        f"Rendered, {arguments.images} images of each kind, one thread: found rightly, RMS per axis,",
+    ]
+    text += [
+        "CPU seconds an image. `python -m scripts.bench.found --write`",
+        "",
+        *head,
+        *(f"| {row} |" for row in rows),
+    ]
     if os.environ.get("KCAL_DATA"):
         text += ["", "Folders of real images: found, CPU seconds an image.", "", *head]
         for folder, board in FOLDERS:

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardPose, BoardSize, project_board
 from kcal.sim.poses import PoseOptions, sample_board_poses
 from kcal.sim.render import RenderOptions, render_light
@@ -125,7 +124,7 @@ def overexposed(generator: torch.Generator) -> Picture:
 
 def screen(generator: torch.Generator) -> Picture:
     """Shown on a screen: its raster beats with the camera's pixels (moire), and lines of its refresh run across."""
-    light, truth, pose = _scene(generator, black=8.0, background=30.0)
+    light, truth, _pose = _scene(generator, black=8.0, background=30.0)
     x, y = _axes(light)
     points = truth.reshape(BOARD.rows, BOARD.columns, 2).numpy()
     first, far, low = points[0, 0], points[0, -1], points[-1, 0]
