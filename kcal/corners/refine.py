@@ -29,9 +29,9 @@ from kcal.errors import InputError
 Refinement = Literal["erf", "saddle", "opencv", "skimage", "none"]
 
 SECOND_BLUR = 0.12  # of the square side: blur above which the erf fit is repeated from its own corners
-# Edges are jagged where the camera sharpened them, or its pixels do not resolve them: the fits of more than this share of
-# the corners do not converge, or find less blur (px) than pixels (0.29) and any lens leave. Jagged edges are blurred by
-# `SMOOTHING` px before the fit, unless squares are so small that this costs corners.
+# Edges are jagged where the camera sharpened them, or its pixels do not resolve them: the fits of more than this share
+# of the corners do not converge, or find less blur (px) than pixels (0.29) and any lens leave. Jagged edges are blurred
+# by `SMOOTHING` px before the fit, unless squares are so small that this costs corners.
 MAX_UNSETTLED, MIN_BLUR, SMOOTHING = 0.02, 0.36, 0.8
 _OPENCV_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 

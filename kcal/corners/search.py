@@ -147,6 +147,7 @@ def _find_classic(image: Gray, board: Board) -> Tensor | None:
 
 
 def find_sector(image: Gray, board: Board, flags: int = 0) -> Tensor | None:
+    """The corners that `findChessboardCornersSB` finds, (corners, 2), or None."""
     found, corners = _alone(cv2.findChessboardCornersSB, image, (board.columns, board.rows), flags=flags)
     return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
 

@@ -42,7 +42,7 @@ def test_glare_leaves_out_corners_only():
     image, truth = picture()
     y, x = np.mgrid[: SIZE[1], : SIZE[0]]
     u, v = truth[22].tolist()
-    spot = 500 * np.exp(-0.5 * (((x - u) / 40) ** 2 + ((y - v) / 32) ** 2))
+    spot = 500 * np.exp(-0.5 * (((x - u) / 22) ** 2 + ((y - v) / 18) ** 2))
     glaring = np.clip(image + spot, 0, 255).astype(np.uint8)
     found = detect_board(glaring, BOARD)
     assert 30 <= int(torch.isfinite(found.pixels).all(-1).sum()) < 54
