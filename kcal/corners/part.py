@@ -90,8 +90,7 @@ def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> Part:
     places = _places(image, grid, ends, board)
     if not places:
         return Part(None, f"a grid of {size} inner corners was found, which is no part of {asked}", seen)
-    top, bottom, left, right = ends
-    if len(places) > _symmetries(board) or not (top or bottom) or not (left or right):
+    if len(places) > _symmetries(board) or not _is_anchored(image, grid, ends):
         where = _hidden_sides(image, grid, ends)
         return Part(
             None,
@@ -99,6 +98,12 @@ def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> Part:
             seen,
         )
     return Part(max(places, key=uprightness).reshape(-1, 2))
+
+
+def _is_anchored(image: npt.NDArray[np.uint8], grid: Tensor, ends: tuple[bool, bool, bool, bool]) -> bool:
+    """Whether both ends of the board are visible in each direction, or one of them with paper beyond."""
+    sure = board_ends(image, grid, paper=True)
+    return all((ends[i] and ends[i + 1]) or sure[i] or sure[i + 1] for i in (0, 2))
 
 
 def grow(image: npt.NDArray[np.generic], grid: Tensor, most: int) -> Tensor:
@@ -127,12 +132,14 @@ def grow(image: npt.NDArray[np.generic], grid: Tensor, most: int) -> Tensor:
             return grid
 
 
-def board_ends(image: npt.NDArray[np.generic], grid: Tensor) -> tuple[bool, bool, bool, bool]:
+def board_ends(image: npt.NDArray[np.generic], grid: Tensor, paper: bool = False) -> tuple[bool, bool, bool, bool]:
     """At which sides (top, bottom, left, right) of a grid (rows, columns, 2) the board's end is visible.
 
-    The outer squares must alternate up to one step outside the outer corners, and nothing may alternate beyond.
+    The outer squares must alternate up to one step outside the outer corners, and nothing may alternate beyond. With
+    `paper` it must be light there as well: what covers a board along a straight line seldom is.
     """
-    return tuple(_is_end(image, side) for side in _sides(grid))  # type: ignore[return-value]
+    top, bottom, left, right = (_is_end(image, side, paper) for side in _sides(grid))
+    return top, bottom, left, right
 
 
 def _sides(grid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -140,13 +147,16 @@ def _sides(grid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0)
 
 
-def _is_end(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
+def _is_end(image: npt.NDArray[np.generic], grid: Tensor, paper: bool) -> bool:
     beyond, out, along = _beyond(grid)
     own, inner, outer = (
         _step_along(image, places, along, down) for places, down in ((grid[0], out), (beyond, -out), (beyond, out))
     )
     usable = _inside(image, beyond + 0.5 * out) & torch.isfinite(own + inner + outer)
     ends = (inner / own > OUTER_SQUARE) & (outer.abs() < MIN_OUTER * inner.abs())
+    if paper:
+        square, ground = (_levels_beside(image, beyond, along, down) for down in (-out, out))
+        ends &= ground.amin(0) > square.mean(0)
     count = int(usable.sum())
     return count >= MIN_END and int((ends & usable).sum()) >= MIN_END_SHARE * count
 
@@ -222,10 +232,15 @@ def _are_corners(
 
 def _step_along(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
     """How much lighter squares are after each of `places` (..., 2) than before it, on the side of `down`."""
+    after, before = _levels_beside(image, places, along, down)
+    return after - before
+
+
+def _levels_beside(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
+    """Gray levels after and before each of `places` (..., 2), on the side of `down`; (2, ...)."""
     share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
     places, along, down = places[..., None, :], along[..., None, :], down[..., None, :]
-    after, before = (levels_at(image, places + share * (sign * along + down)).mean(-1) for sign in (1.0, -1.0))
-    return after - before
+    return torch.stack([levels_at(image, places + share * (sign * along + down)).mean(-1) for sign in (1.0, -1.0)])
 
 
 def _places(

@@ -13,6 +13,7 @@ from kcal.corners.board import Board
 from kcal.corners.detect import detect_board
 from kcal.corners.grid import false_sides, without_false_sides
 from kcal.corners.images import read_gray
+from kcal.corners.part import board_ends
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 SIZE = (480, 360)
@@ -60,6 +61,18 @@ def test_an_uncertain_part_is_refused_with_its_side():
     assert "right" in found.reason
     assert found.rejected is not None
     assert len(found.rejected) >= 12
+
+
+def test_the_edge_of_a_cover_is_not_the_end_of_the_board():
+    """A gray sheet hides the last columns along a line of the board, and the first ones are outside the image."""
+    H = homography(BOARD, SIZE, 30, shift=(-165, 0))
+    image, truth = render(BOARD, SIZE, H, supersample=2)
+    image[:, round(float(truth[6, 0])) + 30 :] = 120
+    grid = truth.reshape(6, 9, 2)[:, 3:7]
+    assert board_ends(image, grid)[3]
+    assert not board_ends(image, grid, paper=True)[3]
+    found = detect_board(image, BOARD)
+    assert found.pixels is None
 
 
 def test_another_board_is_named():
