@@ -10,7 +10,6 @@ from board_render import homography, render
 
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, detect_images
-from kcal.corners.grid import grid_trouble
 from kcal.corners.images import read_gray
 from kcal.corners.observations import Observations
 from kcal.corners.search import find_sector
@@ -109,9 +108,6 @@ def test_no_view_of_a_board_is_taken_for_a_small_board(stereo):
     found = detect_board(image, Board(columns=5, rows=4, square=0.025))
     assert found.pixels is None
     assert re.match("a (board|grid) of 9x6 inner corners was found", found.reason)
-    grid = detect_board(image, BOARD).pixels.reshape(6, 9, 2)
-    every_other = grid[:5:2, ::2].reshape(-1, 2)
-    assert "lie between those of 5x3" in grid_trouble(image, every_other, 5, 3)
 
 
 def test_another_size_is_told(tmp_path):
