@@ -11,7 +11,7 @@ from board_render import homography, render
 
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board
-from kcal.corners.grid import false_sides, without_false_sides
+from kcal.corners.grid import false_sides, skips, without_false_sides
 from kcal.corners.images import read_gray
 from kcal.corners.part import board_ends
 
@@ -97,6 +97,13 @@ def test_the_edge_of_the_paper_is_no_line_of_corners():
     cv2.fillPoly(image, [area.round().int().numpy()], 50)
     assert false_sides(image, longer.reshape(-1, 2), 9, 6).tolist() == [False, False, False, True]
     assert without_false_sides(image, longer).shape == (6, 8, 2)
+
+
+def test_every_other_line_is_noticed():
+    image, truth = picture()
+    assert not skips(image, truth, 9, 6)
+    assert skips(image, truth.reshape(6, 9, 2)[:5:2].reshape(-1, 2), 9, 3)
+    assert skips(image, truth.reshape(6, 9, 2)[:, ::2].reshape(-1, 2), 5, 6)
 
 
 def test_sharpened_edges_lose_no_corners():
