@@ -30,7 +30,10 @@ def detect_command(
     square: SquareSide = None,
     refine: RefineMethod = Refine.erf,
     gallery: Annotated[
-        Path | None, typer.Option(help="PNG file to write: the views with their corners, worst first.")
+        Path | None,
+        typer.Option(
+            help="PNG file to write: images that failed and why, then the views with their corners, worst first."
+        ),
     ] = None,
     coverage: Annotated[
         Path | None, typer.Option(help="PNG file to write: where in the image corners were seen.")
@@ -71,11 +74,16 @@ def detect_command(
     check_writable(output)
     board = Board.parse(size, square)
 
-    from kcal.corners.detect import detect_images
+    from kcal.corners.detect import Detection, detect_images
     from kcal.corners.images import expand_images
     from kcal.corners.orientation import turned_images
     from kcal.corners.video import VIDEO_SUFFIXES, detect_video
     from kcal.sources import is_stream, source_name
+
+    failed: list[tuple[str, Path, Detection]] = []
+
+    def note_failure(name: str, path: Path, found: Detection) -> None:
+        failed.append((name, path, found))
 
     turned: list[Path] = []
     notes: list[str] = []
@@ -101,16 +109,23 @@ def detect_command(
         check_writable(output, *paths)
         with steps("detecting", len(paths)) as advance:
             observations = detect_images(
-                paths, board, refine.value, progress=advance, time_limit=time_limit, note=notes.append
+                paths,
+                board,
+                refine.value,
+                progress=advance,
+                time_limit=time_limit,
+                note=notes.append,
+                on_failure=note_failure,
             )
         turned = turned_images([path for path in paths if os.path.isfile(path)])
         source = f"of {len(paths)} images"
     observations.save(output)
     if pictures:
-        from kcal.report.gallery import save_coverage, save_gallery
+        from kcal.report.gallery import FailedImage, save_coverage, save_gallery
 
         if gallery is not None:
-            save_gallery(gallery, observations)
+            tiles = [FailedImage(name, path, found.reason, found.rejected) for name, path, found in failed]
+            save_gallery(gallery, observations, tiles)
         if coverage is not None:
             save_coverage(coverage, observations)
 

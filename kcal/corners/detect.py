@@ -5,37 +5,30 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import get_args
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from kcal.corners.board import Board
+from kcal.corners.charuco import MIN_CORNERS
 from kcal.corners.detect_targets import detect_charuco, detect_target
 from kcal.corners.detection import Detection, too_few
-from kcal.corners.grid import MIN_SHARPNESS, grid_trouble, local_side, sharpness
+from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness, without_false_sides
 from kcal.corners.images import Gray, decode_gray, to_8bit, unique_names
 from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
-from kcal.corners.order import canonical_order
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus
+from kcal.corners.search import SEARCH_SIDES, find_board, largest_grid, reduce, refine_through_sizes
 from kcal.corners.seen_instead import seen_instead
 from kcal.corners.sizes import common_size, rescaled, resized_alike
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 
-SEARCH_SIDES = (1200, 2400)  # pixels: longer sides of the searched image, small first
-MIN_REFINED_SIDE = 8.0  # pixels: smaller squares in a reduced image are not refined there
 MIN_GOOD = 0.5  # share of the corners that must be refined successfully
-
-_CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-_SECTOR = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
 def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detection:
@@ -78,18 +71,21 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
     if board.pattern != "checkerboard" or board.dictionary is not None:
         return detect_target(image, board, refine)
-    pixels, factor, reason = _find_in_order(to_8bit(image), board)
+    found = find_board(to_8bit(image), board)
+    pixels = found.pixels
     if pixels is None:
-        return Detection(None, reason)
+        return Detection(None, found.reason, rejected=found.rejected)
     if refine != "none":
-        pixels = _refine_through_sizes(image, pixels, board, factor)
+        pixels = refine_through_sizes(image, pixels, board, found.factor)
     if sharpness(image, pixels, board.columns, board.rows) < MIN_SHARPNESS:
-        return Detection(None, "too blurred: edges are nearly as wide as the squares; focus, hold still or move closer")
+        blurred = "too blurred: edges are nearly as wide as the squares; focus, hold still or move closer"
+        return Detection(None, blurred, rejected=pixels)
     side = local_side(pixels, board.columns, board.rows)
     refined = refine_corners(image, pixels, side, refine, (board.columns, board.rows))
+    seen = int(torch.isfinite(pixels).all(-1).sum())
     good = int((refined.status == CornerStatus.GOOD).sum())
-    if good < MIN_GOOD * board.corners:
-        return Detection(None, too_few(refined, board.corners))
+    if good < max(MIN_GOOD * seen, min(MIN_CORNERS, board.corners)):
+        return Detection(None, too_few(refined, seen), rejected=pixels)
     return Detection(refined.pixels, covariance=refined.covariance)
 
 
@@ -100,6 +96,7 @@ def detect_images(
     progress: Callable[[str], None] | None = None,
     time_limit: float | None = None,
     note: Callable[[str], object] = warnings.warn,
+    on_failure: Callable[[str, Path, Detection], None] | None = None,
 ) -> Observations:
     """Find the board in the images of one camera.
 
@@ -115,6 +112,8 @@ def detect_images(
         time_limit: seconds after which an image becomes a failure; no limit by default. See
             `kcal.corners.limited.Limited`.
         note: called with what was done about images of several sizes; a Python warning by default.
+        on_failure: called with the name, path and detection of each readable image that shows no board, for example to
+            draw why (`kcal.report.gallery.FailedImage`).
 
     Raises:
         InputError: no images, images that were cropped or rotated, or no board in any image.
@@ -158,6 +157,8 @@ def detect_images(
                     found = Detection(None, str(error))
                 if found.pixels is None:
                     failures.append(Failure(name=name, reason=found.reason))
+                    if on_failure is not None:
+                        on_failure(name, file, found)
                 else:
                     numberings.setdefault(found.legacy, []).append(name)
                     digest = hashlib.sha256(data).hexdigest()
@@ -226,83 +227,6 @@ def view_of(found: Detection, name: str, image: str | None = None, sha256: str |
     return View(name=name, pixels=pixels, covariance=spread, image=image, sha256=sha256)
 
 
-def _find_in_order(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor | None, float, str]:
-    """Corners to about a pixel of the searched size, the factor by which that is smaller, and why none were found."""
-    reason = f"no board of {board.columns}x{board.rows} inner corners found"
-    tried: set[float] = set()
-    for longest in SEARCH_SIDES:
-        factor = max(1.0, max(image.shape) / longest)
-        if factor in tried:
-            break
-        tried.add(factor)
-        small, scale = _reduced(image, factor, _size(image))
-        for find in (_find_classic, _find_sector):
-            corners = find(small, board)
-            if corners is None:
-                continue
-            trouble = grid_trouble(small, corners, board.columns, board.rows)
-            if trouble is None:
-                ordered = canonical_order(small, corners, board)
-                return _scaled(ordered, scale), factor, ""
-            reason = trouble
-    return None, 1.0, reason
-
-
-def _find_classic(image: Gray, board: Board) -> Tensor | None:
-    found, corners = cv2.findChessboardCorners(image, (board.columns, board.rows), flags=_CLASSIC)
-    return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
-
-
-def _find_sector(image: Gray, board: Board) -> Tensor | None:
-    # OpenCV's random numbers have one state per thread. In a new thread the same image always gives the same corners,
-    # and the caller's state does not change.
-    with ThreadPoolExecutor(1) as fresh:
-        found, corners = fresh.submit(
-            cv2.findChessboardCornersSB, image, (board.columns, board.rows), flags=_SECTOR
-        ).result()
-    return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
-
-
-def _refine_through_sizes(image: Gray, pixels: Tensor, board: Board, factor: float) -> Tensor:
-    """Refine corners found on an image `factor` times smaller until refinement at full size can start from them.
-
-    The first steps use images four and two times smaller still: where OpenCV's own refinement failed, it leaves single
-    corners 3 px off, too far for full size. Squares too small for refinement are left as they are.
-    """
-    factors = []
-    factor = 4 * factor
-    while factor > 1:
-        factors.append(factor)
-        factor = factor / 2
-    # Each is reduced from the one twice as large, because reducing the largest image takes the time.
-    steps, source = [], image
-    for factor in reversed(factors):
-        source, scale = _reduced(source, factor, _size(image))
-        steps.append((source, scale))
-    for small, scale in reversed(steps):
-        start = (pixels + 0.5) / scale - 0.5
-        side = local_side(start, board.columns, board.rows)
-        refined = refine_corners(small, start, side, "saddle")
-        good = ((refined.status == CornerStatus.GOOD) & (side >= MIN_REFINED_SIDE))[:, None]
-        pixels = _scaled(torch.where(good, refined.pixels, start), scale)
-    return pixels
-
-
-def _reduced(image: Gray, factor: float, whole: tuple[int, int]) -> tuple[Gray, Tensor]:
-    """An image of the original size `whole` made `factor` times smaller by averaging, and the exact scale back."""
-    width, height = whole
-    if factor <= 1:
-        return image, torch.ones(2, dtype=torch.float64)
-    size = round(width / factor), round(height / factor)
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(image.dtype, copy=False)
-    return small, torch.tensor([width / size[0], height / size[1]], dtype=torch.float64)
-
-
-def _scaled(pixels: Tensor, scale: Tensor) -> Tensor:
-    """Convert pixels of a reduced image to the original's: edges coincide at -0.5, not centers of the first pixels."""
-    return (pixels + 0.5) * scale - 0.5
-
-
 def _size(image: Gray) -> tuple[int, int]:
     return image.shape[1], image.shape[0]
 
@@ -321,7 +245,7 @@ def _hint(files: list[Path], board: Board) -> str:
             image = to_8bit(decode_gray(read_bytes(file), file))
         except FileError:
             continue
-        small = to_8bit(_reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
+        small = to_8bit(reduce(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
         if other := seen_instead(small, board, seen_size):
             return f"; {other}"
     return ""
@@ -336,9 +260,7 @@ def seen_size(image: Gray) -> tuple[int, int] | None:
         >>> seen_size(np.where(on & ((x // 40 + y // 40) % 2 == 0), 40, 220).astype(np.uint8))
         (5, 3)
     """
-    # In a new thread the same image always gives the same corners, as in `_find_sector`.
-    with ThreadPoolExecutor(1) as fresh:
-        found, _, meta = fresh.submit(
-            cv2.findChessboardCornersSBWithMeta, image, (3, 3), _SECTOR | cv2.CALIB_CB_LARGER
-        ).result()
-    return (max(meta.shape), min(meta.shape)) if found else None
+    grid = largest_grid(image)
+    if grid is not None:
+        grid = without_false_sides(image, grid)
+    return None if grid is None else (max(grid.shape[:2]), min(grid.shape[:2]))

@@ -15,6 +15,9 @@ from kcal.errors import InputError
 MAX_BEND = 0.25  # of a square: distance of a corner from its neighbors' homography; a wrong grid is off by 1
 MAX_RATIO = 1.7  # of one square's side to the next along a row; perspective reaches it only 3 squares from the board
 MIN_ALTERNATING = 0.9  # share of neighboring squares that must alternate; glare may spoil a few
+MIN_OUTER = (
+    0.35  # of the contrast on the inner side of an outer line: true lines have 0.55 to 1.1, false ones up to 0.1
+)
 GOES_ON = 0.75  # of the contrast across a corner: the board's outer edge has half of it, another row all
 _FOUR_COLORS = 0.5  # of a corner's contrast, in the middle between two: a skipped corner has all of it, an edge none
 MIN_SHARPNESS = 0.58  # see `sharpness`: a blur of 0.22 of the square's side
@@ -68,7 +71,7 @@ def cell_levels(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, ro
     a, b = a.reshape(-1, 1), b.reshape(-1, 1)
     top = grid[:-1, :-1, None] * (1 - a) + grid[:-1, 1:, None] * a
     bottom = grid[1:, :-1, None] * (1 - a) + grid[1:, 1:, None] * a
-    return _levels(image, top * (1 - b) + bottom * b).mean(-1)
+    return levels_at(image, top * (1 - b) + bottom * b).mean(-1)
 
 
 def first_square_dark(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> tuple[bool, float]:
@@ -90,15 +93,15 @@ def sharpness(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows
     """
     grid = as_grid(pixels, columns, rows)
     p, q, r, s = grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
-    middle = _levels(image, (p + q + r + s) / 4)
+    middle = levels_at(image, (p + q + r + s) / 4)
     near = torch.stack(
         [
-            _levels(image, (9 * a + 3 * (b + c) + d) / 16)
+            levels_at(image, (9 * a + 3 * (b + c) + d) / 16)
             for a, b, c, d in ((p, q, r, s), (q, p, s, r), (r, s, p, q), (s, r, q, p))
         ]
     ).mean(0)
-    contrast = _alternating(middle).median()
-    return float(_alternating(near).median() / torch.where(contrast == 0, 1e-9, contrast))
+    contrast = _alternating(middle).nanmedian()
+    return float(_alternating(near).nanmedian() / torch.where(contrast == 0, 1e-9, contrast))
 
 
 def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> str | None:
@@ -107,7 +110,8 @@ def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, r
     * Every square must have the same orientation.
     * Every block of up to 3 x 3 corners must fit a homography; a single one for the board would refuse wide lenses.
     * Sides must change slowly along rows and columns; a homography alone would accept a skipped row.
-    * Dark and light squares must alternate, must not go on outside, and no corners may lie between those of the grid.
+    * Dark and light squares must alternate, also outside the outer corners, must not go on farther, and no corners may
+      lie between those of the grid.
     """
     grid = as_grid(pixels, columns, rows)
     if not bool(torch.isfinite(grid).all()):
@@ -115,17 +119,28 @@ def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, r
     side = local_side(pixels, columns, rows)
     if float(side.min()) < MIN_SQUARE:
         return f"the smallest square is only {float(side.min()):.1f} px wide; move closer or use larger squares"
+    trouble = uneven(image, grid)
+    if trouble is not None:
+        return trouble
+    if false_sides(image, pixels, columns, rows).any():
+        return f"the outer line of {columns}x{rows} corners lies on the board's edge: the board has fewer inner corners"
+    if goes_on(image, pixels, columns, rows):
+        return f"the squares go on beyond {columns}x{rows}: the board has more inner corners than that"
+    if skips(image, pixels, columns, rows):
+        return f"lines of corners lie between those of {columns}x{rows}: the board has more inner corners than that"
+    return None
+
+
+def uneven(image: npt.NDArray[np.generic], grid: Tensor) -> str | None:
+    """Why corners (rows, columns, 2) are no grid of squares that alternate, or None."""
     areas = _corner_areas(grid)
     if not (bool((areas > 0).all()) or bool((areas < 0).all())):
         return "the grid found is folded: not the board"
     if float(_bend(grid)) > MAX_BEND or float(_ratio(grid)) > MAX_RATIO:
         return "the grid found is uneven: not the board, or another number of corners"
-    if first_square_dark(image, pixels, columns, rows)[1] < MIN_ALTERNATING:
+    rows, columns = grid.shape[:2]
+    if first_square_dark(image, grid.reshape(-1, 2), columns, rows)[1] < MIN_ALTERNATING:
         return "the squares of the grid found do not alternate between dark and light"
-    if goes_on(image, pixels, columns, rows):
-        return f"the squares go on beyond {columns}x{rows}: the board has more inner corners than that"
-    if skips(image, pixels, columns, rows):
-        return f"lines of corners lie between those of {columns}x{rows}: the board has more inner corners than that"
     return None
 
 
@@ -139,6 +154,49 @@ def goes_on(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: 
     grid = as_grid(pixels, columns, rows)
     sides = (grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0))
     return any(_goes_on_above(image, side) for side in sides if len(side) >= 3)
+
+
+def false_sides(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> Tensor:
+    """Which sides of the grid are no lines of corners: top, bottom, left and right, (4,) bool.
+
+    Asked for 9x6, OpenCV's sector detector takes the paper's edge of an 8x6 board for a ninth column where the ground
+    is dark. Outside such a line squares do not alternate. A side that glare hides, or the image cuts, counts as true.
+    """
+    grid = as_grid(pixels, columns, rows)
+    sides = (grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0))
+    return torch.tensor([_alternates_less_outside(image, side) for side in sides])
+
+
+def without_false_sides(image: npt.NDArray[np.generic], grid: Tensor) -> Tensor | None:
+    """A grid (rows, columns, 2) without the outer lines that are no corners; None if fewer than 3 lines remain."""
+    while min(grid.shape[:2]) >= 3:
+        rows, columns = grid.shape[:2]
+        top, bottom, left, right = (int(side) for side in false_sides(image, grid.reshape(-1, 2), columns, rows))
+        if not top + bottom + left + right:
+            return grid
+        grid = grid[top : rows - bottom, left : columns - right]
+    return None
+
+
+def _alternates_less_outside(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
+    along = torch.gradient(grid, dim=1)[0][0]
+    out = 2 * grid[0] - 3 * grid[1] + grid[2]  # the next step outward, as perspective continues
+    inner, outer = (_step_along(image, grid[0], along, down) for down in (grid[1] - grid[0], out))
+    limit = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)
+    end = grid[0] + 0.5 * out
+    usable = ((end >= 0) & (end <= limit)).all(-1)
+    usable &= inner.abs() > 0.3 * _step_along(image, grid[1], along, grid[2] - grid[1]).abs().median()
+    if 2 * int(usable.sum()) < len(usable):
+        return False
+    return float((-outer / inner)[usable].median()) < MIN_OUTER
+
+
+def _step_along(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
+    """How much lighter squares are after each of `places` (N, 2) than before it, on the side of `down`; (N,)."""
+    share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
+    places, along, down = places[:, None], along[:, None], down[:, None]
+    after, before = (levels_at(image, places + share * (sign * along + down)).mean(-1) for sign in (1.0, -1.0))
+    return after - before
 
 
 def skips(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> bool:
@@ -165,7 +223,7 @@ def _contrast(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, dow
     share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
     signs = ((1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0))
     places, along, down = places[..., None, :], along[..., None, :], down[..., None, :]
-    parts = [sign * _levels(image, places + share * (a * along + b * down)).mean(-1) for a, b, sign in signs]
+    parts = [sign * levels_at(image, places + share * (a * along + b * down)).mean(-1) for a, b, sign in signs]
     return torch.stack(parts).sum(0)
 
 
@@ -191,7 +249,7 @@ def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
     step = along[0][None, :, None]
     share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
     signs = torch.tensor([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]], dtype=torch.float64)
-    four = torch.stack([_levels(image, places + share * (a * step + b * out)).mean(-1) for a, b in signs.tolist()])
+    four = torch.stack([levels_at(image, places + share * (a * step + b * out)).mean(-1) for a, b in signs.tolist()])
     contrast = four[0] + four[1] - four[2] - four[3]  # (beyond or own, along)
     reach = beyond + 0.5 * out[0, :, 0]
     limit = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)
@@ -202,11 +260,15 @@ def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
     return float((-contrast[0] / own)[inside].median()) > GOES_ON
 
 
-def _levels(image: npt.NDArray[np.generic], where: Tensor) -> Tensor:
-    """Gray levels at the pixels nearest to `where` (..., 2), (...) float64; the image's edge goes on outside."""
-    x, y = where.round().long().unbind(-1)
+def levels_at(image: npt.NDArray[np.generic], where: Tensor) -> Tensor:
+    """Gray levels at the pixels nearest to `where` (..., 2), (...) float64; the image's edge goes on outside.
+
+    NaN where `where` is.
+    """
+    x, y = where.nan_to_num().round().long().unbind(-1)
     x, y = x.clamp(0, image.shape[1] - 1), y.clamp(0, image.shape[0] - 1)
-    return torch.from_numpy(image[y.numpy(), x.numpy()].astype(np.float64))
+    levels = torch.from_numpy(image[y.numpy(), x.numpy()].astype(np.float64))
+    return torch.where(torch.isfinite(where).all(-1), levels, torch.nan)
 
 
 def _corner_areas(grid: Tensor) -> Tensor:

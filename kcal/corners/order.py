@@ -40,26 +40,26 @@ def canonical_order(image: npt.NDArray[np.generic], pixels: Tensor, board: Board
         True
     """
     grid = as_grid(pixels, board.columns, board.rows)
-    if _handedness(grid) < 0:
+    if handedness(grid) < 0:
         grid = grid.flip(1)
     turns = [grid, grid.flip(0, 1)]
     if board.columns == board.rows:
         quarter = grid.transpose(0, 1).flip(1)
         turns += [quarter, quarter.flip(0, 1)]
     dark = [turn for turn in turns if first_square_dark(image, turn.reshape(-1, 2), board.columns, board.rows)[0]]
-    return max(dark or turns, key=_uprightness).reshape(-1, 2)
+    return max(dark or turns, key=uprightness).reshape(-1, 2)
 
 
-def _handedness(grid: Tensor) -> float:
+def handedness(grid: Tensor) -> float:
     """Positive where (x along rows, y down columns) turns clockwise in the image, as on a board seen from its front."""
-    across = (grid[:, 1:] - grid[:, :-1]).mean((0, 1))
-    down = (grid[1:] - grid[:-1]).mean((0, 1))
+    across = (grid[:, 1:] - grid[:, :-1]).nanmean((0, 1))
+    down = (grid[1:] - grid[:-1]).nanmean((0, 1))
     return float(across[0] * down[1] - across[1] * down[0])
 
 
-def _uprightness(grid: Tensor) -> float:
+def uprightness(grid: Tensor) -> float:
     """2 for rows to the right and columns down, -2 for the opposite; a slight lean decides between quarter turns."""
-    across = torch.nn.functional.normalize((grid[:, 1:] - grid[:, :-1]).mean((0, 1)), dim=0)
-    down = torch.nn.functional.normalize((grid[1:] - grid[:-1]).mean((0, 1)), dim=0)
+    across = torch.nn.functional.normalize((grid[:, 1:] - grid[:, :-1]).nanmean((0, 1)), dim=0)
+    down = torch.nn.functional.normalize((grid[1:] - grid[:-1]).nanmean((0, 1)), dim=0)
     lean = 1e-6 * float(across[1] - down[0])
     return float(across[0] + down[1]) + lean

@@ -29,6 +29,10 @@ from kcal.errors import InputError
 Refinement = Literal["erf", "saddle", "opencv", "skimage", "none"]
 
 SECOND_BLUR = 0.12  # of the square side: blur above which the erf fit is repeated from its own corners
+# Edges are jagged where the camera sharpened them, or its pixels do not resolve them: the fits of more than this share
+# of the corners do not converge, or find less blur (px) than pixels (0.29) and any lens leave. Jagged edges are blurred
+# by `SMOOTHING` px before the fit, unless squares are so small that this costs corners.
+MAX_UNSETTLED, MIN_BLUR, SMOOTHING = 0.02, 0.36, 0.8
 _OPENCV_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
 
@@ -122,18 +126,38 @@ def _erf(
 
     fit = fitted(found.pixels)
     assert fit.blur is not None
+    if _is_jagged(fit, settled[:, 0]):
+        jagged, sharp = fit, light
+        light = torch.from_numpy(cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING))
+        fit = fitted(found.pixels)
+        saturated = jagged.status == CornerStatus.SATURATED
+        fit = fit._replace(status=torch.where(saturated, int(CornerStatus.SATURATED), fit.status))
+        if int((fit.status == CornerStatus.GOOD).sum()) < int((jagged.status == CornerStatus.GOOD).sum()):
+            fit, light = jagged, sharp
+    assert fit.blur is not None
     if grid is not None and bool((settled[:, 0] & (fit.blur > SECOND_BLUR * side)).any()):
         # There a corner depends on where its neighbors are, and errors of the saddle would pass between them.
         fit = fitted(torch.where((fit.status == CornerStatus.GOOD)[:, None], fit.pixels, found.pixels))
     assert fit.covariance is not None
     assert fit.blur is not None
     nan = float("nan")
+    status = torch.where(settled[:, 0] | (fit.status == CornerStatus.SATURATED), fit.status, found.status)
+    good = status == CornerStatus.GOOD
     return Refined(
-        torch.where(settled, fit.pixels, nan),
-        torch.where(settled[:, 0] | (fit.status == CornerStatus.SATURATED), fit.status, found.status),
-        torch.where(settled[..., None], fit.covariance, nan),
-        torch.where(settled[:, 0], fit.blur, nan),
+        torch.where(good[:, None], fit.pixels, nan),
+        status,
+        torch.where(good[:, None, None], fit.covariance, nan),
+        torch.where(good, fit.blur, nan),
     )
+
+
+def _is_jagged(fit: Refined, settled: Tensor) -> bool:
+    assert fit.blur is not None
+    unsettled = settled & (fit.status == CornerStatus.NOT_CONVERGED)
+    good = fit.status == CornerStatus.GOOD
+    if int(unsettled.sum()) > MAX_UNSETTLED * int(settled.sum()):
+        return True
+    return bool(good.any()) and float(fit.blur[good].median()) < MIN_BLUR
 
 
 def _saturation_levels(image: Gray) -> tuple[float, float]:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from torch import Tensor
 
 from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View
@@ -17,40 +21,65 @@ from kcal.errors import FileError
 from kcal.report.figures import ACCENT, INK, WARN, frame_image, new_figure, save_picture
 
 _MOST_VIEWS = 24  # views in a gallery
+_MOST_FAILED = 8  # failed images in it
 _ACROSS = 4
 _THUMB = 480  # pixels of a view's longer side
 _CELLS = 8  # of the coverage map along the image's longer side
 
 
-def gallery_figure(observations: Observations) -> Figure:
-    """Draw the views with their corners: those with corners left out first, then by the corners' predicted error.
+class FailedImage(NamedTuple):
+    """An image in which no board was found.
 
-    Corner 0 is a ring and the first row a line, so that a board read from its other end is seen at once. At most 24
-    views are shown; images that gave none are listed with their reasons.
+    Args:
+        name: as in the observations' failures.
+        path: of the image.
+        reason: why, in words.
+        rejected: (N, 2) corners found that are not used, NaN or none where nothing was found.
+    """
+
+    name: str
+    path: Path
+    reason: str
+    rejected: Tensor | None = None
+
+
+def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = ()) -> Figure:
+    """Draw the failed images with their reasons, then the views with their corners.
+
+    A failed image shows the corners that were found in it and rejected. Views with corners left out come first, then by
+    the corners' predicted error. Corner 0 is a ring and the first row a line, so that a board read from its other end
+    is seen at once. At most 8 failed images and 24 views are shown; other failures are listed with their reasons.
 
     Args:
         observations: with the paths of their images; a view whose image is not there is drawn on gray.
+        failed: images that gave no view, from `kcal.corners.detect.detect_images`.
     """
     order = sorted(range(len(observations.views)), key=lambda i: _badness(observations.views[i]), reverse=True)
-    shown = order[:_MOST_VIEWS]
-    across = max(1, min(_ACROSS, len(shown)))
-    down = max(1, math.ceil(len(shown) / across))
+    shown, drawn = order[:_MOST_VIEWS], failed[:_MOST_FAILED]
+    across = max(1, min(_ACROSS, len(shown) + len(drawn)))
+    down = max(1, math.ceil((len(shown) + len(drawn)) / across))
     width, height = observations.image_size
-    listed = [f"{failure.name}: {failure.reason}" for failure in observations.failures[:10]]
+    names = {one.name for one in drawn}
+    listed = [f"{failure.name}: {failure.reason}" for failure in observations.failures if failure.name not in names]
+    listed = listed[:10]
     foot = 0.22 * len(listed) + 0.15
-    tall = down * (3.6 * height / width + 0.32) + 0.7 + foot
+    gap = 0.32 + (0.35 if drawn else 0.0)  # room for reasons
+    tall = down * (3.6 * height / width + gap) + 0.7 + foot
     figure = new_figure(3.6 * across + 0.3, tall, dpi=110)
+    between = gap / (3.6 * height / width)
     grid = figure.add_gridspec(
-        down, across, left=0.02, right=0.98, top=1 - 0.7 / tall, bottom=foot / tall, hspace=0.16, wspace=0.04
+        down, across, left=0.02, right=0.98, top=1 - 0.7 / tall, bottom=foot / tall, hspace=between, wspace=0.04
     )
-    for place, i in enumerate(shown):
+    for place, one in enumerate(drawn):
+        _draw_failed(figure.add_subplot(grid[place // across, place % across]), one, observations.image_size)
+    for place, i in enumerate(shown, len(drawn)):
         _draw_view(figure.add_subplot(grid[place // across, place % across]), observations, observations.views[i])
     title = f"{len(observations.views)} views, worst first"
     if len(order) > _MOST_VIEWS:
         title += f" (the {_MOST_VIEWS} worst)"
     if observations.failures:
         title += f"; without a board: {len(observations.failures)}"
-    figure.text(0.02, 1 - 0.3 / tall, title, fontsize=13, color=INK, va="center")
+    figure.text(0.02, 1 - 0.25 / tall, title, fontsize=13, color=INK, va="center")
     for row, text in enumerate(listed):
         figure.text(0.02, (foot - 0.15 - 0.22 * row) / tall, text[:130], fontsize=8, color=WARN, va="center")
     return figure
@@ -105,9 +134,9 @@ def coverage_figure(observations: Observations) -> Figure:
     return figure
 
 
-def save_gallery(path: str | Path, observations: Observations) -> Path:
+def save_gallery(path: str | Path, observations: Observations, failed: Sequence[FailedImage] = ()) -> Path:
     """Write the picture of `gallery_figure` as PNG or SVG, atomically."""
-    return save_picture(path, gallery_figure(observations))
+    return save_picture(path, gallery_figure(observations, failed))
 
 
 def save_coverage(path: str | Path, observations: Observations) -> Path:
@@ -130,7 +159,7 @@ def _predicted_sigma(view: View) -> float | None:
 def _draw_view(axes: Axes, observations: Observations, view: View) -> None:
     width, height = observations.image_size
     whole = (-0.5, width - 0.5, height - 0.5, -0.5)
-    axes.imshow(_thumbnail(view, (width, height)), cmap="gray", vmin=0, vmax=255, extent=whole)
+    axes.imshow(_thumbnail(view.image, (width, height)), cmap="gray", vmin=0, vmax=255, extent=whole)
     places = np.array([(math.nan, math.nan) if pixel is None else pixel for pixel in view.pixels])
     first = places[: observations.board.columns]
     axes.plot(first[:, 0], first[:, 1], color=ACCENT, linewidth=1.2)
@@ -145,13 +174,28 @@ def _draw_view(axes: Axes, observations: Observations, view: View) -> None:
     axes.set_title(text, fontsize=8.5, loc="left", pad=3, color=WARN if unseen else INK)
 
 
-def _thumbnail(view: View, size: tuple[int, int]) -> npt.NDArray[np.uint8]:
-    """Subsample the view's image; gray where the file is missing or has another size."""
+def _draw_failed(axes: Axes, failed: FailedImage, size: tuple[int, int]) -> None:
+    width, height = size
+    whole = (-0.5, width - 0.5, height - 0.5, -0.5)
+    axes.imshow(_thumbnail(failed.path, size), cmap="gray", vmin=0, vmax=255, extent=whole)
+    if failed.rejected is not None:
+        axes.scatter(*failed.rejected.numpy().T, s=16, marker="x", color=WARN, linewidths=1.0)
+    frame_image(axes, size)
+    axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    for spine in axes.spines.values():
+        spine.set(visible=True, color=WARN, linewidth=2.0)
+    name = failed.name if len(failed.name) <= 34 else "…" + failed.name[-33:]
+    text = textwrap.wrap(f"failed: {name}: {failed.reason}", 66)[:3]
+    axes.set_title("\n".join(text), fontsize=7.5, loc="left", pad=3, color=WARN)
+
+
+def _thumbnail(path: str | Path | None, size: tuple[int, int]) -> npt.NDArray[np.uint8]:
+    """Subsample an image; gray where the file is missing or has another size."""
     gray = np.full((2, 2), 200, np.uint8)
-    if view.image is None:
+    if path is None:
         return gray
     try:
-        image = to_8bit(read_gray(view.image))
+        image = to_8bit(read_gray(path))
     except FileError:
         return gray
     if (image.shape[1], image.shape[0]) != size:

@@ -1,0 +1,295 @@
+"""Find a part of a checkerboard, where it is certain which part it is.
+
+A grid of corners is grown from the largest one that OpenCV finds, over what glare or a shadow left out. Its place in
+the board follows from the board's ends, beyond which squares no longer alternate, and from which squares are dark.
+Where several places remain possible, there is no result: a wrong place would be a wrong lens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from kcal.corners.board import Board
+from kcal.corners.grid import MIN_OUTER, MIN_SQUARE, levels_at, skips, uneven, without_false_sides
+from kcal.corners.order import handedness, uprightness
+from kcal.corners.saddle import CornerStatus, saddle
+
+MIN_CORNERS = 12
+MIN_FILLED = 0.5  # share of the places of the grown grid at which corners were found
+MIN_LINES = 3  # each way
+MAX_MISS = 0.25  # of the square: distance of a corner from where its neighbors predict it
+MIN_CONTRAST = 0.15  # of the corners beside it; a hard shadow leaves a quarter
+MIN_END, MIN_END_SHARE = 3, 0.8  # corners that must show the board's end on one side, and their share
+OUTER_SQUARE = 0.5  # of its contrast at the corner that the outer square must have up to the board's end
+SIDES = ("top", "bottom", "left", "right")  # of a grid
+
+
+class Part(NamedTuple):
+    """A part of a board, or why there is none.
+
+    Args:
+        pixels: (corners, 2), NaN outside the part; None if there is none.
+        reason: why.
+        rejected: (N, 2) corners found.
+        other: whether they are certainly those of another board.
+    """
+
+    pixels: Tensor | None
+    reason: str = ""
+    rejected: Tensor | None = None
+    other: bool = False
+
+
+def find_part(image: npt.NDArray[np.uint8], board: Board, seeds: Iterable[Tensor]) -> Part:
+    """Find the visible corners of a board that is cut by the image's edge, covered or glaring in places.
+
+    Args:
+        image: (H, W) uint8.
+        board: the board.
+        seeds: grids of corners (rows, columns, 2) in the image, such as detectors find; they are tried in turn.
+
+    Returns:
+        The corners; without a reason if there is no grid at all.
+    """
+    best = Part(None)
+    for seed in seeds:
+        whole = without_false_sides(image, seed)
+        if whole is None or uneven(image, whole) is not None:
+            continue
+        if skips(image, whole.reshape(-1, 2), whole.shape[1], whole.shape[0]):
+            continue
+        part = _grown(image, whole.flip(1) if handedness(whole) < 0 else whole, board)
+        if part.pixels is not None:
+            return part
+        if best.rejected is None or (part.rejected is not None and len(part.rejected) > len(best.rejected)):
+            best = part
+    return best
+
+
+def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> Part:
+    """The part of the board that grows from a seed."""
+    longer, shorter = max(board.columns, board.rows), min(board.columns, board.rows)
+    grid = grow(image, seed, longer + 1)
+    known = torch.isfinite(grid).all(-1)
+    seen = grid[known]
+    high, wide = grid.shape[:2]
+    if len(seen) < max(MIN_CORNERS, MIN_FILLED * known.numel()) or min(high, wide) < MIN_LINES:
+        return Part(None)
+    asked, size = f"{board.columns}x{board.rows}", f"{max(high, wide)}x{min(high, wide)}"
+    ends = board_ends(image, grid)
+    if all(ends) and (max(high, wide), min(high, wide)) != (longer, shorter):
+        return Part(None, f"a board of {size} inner corners was found, not {asked}: give --board {size}", seen, True)
+    if max(high, wide) > longer or min(high, wide) > shorter:
+        return Part(None, f"a grid of {size} inner corners was found, larger than {asked}", seen, True)
+    places = _places(image, grid, ends, board)
+    if not places:
+        return Part(None, f"a grid of {size} inner corners was found, which is no part of {asked}", seen)
+    if len(places) > _symmetries(board) or not _is_anchored(image, grid, ends):
+        where = _hidden_sides(image, grid, ends)
+        return Part(
+            None,
+            f"{len(seen)} of {board.corners} corners found, but not which ones: {where}; show two sides that meet",
+            seen,
+        )
+    return Part(max(places, key=uprightness).reshape(-1, 2))
+
+
+def _is_anchored(image: npt.NDArray[np.uint8], grid: Tensor, ends: tuple[bool, bool, bool, bool]) -> bool:
+    """Whether both ends of the board are visible in each direction, or one of them with paper beyond."""
+    sure = board_ends(image, grid, paper=True)
+    return all((ends[i] and ends[i + 1]) or sure[i] or sure[i + 1] for i in (0, 2))
+
+
+def grow(image: npt.NDArray[np.generic], grid: Tensor, most: int) -> Tensor:
+    """Extend a grid of corners (rows, columns, 2) to its neighbors in the image, up to `most` lines each way.
+
+    Each neighbor is predicted from the corners beside it and refined; squares must alternate on all its four sides.
+    """
+    light = torch.from_numpy(image.astype(np.float32))
+    while True:
+        grid = torch.nn.functional.pad(grid, (0, 0, 1, 1, 1, 1), value=torch.nan)
+        before = torch.isfinite(grid).all(-1)
+        predicted, (along, down) = _predicted(grid), _steps(grid)
+        new = ~before & torch.isfinite(predicted + along + down).all(-1)
+        if bool(new.any()):
+            places, along, down = predicted[new], along[new], down[new]
+            side = torch.minimum(torch.linalg.vector_norm(along, dim=-1), torch.linalg.vector_norm(down, dim=-1))
+            refined = saddle(light, places, side.clamp_min(1.0))
+            apart = torch.linalg.vector_norm(refined.pixels - places, dim=-1)
+            good = (refined.status == CornerStatus.GOOD) & (side >= MIN_SQUARE) & (apart < MAX_MISS * side)
+            good &= _are_corners(image, grid, refined.pixels, along, down, new)
+            grid[new] = torch.where(good[:, None], refined.pixels, torch.nan)
+        known = torch.isfinite(grid).all(-1)
+        rows, columns = known.any(1).nonzero()[:, 0], known.any(0).nonzero()[:, 0]
+        grid = grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        if bool((known == before).all()) or max(grid.shape[:2]) > most:
+            return grid
+
+
+def board_ends(image: npt.NDArray[np.generic], grid: Tensor, paper: bool = False) -> tuple[bool, bool, bool, bool]:
+    """At which sides (top, bottom, left, right) of a grid (rows, columns, 2) the board's end is visible.
+
+    The outer squares must alternate up to one step outside the outer corners, and nothing may alternate beyond. With
+    `paper` it must be light there as well: what covers a board along a straight line seldom is.
+    """
+    top, bottom, left, right = (_is_end(image, side, paper) for side in _sides(grid))
+    return top, bottom, left, right
+
+
+def _sides(grid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The grid, turned or mirrored so that each side in turn is its first row."""
+    return grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0)
+
+
+def _is_end(image: npt.NDArray[np.generic], grid: Tensor, paper: bool) -> bool:
+    beyond, out, along = _beyond(grid)
+    own, inner, outer = (
+        _step_along(image, places, along, down) for places, down in ((grid[0], out), (beyond, -out), (beyond, out))
+    )
+    usable = _inside(image, beyond + 0.5 * out) & torch.isfinite(own + inner + outer)
+    ends = (inner / own > OUTER_SQUARE) & (outer.abs() < MIN_OUTER * inner.abs())
+    if paper:
+        square, ground = (_levels_beside(image, beyond, along, down) for down in (-out, out))
+        ends &= ground.amin(0) > square.mean(0)
+    count = int(usable.sum())
+    return count >= MIN_END and int((ends & usable).sum()) >= MIN_END_SHARE * count
+
+
+def _beyond(grid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where the next line above the first would be (columns, 2), the step to it, and the step along it."""
+    along = _steps(grid)[0][0]
+    beyond = 3 * grid[0] - 3 * grid[1] + grid[2]
+    beyond = torch.where(torch.isfinite(beyond), beyond, 2 * grid[0] - grid[1])
+    return beyond, beyond - grid[0], along
+
+
+def _inside(image: npt.NDArray[np.generic], places: Tensor) -> Tensor:
+    limit = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)
+    return ((places >= 0) & (places <= limit)).all(-1)  # False for NaN
+
+
+def _steps(grid: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean steps along rows and down columns near each corner (rows, columns, 2), NaN where none is known nearby."""
+    steps = []
+    for dim in (1, 0):
+        step = grid.diff(dim=dim)
+        pad = (0, 0, 1, 1, 0, 0) if dim == 1 else (0, 0, 0, 0, 1, 1)
+        step = torch.nn.functional.pad(step, pad, value=torch.nan)
+        both = torch.stack([step.narrow(dim, 0, grid.shape[dim]), step.narrow(dim, 1, grid.shape[dim])]).nanmean(0)
+        around = torch.nn.functional.pad(both, (0, 0, 1, 1, 1, 1), value=torch.nan)
+        near = [around[i : i + grid.shape[0], j : j + grid.shape[1]] for i in range(3) for j in range(3)]
+        steps.append(torch.stack(near).nanmean(0))
+    return steps[0], steps[1]
+
+
+def _predicted(grid: Tensor) -> Tensor:
+    """Where the corners beside each place predict it: by quadratics along lines, or straight ones where too few are."""
+    third, second = [], []
+    for side in range(4):
+        turned = _sides(grid)[side]
+        padded = torch.nn.functional.pad(turned, (0, 0, 0, 0, 0, 3), value=torch.nan)
+        one, two, three = (padded[k : k + len(turned)] for k in (1, 2, 3))
+        for values, guess in ((third, 3 * one - 3 * two + three), (second, 2 * one - two)):
+            guess = guess if side in (0, 2) else guess.flip(0)
+            values.append(guess if side < 2 else guess.transpose(0, 1))
+    straight = torch.stack(second).nanmean(0)
+    curved = torch.stack(third).nanmean(0)
+    return torch.where(torch.isfinite(curved), curved, straight)
+
+
+def _parity(grid: Tensor) -> Tensor:
+    """1 and -1 in turn, (rows, columns)."""
+    i, j = torch.meshgrid(torch.arange(grid.shape[0]), torch.arange(grid.shape[1]), indexing="ij")
+    return 1.0 - 2.0 * ((i + j) % 2)
+
+
+def _are_corners(
+    image: npt.NDArray[np.generic], grid: Tensor, places: Tensor, along: Tensor, down: Tensor, new: Tensor
+) -> Tensor:
+    """Whether squares alternate on all four sides of new places (N, 2), in step with the corners known in `grid`."""
+    own_along, own_down = _steps(grid)
+    known = (_step_along(image, grid, own_along, own_down) - _step_along(image, grid, own_along, -own_down)) / 2
+    known = known * _parity(grid)
+    around = torch.nn.functional.pad(known, (2, 2, 2, 2), value=torch.nan)
+    near = [around[i : i + known.shape[0], j : j + known.shape[1]] for i in range(5) for j in range(5)]
+    typical = torch.stack(near).nanmedian(0).values[new] * _parity(grid)[new]
+    four = torch.stack(
+        [
+            _step_along(image, places, along, down),
+            -_step_along(image, places, along, -down),
+            _step_along(image, places, down, along),
+            -_step_along(image, places, down, -along),
+        ]
+    ) / torch.where(typical == 0, torch.nan, typical)
+    return (four.amin(0) > MIN_OUTER * four.amax(0)) & (four.mean(0) > MIN_CONTRAST)
+
+
+def _step_along(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
+    """How much lighter squares are after each of `places` (..., 2) than before it, on the side of `down`."""
+    after, before = _levels_beside(image, places, along, down)
+    return after - before
+
+
+def _levels_beside(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
+    """Gray levels after and before each of `places` (..., 2), on the side of `down`; (2, ...)."""
+    share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
+    places, along, down = places[..., None, :], along[..., None, :], down[..., None, :]
+    return torch.stack([levels_at(image, places + share * (sign * along + down)).mean(-1) for sign in (1.0, -1.0)])
+
+
+def _places(
+    image: npt.NDArray[np.generic], grid: Tensor, ends: tuple[bool, bool, bool, bool], board: Board
+) -> list[Tensor]:
+    """All boards (rows, columns, 2) of which the grid can be a part, NaN outside it."""
+    places = []
+    top, bottom, left, right = ends
+    for _ in range(4):
+        high, wide = grid.shape[:2]
+        along, down = _steps(grid)
+        lighter = (_step_along(image, grid, along, down) - _step_along(image, grid, along, -down)) * _parity(grid)
+        dark = bool(lighter.nanmedian() < 0)  # the square diagonally outside the grid's first corner
+        for row in range(board.rows - high + 1):
+            for column in range(board.columns - wide + 1):
+                fits = (not top or row == 0) and (not bottom or row + high == board.rows)
+                fits = fits and (not left or column == 0) and (not right or column + wide == board.columns)
+                if fits and dark == ((row + column) % 2 == 0):
+                    whole = torch.full((board.rows, board.columns, 2), torch.nan, dtype=torch.float64)
+                    whole[row : row + high, column : column + wide] = grid
+                    places.append(whole)
+        grid = grid.transpose(0, 1).flip(1)
+        top, bottom, left, right = left, right, bottom, top
+    return places
+
+
+def _symmetries(board: Board) -> int:
+    """Turns after which the board looks the same."""
+    if (board.columns + board.rows) % 2:
+        return 1
+    return 4 if board.columns == board.rows and board.columns % 2 == 0 else 2
+
+
+def _hidden_sides(image: npt.NDArray[np.generic], grid: Tensor, ends: tuple[bool, bool, bool, bool]) -> str:
+    """Where in the image the board's end is not visible, in words."""
+    middle = grid.nanmean((0, 1))
+    cut, unclear = [], []
+    for side, end in zip(_sides(grid), ends, strict=True):
+        if end:
+            continue
+        beyond, out, _ = _beyond(side)
+        x, y = (side[0].nanmean(0) - middle).tolist()
+        name = ("right" if x > 0 else "left") if abs(x) > abs(y) else ("bottom" if y > 0 else "top")
+        known = torch.isfinite(beyond + out).all(-1)
+        outside = known & ~_inside(image, beyond + 0.5 * out)
+        (cut if 2 * int(outside.sum()) >= int(known.sum()) else unclear).append(name)
+    texts = []
+    if cut:
+        texts.append(f"the board is cut by the image's edge at the {' and '.join(cut)}")
+    if unclear:
+        texts.append(f"its end at the {' and '.join(unclear)} is covered, glaring or unclear")
+    return ", ".join(texts)
