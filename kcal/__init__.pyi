@@ -184,6 +184,7 @@ from kcal.report.calibration import save_calibration_picture as save_calibration
 from kcal.report.camera_verdict import camera_verdict as camera_verdict
 from kcal.report.camera_verdict import stored_verdict as stored_verdict
 from kcal.report.difference import save_difference_picture as save_difference_picture
+from kcal.report.gallery import FailedImage as FailedImage
 from kcal.report.gallery import save_coverage as save_coverage
 from kcal.report.gallery import save_gallery as save_gallery
 from kcal.report.map_page import save_map as save_map

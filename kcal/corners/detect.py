@@ -16,13 +16,14 @@ from kcal.corners.board import Board
 from kcal.corners.charuco import MIN_CORNERS
 from kcal.corners.detect_targets import detect_charuco, detect_target
 from kcal.corners.detection import Detection, too_few
-from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness, without_false_sides
+from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness
+from kcal.corners.grid_check import without_false_sides
 from kcal.corners.images import Gray, decode_gray, to_8bit, unique_names
 from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus
-from kcal.corners.search import SEARCH_SIDES, find_board, largest_grid, reduce, refine_through_sizes
+from kcal.corners.search import SEARCH_SIDES, find_board, largest_grid, reduced, refine_through_sizes
 from kcal.corners.seen_instead import seen_instead
 from kcal.corners.sizes import common_size, rescaled, resized_alike
 from kcal.errors import FileError, InputError
@@ -36,7 +37,7 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
 
     OpenCV's `findChessboardCorners` searches first; where it fails, `findChessboardCornersSB` (A. Duda and U. Frese,
     BMVC 2018). Images above 1200 px are searched at a reduced size and refined in steps of two. The grid found must
-    look like the whole board (`kcal.corners.grid.grid_trouble`). It is put into the board's order
+    look like the whole board (`kcal.corners.grid_check.grid_trouble`). It is put into the board's order
     (`kcal.corners.order.canonical_order`) and refined at the image's full size and depth.
 
     Args:
@@ -245,7 +246,7 @@ def _hint(files: list[Path], board: Board) -> str:
             image = to_8bit(decode_gray(read_bytes(file), file))
         except FileError:
             continue
-        small = to_8bit(reduce(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
+        small = to_8bit(reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
         if other := seen_instead(small, board, seen_size):
             return f"; {other}"
     return ""

@@ -16,7 +16,15 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.grid import MIN_OUTER, MIN_SQUARE, levels_at, skips, uneven, without_false_sides
+from kcal.corners.grid_check import (
+    MIN_OUTER,
+    MIN_SQUARE,
+    levels_beside,
+    skips,
+    step_along,
+    uneven,
+    without_false_sides,
+)
 from kcal.corners.order import handedness, uprightness
 from kcal.corners.saddle import CornerStatus, saddle
 
@@ -30,7 +38,7 @@ OUTER_SQUARE = 0.5  # of its contrast at the corner that the outer square must h
 SIDES = ("top", "bottom", "left", "right")  # of a grid
 
 
-class Part(NamedTuple):
+class BoardPart(NamedTuple):
     """A part of a board, or why there is none.
 
     Args:
@@ -46,7 +54,7 @@ class Part(NamedTuple):
     other: bool = False
 
 
-def find_part(image: npt.NDArray[np.uint8], board: Board, seeds: Iterable[Tensor]) -> Part:
+def find_part(image: npt.NDArray[np.uint8], board: Board, seeds: Iterable[Tensor]) -> BoardPart:
     """Find the visible corners of a board that is cut by the image's edge, covered or glaring in places.
 
     Args:
@@ -57,7 +65,7 @@ def find_part(image: npt.NDArray[np.uint8], board: Board, seeds: Iterable[Tensor
     Returns:
         The corners; without a reason if there is no grid at all.
     """
-    best = Part(None)
+    best = BoardPart(None)
     for seed in seeds:
         whole = without_false_sides(image, seed)
         if whole is None or uneven(image, whole) is not None:
@@ -72,32 +80,34 @@ def find_part(image: npt.NDArray[np.uint8], board: Board, seeds: Iterable[Tensor
     return best
 
 
-def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> Part:
+def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> BoardPart:
     """The part of the board that grows from a seed."""
     longer, shorter = max(board.columns, board.rows), min(board.columns, board.rows)
-    grid = grow(image, seed, longer + 1)
+    grid = grown_grid(image, seed, longer + 1)
     known = torch.isfinite(grid).all(-1)
     seen = grid[known]
     high, wide = grid.shape[:2]
     if len(seen) < max(MIN_CORNERS, MIN_FILLED * known.numel()) or min(high, wide) < MIN_LINES:
-        return Part(None)
+        return BoardPart(None)
     asked, size = f"{board.columns}x{board.rows}", f"{max(high, wide)}x{min(high, wide)}"
     ends = board_ends(image, grid)
     if all(ends) and (max(high, wide), min(high, wide)) != (longer, shorter):
-        return Part(None, f"a board of {size} inner corners was found, not {asked}: give --board {size}", seen, True)
+        return BoardPart(
+            None, f"a board of {size} inner corners was found, not {asked}: give --board {size}", seen, True
+        )
     if max(high, wide) > longer or min(high, wide) > shorter:
-        return Part(None, f"a grid of {size} inner corners was found, larger than {asked}", seen, True)
-    places = _places(image, grid, ends, board)
+        return BoardPart(None, f"a grid of {size} inner corners was found, larger than {asked}", seen, other=True)
+    places = _placements(image, grid, ends, board)
     if not places:
-        return Part(None, f"a grid of {size} inner corners was found, which is no part of {asked}", seen)
+        return BoardPart(None, f"a grid of {size} inner corners was found, which is no part of {asked}", seen)
     if len(places) > _symmetries(board) or not _is_anchored(image, grid, ends):
         where = _hidden_sides(image, grid, ends)
-        return Part(
+        return BoardPart(
             None,
             f"{len(seen)} of {board.corners} corners found, but not which ones: {where}; show two sides that meet",
             seen,
         )
-    return Part(max(places, key=uprightness).reshape(-1, 2))
+    return BoardPart(max(places, key=uprightness).reshape(-1, 2))
 
 
 def _is_anchored(image: npt.NDArray[np.uint8], grid: Tensor, ends: tuple[bool, bool, bool, bool]) -> bool:
@@ -106,7 +116,7 @@ def _is_anchored(image: npt.NDArray[np.uint8], grid: Tensor, ends: tuple[bool, b
     return all((ends[i] and ends[i + 1]) or sure[i] or sure[i + 1] for i in (0, 2))
 
 
-def grow(image: npt.NDArray[np.generic], grid: Tensor, most: int) -> Tensor:
+def grown_grid(image: npt.NDArray[np.generic], grid: Tensor, most: int) -> Tensor:
     """Extend a grid of corners (rows, columns, 2) to its neighbors in the image, up to `most` lines each way.
 
     Each neighbor is predicted from the corners beside it and refined; squares must alternate on all its four sides.
@@ -115,7 +125,7 @@ def grow(image: npt.NDArray[np.generic], grid: Tensor, most: int) -> Tensor:
     while True:
         grid = torch.nn.functional.pad(grid, (0, 0, 1, 1, 1, 1), value=torch.nan)
         before = torch.isfinite(grid).all(-1)
-        predicted, (along, down) = _predicted(grid), _steps(grid)
+        predicted, (along, down) = _predicted(grid), _local_steps(grid)
         new = ~before & torch.isfinite(predicted + along + down).all(-1)
         if bool(new.any()):
             places, along, down = predicted[new], along[new], down[new]
@@ -148,33 +158,33 @@ def _sides(grid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _is_end(image: npt.NDArray[np.generic], grid: Tensor, paper: bool) -> bool:
-    beyond, out, along = _beyond(grid)
+    beyond, out, along = _next_line(grid)
     own, inner, outer = (
-        _step_along(image, places, along, down) for places, down in ((grid[0], out), (beyond, -out), (beyond, out))
+        step_along(image, places, along, down) for places, down in ((grid[0], out), (beyond, -out), (beyond, out))
     )
-    usable = _inside(image, beyond + 0.5 * out) & torch.isfinite(own + inner + outer)
+    usable = _is_inside(image, beyond + 0.5 * out) & torch.isfinite(own + inner + outer)
     ends = (inner / own > OUTER_SQUARE) & (outer.abs() < MIN_OUTER * inner.abs())
     if paper:
-        square, ground = (_levels_beside(image, beyond, along, down) for down in (-out, out))
+        square, ground = (levels_beside(image, beyond, along, down) for down in (-out, out))
         ends &= ground.amin(0) > square.mean(0)
     count = int(usable.sum())
     return count >= MIN_END and int((ends & usable).sum()) >= MIN_END_SHARE * count
 
 
-def _beyond(grid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _next_line(grid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Where the next line above the first would be (columns, 2), the step to it, and the step along it."""
-    along = _steps(grid)[0][0]
+    along = _local_steps(grid)[0][0]
     beyond = 3 * grid[0] - 3 * grid[1] + grid[2]
     beyond = torch.where(torch.isfinite(beyond), beyond, 2 * grid[0] - grid[1])
     return beyond, beyond - grid[0], along
 
 
-def _inside(image: npt.NDArray[np.generic], places: Tensor) -> Tensor:
+def _is_inside(image: npt.NDArray[np.generic], places: Tensor) -> Tensor:
     limit = torch.tensor([image.shape[1] - 1.0, image.shape[0] - 1.0], dtype=torch.float64)
     return ((places >= 0) & (places <= limit)).all(-1)  # False for NaN
 
 
-def _steps(grid: Tensor) -> tuple[Tensor, Tensor]:
+def _local_steps(grid: Tensor) -> tuple[Tensor, Tensor]:
     """Mean steps along rows and down columns near each corner (rows, columns, 2), NaN where none is known nearby."""
     steps = []
     for dim in (1, 0):
@@ -190,7 +200,8 @@ def _steps(grid: Tensor) -> tuple[Tensor, Tensor]:
 
 def _predicted(grid: Tensor) -> Tensor:
     """Where the corners beside each place predict it: by quadratics along lines, or straight ones where too few are."""
-    third, second = [], []
+    third: list[Tensor] = []
+    second: list[Tensor] = []
     for side in range(4):
         turned = _sides(grid)[side]
         padded = torch.nn.functional.pad(turned, (0, 0, 0, 0, 0, 3), value=torch.nan)
@@ -203,7 +214,7 @@ def _predicted(grid: Tensor) -> Tensor:
     return torch.where(torch.isfinite(curved), curved, straight)
 
 
-def _parity(grid: Tensor) -> Tensor:
+def _checkered(grid: Tensor) -> Tensor:
     """1 and -1 in turn, (rows, columns)."""
     i, j = torch.meshgrid(torch.arange(grid.shape[0]), torch.arange(grid.shape[1]), indexing="ij")
     return 1.0 - 2.0 * ((i + j) % 2)
@@ -213,37 +224,24 @@ def _are_corners(
     image: npt.NDArray[np.generic], grid: Tensor, places: Tensor, along: Tensor, down: Tensor, new: Tensor
 ) -> Tensor:
     """Whether squares alternate on all four sides of new places (N, 2), in step with the corners known in `grid`."""
-    own_along, own_down = _steps(grid)
-    known = (_step_along(image, grid, own_along, own_down) - _step_along(image, grid, own_along, -own_down)) / 2
-    known = known * _parity(grid)
+    own_along, own_down = _local_steps(grid)
+    known = (step_along(image, grid, own_along, own_down) - step_along(image, grid, own_along, -own_down)) / 2
+    known = known * _checkered(grid)
     around = torch.nn.functional.pad(known, (2, 2, 2, 2), value=torch.nan)
     near = [around[i : i + known.shape[0], j : j + known.shape[1]] for i in range(5) for j in range(5)]
-    typical = torch.stack(near).nanmedian(0).values[new] * _parity(grid)[new]
+    typical = torch.stack(near).nanmedian(0).values[new] * _checkered(grid)[new]
     four = torch.stack(
         [
-            _step_along(image, places, along, down),
-            -_step_along(image, places, along, -down),
-            _step_along(image, places, down, along),
-            -_step_along(image, places, down, -along),
+            step_along(image, places, along, down),
+            -step_along(image, places, along, -down),
+            step_along(image, places, down, along),
+            -step_along(image, places, down, -along),
         ]
     ) / torch.where(typical == 0, torch.nan, typical)
     return (four.amin(0) > MIN_OUTER * four.amax(0)) & (four.mean(0) > MIN_CONTRAST)
 
 
-def _step_along(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
-    """How much lighter squares are after each of `places` (..., 2) than before it, on the side of `down`."""
-    after, before = _levels_beside(image, places, along, down)
-    return after - before
-
-
-def _levels_beside(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
-    """Gray levels after and before each of `places` (..., 2), on the side of `down`; (2, ...)."""
-    share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
-    places, along, down = places[..., None, :], along[..., None, :], down[..., None, :]
-    return torch.stack([levels_at(image, places + share * (sign * along + down)).mean(-1) for sign in (1.0, -1.0)])
-
-
-def _places(
+def _placements(
     image: npt.NDArray[np.generic], grid: Tensor, ends: tuple[bool, bool, bool, bool], board: Board
 ) -> list[Tensor]:
     """All boards (rows, columns, 2) of which the grid can be a part, NaN outside it."""
@@ -251,8 +249,8 @@ def _places(
     top, bottom, left, right = ends
     for _ in range(4):
         high, wide = grid.shape[:2]
-        along, down = _steps(grid)
-        lighter = (_step_along(image, grid, along, down) - _step_along(image, grid, along, -down)) * _parity(grid)
+        along, down = _local_steps(grid)
+        lighter = (step_along(image, grid, along, down) - step_along(image, grid, along, -down)) * _checkered(grid)
         dark = bool(lighter.nanmedian() < 0)  # the square diagonally outside the grid's first corner
         for row in range(board.rows - high + 1):
             for column in range(board.columns - wide + 1):
@@ -277,15 +275,16 @@ def _symmetries(board: Board) -> int:
 def _hidden_sides(image: npt.NDArray[np.generic], grid: Tensor, ends: tuple[bool, bool, bool, bool]) -> str:
     """Where in the image the board's end is not visible, in words."""
     middle = grid.nanmean((0, 1))
-    cut, unclear = [], []
+    cut: list[str] = []
+    unclear: list[str] = []
     for side, end in zip(_sides(grid), ends, strict=True):
         if end:
             continue
-        beyond, out, _ = _beyond(side)
+        beyond, out, _ = _next_line(side)
         x, y = (side[0].nanmean(0) - middle).tolist()
         name = ("right" if x > 0 else "left") if abs(x) > abs(y) else ("bottom" if y > 0 else "top")
         known = torch.isfinite(beyond + out).all(-1)
-        outside = known & ~_inside(image, beyond + 0.5 * out)
+        outside = known & ~_is_inside(image, beyond + 0.5 * out)
         (cut if 2 * int(outside.sum()) >= int(known.sum()) else unclear).append(name)
     texts = []
     if cut:

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.grid import grid_trouble, local_side
+from kcal.corners.grid import local_side
+from kcal.corners.grid_check import grid_trouble
 from kcal.corners.images import Gray
 from kcal.corners.order import canonical_order
 from kcal.corners.part import find_part
@@ -27,7 +28,7 @@ _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _LOCAL_CONTRAST, _TILES = 4.0, (8, 8)  # of the adaptive histogram equalization
 
 
-class Found(NamedTuple):
+class FoundBoard(NamedTuple):
     """What a search found.
 
     Args:
@@ -44,7 +45,7 @@ class Found(NamedTuple):
     rejected: Tensor | None = None
 
 
-def find_board(image: npt.NDArray[np.uint8], board: Board) -> Found:
+def find_board(image: npt.NDArray[np.uint8], board: Board) -> FoundBoard:
     """Find a checkerboard's corners to about a pixel of the searched size.
 
     `findChessboardCorners` goes first: it is the fastest and finds most boards. `findChessboardCornersSB` (A. Duda and
@@ -56,24 +57,24 @@ def find_board(image: npt.NDArray[np.uint8], board: Board) -> Found:
         image: (H, W) uint8.
         board: a checkerboard of at least 3x3 inner corners.
     """
-    missing = Found(None, reason=f"no board of {board.columns}x{board.rows} inner corners found")
-    reduced = [(factor, *reduce(image, factor, (image.shape[1], image.shape[0]))) for factor in _factors(image)]
-    for factor, small, scale in reduced:
+    missing = FoundBoard(None, reason=f"no board of {board.columns}x{board.rows} inner corners found")
+    sizes = [(factor, *_reduced_8bit(image, factor)) for factor in _factors(image)]
+    for factor, small, scale in sizes:
         for find in (_find_classic, find_sector, _find_shadowed):
             corners = find(small, board)
             if corners is None:
                 continue
             trouble = grid_trouble(small, corners, board.columns, board.rows)
             if trouble is None:
-                return Found(enlarge(canonical_order(small, corners, board), scale), factor)
+                return FoundBoard(to_full_size(canonical_order(small, corners, board), scale), factor)
             if missing.rejected is None:
-                missing = Found(None, reason=trouble, rejected=enlarge(corners, scale))
-    factor, small, scale = reduced[0]
+                missing = FoundBoard(None, reason=trouble, rejected=to_full_size(corners, scale))
+    factor, small, scale = sizes[0]
     part = find_part(small, board, _seeds(small))
     if part.pixels is not None:
-        return Found(enlarge(part.pixels, scale), factor)
+        return FoundBoard(to_full_size(part.pixels, scale), factor)
     if part.rejected is not None and (part.other or missing.rejected is None):
-        return Found(None, reason=part.reason, rejected=enlarge(part.rejected, scale))
+        return FoundBoard(None, reason=part.reason, rejected=to_full_size(part.rejected, scale))
     return missing
 
 
@@ -92,18 +93,18 @@ def refine_through_sizes(image: Gray, pixels: Tensor, board: Board, factor: floa
     # Each is reduced from the one twice as large, because reducing the largest image takes the time.
     steps, source = [], image
     for factor in reversed(factors):
-        source, scale = reduce(source, factor, whole)
+        source, scale = reduced(source, factor, whole)
         steps.append((source, scale))
     for small, scale in reversed(steps):
         start = (pixels + 0.5) / scale - 0.5
         side = local_side(start, board.columns, board.rows)
         refined = refine_corners(small, start, side, "saddle")
         good = ((refined.status == CornerStatus.GOOD) & (side >= MIN_REFINED_SIDE))[:, None]
-        pixels = enlarge(torch.where(good, refined.pixels, start), scale)
+        pixels = to_full_size(torch.where(good, refined.pixels, start), scale)
     return pixels
 
 
-def reduce(image: Gray, factor: float, whole: tuple[int, int]) -> tuple[Gray, Tensor]:
+def reduced(image: Gray, factor: float, whole: tuple[int, int]) -> tuple[Gray, Tensor]:
     """An image of the original size `whole` made `factor` times smaller by averaging, and the exact scale back."""
     width, height = whole
     if factor <= 1:
@@ -113,14 +114,16 @@ def reduce(image: Gray, factor: float, whole: tuple[int, int]) -> tuple[Gray, Te
     return small, torch.tensor([width / size[0], height / size[1]], dtype=torch.float64)
 
 
-def enlarge(pixels: Tensor, scale: Tensor) -> Tensor:
+def to_full_size(pixels: Tensor, scale: Tensor) -> Tensor:
     """Convert pixels of a reduced image to the original's: edges coincide at -0.5, not centers of the first pixels."""
     return (pixels + 0.5) * scale - 0.5
 
 
 def largest_grid(image: Gray, flags: int = cv2.CALIB_CB_EXHAUSTIVE) -> Tensor | None:
     """The corners of the largest checkerboard grid in an image, (rows, columns, 2), at least 3x3; None without one."""
-    found, corners, meta = _alone(cv2.findChessboardCornersSBWithMeta, image, (3, 3), flags | cv2.CALIB_CB_LARGER)
+    found, corners, meta = _in_new_thread(
+        cv2.findChessboardCornersSBWithMeta, image, (3, 3), flags | cv2.CALIB_CB_LARGER
+    )
     if not found:
         return None
     return torch.from_numpy(corners.reshape(*meta.shape[:2], 2).astype(np.float64))
@@ -136,6 +139,11 @@ def _seeds(image: npt.NDArray[np.uint8]) -> Iterator[Tensor]:
             yield grid
 
 
+def _reduced_8bit(image: npt.NDArray[np.uint8], factor: float) -> tuple[npt.NDArray[np.uint8], Tensor]:
+    small, scale = reduced(image, factor, (image.shape[1], image.shape[0]))
+    return small.astype(np.uint8, copy=False), scale
+
+
 def _factors(image: Gray) -> list[float]:
     longest = max(image.shape)
     return sorted({max(1.0, longest / side) for side in SEARCH_SIDES}, reverse=True)
@@ -148,11 +156,11 @@ def _find_classic(image: Gray, board: Board) -> Tensor | None:
 
 def find_sector(image: Gray, board: Board, flags: int = 0) -> Tensor | None:
     """The corners that `findChessboardCornersSB` finds, (corners, 2), or None."""
-    found, corners = _alone(cv2.findChessboardCornersSB, image, (board.columns, board.rows), flags=flags)
+    found, corners = _in_new_thread(cv2.findChessboardCornersSB, image, (board.columns, board.rows), flags=flags)
     return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
 
 
-def _find_shadowed(image: Gray, board: Board) -> Tensor | None:
+def _find_shadowed(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
     return find_sector(_equalized(image), board, cv2.CALIB_CB_EXHAUSTIVE)
 
 
@@ -160,7 +168,7 @@ def _equalized(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     return np.asarray(cv2.createCLAHE(_LOCAL_CONTRAST, _TILES).apply(image), dtype=np.uint8)
 
 
-def _alone(detector: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+def _in_new_thread(detector: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
     """Call a detector in a new thread.
 
     OpenCV's random numbers have one state per thread. In a new thread the same image always gives the same corners,

@@ -179,7 +179,8 @@ def _draw_failed(axes: Axes, failed: FailedImage, size: tuple[int, int]) -> None
     whole = (-0.5, width - 0.5, height - 0.5, -0.5)
     axes.imshow(_thumbnail(failed.path, size), cmap="gray", vmin=0, vmax=255, extent=whole)
     if failed.rejected is not None:
-        axes.scatter(*failed.rejected.numpy().T, s=16, marker="x", color=WARN, linewidths=1.0)
+        u, v = failed.rejected.numpy().T
+        axes.scatter(u, v, s=16, marker="x", color=WARN, linewidths=1.0)
     frame_image(axes, size)
     axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
     for spine in axes.spines.values():

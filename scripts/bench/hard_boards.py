@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -25,13 +26,13 @@ from kcal.sim.render import RenderOptions, render_light
 BOARD = Board(columns=9, rows=6, square=0.025)
 SIZE = 640, 480
 _GRAY = 0.114, 0.587, 0.299  # OpenCV's weights of blue, green and red
-Light = NDArray[np.float64]
+Light = NDArray[Any]
 
 
 class Picture(NamedTuple):
     """An image, and the true corners (N, 2) of the board in its order, NaN where outside the image; None without."""
 
-    image: NDArray[np.uint8] | NDArray[np.uint16]
+    image: NDArray[Any]
     truth: Tensor | None
 
 
@@ -56,7 +57,7 @@ def _scene(
     lens, extent = camera(size), BoardSize(board.columns, board.rows, board.square)
     options = PoseOptions(max_tilt=math.radians(tilt))
     pose = sample_board_poses(lens, extent, 1, generator, fill=fill, options=options)[0]
-    light = render_light(lens, pose, extent, RenderOptions(**{"gamma": 2.2, "noise": 0.0, **look}))
+    light = render_light(lens, pose, extent, replace(RenderOptions(gamma=2.2, noise=0.0), **look))  # type: ignore[arg-type]
     return light.numpy(), project_board(lens, pose, extent)[0], pose
 
 
