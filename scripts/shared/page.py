@@ -20,7 +20,7 @@ CONCLUSIONS = {
         "up to 2.5. The lowest versions that `pyproject.toml` allows work on 3.11, from the wheel: torch 2.7.1, numpy "
         "2.0.2, scipy 1.13.1; on 3.12 and 3.13 they have not been run."
     ),
-    "cpus.md": ("**Conclusion.** TODO"),
+    "cpus.md": "Figures of the latest run.",
     "capture.md": (
         "**Conclusion.** Follow the outline: half of the views are enough. The σ of 20 random views is reached with 6 "
         "to 15 guided ones (median 9); true errors are then 0.76 of those of the random views (geometric mean of six "
