@@ -32,6 +32,7 @@ from kcal.calibrate.lensfit.hybrid_problem import HybridState as HybridState
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard as MeasuredBoard
 from kcal.calibrate.lensfit.measured_board import load_measured_board as load_measured_board
 from kcal.calibrate.lensfit.measured_board import save_measured_board as save_measured_board
+from kcal.calibrate.lensfit.readout import Readout as Readout
 from kcal.calibrate.rig.drift import Drift as Drift
 from kcal.calibrate.rig.drift import measure_drift as measure_drift
 from kcal.calibrate.rig.from_boards import calibrate_rig as calibrate_rig

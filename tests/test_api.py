@@ -74,6 +74,7 @@ PUBLIC = {
     "HybridFit",
     "HybridForm",
     "HybridState",
+    "Readout",
     "ImageTransform",
     "ImportedCameras",
     "InputError",

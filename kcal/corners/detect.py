@@ -29,6 +29,7 @@ from kcal.corners.sizes import common_size, rescaled, resized_alike
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 
+_THOROUGH = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 MIN_GOOD = 0.5  # share of the corners that must be refined successfully
 
 
@@ -59,7 +60,7 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
         >>> [round(value, 3) for value in found.pixels[0].tolist()]
         [39.5, 39.5]
         >>> detect_board(image, Board(columns=6, rows=5, square=0.02)).reason
-        'no board of 6x5 inner corners found'
+        'a board of 5x3 inner corners was found, not 6x5: give --board 5x3'
     """
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"image: (H, W) uint8 or uint16 is needed, got {image.shape} {image.dtype}")
@@ -261,7 +262,7 @@ def seen_size(image: Gray) -> tuple[int, int] | None:
         >>> seen_size(np.where(on & ((x // 40 + y // 40) % 2 == 0), 40, 220).astype(np.uint8))
         (5, 3)
     """
-    grid = largest_grid(image)
+    grid = largest_grid(image, _THOROUGH)
     if grid is not None:
         grid = without_false_sides(image, grid)
     return None if grid is None else (max(grid.shape[:2]), min(grid.shape[:2]))

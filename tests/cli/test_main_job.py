@@ -85,7 +85,9 @@ class TestRealImages:
             code, text, error = run(
                 "calibrate", f"{side}.obs.json", "-o", f"{side}.camera.json", "--picture", f"{side}.png"
             )
-            assert (code, error) == (0, "")
+            # These cameras, or their board, moved a little.
+            assert code == 0
+            assert error.count("warning:") == error.count("moved while rows were read")
             assert (tmp_path / f"{side}.png").stat().st_size > 10_000
         files = [CameraFile.load(f"{side}.camera.json") for side in ("left", "right")]
         # The peers' best refiner ends at 0.158 and 0.156 px, cornerSubPix at 0.195 and 0.207.
@@ -238,10 +240,10 @@ class TestBadInput:
 
     def test_two_image_sizes(self, run: Run) -> None:
         generator = np.random.default_rng(0)
-        for name, shape in (("a.png", (240, 320)), ("b.png", (480, 640))):
+        for name, shape in (("a.png", (240, 320)), ("b.png", (480, 600))):
             write_png(name, generator.integers(0, 255, shape, dtype=np.uint8))
         answer = run("detect", "a.png", "b.png", "--board", "9x6", "--square", "25mm", "-o", "a.obs.json")
-        refused(answer, "320x240", "640x480")
+        refused(answer, "320x240", "600x480")
 
     def test_a_rig_file_where_a_camera_file_belongs(self, run: Run) -> None:
         Path("rig.json").write_text('{"kcal": "rig", "version": 1}')

@@ -155,8 +155,10 @@ def test_names_priors_and_peaks_are_of_the_weights(kind: str) -> None:
 
 def test_priors_of_zernike_modes() -> None:
     modes = ZernikeModes(radial=7, decentered=4, astigmatic=3, other=2)
-    assert [round(math.exp(mean), 6) for mean, _ in modes.hyperprior] == [5e-4, 3e-4, 5e-5, 4e-5, 0.5, 0.6]
-    assert [sd for _, sd in modes.hyperprior] == [1.75, 1.5, 1.75, 1.75, 0.7, 0.5]
+    assert [round(math.exp(mean), 6) for mean, _, _ in modes.hyperprior] == [5e-4, 3e-4, 5e-5, 4e-5, 0.5, 0.6]
+    assert [sd for _, sd, _ in modes.hyperprior] == [1.75, 1.5, 1.75, 1.75, 0.7, 0.5]
+    # Radial modes cannot stand for the focal length.
+    assert [round(math.exp(most), 6) for *_, most in modes.hyperprior] == [0.01, *5 * [math.inf]]
     found = dict(zip(modes.names, modes.weight_priors, strict=True))
     assert found["z5+1"] == (0, 4, 0)
     assert found["z7+1"] == (0, 4, 2)

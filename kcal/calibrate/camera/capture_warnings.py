@@ -38,7 +38,7 @@ def motion_warnings(fit: HybridFit) -> list[str]:
     ]
 
 
-def aspect_of(fit: HybridFit) -> tuple[float, float]:
+def measured_aspect(fit: HybridFit) -> tuple[float, float]:
     """f_y / f_x of the base projection, and its standard deviation."""
     fx, fy = fit.camera.params[:2].tolist()
     slope = torch.zeros(len(fit.camera.params), dtype=torch.float64)
@@ -50,7 +50,7 @@ def pixel_warnings(fit: HybridFit) -> list[str]:
     """A warning where pixels are not square."""
     if fit.square:
         return []
-    aspect, sigma = aspect_of(fit)
+    aspect, sigma = measured_aspect(fit)
     return [
         f"pixels are not square: f_y / f_x = {aspect:.4f} ± {sigma:.4f}; was the image or video resized, or taken in "
         "an anamorphic mode? The camera is right for images of this size and shape only: photograph boards and targets "

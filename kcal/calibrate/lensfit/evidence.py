@@ -184,7 +184,7 @@ class _Root(NamedTuple):
     rest: float
 
 
-def _root(data: Quadratic) -> _Root:
+def _rooted(data: Quadratic) -> _Root:
     # In units of the diagonal, below which nothing but rounding is left of directions that the data do not determine.
     scale = data.K.diagonal().clamp_min(1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(data.K * scale[:, None] * scale)
@@ -196,7 +196,7 @@ def _root(data: Quadratic) -> _Root:
 
 def negative_log_evidence(data: Quadratic, families: PriorFamilies, v: np.ndarray) -> tuple[float, np.ndarray]:
     """The negative logarithm of the evidence of v = (h, ln σ²), (H + 1,), and its gradient."""
-    return _still_evidence(_root(data), data.freedom, families, v)
+    return _still_evidence(_rooted(data), data.freedom, families, v)
 
 
 def _still_evidence(data: _Root, freedom: float, families: PriorFamilies, v: np.ndarray) -> tuple[float, np.ndarray]:
@@ -228,7 +228,7 @@ class _Evidence(NamedTuple):
     factor: Tensor
 
 
-def _evidence(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Evidence | None:
+def _moving_evidence(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Evidence | None:
     """None where priors are too wide for the precision of numbers."""
     K, g, c, freedom = data.K.numpy(), data.g.numpy(), data.c, data.freedom
     here = torch.from_numpy(h)
@@ -292,7 +292,7 @@ def maximize_evidence(
     moving = isinstance(data, ViewData)
     ratios = np.zeros(0) if not moving or log_ratio is None else log_ratio
     count = len(mean)
-    root = None if isinstance(data, ViewData) else _root(data.tempered(tempering))
+    root = None if isinstance(data, ViewData) else _rooted(data.tempered(tempering))
 
     values: list[float] = []
 
@@ -304,7 +304,7 @@ def maximize_evidence(
             value, slope = _still_evidence(root, data.freedom / tempering, families, v)
             return value + 0.5 * float(z @ z), slope + np.append(z / sd, 0.0)
         integrated = data.integrated(ratio)
-        found = _evidence(integrated.data.tempered(tempering), families, here, log_variance)
+        found = _moving_evidence(integrated.data.tempered(tempering), families, here, log_variance)
         if found is None:
             # Priors are far too wide for this precision: worse than any trial before, so that a shorter step follows.
             return max(values, default=1e30) + 1.0, np.zeros_like(v)
@@ -341,6 +341,6 @@ def evidence_of_motion(data: ViewData, best: Maximum, families: PriorFamilies, t
     moving = data.integrated(best.log_ratio)
     losses = []
     for quadratic, determinant in ((data.still, 0.0), (moving.data, moving.log_determinant)):
-        found = _evidence(quadratic.tempered(tempering), families, best.h.numpy(), log_variance)
+        found = _moving_evidence(quadratic.tempered(tempering), families, best.h.numpy(), log_variance)
         losses.append(math.inf if found is None else found.value + 0.5 * determinant / tempering)
     return losses[0] - losses[1]

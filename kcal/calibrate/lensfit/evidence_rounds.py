@@ -34,7 +34,7 @@ _AT_REST = 0.1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Capture:
+class FittedViews:
     """What a camera is fitted to.
 
     Args:
@@ -122,7 +122,7 @@ class Rounds(NamedTuple):
         converged: whether the hyperparameters came to rest.
     """
 
-    capture: Capture
+    capture: FittedViews
     estimate: Estimate
     data: Quadratic | ViewData
     loss: float
@@ -130,7 +130,7 @@ class Rounds(NamedTuple):
     converged: bool
 
 
-def begin_motion(capture: Capture, estimate: Estimate) -> Estimate:
+def begin_motion(capture: FittedViews, estimate: Estimate) -> Estimate:
     """An estimate of still views as one of views that may move, with a typical amplitude; or of views that may not."""
     moving = capture.readout is not None
     count = len(capture.pixels)
@@ -142,7 +142,7 @@ def begin_motion(capture: Capture, estimate: Estimate) -> Estimate:
 
 
 def run_rounds(
-    capture: Capture,
+    capture: FittedViews,
     estimate: Estimate,
     hyperprior: Hyperprior,
     never: Tensor,
@@ -189,7 +189,7 @@ def run_rounds(
             estimate.log_ratio,
             tempering,
         )
-        change = _change(estimate, best)
+        change = _moved_by(estimate, best)
         resting = not first and change < _AT_REST and steps <= 2
         estimate = estimate._replace(
             hyperparameters=best.h,
@@ -251,7 +251,7 @@ def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -
     return losses[1] < losses[0]
 
 
-def _change(estimate: Estimate, best: Maximum) -> float:
+def _moved_by(estimate: Estimate, best: Maximum) -> float:
     """By how much the hyperparameters moved."""
     change = float((best.h - estimate.hyperparameters).abs().max())
     if len(best.log_ratio):

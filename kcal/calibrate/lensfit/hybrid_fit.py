@@ -18,7 +18,7 @@ from kcal.calibrate.lensfit.base_fit import Estimate, fit_base
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
 from kcal.calibrate.lensfit.board_prior import BoardPrior
 from kcal.calibrate.lensfit.evidence import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, typical_hyperprior
-from kcal.calibrate.lensfit.evidence_rounds import LAST, Capture, Rounds, columns_may_be_read, run_rounds
+from kcal.calibrate.lensfit.evidence_rounds import LAST, FittedViews, Rounds, columns_may_be_read, run_rounds
 from kcal.calibrate.lensfit.fleet import LensPrior
 from kcal.calibrate.lensfit.hybrid_problem import HybridState, hybrid_unknowns
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
@@ -198,7 +198,7 @@ def fit_hybrid(
         board = board.prior_for(points)
     ordered, own = points, board_modes(points)
     points, shown = board.applied(points, own) if isinstance(board, BoardPrior) else (points, own)
-    capture = Capture(
+    capture = FittedViews(
         points=points,
         board=shown,
         pixels=pixels,
@@ -209,13 +209,13 @@ def fit_hybrid(
         exact=board == "exact",
     )
 
-    def run(capture: Capture, estimate: Estimate, spent: int, cold: bool) -> tuple[Rounds, Tensor]:
+    def run(capture: FittedViews, estimate: Estimate, spent: int, cold: bool) -> tuple[Rounds, Tensor]:
         held = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
         if capture.exact:
             held[-len(shown.unit) :] = True
         return run_rounds(capture, estimate, hyperprior, held, cold=cold, spent=spent, progress=progress), held
 
-    def begin(capture: Capture) -> tuple[Rounds, Tensor]:
+    def begin(capture: FittedViews) -> tuple[Rounds, Tensor]:
         estimate, steps = fit_base(
             points, pixels, size, weights, modes, shown, capture.square, focal, robust, hyperprior.mean, lens
         )

@@ -54,7 +54,7 @@ class Readout:
         axis = 0 if self.columns else 1
         return ((pixels[..., axis] + 0.5) / self.size[axis] - 0.5).nan_to_num(0.0)
 
-    def moved(self, motion: Tensor, time: Tensor, points: Tensor) -> Moved:
+    def moved(self, motion: Tensor, time: Tensor, points: Tensor) -> MovedBoard:
         """Boards as they stand when their corners are read.
 
         Args:
@@ -65,7 +65,7 @@ class Readout:
         powers = torch.stack([time, time * time], -1)
         turn, shift = torch.einsum("vno,vokj->kvjn", powers, motion.unflatten(1, (ORDERS, 2, 3)))
         about = (points - self.center[:, None]).expand_as(turn)
-        return Moved(points + torch.linalg.cross(turn, about, dim=1), self.distance * shift, turn)
+        return MovedBoard(points + torch.linalg.cross(turn, about, dim=1), self.distance * shift, turn)
 
     def columns_of(self, by_point: Tensor, rotation: Tensor, time: Tensor, points: Tensor) -> Tensor:
         """(V, 12, 2, N) derivatives of pixels by motions.
@@ -99,7 +99,7 @@ def motion_sigma(log_ratio: np.ndarray, variance: float) -> tuple[float, float]:
     return float(first), float(second)
 
 
-class Moved(NamedTuple):
+class MovedBoard(NamedTuple):
     """Boards while they are read.
 
     Attributes:
