@@ -26,7 +26,7 @@ from kcal.calibrate.camera.trust import ResidualStructure as ResidualStructure
 from kcal.calibrate.camera.trust import examine as examine
 from kcal.calibrate.lensfit.board_modes import BoardModes as BoardModes
 from kcal.calibrate.lensfit.cameras_fit import measure_board as measure_board
-from kcal.calibrate.lensfit.evidence import PriorFamilies as PriorFamilies
+from kcal.calibrate.lensfit.families import PriorFamilies as PriorFamilies
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit as HybridFit
 from kcal.calibrate.lensfit.hybrid_problem import HybridState as HybridState
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard as MeasuredBoard

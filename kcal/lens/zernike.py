@@ -28,21 +28,25 @@ from kcal.errors import InputError
 from kcal.lens.field_modes import WeightPrior
 from kcal.lens.tracing import may_overwrite
 
-RADIAL, DECENTERED, ASTIGMATIC, OTHER, ASPECT = range(5)
+RADIAL, DECENTERED, ASTIGMATIC, OTHER, TILTED, ASPECT = range(6)
 
 # Median, sd of ln, and largest value: amplitudes of the families in this order, decays per degree of radial and of
-# other modes. Radial modes beyond a hundredth of the disc stand for the focal length and shape of the base projection
-# (measured on halves of a fisheye's capture). Below: the degrees at which these families begin, to which the
-# amplitudes refer.
+# other modes. Decentered modes of second degree are a family of their own: they are all that a tilt of the sensor makes,
+# so that finer ones do not tell how large they are. Radial modes beyond a hundredth of the disc stand for the focal
+# length and shape of the base projection (measured on halves of a fisheye's capture). Below: the degrees at which these
+# families begin, to which the amplitudes refer.
 _HYPERPRIOR = (
     (5e-4, 1.75, 0.01),
     (3e-4, 1.5, math.inf),
     (5e-5, 1.75, math.inf),
     (4e-5, 1.75, math.inf),
+    (3e-4, 1.5, math.inf),
     (0.5, 0.7, math.inf),
     (0.6, 0.5, math.inf),
 )
-_FIRST_DEGREE = (5, 2, 3, 2)
+_FIRST_DEGREE = (5, 2, 3, 2, 2)
+# Where the decays stand: after the amplitudes.
+_DECAY = len(_FIRST_DEGREE)
 # The coefficients of Jacobi polynomials by powers of t grow by 2.4 with each second degree: 5e7 at degree 40.
 _HIGHEST = 40
 # Real and imaginary part of a complex number for each point.
@@ -64,8 +68,8 @@ class ZernikeModes:
     Attributes:
         complex_modes: (j, n) of each complex mode.
         real_modes: (complex mode, part, family, degree) of each real weight: part 0 multiplies the mode, part 1
-            multiplies i times the mode. Families are `RADIAL`, `DECENTERED`, `ASTIGMATIC`, `OTHER`, and `ASPECT` for
-            unequal and skewed axes.
+            multiplies i times the mode. Families are `RADIAL`, `DECENTERED`, `ASTIGMATIC`, `OTHER`, `TILTED` (decentered
+            of second degree), and `ASPECT` for unequal and skewed axes.
         names: of the real weights: "z5+3" is that of the mode n = 5, j = 3, and "z5+3i" that of i times this mode.
 
     Raises:
@@ -100,7 +104,7 @@ class ZernikeModes:
                 m = abs(j - 1)
                 if (j, n) == (1, 1) or ((j, n) == (1, 3) and part == 0):
                     continue
-                family = ASPECT if (j, n) == (-1, 1) else (OTHER if part else RADIAL) if m == 0 else min(m, 3)
+                family = ASPECT if (j, n) == (-1, 1) else _family(m, n, part)
                 real_modes.append((i, part, family, n))
         modes = ((*complex_modes[i], part) for i, part, _, _ in real_modes)
         chains, matrix = _polynomial_layout(complex_modes, [(i, part) for i, part, _, _ in real_modes])
@@ -137,7 +141,7 @@ class ZernikeModes:
 
     @property
     def hyperprior(self) -> tuple[tuple[float, float, float], ...]:
-        """See `FieldModes`: amplitudes of the four families, then decays per degree of radial and of other modes."""
+        """See `FieldModes`: amplitudes of the five families, then decays per degree of radial and of other modes."""
         return tuple((math.log(value), sd, math.log(most)) for value, sd, most in _HYPERPRIOR)
 
     @property
@@ -146,7 +150,7 @@ class ZernikeModes:
         return tuple(
             WeightPrior(None, None, 0.0)
             if family == ASPECT
-            else WeightPrior(family, 4 if family == RADIAL else 5, max(degree - _FIRST_DEGREE[family], -1.0))
+            else WeightPrior(family, _DECAY if family == RADIAL else _DECAY + 1, max(degree - _FIRST_DEGREE[family], -1.0))
             for _, _, family, degree in self.real_modes
         )
 
@@ -195,6 +199,13 @@ class ZernikeModes:
             torch.addcmul(re + re_back, x, f_t), torch.addcmul(im_back - im, y, f_t),
             torch.addcmul(im + im_back, x, g_t), torch.addcmul(re - re_back, y, g_t),
         )  # fmt: skip
+
+
+def _family(m: int, degree: int, part: int) -> int:
+    """Of a mode that turns m times about the axis."""
+    if m == 1:
+        return TILTED if degree == 2 else DECENTERED
+    return (OTHER if part else RADIAL) if m == 0 else min(m, OTHER)
 
 
 def _polynomial_layout(

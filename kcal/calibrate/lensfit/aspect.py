@@ -9,8 +9,8 @@ from torch import Tensor
 
 from kcal.calibrate.lensfit.base_fit import Estimate
 from kcal.calibrate.lensfit.board_modes import STRETCH, BoardModes
-from kcal.calibrate.lensfit.evidence import BOARD, PriorFamilies
 from kcal.calibrate.lensfit.evidence_rounds import Rounds
+from kcal.calibrate.lensfit.families import BOARD, PriorFamilies
 from kcal.calibrate.lensfit.quadratic import ViewData, posterior_root
 
 # Stretch that a print may have whatever this board's amplitude is, in units of its extent to each side: one tenth of a

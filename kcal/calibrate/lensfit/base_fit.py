@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
 from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.board_modes import BoardModes
-from kcal.calibrate.lensfit.evidence import PriorFamilies, prior_families
+from kcal.calibrate.lensfit.families import PriorFamilies, prior_families
 from kcal.calibrate.lensfit.fleet import LensPrior
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, hybrid_unknowns
 from kcal.errors import DegenerateError, InputError

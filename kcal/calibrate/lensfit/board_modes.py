@@ -1,8 +1,10 @@
 """How a printed board differs from the one that was ordered: smooth modes of bending and of print errors.
 
 With a, b = ±1 at the outermost corners, bending is a sum of Legendre products L_i(a) L_j(b) of degree 2 to 4 in z; the
-print errs in the plane by stretch (a, 0), shear (b, 0), and products of degree 2 and 3 in x and y. Degree 1 in z is a
-turn of the board, and what is left of degree 1 in the plane is its scale and a turn.
+print errs in the plane by stretch (a, 0), shear (b, 0), and products of degree 2 and 3 in x and y. The products ab, of
+which the lengths of opposite sides differ, have an amplitude of their own: views hardly tell them from decentered
+lenses, and other modes do not say how large they are. Degree 1 in z is a turn of the board, and what is left of degree 1
+in the plane is its scale and a turn.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-BENDING, STRETCH, PRINT = range(3)
+BENDING, STRETCH, PRINT, TRAPEZOID = range(4)
 # Of modes whose amplitudes have a prior of their own.
 KNOWN = -1
 
@@ -23,13 +25,13 @@ class BoardModes(NamedTuple):
     Attributes:
         shapes: (B, 3, N) displacement of each corner by a mode of amplitude one.
         unit: (B,) meters; amplitudes of a family are this times the same number.
-        family: (B,) `BENDING`, `STRETCH` (with shear) or `PRINT`; `KNOWN` where the unit is the standard deviation.
+        family: (B,) `BENDING`, `STRETCH` (with shear), `PRINT` or `TRAPEZOID`; `KNOWN` where the unit is the standard deviation.
 
     Example:
         >>> grid = torch.cartesian_prod(torch.arange(7.0), torch.arange(6.0)).double()
         >>> modes = board_modes(torch.cat([grid, torch.zeros(42, 1).double()], 1))
         >>> modes.family.bincount().tolist(), float(modes.unit.max())  # twelve of bending; the extent is 6
-        ([12, 2, 14], 6.0)
+        ([12, 2, 12, 2], 6.0)
     """
 
     shapes: Tensor
@@ -75,7 +77,7 @@ def board_modes(points: Tensor) -> BoardModes:
             product = left[i] * right[degree - i]
             shapes += [torch.stack([product, zero, zero]), torch.stack([zero, product, zero])]
             unit += [0.5 ** (degree - 1)] * 2
-            family += [PRINT] * 2
+            family += [TRAPEZOID if i == 1 == degree - i else PRINT] * 2
     return BoardModes(torch.stack(shapes), extent * torch.tensor(unit, dtype=points.dtype), torch.tensor(family))
 
 

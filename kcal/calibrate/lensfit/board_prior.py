@@ -18,7 +18,7 @@ from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
 from kcal.calibrate.lensfit.board_modes import KNOWN, BoardModes
-from kcal.calibrate.lensfit.evidence import BOARD, Hyperprior, typical_hyperprior
+from kcal.calibrate.lensfit.families import BOARD, Hyperprior, typical_hyperprior
 from kcal.lens.information import CameraInformation
 
 
@@ -143,7 +143,7 @@ def told_by_others(prior: BoardPrior, message: BoardMessage) -> BoardPrior:
 
 
 def printed_prior(modes: BoardModes, amplitudes: Tensor) -> BoardPrior:
-    """The prior of a printed board, from the ln amplitudes (3,) of its families of modes."""
+    """The prior of a printed board, from the ln amplitudes (4,) of its families of modes."""
     return BoardPrior(torch.zeros_like(modes.unit), torch.diag(modes.unit * torch.exp(amplitudes[modes.family])))
 
 

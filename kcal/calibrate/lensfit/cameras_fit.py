@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kcal.calibrate.lensfit.board_groups import compared, grouped, others_of
 from kcal.calibrate.lensfit.board_prior import BoardPrior, multiplied, printed_board, told_by_others
-from kcal.calibrate.lensfit.evidence import Hyperprior, typical_hyperprior
+from kcal.calibrate.lensfit.families import Hyperprior, typical_hyperprior
 from kcal.calibrate.lensfit.fleet import LEAST_CAMERAS, LensPrior, fleet_priors, typical_lens
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard

@@ -12,7 +12,7 @@ prior on h (type-II maximum likelihood, MacKay 1992; restricted maximum likeliho
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -21,153 +21,9 @@ from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
 from kcal.calibrate.bundle.views import LEAST_NOISE
-from kcal.calibrate.lensfit.board_modes import KNOWN, BoardModes
+from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
 from kcal.calibrate.lensfit.readout import LARGEST, MEDIAN, SMALLEST, SPREAD
-from kcal.lens.field_modes import FieldModes
-from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.zernike import ZernikeModes
-
-# After the hyperparameters of the modes: ln amplitudes of the pupil (in units of the board's range) and of the board:
-# bending, stretch, print (in units of its extent): mean and sd of ln.
-_MEAN = np.log([2e-4, 5e-4, 5e-4, 2e-4])
-_SD = np.array([2.0, 1.5, 1.5, 1.5])
-# Where the amplitudes of the board stand among the hyperparameters: the last three.
-BOARD = -3
-# Unknowns before the field's weights: focal length, principal point, shape, pupil; where the pupil stands among them.
-LEADING_UNKNOWNS, _PUPIL = 6, 4
-# Unequal and skewed axes, in units of R: pixels are square.
-SQUARE = 1e-4
-# Of the principal point about the middle, in diagonals.
-_CENTER = 0.05
-
-
-class Hyperprior(NamedTuple):
-    """A normal prior of the hyperparameters h.
-
-    Attributes:
-        mean: (H,).
-        sd: (H,) standard deviations.
-        most: (H,) largest values; None: there is no limit.
-    """
-
-    mean: Tensor
-    sd: Tensor
-    most: Tensor | None = None
-
-
-class PriorFamilies(NamedTuple):
-    """Which hyperparameters set the standard deviation of each unknown: ln sd = ln unit + ln h[amplitude] - h[decay] x.
-
-    Attributes:
-        mean: (S,).
-        log_unit: (S,).
-        amplitude: (S,) index of the log amplitude, -1 where the standard deviation is the unit.
-        decay: (S,) index of the log decay, -1 where there is none.
-        degree: (S,) x above.
-
-    Example:
-        >>> one = torch.ones(1, dtype=torch.float64)
-        >>> families = PriorFamilies(0 * one, 0 * one, torch.tensor([0]), torch.tensor([1]), 2 * one)
-        >>> h = torch.tensor([0.3, 0.5], dtype=torch.float64).log()
-        >>> round(float(families.deviation(h)), 4)  # 0.3 exp(-0.5 * 2)
-        0.1104
-    """
-
-    mean: Tensor
-    log_unit: Tensor
-    amplitude: Tensor
-    decay: Tensor
-    degree: Tensor
-
-    def with_board(self, board: BoardModes) -> PriorFamilies:
-        """The same camera, and another board, or the same in other variables."""
-        lens = len(self.mean) - len(board.unit)
-        family = torch.where(board.family == KNOWN, -1, self.amplitude[_PUPIL] + 1 + board.family)
-        return self._replace(
-            log_unit=torch.cat([self.log_unit[:lens], board.unit.log()]),
-            amplitude=torch.cat([self.amplitude[:lens], family]),
-        )
-
-    def deviation(self, h: Tensor) -> Tensor:
-        """(S,) prior standard deviations."""
-        out = self.log_unit + torch.where(self.amplitude >= 0, h[self.amplitude], 0.0)
-        return torch.exp(out - torch.where(self.decay >= 0, torch.exp(h[self.decay]), 0.0) * self.degree)
-
-    def slopes(self, h: Tensor) -> Tensor:
-        """(H, S) derivatives of 2 ln sd by h."""
-        out = torch.zeros(len(h), len(self.mean), dtype=h.dtype)
-        column = torch.arange(len(self.mean))
-        some = self.amplitude >= 0
-        out[self.amplitude[some], column[some]] = 2.0
-        some = self.decay >= 0
-        out[self.decay[some], column[some]] -= 2.0 * torch.exp(h[self.decay[some]]) * self.degree[some]
-        return out
-
-
-def prior_families(
-    form: HybridForm,
-    focal: float,
-    board: BoardModes,
-    size: tuple[int, int],
-    distance: float,
-    aspect: float | None = None,
-) -> PriorFamilies:
-    """The priors of a camera and the board that it saw.
-
-    Args:
-        form: constants of the lens.
-        focal: F₀, pixels.
-        board: modes of the board.
-        size: of the image.
-        distance: typical distance of the board, meters.
-        aspect: f_y / f_x of pixels that are not square, roughly; None: they are square.
-    """
-    diagonal = math.hypot(*size)
-    corner = math.atan(0.5 * diagonal / focal)
-    leading = [focal, _CENTER * diagonal, _CENTER * diagonal, 1.0 + 0.5 / corner**2, distance, distance]
-    rows = [] if aspect is None else [aspect * focal]
-    mean = torch.zeros(len(leading) + len(form.modes) + len(rows) + len(board.unit), dtype=torch.float64)
-    mean[:4] = torch.tensor([focal, (size[0] - 1) / 2, (size[1] - 1) / 2, 0.5 - form.shape])
-    if aspect is not None:
-        mean[-1 - len(board.unit)] = aspect * focal
-    amplitude, decay, degree = zip(*form.modes.weight_priors, strict=True)
-    by_pupil = len(form.modes.hyperprior)
-    # Without an amplitude: how surely pixels are square.
-    field_unit = [math.log(form.radius) + (math.log(SQUARE) if own is None else 0.0) for own in amplitude]
-    none, more = [-1] * len(leading), [-1] * len(rows)
-    board_family = torch.where(board.family == KNOWN, -1, by_pupil + 1 + board.family)
-    return PriorFamilies(
-        mean,
-        torch.cat(
-            [
-                torch.tensor([*map(math.log, leading), *field_unit, *map(math.log, rows)], dtype=torch.float64),
-                board.unit.log(),
-            ]
-        ),
-        torch.cat([torch.tensor([*none[:-2], by_pupil, by_pupil, *_numbers(amplitude), *more]), board_family]),
-        torch.cat([torch.tensor([*none, *_numbers(decay), *more]), torch.full_like(board.family, -1)]),
-        torch.cat(
-            [
-                torch.tensor([0.0] * len(leading) + [*degree] + [0.0] * len(rows), dtype=torch.float64),
-                torch.zeros_like(board.unit),
-            ]
-        ),
-    )
-
-
-def _numbers(indices: Sequence[int | None]) -> list[int]:
-    return [-1 if index is None else index for index in indices]
-
-
-def typical_hyperprior(modes: FieldModes | None = None) -> Hyperprior:
-    """That of a camera and a board of which nothing is known; without modes, for the default field."""
-    mean, sd, most = np.array((modes or ZernikeModes()).hyperprior).T
-    return Hyperprior(
-        torch.from_numpy(np.concatenate([mean, _MEAN])),
-        torch.from_numpy(np.concatenate([sd, _SD])),
-        torch.from_numpy(np.concatenate([most, np.full(len(_MEAN), np.inf)])),
-    )
 
 
 class _Root(NamedTuple):
@@ -288,12 +144,40 @@ def maximize_evidence(
         tempering: by which the data count less.
     """
     prior = hyperprior or typical_hyperprior()
+    ratios = np.zeros(0) if not isinstance(data, ViewData) or log_ratio is None else log_ratio
+    count = len(prior.mean)
+    log_variance = math.log(variance)
+    bounds = hyper_bounds(prior, len(ratios), log_variance)
+    found = lbfgs(
+        evidence_loss(data, families, prior, tempering),
+        np.concatenate([h.numpy(), ratios, [log_variance]]),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        # To the maximum, not to wherever rounding lets the steps become small: 1e-2 of ln amplitude is 5e-3 sigma.
+        options={"maxiter": 200, "ftol": 1e-12, "gtol": 1e-4, "maxcor": 20},
+    )
+    at = found.x
+    return Maximum(torch.from_numpy(at[:count].copy()), at[count:-1].copy(), math.exp(at[-1]), float(found.fun))
+
+
+def hyper_bounds(prior: Hyperprior, motions: int, log_variance: float) -> list[tuple[float, float | None]]:
+    """Bounds of v = (h, logarithms of the ratios of motions, ln σ²), near a variance of the noise."""
     mean, sd = prior.mean.numpy(), prior.sd.numpy()
-    moving = isinstance(data, ViewData)
-    ratios = np.zeros(0) if not moving or log_ratio is None else log_ratio
+    most = mean + 5 * sd if prior.most is None else np.minimum(mean + 5 * sd, prior.most.numpy())
+    bounds: list[tuple[float, float | None]] = [*zip(mean - 5 * sd, most, strict=True)]
+    bounds += [(math.log(SMALLEST) - 0.5 * log_variance, math.log(LARGEST) - 0.5 * log_variance)] * motions
+    # The last bound is open: where all are closed, L-BFGS-B makes its first trial at the bounds.
+    return [*bounds, (max(log_variance - 8, 2.0 * math.log(LEAST_NOISE)), None)]
+
+
+def evidence_loss(
+    data: Quadratic | ViewData, families: PriorFamilies, prior: Hyperprior, tempering: float
+) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
+    """The negative logarithm of evidence and hyperprior of v = (h, logarithms of ratios, ln σ²), and its gradient."""
+    mean, sd = prior.mean.numpy(), prior.sd.numpy()
     count = len(mean)
     root = None if isinstance(data, ViewData) else _rooted(data.tempered(tempering))
-
     values: list[float] = []
 
     def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
@@ -315,24 +199,7 @@ def maximize_evidence(
         by_noise = found.by_noise + 0.5 * float(w.sum()) / SPREAD
         return values[-1], np.concatenate([found.by_h + z / sd, by_ratio, [by_noise]])
 
-    log_variance = math.log(variance)
-    start = np.concatenate([h.numpy(), ratios, [log_variance]])
-    # The last bound is open: where all are closed, L-BFGS-B makes its first trial at the bounds.
-    most = mean + 5 * sd if prior.most is None else np.minimum(mean + 5 * sd, prior.most.numpy())
-    bounds: list[tuple[float, float | None]] = [*zip(mean - 5 * sd, most, strict=True)]
-    bounds += [(math.log(SMALLEST) - 0.5 * log_variance, math.log(LARGEST) - 0.5 * log_variance)] * len(ratios)
-    bounds.append((max(log_variance - 8, 2.0 * math.log(LEAST_NOISE)), None))
-    found = lbfgs(
-        objective,
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=bounds,
-        # To the maximum, not to wherever rounding lets the steps become small: 1e-2 of ln amplitude is 5e-3 sigma.
-        options={"maxiter": 200, "ftol": 1e-12, "gtol": 1e-4, "maxcor": 20},
-    )
-    at = found.x
-    return Maximum(torch.from_numpy(at[:count].copy()), at[count:-1].copy(), math.exp(at[-1]), float(found.fun))
+    return objective
 
 
 def evidence_of_motion(data: ViewData, best: Maximum, families: PriorFamilies, tempering: float) -> float:

@@ -11,9 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.calibrate.lensfit.amplitudes import expected_amplitudes
 from kcal.calibrate.lensfit.base_fit import NO_MOTION, Estimate, cauchy_weights
 from kcal.calibrate.lensfit.board_modes import BoardModes
-from kcal.calibrate.lensfit.evidence import Hyperprior, Maximum, evidence_of_motion, maximize_evidence
+from kcal.calibrate.lensfit.evidence import (
+    Maximum,
+    evidence_loss,
+    evidence_of_motion,
+    hyper_bounds,
+    maximize_evidence,
+)
+from kcal.calibrate.lensfit.families import Hyperprior
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, overdispersion, quadratic_of, view_data
 from kcal.calibrate.lensfit.readout import LARGEST, MEDIAN, MOTION, ORDERS, Readout, motion_sigma, stillness
@@ -222,6 +230,22 @@ def run_rounds(
         tempering = _overdispersion(data, data.score, estimate, never)
         estimate = estimate._replace(variance=estimate.variance * tempering, tempering=tempering)
     return Rounds(capture, estimate, data, best.loss, spent, converged)
+
+
+def expected_estimate(rounds: Rounds, hyperprior: Hyperprior) -> Estimate:
+    """The estimate with the amplitudes that are to be expected in place of the most likely ones."""
+    estimate, data = rounds.estimate, rounds.data
+    count = len(estimate.hyperparameters)
+    log_variance = math.log(estimate.variance / estimate.tempering)
+    # Views that move were tempered after their amplitudes were found.
+    tempering = 1.0 if isinstance(data, ViewData) else estimate.tempering
+    loss = evidence_loss(data, estimate.families, hyperprior, tempering)
+    bounds = hyper_bounds(hyperprior, len(estimate.log_ratio), log_variance)
+    used = estimate.families.amplitude
+    which = [*used[used >= 0].unique().tolist(), *range(count, count + len(estimate.log_ratio))]
+    at = np.concatenate([estimate.hyperparameters.numpy(), estimate.log_ratio, [log_variance]])
+    found = expected_amplitudes(loss, at, which, bounds)
+    return estimate._replace(hyperparameters=torch.from_numpy(found[:count].copy()), log_ratio=found[count:-1].copy())
 
 
 def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> bool:

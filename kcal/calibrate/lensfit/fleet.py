@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.evidence import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, negative_log_evidence
+from kcal.calibrate.lensfit.evidence import negative_log_evidence
+from kcal.calibrate.lensfit.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies
 from kcal.calibrate.lensfit.quadratic import Quadratic
 from kcal.lens.hybrid_terms import HybridForm
 

@@ -17,8 +17,15 @@ from kcal.calibrate.lensfit.aspect import aspect_of, pixels_are_square, with_squ
 from kcal.calibrate.lensfit.base_fit import Estimate, fit_base
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
 from kcal.calibrate.lensfit.board_prior import BoardPrior
-from kcal.calibrate.lensfit.evidence import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, typical_hyperprior
-from kcal.calibrate.lensfit.evidence_rounds import LAST, FittedViews, Rounds, columns_may_be_read, run_rounds
+from kcal.calibrate.lensfit.evidence_rounds import (
+    LAST,
+    FittedViews,
+    Rounds,
+    columns_may_be_read,
+    expected_estimate,
+    run_rounds,
+)
+from kcal.calibrate.lensfit.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.lensfit.fleet import LensPrior
 from kcal.calibrate.lensfit.hybrid_problem import HybridState, hybrid_unknowns
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
@@ -46,7 +53,8 @@ class HybridFit:
         information: the same before anything was inverted, with data and priors apart.
         sigma: px, of a corner of weight one, tempering included.
         tempering: T, by which the data count less because residuals repeat within views.
-        hyperparameters: (H,).
+        hyperparameters: (H,) of largest evidence.
+        expected: (H,) the same with the mean squares of amplitudes, which set the priors.
         families: the priors that these set; of a board with a prior of its own, those after the change of variables.
         log_evidence: of the last round.
         effective: number of parameters that the data determine.
@@ -80,6 +88,7 @@ class HybridFit:
     sigma: float
     tempering: float
     hyperparameters: Tensor
+    expected: Tensor
     families: PriorFamilies
     log_evidence: float
     effective: float
@@ -251,7 +260,8 @@ def fit_hybrid(
             other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))
             if other[0].loss < rounds.loss:
                 rounds, never = other
-    capture, estimate = rounds.capture, rounds.estimate
+    capture, likely = rounds.capture, rounds.estimate
+    estimate = likely if robust else expected_estimate(rounds, hyperprior)
     model, families, state, h, _, variance, tempering = estimate
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
     peaks = torch.tensor(modes.peaks, dtype=torch.float64)
@@ -286,7 +296,8 @@ def fit_hybrid(
         information=information,
         sigma=math.sqrt(variance),
         tempering=tempering,
-        hyperparameters=h,
+        hyperparameters=likely.hyperparameters,
+        expected=h,
         families=families,
         log_evidence=-rounds.loss,
         square=capture.square,

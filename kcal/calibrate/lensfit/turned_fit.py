@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcal.calibrate.lensfit.board_orders import find_turns, turned_corners
 from kcal.calibrate.lensfit.board_prior import BoardMessage, BoardPrior, message_from_rows, printed_prior
-from kcal.calibrate.lensfit.evidence import BOARD
+from kcal.calibrate.lensfit.families import BOARD
 from kcal.calibrate.lensfit.fleet import LensPrior, Likelihood, hyper_likelihood
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem
@@ -83,10 +83,10 @@ def fit_turned(
         else:
             fit = fit_hybrid(board.points, ordered, seen.image_size, weighted, modes, shape, lens=lens, start=start)
         rows = _absolute_rows(fit, board.points, ordered, weighted)
-        deviation = fit.families.deviation(fit.hyperparameters)[: -len(fit.state.board)]
+        deviation = fit.families.deviation(fit.expected)[: -len(fit.state.board)]
         if shape == "exact" or attempt == _MOST_FITS - 1:
             break
-        prior = printed_prior(fit.board_shapes, fit.hyperparameters[BOARD:]) if shape == "printed" else shape
+        prior = printed_prior(fit.board_shapes, fit.expected[BOARD:]) if shape == "printed" else shape
         more = find_turns(rows, board, prior, deviation, fit.sigma**2)
         if not bool(more.any()):
             break
@@ -99,7 +99,7 @@ def fit_turned(
     if shape == "exact":
         by_board = torch.zeros_like(by_board)
     elif shape == "printed":
-        by_board = by_board * fit.families.deviation(fit.hyperparameters)[len(deviation) :]
+        by_board = by_board * fit.families.deviation(fit.expected)[len(deviation) :]
     else:
         by_board, target = by_board @ shape.half.T, target - by_board @ shape.mean[:, None]
     unit = torch.ones(by_board.shape[1], dtype=by_board.dtype)

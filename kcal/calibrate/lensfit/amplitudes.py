@@ -1,0 +1,64 @@
+"""How large amplitudes are on the average, where views tell them only roughly.
+
+The largest evidence is at one amplitude A of a family of modes; others explain the views nearly as well. A mode of which
+the views say nothing then has the variance <A²>, the mean over what they leave, which is larger than that at the
+maximum: few views of a board let its print errors come out as nearly none, and lens and error bars with them (Kass and
+Steffey 1989 correct for it; measured on simulated captures of eight views, `docs/measured/ordinary.md`).
+
+Each ln A is varied by itself, all others following along the Hessian of -ln p at the maximum.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+Loss = Callable[[np.ndarray], tuple[float, np.ndarray]]
+
+# For differences of the gradient, in ln A.
+_STEP = 0.02
+# Where -ln p is taken, in standard deviations: the upper side has the long tail of <A²>.
+_PLACES = np.arange(-2.0, 4.01, 0.5)
+# Directions in which -ln p does not bend are followed by no more than this standard deviation.
+_WIDEST = 2.0
+
+
+def expected_amplitudes(
+    loss: Loss, at: np.ndarray, which: list[int], bounds: list[tuple[float, float | None]]
+) -> np.ndarray:
+    """½ ln <A²> of some hyperparameters, and the others as they are.
+
+    Args:
+        loss: -ln p and its gradient.
+        at: (H,) where it is smallest.
+        which: numbers of the ln A.
+        bounds: of all.
+
+    Example:
+        >>> def loss(v):  # ln A is normal, with a standard deviation of a half: <A²> = exp(2 · ¼)
+        ...     return float(2.0 * (v @ v)), 4.0 * v
+        >>> found = expected_amplitudes(loss, np.zeros(2), [0], [(-9.0, 9.0), (-9.0, None)])
+        >>> [round(float(value), 3) for value in found]
+        [0.25, 0.0]
+    """
+    covariance = _covariance(loss, at)
+    found = at.copy()
+    least = loss(at)[0]
+    for i in which:
+        sigma = math.sqrt(covariance[i, i])
+        low, high = bounds[i]
+        places = np.array([t for t in sigma * _PLACES if low <= at[i] + t <= (math.inf if high is None else high)])
+        along = covariance[:, i] / covariance[i, i]
+        share = np.exp([least - loss(at + t * along)[0] for t in places])
+        found[i] += 0.5 * math.log(float(share @ np.exp(2.0 * places)) / float(share.sum()))
+    return found
+
+
+def _covariance(loss: Loss, at: np.ndarray) -> np.ndarray:
+    """The inverse of the Hessian; where it does not bend upward, the widest."""
+    steps = _STEP * np.eye(len(at))
+    bend = np.stack([loss(at + step)[1] - loss(at - step)[1] for step in steps]) / (2.0 * _STEP)
+    values, vectors = np.linalg.eigh(0.5 * (bend + bend.T))
+    return np.asarray((vectors / np.maximum(values, _WIDEST**-2)) @ vectors.T)
