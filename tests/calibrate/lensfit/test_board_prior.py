@@ -18,7 +18,7 @@ from kcal.calibrate.lensfit.board_prior import (
     printed_board,
     printed_prior,
 )
-from kcal.calibrate.lensfit.evidence import BOARD, typical_hyperprior
+from kcal.calibrate.lensfit.families import BOARD, typical_hyperprior
 from kcal.corners.board import Board
 
 F64 = torch.float64
@@ -65,23 +65,23 @@ def test_products_and_evidence() -> None:
 
 def test_amplitudes_of_largest_evidence() -> None:
     """Boards with known spreads, seen well: the families' amplitudes come back, and no neighbor is better."""
-    spread = torch.tensor([1e-3, 1e-4, 3e-4], dtype=F64)
+    spread = torch.tensor([1e-3, 1e-4, 3e-4, 2e-4], dtype=F64)
     a = MODES.unit * spread[MODES.family] * normal(28, seed=4)
     message = BoardMessage(1e6 * torch.eye(28, dtype=F64), 1e6 * a)
     prior, value = printed_board(MODES, [message])
     typical = typical_hyperprior()
     mean, sd = typical.mean[BOARD:], typical.sd[BOARD:]
-    h = torch.stack([(prior.half.diagonal() / MODES.unit)[MODES.family == k][0].log() for k in range(3)])
+    h = torch.stack([(prior.half.diagonal() / MODES.unit)[MODES.family == k][0].log() for k in range(4)])
 
     def evidence(h: Tensor) -> float:
         hyper = 0.5 * float(((h - mean) / sd).square().sum())
         return multiplied(printed_prior(MODES, h), [message]).log_evidence - hyper
 
     assert value == pytest.approx(evidence(h), rel=1e-9)
-    for k in range(3):
+    for k in range(4):
         for sign in (-0.3, 0.3):
-            assert evidence(h + sign * torch.eye(3, dtype=F64)[k]) < value
-    # Twelve, two and fourteen draws determine a spread to 20 %, to half, and to 19 %.
+            assert evidence(h + sign * torch.eye(4, dtype=F64)[k]) < value
+    # Twelve draws determine a spread to 20 %; two, as of stretch and trapezoid, to half.
     assert (h[[0, 2]] - spread[[0, 2]].log()).abs().max() < 0.6
 
 
@@ -148,7 +148,7 @@ def test_turned_views_are_found(count: int) -> None:
     """Also if nearly half of them are turned; of a board without print errors none is."""
     turns = 2 * (torch.randperm(20, generator=torch.Generator().manual_seed(3)) < count).long()
     lens = torch.full((4,), 10.0, dtype=F64)
-    prior = printed_prior(MODES, torch.full((3,), math.log(5e-4), dtype=F64))
+    prior = printed_prior(MODES, torch.full((4,), math.log(5e-4), dtype=F64))
     a = prior.half.diagonal() * normal(28, seed=12)
     found = find_turns(linear_views(a, turns, 20), BOARD_86, prior, lens, 1.0)
     assert torch.equal(found, turns)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.lensfit.board_modes import board_modes
-from kcal.calibrate.lensfit.evidence import SQUARE, prior_families, typical_hyperprior
+from kcal.calibrate.lensfit.families import SQUARE, prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
@@ -72,7 +72,7 @@ def test_a_camera_is_found_with_each(kind: str) -> None:
     assert found.sigma == pytest.approx(NOISE, rel=0.12)
     # Only Zernike fields know that lenses are round: others leave more between field, focal length and pupil.
     assert off(found.camera) < (2.5 if kind == "zernike" else 6.0) * NOISE
-    assert len(found.hyperparameters) == len(KINDS[kind].hyperprior) + 4
+    assert len(found.hyperparameters) == len(KINDS[kind].hyperprior) + 5
     assert 8 < found.effective < 80
 
 

@@ -7,13 +7,8 @@ import math
 import numpy as np
 import torch
 
-from kcal.calibrate.lensfit.evidence import (
-    Hyperprior,
-    PriorFamilies,
-    Quadratic,
-    maximize_evidence,
-    negative_log_evidence,
-)
+from kcal.calibrate.lensfit.evidence import Quadratic, maximize_evidence, negative_log_evidence
+from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
 from kcal.calibrate.lensfit.fleet import Likelihood, fleet_priors, hyper_likelihood
 
 F64 = torch.float64

@@ -10,13 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import BENDING, PRINT, STRETCH, board_modes
-from kcal.calibrate.lensfit.evidence import (
-    maximize_evidence,
-    negative_log_evidence,
-    prior_families,
-    typical_hyperprior,
-)
+from kcal.calibrate.lensfit.board_modes import BENDING, PRINT, STRETCH, TRAPEZOID, board_modes
+from kcal.calibrate.lensfit.evidence import maximize_evidence, negative_log_evidence
+from kcal.calibrate.lensfit.families import prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.calibrate.lensfit.quadratic import Quadratic
@@ -174,8 +170,12 @@ def test_views_of_something_else() -> None:
 def test_board_modes() -> None:
     modes = board_modes(BOARD.points)
     assert modes.shapes.shape == (28, 3, BOARD.corners)
-    assert torch.bincount(modes.family).tolist() == [12, 2, 14]
-    assert (BENDING, STRETCH, PRINT) == (0, 1, 2)
+    assert torch.bincount(modes.family).tolist() == [12, 2, 12, 2]
+    assert (BENDING, STRETCH, PRINT, TRAPEZOID) == (0, 1, 2, 3)
+    # Of a trapezoid, opposite sides differ: they are longer or higher as one moves across.
+    a, b, _ = (2.0 * BOARD.points / BOARD.points.amax(0) - 1.0).unbind(-1)
+    trapezoids = modes.shapes[modes.family == TRAPEZOID]
+    assert torch.allclose(trapezoids[:, :2], torch.eye(2, dtype=torch.float64)[..., None] * (a * b), atol=1e-12)
     # No mode is a rigid motion of the board or its scale, to first order.
     points = BOARD.points - BOARD.points.mean(0)
     x, y, one = points[:, 0], points[:, 1], torch.ones_like(points[:, 0])

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.lensfit.board_modes import board_modes
-from kcal.calibrate.lensfit.evidence import maximize_evidence, prior_families, typical_hyperprior
+from kcal.calibrate.lensfit.evidence import maximize_evidence
+from kcal.calibrate.lensfit.families import prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, unknown_values
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, view_data
