@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.blocks import Block, BoardBlock, FeatureBlock, Kind, LandmarkBlock, PerKind, RigState
 from kcal.calibrate.rig.initial_poses import Start
+from kcal.calibrate.rig.motion import BoardMotion, SeenBoards, board_motion
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedTerm
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
 from kcal.calibrate.rig.unknowns import SharedUnknowns
@@ -21,6 +22,8 @@ from kcal.solve.robust import RobustLoss
 
 # px, of a corner: noise-free corners would otherwise weigh infinitely much.
 _LEAST_SIGMA = 1e-3
+# Boards whose mean square is this many times the typical one do not tell how others move.
+_WRONG = 9.0
 
 
 def chi2_quantile(dof: Tensor, probability: float) -> Tensor:
@@ -62,6 +65,7 @@ class Adjustment:
         self.anchor = start.center.mean(0)
         self._terms: list[SharedTerm] = [DistanceTerm(b.first, b.second, b.length, b.sigma) for b in data.baselines]
         self._terms += [PlaceTerm(p.camera, p.point, p.sigma) for p in data.positions]
+        self.motion: list[BoardMotion | None] = [None] * len(data.cameras)
         direction, inverse_range = _feature_start(data, start, self.anchor)
         self.state = RigState(
             parameters=torch.cat([camera.params.detach() for camera in data.cameras]),
@@ -90,7 +94,9 @@ class Adjustment:
         data, found = self.data, list[Block]()
         if data.boards and masks.boards.any():
             pixels, white = (value[masks.boards] for value in (data.boards.pixels, self.corner_whitening()))
-            found.append(BoardBlock(pixels, white, data.boards.points, self.unknowns.shapes, unknowns.board))
+            shapes, by_unknown = self.unknowns.shapes, unknowns.board
+            motion = [one and one.columns[masks.boards] for one in self.motion]
+            found.append(BoardBlock(pixels, white, data.boards.points, shapes, by_unknown, motion))
         if data.landmarks and masks.landmarks.any():
             surveyed = data.landmarks.points[masks.landmarks], data.landmarks.sigma[masks.landmarks]
             marks = _weighted(data.landmarks, masks.landmarks)
@@ -153,6 +159,37 @@ class Adjustment:
         for block in self.problem(masks).blocks:
             getattr(found, block.kind)[getattr(masks, block.kind)] = block.counts - block.size
         return found
+
+    def fit_motion(self, masks: PerKind) -> None:
+        """Find how boards move while the cameras' rows are read, from residuals at the present state."""
+        boards, state = self.data.boards, self.state
+        if boards is None or not bool(masks.boards.any()):
+            return
+        problem = self.problem(masks)
+        block = next(block for block in problem.blocks if isinstance(block, BoardBlock))
+        # Boards that are off by far are wrong, not moved.
+        square = self.squares(masks).boards / self.freedom(masks).boards.clamp_min(1)
+        good = masks.boards & (square <= _WRONG * square[masks.boards].median())
+        shaped, white = block.shaped(state), self.corner_whitening()
+        found: list[BoardMotion | None] = []
+        for c, posed in enumerate(problem.posed(state)):
+            seen = torch.isfinite(boards.pixels[:, c]).all(-1)
+            found.append(
+                board_motion(
+                    SeenBoards(
+                        model=posed.camera.model,
+                        parameters=posed.parameters,
+                        rotation=posed.rotation @ state.board_rotation,
+                        translation=(state.board_translation - posed.center) @ posed.rotation.T,
+                        points=shaped,
+                        pixels=boards.pixels[:, c],
+                        whitening=torch.where(seen[..., None, None], white[:, c], 0.0).movedim(1, -1),
+                        size=posed.camera.size,
+                    ),
+                    good & seen.any(-1),
+                )
+            )
+        self.motion = found
 
     def fit_corners(self, masks: PerKind, *, robust: bool = False) -> None:
         """Set the corners' sigma from the boards' residuals, unless it was given.

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.bundle.twist import apply_twist
+from kcal.calibrate.rig.motion import WithoutMotion
 from kcal.lens.camera import Camera
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection, project_components
@@ -147,6 +148,10 @@ class Block(ABC):
         """Derivatives by where things stand, from those by where they are seen."""
         return by_q
 
+    def _white(self, camera: int, rows: Tensor) -> Tensor:
+        """(V, P, 2 N) rows (V, P, 2, N) of pixels of one camera in units of their standard deviations."""
+        return torch.einsum("vuwn,vpwn->vpun", self.whitening[:, camera], rows).flatten(-2)
+
     def _prior(self, state: RigState) -> Tensor | None:
         """(V, L + 1, Q): derivatives of Q residuals of what is known beforehand; the last row holds the residuals."""
         return None
@@ -171,7 +176,8 @@ class Block(ABC):
 
     def residuals(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
         """(V, R) whitened residuals, pixels first."""
-        white = torch.einsum("vcuwn,vcwn->vcun", self.whitening, self.errors(cameras, state)).flatten(1)
+        errors = self.errors(cameras, state).unbind(1)
+        white = torch.cat([self._white(c, error[:, None])[:, 0] for c, error in enumerate(errors)], -1)
         prior = self._prior(state)
         return white if prior is None else torch.cat([white, prior[:, -1]], -1)
 
@@ -197,7 +203,7 @@ class Block(ABC):
                 shared[:, posed.shift] = -w[..., None] * by_offset
             rows[:, -1] = error
             rows = torch.where(self.seen[:, c, None, None, :], rows, 0.0)
-            out.append(torch.einsum("vuwn,vpwn->vpun", self.whitening[:, c], rows).flatten(-2))
+            out.append(self._white(c, rows))
         prior = self._prior(state)
         if prior is not None:
             rows = prior.new_zeros((len(self), self.size + shared_size + 1, prior.shape[-1]))
@@ -215,6 +221,7 @@ class BoardBlock(Block):
         board_points: (N, 3) meters.
         shapes: (B, 3, N) by which the state's amplitudes displace the corners.
         by_unknown: (B, K) these amplitudes by the unknowns.
+        motion: for each camera (V, 12, 2, N) what boards move while it reads its rows; None where they stand still.
     """
 
     kind: Kind = "boards"
@@ -227,22 +234,32 @@ class BoardBlock(Block):
         board_points: Tensor,
         shapes: Tensor | None = None,
         by_unknown: Tensor | None = None,
+        motion: Sequence[Tensor | None] = (),
     ) -> None:
         super().__init__(pixels, whitening)
+        self._motion = [
+            None if one is None else WithoutMotion(one, self.whitening[:, c]) for c, one in enumerate(motion)
+        ]
         self._board, self._shapes, self._by_unknown = board_points.T.contiguous(), shapes, by_unknown
 
-    def _shaped(self, state: RigState) -> Tensor:
+    def _white(self, camera: int, rows: Tensor) -> Tensor:
+        white = super()._white(camera, rows)
+        taken_out = self._motion[camera] if self._motion else None
+        return white if taken_out is None else taken_out(white)
+
+    def shaped(self, state: RigState) -> Tensor:
+        """(3, N) the board, meters."""
         if self._shapes is None or not len(self._shapes):
             return self._board
         return self._board + torch.einsum("b,bkn->kn", state.board, self._shapes)
 
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
-        points = state.board_rotation @ self._shaped(state) + state.board_translation[..., None]
+        points = state.board_rotation @ self.shaped(state) + state.board_translation[..., None]
         return points, points.new_ones(len(self), 1, 1)
 
     def _by_local(self, state: RigState, by_q: Tensor, center: Tensor, by_w: Tensor | None) -> Tensor:
         # By ω through ω × (R x), then by v.
-        return step_rows(by_q, state.board_rotation @ self._shaped(state))
+        return step_rows(by_q, state.board_rotation @ self.shaped(state))
 
     def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor | None:
         if self._shapes is None or self._by_unknown is None or not self._by_unknown.any():

@@ -16,6 +16,7 @@ from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
 from kcal.calibrate.rig.knowledge import gathered, joint_unknowns
 from kcal.calibrate.rig.mixups import cost_of_features_behind, refuse_same_camera, swap_warnings
+from kcal.calibrate.rig.motion import motion_warnings
 from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible, without_wrong
 from kcal.calibrate.rig.records import Reasons, item_records, places, source_records
 from kcal.calibrate.rig.repeated_views import without_repeated
@@ -53,6 +54,8 @@ class RigOptions:
             them.
         board_warp: estimate two parabolas by which the board bends, where no calibration knows its shape.
         weighted: let corners count by their covariances where all views have them.
+        motion: boards may move while the rows of an image are read, if they or the cameras are held by hand; how much
+            the boards tell. False: they stand still.
         reject: leave out what contradicts the rest; otherwise warnings name it. Left out or not, it is listed.
         refraction: of light towards landmarks, as a share of the Earth's curvature; estimated from here. For
             simulations and other straight lines it and its sigma are 0.
@@ -63,6 +66,7 @@ class RigOptions:
     intrinsics: Literal["prior", "fixed", "free"] = "prior"
     board_warp: bool = False
     weighted: bool = True
+    motion: bool = True
     reject: bool = True
     refraction: float = REFRACTION
     refraction_sigma: float = REFRACTION_SIGMA
@@ -118,6 +122,8 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     initial = first_poses(data, options.solver)
     masks, reasons = _first_masks(initial, reject=options.reject)
     work = _robust(initial, masks, unknowns)
+    if options.motion:
+        work.fit_motion(possible(work, masks))
     # With lenses among the unknowns digits are dear, and what is wrong shows without them.
     looking = ROUGHLY if unknowns.refine_lenses else options.solver
     if options.reject:
@@ -125,6 +131,8 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     else:
         masks = possible(work, masks)
         warnings += _suspicions(work, masks, reasons, looking)
+    if options.motion:
+        work.fit_motion(masks)
     for _ in range(3):
         work.solve(masks, options.solver)
         before = work.sigma_corner
@@ -301,10 +309,11 @@ def _rig_result(
     only_boards = len(problem.blocks) == 1 and problem.blocks[0].kind == "boards"
     if only_boards and (count := int(masks.boards.sum())) < _FEW_BOARDS:
         warnings.append(f"{count} pair(s) only: a wrong one could not be noticed; 5 or more are good")
-    if only_boards and rms > _HIGH_RMS:
+    if only_boards and rms > _HIGH_RMS and not any(work.motion):
         warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         warnings.append(f"the solver {status.message}")
+    warnings += motion_warnings(data.names, [float(camera.params[0]) for camera in data.cameras], work.motion)
     warnings += doubts
     warnings += [f"not determined by the data: {text}" for text in undetermined]
     whole = [parameter_rows(problem, c) for c in range(len(data.cameras))]

@@ -1,0 +1,140 @@
+"""Boards that move while the rows of a rig's images are read: how much by evidence, and taken out of the residuals.
+
+Each board has, in each camera, a motion of its own beside its pose (`kcal.calibrate.lensfit.readout`). Integrated out
+under a normal prior, whitened residuals r have the covariance I + U Uᵀ, U being their derivatives by the motion times
+its standard deviations, and (I + U Uᵀ)^-½ r takes the place of r.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcal.calibrate.lensfit.evidence import evidence_of_motion, maximize_evidence
+from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
+from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
+from kcal.calibrate.lensfit.readout import MEDIAN, MOTION, ORDERS, Readout
+from kcal.lens.model import LensModel
+from kcal.lens.pose import step_rows
+from kcal.lens.projection import project_components
+from kcal.solve.schur import without_local
+
+# Nats by which motions must raise the evidence to be taken for real, as in the calibration of a single camera.
+_GAIN = 3.0
+_POSE = 6
+_NOTHING = torch.zeros(0, dtype=torch.float64)
+_NO_INDEX = torch.zeros(0, dtype=torch.int64)
+# Of cameras and boards that are as they are.
+_HELD = PriorFamilies(_NOTHING, _NOTHING, _NO_INDEX, _NO_INDEX, _NOTHING)
+_NO_PRIOR = Hyperprior(_NOTHING, _NOTHING)
+
+
+class SeenBoards(NamedTuple):
+    """Boards as one camera sees them.
+
+    Attributes:
+        model: of the camera.
+        parameters: of the camera.
+        rotation: (V, 3, 3) cam_from_board.
+        translation: (V, 3) meters.
+        points: (3, N) the board, meters.
+        pixels: (V, N, 2), NaN where not seen.
+        whitening: (V, 2, 2, N) by which residuals are multiplied; zero where not seen.
+        size: of the image.
+    """
+
+    model: LensModel
+    parameters: Tensor
+    rotation: Tensor
+    translation: Tensor
+    points: Tensor
+    pixels: Tensor
+    whitening: Tensor
+    size: tuple[int, int]
+
+
+class BoardMotion(NamedTuple):
+    """How boards move while a camera reads its rows.
+
+    Attributes:
+        columns: (V, 12, 2, N) derivatives of pixels by a motion, times its standard deviations.
+        sigma: (2,) standard deviations of motions of first and second order: radians, and distances of the board.
+    """
+
+    columns: Tensor
+    sigma: tuple[float, float]
+
+
+def board_motion(seen: SeenBoards, good: Tensor) -> BoardMotion | None:
+    """How boards move while this camera reads its rows; None where they stand still.
+
+    Args:
+        seen: all boards.
+        good: (V,) of which boards the motion is told.
+    """
+    rotated = seen.rotation @ seen.points
+    found = project_components(rotated + seen.translation[..., None], seen.parameters, seen.model, [])
+    usable = good & (found.regular | (seen.whitening == 0).all(1).all(1)).all(-1)
+    if not bool(usable.any()):
+        return None
+    distance = float(seen.translation[usable].norm(dim=-1).median())
+    readout = Readout(center=seen.points.mean(-1), distance=distance, size=seen.size)
+    columns = readout.columns_of(found.by_point, seen.rotation, readout.time(seen.pixels), seen.points)
+    error = found.pixels - seen.pixels.transpose(-1, -2)
+    rows = torch.cat([step_rows(found.by_point, rotated), columns, error[:, None]], 1)
+    rows = torch.einsum("vuwn,vpwn->vpun", seen.whitening, rows.nan_to_num(0.0))[usable].flatten(-2)
+    off = without_local(rows, _POSE)
+    own, residual = off[:, :MOTION], off[:, -1]
+    freedom = float((seen.whitening[usable] != 0).any(1).sum()) - _POSE * len(own)
+    if freedom <= 0:
+        return None
+    cross = (own @ residual[..., None])[..., 0]
+    still = Quadratic(_NOTHING[:, None][:, :0], _NOTHING, float(residual.square().sum()), freedom)
+    data = ViewData(still, own @ own.transpose(1, 2), cross[..., None], own.new_zeros(len(own), 0), cross)
+    start = np.full(ORDERS, math.log(MEDIAN) - 0.5 * math.log(still.c / freedom))
+    best = maximize_evidence(data, _HELD, _NOTHING, still.c / freedom, _NO_PRIOR, start)
+    if evidence_of_motion(data, best, _HELD, 1.0) < _GAIN:
+        return None
+    first, second = (np.exp(best.log_ratio) * math.sqrt(best.variance)).tolist()
+    sigma = torch.tensor([first, second], dtype=torch.float64).repeat_interleave(MOTION // ORDERS)
+    return BoardMotion((columns * sigma[:, None, None]).nan_to_num(0.0), (first, second))
+
+
+class WithoutMotion:
+    """(I + U Uᵀ)^-½ of each view of a camera.
+
+    Args:
+        columns: (V, 12, 2, N) as `BoardMotion.columns`.
+        whitening: (V, 2, 2, N).
+    """
+
+    def __init__(self, columns: Tensor, whitening: Tensor) -> None:
+        self._columns = torch.einsum("vuwn,vpwn->vpun", whitening, columns).flatten(-2)
+        values, vectors = torch.linalg.eigh(self._columns @ self._columns.transpose(-1, -2))
+        root = (1.0 + values.clamp_min(0.0)).sqrt()
+        # (1 / √(1 + λ) - 1) / λ, for small λ too.
+        shrink = -1.0 / (root * (1.0 + root))
+        self._inner = (vectors * shrink[:, None]) @ vectors.transpose(-1, -2)
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """(V, P, R) whitened rows, with motions integrated out."""
+        along = rows @ self._columns.transpose(-1, -2)
+        return rows + along @ self._inner @ self._columns
+
+
+def motion_warnings(names: Sequence[str], focal: Sequence[float], motions: Sequence[BoardMotion | None]) -> list[str]:
+    """One warning for each camera before which boards moved."""
+    found = []
+    for name, length, motion in zip(names, focal, motions, strict=True):
+        if motion is not None:
+            moved = length * math.hypot(motion.sigma[0], 0.25 * motion.sigma[1])
+            found.append(
+                f"the boards or {name} moved while rows were read (rolling shutter), by some {moved:.1f} px from the "
+                "first row to the last: this is taken out, and the covariance allows for it; stands make it smaller"
+            )
+    return found
