@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
@@ -19,16 +17,15 @@ def motion_warnings(fit: HybridFit) -> list[str]:
     """A warning where the camera or the board moved while an image was read, with how much that moved corners."""
     if fit.motion_sigma is None or fit.readout is None:
         return []
-    first, second = fit.motion_sigma
-    if max(first, second) > _LIMIT * LARGEST:
+    if max(fit.motion_sigma) > _LIMIT * LARGEST:
         return [
             "while an image is read, views move by more than any hand does: these motions stand for something else "
             "(wrong corners, a board that flexes, a cropped or stabilized video); look at the views that fit worst, "
             "and photograph a stiff board on a stand"
         ]
     lines = "column" if fit.readout.columns else "row"
-    # From the first line to the last; the second order covers a quarter of that, as it is the same at both ends.
-    moved = float(fit.camera.params[0]) * math.hypot(first, 0.25 * second)
+    reach = float((fit.board_points - fit.readout.center).norm(dim=-1).max()) / fit.readout.distance
+    moved = fit.motion_sigma.moved(float(fit.camera.params[0]), reach)
     if moved < _FELT * fit.sigma:
         return []
     return [

@@ -112,7 +112,7 @@ class Maximum(NamedTuple):
 
     Attributes:
         h: (H,) hyperparameters of the modes.
-        log_ratio: (2,) logarithms of the motions' standard deviations over the noise; () where views stand still.
+        log_ratio: (4,) logarithms of the motions' standard deviations over the noise; () where views stand still.
         variance: of the noise.
         loss: the negative logarithm of the evidence.
     """

@@ -24,7 +24,7 @@ from kcal.calibrate.lensfit.evidence import (
 from kcal.calibrate.lensfit.families import Hyperprior
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, overdispersion, quadratic_of, view_data
-from kcal.calibrate.lensfit.readout import LARGEST, MOTION, ORDERS, Readout, motion_sigma, stillness
+from kcal.calibrate.lensfit.readout import AMPLITUDES, LARGEST, MOTION, Readout, motion_sigma, stillness
 from kcal.solve.lm import LMOptions, minimize
 
 _ROUNDS = 12
@@ -150,7 +150,7 @@ def begin_motion(capture: FittedViews, estimate: Estimate) -> Estimate:
     if (len(estimate.log_ratio) > 0) == moving and len(estimate.state.motion) == count:
         return estimate
     state = estimate.state._replace(motion=estimate.state.rotation.new_zeros(count, MOTION if moving else 0))
-    ratio = np.full(ORDERS, math.log(_MOVING) - 0.5 * math.log(estimate.variance / estimate.tempering))
+    ratio = np.full(AMPLITUDES, math.log(_MOVING) - 0.5 * math.log(estimate.variance / estimate.tempering))
     return estimate._replace(state=state, log_ratio=ratio if moving else NO_MOTION)
 
 
@@ -261,7 +261,8 @@ def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -
     readout, estimate = rounds.capture.readout, rounds.estimate
     if readout is None:
         return False
-    if not rounds.converged or motion_sigma(estimate.log_ratio, estimate.variance / estimate.tempering)[0] > _TOO_MUCH:
+    found = motion_sigma(estimate.log_ratio, estimate.variance / estimate.tempering)
+    if not rounds.converged or max(found.turn, found.shift) > _TOO_MUCH:
         return True
     losses = []
     still = estimate.state._replace(motion=torch.zeros_like(estimate.state.motion))

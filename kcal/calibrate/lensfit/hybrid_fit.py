@@ -30,7 +30,7 @@ from kcal.calibrate.lensfit.fleet import LensPrior
 from kcal.calibrate.lensfit.hybrid_problem import HybridState, hybrid_unknowns
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.calibrate.lensfit.quadratic import posterior_root, quadratic_of
-from kcal.calibrate.lensfit.readout import Readout, motion_sigma, stillness
+from kcal.calibrate.lensfit.readout import MotionSigma, Readout, motion_sigma, stillness
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
@@ -60,7 +60,7 @@ class HybridFit:
         effective: number of parameters that the data determine.
         square: whether pixels are square.
         readout: how views move while they are read; None: they stand still.
-        log_ratio: (2,) logarithms of the motions' standard deviations of first and second order over the noise, ().
+        log_ratio: (4,) logarithms of the motions' standard deviations over the noise, as in `MotionSigma`; ().
         board_shapes: modes of the board.
         board_points: (N, 3) meters, the board as it was measured.
         residuals: (V, N, 2) projected minus observed, pixels, weights left out; NaN where a corner did not count.
@@ -114,8 +114,8 @@ class HybridFit:
         return stillness(self.log_ratio)
 
     @property
-    def motion_sigma(self) -> tuple[float, float] | None:
-        """Standard deviations of motions of first and second order: radians, and distances of the board."""
+    def motion_sigma(self) -> MotionSigma | None:
+        """Standard deviations of motions; None where views stand still."""
         return motion_sigma(self.log_ratio, self.sigma**2 / self.tempering) if self.readout else None
 
     def residuals_of(self, pixels: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.readout import MOTION, ORDERS
+from kcal.calibrate.lensfit.readout import AMPLITUDES, MOTION
 
 Array = npt.NDArray[np.float64]
 
@@ -59,7 +59,7 @@ class ViewData(NamedTuple):
 
     def integrated(self, log_ratio: Array) -> Integrated:
         """With motions integrated out, whose standard deviation over the noise has these logarithms by order."""
-        ratio = np.repeat(np.exp(log_ratio), MOTION // ORDERS)
+        ratio = np.repeat(np.exp(log_ratio), MOTION // AMPLITUDES)
         matrix = self.own * torch.from_numpy(ratio[:, None] * ratio)
         matrix.diagonal(dim1=-2, dim2=-1).add_(1.0)
         root = torch.linalg.cholesky(matrix)
@@ -76,7 +76,7 @@ class ViewData(NamedTuple):
 
     def scores(self, log_ratio: Array) -> Tensor:
         """(V, S) derivatives of each view's -½ chi² by the shared unknowns, motions integrated out."""
-        ratio = np.repeat(np.exp(log_ratio), MOTION // ORDERS)
+        ratio = np.repeat(np.exp(log_ratio), MOTION // AMPLITUDES)
         matrix = self.own + torch.diag(torch.from_numpy(ratio**-2.0))
         best = torch.linalg.solve(matrix, self.residual[..., None])
         return self.score - (self.cross[..., :-1].transpose(1, 2) @ best)[..., 0]
@@ -98,7 +98,7 @@ class Integrated(NamedTuple):
     half: Tensor
 
     def slopes(self, x: Array, factor: Tensor, variance: float, tempering: float) -> Array:
-        """(2,) derivatives of -ln p by the logarithms of the ratios.
+        """(4,) derivatives of -ln p by the logarithms of the ratios.
 
         Each is the sum over motions of 1 less the posterior's second moment in units of the prior.
 
@@ -116,7 +116,7 @@ class Integrated(NamedTuple):
         reach[..., 0] += self.half[..., -1]
         moments = (inverse.transpose(1, 2) @ reach).square().sum(-1) / variance
         by_motion = ((1.0 - kept) - moments).sum(0) / tempering
-        return by_motion.view(ORDERS, -1).sum(1).numpy()
+        return by_motion.view(AMPLITUDES, -1).sum(1).numpy()
 
 
 def quadratic_of(off: Tensor, x: Tensor, freedom: float) -> Quadratic:

@@ -6,22 +6,25 @@ second order in g: a turn ω of the board about its centroid c and a shift of it
     X = R (P + ω × (P - c)) + t + d s,   ω = g ω₁ + g² ω₂,   s = g s₁ + g² s₂
 
 ω (radians) is in the board's frame and s in the camera's. Twelve numbers for each view are many; they are integrated
-out under a normal prior, whose two standard deviations, of first and of second order, the evidence of all views sets.
+out under a normal prior, whose four standard deviations the evidence of all views sets: of turns and of shifts, of
+first and of second order (hands turn by more than they shift).
 Rows that are read upward are the same with another sign; where a picture was turned, columns stand for rows.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-# Numbers of a motion: for each order three of the turn and three of the shift.
+# Numbers of a motion: for each order three of the turn and three of the shift, of which each three have an amplitude.
 MOTION = 12
 ORDERS = 2
+AMPLITUDES = 4
 # Median and standard deviation of the logarithm of a motion's standard deviation: radians, and distances of the board,
 # while an image is read. A hand that turns by 1 rad/s moves by 0.03 in 30 ms: beyond it is no motion. Below the
 # smallest no pixel feels it.
@@ -84,19 +87,45 @@ class Readout:
 
 
 def stillness(log_ratio: np.ndarray) -> Tensor:
-    """(12,) weights of a motion's numbers, from the logarithms (2,) of their deviations over the noise; or none, ()."""
-    return torch.from_numpy(np.exp(-2.0 * log_ratio)).repeat_interleave(MOTION // ORDERS)
+    """(12,) weights of a motion's numbers, from the logarithms (4,) of their deviations over the noise; or none, ()."""
+    return torch.from_numpy(np.exp(-2.0 * log_ratio)).repeat_interleave(MOTION // AMPLITUDES)
 
 
-def motion_sigma(log_ratio: np.ndarray, variance: float) -> tuple[float, float]:
-    """Standard deviations of motions of first and second order, radians and distances of the board.
+class MotionSigma(NamedTuple):
+    """Standard deviations of motions along each axis, while an image is read.
+
+    Attributes:
+        turn: of first order, radians.
+        shift: of first order, distances of the board.
+        turn_twice: of second order.
+        shift_twice: of second order.
+    """
+
+    turn: float
+    shift: float
+    turn_twice: float
+    shift_twice: float
+
+    def moved(self, focal: float, reach: float) -> float:
+        """Pixels by which a corner moves from the first row to the last.
+
+        Args:
+            focal: length, pixels.
+            reach: of the board about its middle, distances of the board.
+        """
+        # The second order covers a quarter of that, as it is the same at both ends.
+        turn, shift = math.hypot(self.turn, 0.25 * self.turn_twice), math.hypot(self.shift, 0.25 * self.shift_twice)
+        return focal * math.hypot(shift, reach * turn)
+
+
+def motion_sigma(log_ratio: np.ndarray, variance: float) -> MotionSigma:
+    """Standard deviations of motions.
 
     Args:
-        log_ratio: (2,) their logarithms over the noise.
+        log_ratio: (4,) their logarithms over the noise.
         variance: of the noise.
     """
-    first, second = np.exp(log_ratio) * np.sqrt(variance)
-    return float(first), float(second)
+    return MotionSigma(*(np.exp(log_ratio) * np.sqrt(variance)).tolist())
 
 
 class MovedBoard(NamedTuple):

@@ -24,6 +24,8 @@ from kcal.solve.robust import RobustLoss
 _LEAST_SIGMA = 1e-3
 # Boards whose mean square is this many times the typical one do not tell how others move.
 _WRONG = 9.0
+# How often each camera's motions are found, those of the others being known: the second time changes little.
+_TURNS = 2
 
 
 def chi2_quantile(dof: Tensor, probability: float) -> Tensor:
@@ -165,31 +167,28 @@ class Adjustment:
         boards, state = self.data.boards, self.state
         if boards is None or not bool(masks.boards.any()):
             return
-        problem = self.problem(masks)
-        block = next(block for block in problem.blocks if isinstance(block, BoardBlock))
+        everything = masks._replace(boards=torch.ones_like(masks.boards))
         # Boards that are off by far are wrong, not moved.
         square = self.squares(masks).boards / self.freedom(masks).boards.clamp_min(1)
         good = masks.boards & (square <= _WRONG * square[masks.boards].median())
-        shaped, white = block.shaped(state), self.corner_whitening()
-        found: list[BoardMotion | None] = []
-        for c, posed in enumerate(problem.posed(state)):
-            seen = torch.isfinite(boards.pixels[:, c]).all(-1)
-            found.append(
-                board_motion(
-                    SeenBoards(
-                        model=posed.camera.model,
-                        parameters=posed.parameters,
-                        rotation=posed.rotation @ state.board_rotation,
-                        translation=(state.board_translation - posed.center) @ posed.rotation.T,
-                        points=shaped,
-                        pixels=boards.pixels[:, c],
-                        whitening=torch.where(seen[..., None, None], white[:, c], 0.0).movedim(1, -1),
-                        size=posed.camera.size,
-                    ),
-                    good & seen.any(-1),
-                )
+        for c in list(range(len(self.data.cameras))) * _TURNS:
+            self.motion[c] = None
+            problem = self.problem(everything)
+            block = next(block for block in problem.blocks if isinstance(block, BoardBlock))
+            posed = problem.posed(state)
+            rows = block.rows(posed, state, problem.shared_size)
+            seen = SeenBoards(
+                model=posed[c].camera.model,
+                parameters=posed[c].parameters,
+                rotation=posed[c].rotation @ state.board_rotation,
+                translation=(state.board_translation - posed[c].center) @ posed[c].rotation.T,
+                points=block.shaped(state),
+                pixels=boards.pixels[:, c],
+                whitening=block.whitening[:, c],
+                size=posed[c].camera.size,
             )
-        self.motion = found
+            local = torch.cat([rows[:, : block.size], rows[:, -1:]], 1)
+            self.motion[c] = board_motion(seen, local, 2 * c * boards.pixels.shape[2], good)
 
     def fit_corners(self, masks: PerKind, *, robust: bool = False) -> None:
         """Set the corners' sigma from the boards' residuals, unless it was given.

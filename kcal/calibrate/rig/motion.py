@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.evidence import evidence_of_motion, maximize_evidence
+from kcal.calibrate.lensfit.amplitudes import expected_amplitudes
+from kcal.calibrate.lensfit.evidence import evidence_loss, evidence_of_motion, hyper_bounds, maximize_evidence
 from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
-from kcal.calibrate.lensfit.readout import MEDIAN, MOTION, ORDERS, Readout
+from kcal.calibrate.lensfit.readout import AMPLITUDES, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
 from kcal.lens.model import LensModel
-from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from kcal.solve.schur import without_local
 
@@ -63,46 +63,55 @@ class BoardMotion(NamedTuple):
 
     Attributes:
         columns: (V, 12, 2, N) derivatives of pixels by a motion, times its standard deviations.
-        sigma: (2,) standard deviations of motions of first and second order: radians, and distances of the board.
+        sigma: standard deviations of motions.
+        reach: of the board about its middle, distances of the board.
     """
 
     columns: Tensor
-    sigma: tuple[float, float]
+    sigma: MotionSigma
+    reach: float
 
 
-def board_motion(seen: SeenBoards, good: Tensor) -> BoardMotion | None:
+def board_motion(seen: SeenBoards, rows: Tensor, start: int, good: Tensor) -> BoardMotion | None:
     """How boards move while this camera reads its rows; None where they stand still.
 
     Args:
         seen: all boards.
+        rows: (V, 7, R) of all cameras, whitened, other cameras' motions integrated out: derivatives of residuals by the
+            boards' poses, and the residuals.
+        start: where the 2 N rows of this camera begin.
         good: (V,) of which boards the motion is told.
     """
-    rotated = seen.rotation @ seen.points
-    found = project_components(rotated + seen.translation[..., None], seen.parameters, seen.model, [])
-    usable = good & (found.regular | (seen.whitening == 0).all(1).all(1)).all(-1)
-    if not bool(usable.any()):
+    points_cam = seen.rotation @ seen.points + seen.translation[..., None]
+    found = project_components(points_cam, seen.parameters, seen.model, [])
+    good = good & rows.isfinite().all(-1).all(-1)
+    if not bool(good.any()):
         return None
-    distance = float(seen.translation[usable].norm(dim=-1).median())
+    distance = float(seen.translation[good].norm(dim=-1).median())
     readout = Readout(center=seen.points.mean(-1), distance=distance, size=seen.size)
-    columns = readout.columns_of(found.by_point, seen.rotation, readout.time(seen.pixels), seen.points)
-    error = found.pixels - seen.pixels.transpose(-1, -2)
-    rows = torch.cat([step_rows(found.by_point, rotated), columns, error[:, None]], 1)
-    rows = torch.einsum("vuwn,vpwn->vpun", seen.whitening, rows.nan_to_num(0.0))[usable].flatten(-2)
-    off = without_local(rows, _POSE)
+    columns = readout.columns_of(found.by_point, seen.rotation, readout.time(seen.pixels), seen.points).nan_to_num(0.0)
+    white = torch.einsum("vuwn,vpwn->vpun", seen.whitening, columns).flatten(-2)
+    moving = torch.zeros(*white.shape[:2], rows.shape[-1], dtype=rows.dtype)
+    moving[..., start : start + white.shape[-1]] = white
+    off = without_local(torch.cat([rows[:, :_POSE], moving, rows[:, _POSE:]], 1)[good], _POSE)
     own, residual = off[:, :MOTION], off[:, -1]
-    freedom = float((seen.whitening[usable] != 0).any(1).sum()) - _POSE * len(own)
+    freedom = float((rows[good, :_POSE] != 0).any(1).sum()) - _POSE * len(own)
     if freedom <= 0:
         return None
     cross = (own @ residual[..., None])[..., 0]
     still = Quadratic(_NOTHING[:, None][:, :0], _NOTHING, float(residual.square().sum()), freedom)
     data = ViewData(still, own @ own.transpose(1, 2), cross[..., None], own.new_zeros(len(own), 0), cross)
-    start = np.full(ORDERS, math.log(MEDIAN) - 0.5 * math.log(still.c / freedom))
-    best = maximize_evidence(data, _HELD, _NOTHING, still.c / freedom, _NO_PRIOR, start)
+    begin = np.full(AMPLITUDES, math.log(MEDIAN) - 0.5 * math.log(still.c / freedom))
+    best = maximize_evidence(data, _HELD, _NOTHING, still.c / freedom, _NO_PRIOR, begin)
     if evidence_of_motion(data, best, _HELD, 1.0) < _GAIN:
         return None
-    first, second = (np.exp(best.log_ratio) * math.sqrt(best.variance)).tolist()
-    sigma = torch.tensor([first, second], dtype=torch.float64).repeat_interleave(MOTION // ORDERS)
-    return BoardMotion((columns * sigma[:, None, None]).nan_to_num(0.0), (first, second))
+    log_variance = math.log(best.variance)
+    at, bounds = np.append(best.log_ratio, log_variance), hyper_bounds(_NO_PRIOR, AMPLITUDES, log_variance)
+    expected = expected_amplitudes(evidence_loss(data, _HELD, _NO_PRIOR, 1.0), at, list(range(AMPLITUDES)), bounds)
+    sigma = motion_sigma(expected[:-1], best.variance)
+    each = torch.tensor(sigma, dtype=torch.float64).repeat_interleave(MOTION // AMPLITUDES)
+    reach = float((seen.points.T - readout.center).norm(dim=-1).max()) / distance
+    return BoardMotion(columns * each[:, None, None], sigma, reach)
 
 
 class WithoutMotion:
@@ -132,7 +141,7 @@ def motion_warnings(names: Sequence[str], focal: Sequence[float], motions: Seque
     found = []
     for name, length, motion in zip(names, focal, motions, strict=True):
         if motion is not None:
-            moved = length * math.hypot(motion.sigma[0], 0.25 * motion.sigma[1])
+            moved = motion.sigma.moved(length, motion.reach)
             found.append(
                 f"the boards or {name} moved while rows were read (rolling shutter), by some {moved:.1f} px from the "
                 "first row to the last: this is taken out, and the covariance allows for it; stands make it smaller"
