@@ -12,7 +12,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
-from kcal.lens.zernike import ASPECT, ASTIGMATIC, DECENTERED, OTHER, RADIAL, ZernikeModes
+from kcal.lens.zernike import ASPECT, ASTIGMATIC, DECENTERED, OTHER, RADIAL, TILTED, ZernikeModes
 
 MODELS = ("opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "ext20", "ext24")
 # A hybrid lens with modes of every family; points with |x|, |y| <= 0.6 are well inside its disc.
@@ -40,7 +40,7 @@ def strong(model: str | LensModel) -> Tensor:
 # Amplitude in radii of the disc, decay per degree and first degree of each family of modes, as in calibrated lenses.
 _TYPICAL = {
     RADIAL: (5e-4, 0.5, 5), DECENTERED: (3e-4, 0.6, 2), ASTIGMATIC: (5e-5, 0.6, 3), OTHER: (4e-5, 0.6, 2),
-    ASPECT: (1e-4, 0.0, 1),
+    TILTED: (3e-4, 0.0, 2), ASPECT: (1e-4, 0.0, 1),
 }  # fmt: skip
 # Shape of the base projection and angle of the image's corner off axis, degrees.
 KINDS = {"webcam": (0.9, 36.0), "wide": (0.2, 75.0), "pinhole": (1.0, 30.0), "tanh": (-0.3, 60.0)}

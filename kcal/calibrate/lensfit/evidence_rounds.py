@@ -37,7 +37,7 @@ _FIRST, _LATER, LAST = (8, 0.1), (12, 0.02), (10, 0.01)
 _DRIFT = 5.0
 # Motions beyond this stand for something else.
 _TOO_MUCH = 0.5 * LARGEST
-# Hyperparameters have come to rest when none moves by more.
+# Hyperparameters have come to rest when none, nor the logarithm of the tempering, moves by more.
 _AT_REST = 0.1
 # With which motions begin: as a hand moves. From that of still views, field and board explain the motion first, and
 # the evidence has another maximum there (one of sixty simulated captures by hand).
@@ -203,6 +203,7 @@ def run_rounds(
             tempering,
         )
         change = _moved_by(estimate, best)
+        change = max(change, abs(math.log(tempering / former)))
         resting = not first and change < _AT_REST and steps <= 2
         estimate = estimate._replace(
             hyperparameters=best.h,

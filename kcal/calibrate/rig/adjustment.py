@@ -187,8 +187,7 @@ class Adjustment:
                 whitening=block.whitening[:, c],
                 size=posed[c].camera.size,
             )
-            local = torch.cat([rows[:, : block.size], rows[:, -1:]], 1)
-            self.motion[c] = board_motion(seen, local, 2 * c * boards.pixels.shape[2], good)
+            self.motion[c] = board_motion(seen, rows, 2 * c * boards.pixels.shape[2], good)
 
     def fit_corners(self, masks: PerKind, *, robust: bool = False) -> None:
         """Set the corners' sigma from the boards' residuals, unless it was given.

@@ -18,20 +18,24 @@ from torch import Tensor
 from kcal.calibrate.lensfit.amplitudes import expected_amplitudes
 from kcal.calibrate.lensfit.evidence import evidence_loss, evidence_of_motion, hyper_bounds, maximize_evidence
 from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
-from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
+from kcal.calibrate.lensfit.quadratic import ViewData, view_data
 from kcal.calibrate.lensfit.readout import AMPLITUDES, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.solve.schur import without_local
 
-# Nats by which motions must raise the evidence to be taken for real, as in the calibration of a single camera.
-_GAIN = 3.0
+# Nats by which motions must raise the evidence to be taken for real, as in the calibration of a single camera; of which
+# those boards must tell a part that are left without the board that tells most. And the mean square of residuals, in
+# sigmas, below which corners have no noise.
+_GAIN, _GAIN_OF_OTHERS, _EXACT = 3.0, 1.0, 0.01
 _POSE = 6
-_NOTHING = torch.zeros(0, dtype=torch.float64)
-_NO_INDEX = torch.zeros(0, dtype=torch.int64)
-# Of cameras and boards that are as they are.
-_HELD = PriorFamilies(_NOTHING, _NOTHING, _NO_INDEX, _NO_INDEX, _NOTHING)
-_NO_PRIOR = Hyperprior(_NOTHING, _NOTHING)
+# Of what boards share, in standard deviations of the noise: they tell it.
+_WIDE = 1e3
+# Of fewer boards, one that is wrong cannot be told from motion.
+_FEWEST = 3
+# One amplitude, which stands for none.
+_NONE = torch.zeros(1, dtype=torch.float64)
+_NO_PRIOR = Hyperprior(_NONE, torch.ones_like(_NONE))
 
 
 class SeenBoards(NamedTuple):
@@ -77,15 +81,15 @@ def board_motion(seen: SeenBoards, rows: Tensor, start: int, good: Tensor) -> Bo
 
     Args:
         seen: all boards.
-        rows: (V, 7, R) of all cameras, whitened, other cameras' motions integrated out: derivatives of residuals by the
-            boards' poses, and the residuals.
+        rows: (V, 6 + S + 1, R) of all cameras, whitened, other cameras' motions integrated out: derivatives of
+            residuals by the boards' poses and by what they share, and the residuals.
         start: where the 2 N rows of this camera begin.
         good: (V,) of which boards the motion is told.
     """
     points_cam = seen.rotation @ seen.points + seen.translation[..., None]
     found = project_components(points_cam, seen.parameters, seen.model, [])
     good = good & rows.isfinite().all(-1).all(-1)
-    if not bool(good.any()):
+    if int(good.sum()) < _FEWEST:
         return None
     distance = float(seen.translation[good].norm(dim=-1).median())
     readout = Readout(center=seen.points.mean(-1), distance=distance, size=seen.size)
@@ -94,24 +98,43 @@ def board_motion(seen: SeenBoards, rows: Tensor, start: int, good: Tensor) -> Bo
     moving = torch.zeros(*white.shape[:2], rows.shape[-1], dtype=rows.dtype)
     moving[..., start : start + white.shape[-1]] = white
     off = without_local(torch.cat([rows[:, :_POSE], moving, rows[:, _POSE:]], 1)[good], _POSE)
-    own, residual = off[:, :MOTION], off[:, -1]
-    freedom = float((rows[good, :_POSE] != 0).any(1).sum()) - _POSE * len(own)
-    if freedom <= 0:
+    counts = (rows[good, :_POSE] != 0).any(1).sum(-1) - _POSE
+    shared = off[:, MOTION:-1].transpose(0, 1).flatten(1).norm(dim=1)
+    families = _hardly_known(torch.where(shared > 0, _WIDE / shared, 0.0))
+    zero = torch.zeros_like(shared)
+
+    def told_by(views: Tensor) -> ViewData:
+        return view_data(off[views], zero, off.new_zeros(int(views.sum()), MOTION), float(counts[views].sum()))
+
+    every = torch.ones(len(off), dtype=torch.bool)
+    data = told_by(every)
+    variance = float(off[:, -1].square().sum()) / max(float(counts.sum()), 1.0)
+    # Nothing is left to explain of corners without noise.
+    if variance < _EXACT:
         return None
-    cross = (own @ residual[..., None])[..., 0]
-    still = Quadratic(_NOTHING[:, None][:, :0], _NOTHING, float(residual.square().sum()), freedom)
-    data = ViewData(still, own @ own.transpose(1, 2), cross[..., None], own.new_zeros(len(own), 0), cross)
-    begin = np.full(AMPLITUDES, math.log(MEDIAN) - 0.5 * math.log(still.c / freedom))
-    best = maximize_evidence(data, _HELD, _NOTHING, still.c / freedom, _NO_PRIOR, begin)
-    if evidence_of_motion(data, best, _HELD, 1.0) < _GAIN:
+    begin = np.full(AMPLITUDES, math.log(MEDIAN) - 0.5 * math.log(variance))
+    best = maximize_evidence(data, families, _NONE, variance, _NO_PRIOR, begin)
+    # What a single board tells of is wrong with that board.
+    explained = data.integrated(best.log_ratio).half[..., -1].square().sum(-1)
+    others = every.clone()
+    others[int(explained.argmax())] = False
+    gain, without_one = (evidence_of_motion(told_by(views), best, families, 1.0) for views in (every, others))
+    if gain < _GAIN or without_one < _GAIN_OF_OTHERS:
         return None
     log_variance = math.log(best.variance)
-    at, bounds = np.append(best.log_ratio, log_variance), hyper_bounds(_NO_PRIOR, AMPLITUDES, log_variance)
-    expected = expected_amplitudes(evidence_loss(data, _HELD, _NO_PRIOR, 1.0), at, list(range(AMPLITUDES)), bounds)
-    sigma = motion_sigma(expected[:-1], best.variance)
+    at, bounds = np.array([0.0, *best.log_ratio, log_variance]), hyper_bounds(_NO_PRIOR, AMPLITUDES, log_variance)
+    which = list(range(1, 1 + AMPLITUDES))
+    expected = expected_amplitudes(evidence_loss(data, families, _NO_PRIOR, 1.0), at, which, bounds)
+    sigma = motion_sigma(expected[1:-1], best.variance)
     each = torch.tensor(sigma, dtype=torch.float64).repeat_interleave(MOTION // AMPLITUDES)
     reach = float((seen.points.T - readout.center).norm(dim=-1).max()) / distance
     return BoardMotion(columns * each[:, None, None], sigma, reach)
+
+
+def _hardly_known(deviation: Tensor) -> PriorFamilies:
+    """Priors of unknowns about zero with these standard deviations; unknowns of no effect are held."""
+    none = torch.full(deviation.shape, -1)
+    return PriorFamilies(torch.zeros_like(deviation), deviation.log(), none, none, torch.zeros_like(deviation))
 
 
 class WithoutMotion:
@@ -144,6 +167,7 @@ def motion_warnings(names: Sequence[str], focal: Sequence[float], motions: Seque
             moved = motion.sigma.moved(length, motion.reach)
             found.append(
                 f"the boards or {name} moved while rows were read (rolling shutter), by some {moved:.1f} px from the "
-                "first row to the last: this is taken out, and the covariance allows for it; stands make it smaller"
+                "first row to the last: this is taken out, and the covariance allows for it; stands make it smaller "
+                "(if nothing moved, pairs are mixed up or a camera is wrong)"
             )
     return found

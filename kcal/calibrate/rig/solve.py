@@ -309,7 +309,7 @@ def _rig_result(
     only_boards = len(problem.blocks) == 1 and problem.blocks[0].kind == "boards"
     if only_boards and (count := int(masks.boards.sum())) < _FEW_BOARDS:
         warnings.append(f"{count} pair(s) only: a wrong one could not be noticed; 5 or more are good")
-    if only_boards and rms > _HIGH_RMS and not any(work.motion):
+    if only_boards and rms > _HIGH_RMS:
         warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         warnings.append(f"the solver {status.message}")

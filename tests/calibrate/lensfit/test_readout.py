@@ -16,7 +16,7 @@ from kcal.calibrate.lensfit.families import prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, unknown_values
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, view_data
-from kcal.calibrate.lensfit.readout import LARGEST, MEDIAN, MOTION, SMALLEST, SPREAD, Readout, stillness
+from kcal.calibrate.lensfit.readout import AMPLITUDES, LARGEST, MEDIAN, MOTION, SMALLEST, SPREAD, Readout, stillness
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
@@ -30,6 +30,8 @@ BOARD = Board(columns=9, rows=7, square=0.04)
 SIZE = (1280, 960)
 MODES = ZernikeModes(radial=9, decentered=4, astigmatic=3, other=2)
 NOISE = 0.05
+# Of turns and shifts of first and second order, as they are drawn.
+MOVES = (2e-3, 7e-4, 5e-4, 1e-3)
 
 
 def truth() -> Camera:
@@ -92,7 +94,7 @@ def moving_problem(square: bool) -> tuple[HybridProblem, HybridState]:
     readout = Readout(center=BOARD.points.mean(0), distance=0.6, size=SIZE)
     problem = HybridProblem(
         BOARD.points, shapes, pixels, torch.ones(4, BOARD.corners, dtype=F64), model, torch.zeros(count, dtype=F64),
-        torch.zeros(count, dtype=F64), readout, stillness(np.array([-3.0, -2.0])), square,
+        torch.zeros(count, dtype=F64), readout, stillness(np.array([-3.0, -2.0, -4.0, -2.5])), square,
     )  # fmt: skip
     params = torch.zeros(5 + model.size, dtype=F64)
     params[:4] = torch.tensor([800.0, 800.0 if square else 830.0, 640.0, 480.0])
@@ -133,13 +135,13 @@ def test_motions_are_eliminated_like_poses() -> None:
     reduced = matrix / scale[:, None] / scale
     torch.testing.assert_close(flat[:-1] @ flat[:-1].T, reduced, rtol=1e-6, atol=1e-6 * float(reduced.max()))
     data = view_data(problem.motion_without_poses(state), x, state.motion, 100.0)
-    ratio = np.array([-3.0, -2.0])
+    ratio = np.array([-3.0, -2.0, -4.0, -2.5])
     found = data.integrated(ratio)
     torch.testing.assert_close(found.data.K, reduced, rtol=1e-6, atol=1e-6 * float(reduced.max()))
     # Chi² at any x is that of residuals whose covariance contains the motions.
     each = problem.motion_without_poses(state)
     there = x + 1e-3 * torch.randn(len(x), generator=torch.Generator().manual_seed(3), dtype=F64) / scale
-    spread = torch.exp(torch.from_numpy(ratio)).repeat_interleave(6)
+    spread = torch.exp(torch.from_numpy(ratio)).repeat_interleave(3)
     chi2 = logdet = 0.0
     for rows, motion in zip(each, state.motion, strict=True):
         still = rows[-1] - motion @ rows[:MOTION] + (there - x) @ rows[MOTION:-1]
@@ -176,7 +178,7 @@ def linear_views() -> tuple[ViewData, object]:
     lens = torch.randn(views, size, residuals, generator=generator, dtype=F64) / deviation[:, None]
     motion = 1e3 * torch.randn(views, MOTION, residuals, generator=generator, dtype=F64)
     x = deviation * torch.randn(size, generator=generator, dtype=F64)
-    moves = torch.tensor([2e-3, 5e-4], dtype=F64).repeat_interleave(6)
+    moves = torch.tensor(MOVES, dtype=F64).repeat_interleave(3)
     m = moves * torch.randn(views, MOTION, generator=generator, dtype=F64)
     error = torch.einsum("s,vsr->vr", x, lens) + torch.einsum("vm,vmr->vr", m, motion)
     error = -error + 0.3 * torch.randn(views, residuals, generator=generator, dtype=F64)
@@ -190,11 +192,11 @@ def test_deviations_of_motions_by_evidence() -> None:
     """They come back as they were drawn; and the evidence is a maximum, which its slopes must have led to."""
     data, (families, modes) = linear_views()
     prior = typical_hyperprior(modes)
-    start = np.full(2, math.log(MEDIAN / 0.3))
+    start = np.full(AMPLITUDES, math.log(MEDIAN / 0.3))
     best = maximize_evidence(data, families, prior.mean, 0.2, prior, start)
     found = np.exp(best.log_ratio) * math.sqrt(best.variance)
-    # 180 numbers each know their deviation to 5 %.
-    assert found == pytest.approx([2e-3, 5e-4], rel=0.2)
+    # 90 numbers each know their deviation to 8 %.
+    assert found == pytest.approx(MOVES, rel=0.3)
     assert best.variance == pytest.approx(0.09, rel=0.1)
 
     def value(h: Tensor, ratio: np.ndarray, variance: float) -> float:
@@ -209,9 +211,9 @@ def test_deviations_of_motions_by_evidence() -> None:
         return 0.5 * (inner + float(z @ z) + float(w @ w))
 
     assert best.loss == pytest.approx(value(best.h, best.log_ratio, best.variance), rel=1e-9)
-    for k in range(2):
+    for k in range(AMPLITUDES):
         for sign in (-0.1, 0.1):
-            step = np.zeros(2)
+            step = np.zeros(AMPLITUDES)
             step[k] = sign
             assert value(best.h, best.log_ratio + step, best.variance) > best.loss
     assert value(best.h, best.log_ratio, 1.1 * best.variance) > best.loss
@@ -222,8 +224,9 @@ def test_motion_is_found_and_taken_out() -> None:
     """Its deviation as drawn, the noise, and a lens that a fit of still views does not find."""
     found, still = fitted(2e-3), fitted(2e-3, motion=False)
     assert found.motion_sigma is not None
-    # Twelve views: 72 numbers each.
-    assert found.motion_sigma == pytest.approx((2e-3, 2e-3), rel=0.45)
+    # Twelve views: 36 numbers each, of which poses take up a part, and of second order most.
+    assert found.motion_sigma[:2] == pytest.approx((2e-3, 2e-3), rel=0.5)
+    assert max(found.motion_sigma[2:]) < 4e-3
     assert found.sigma == pytest.approx(NOISE, rel=0.15)
     assert found.rms == pytest.approx(NOISE * math.sqrt(2.0), rel=0.15)
     assert off(found.camera) < 0.5 * off(still.camera)
@@ -296,7 +299,7 @@ def test_limits_of_motions() -> None:
     data, (families, modes) = linear_views()
     prior = typical_hyperprior(modes)
     wild = ViewData(data.still, data.own * 1e-6, data.cross * 1e-3, data.score, data.residual * 1e-3)
-    best = maximize_evidence(wild, families, prior.mean, 0.09, prior, np.full(2, math.log(MEDIAN / 0.3)))
+    best = maximize_evidence(wild, families, prior.mean, 0.09, prior, np.full(AMPLITUDES, math.log(MEDIAN / 0.3)))
     # Motions a thousand times as large come to the limit, which refers to the noise before.
     assert float((np.exp(best.log_ratio) * 0.3).max()) <= LARGEST * (1 + 1e-9)
     assert float((np.exp(best.log_ratio) * 0.3).min()) >= SMALLEST * (1 - 1e-9)
