@@ -9,8 +9,8 @@ from torch import Tensor
 
 from kcal.calibrate.lensfit.base_fit import Estimate
 from kcal.calibrate.lensfit.board_modes import STRETCH, BoardModes
-from kcal.calibrate.lensfit.evidence_rounds import Rounds
-from kcal.calibrate.lensfit.families import BOARD, PriorFamilies
+from kcal.calibrate.lensfit.evidence_rounds import Rounds, expected_estimate
+from kcal.calibrate.lensfit.families import BOARD, Hyperprior, PriorFamilies
 from kcal.calibrate.lensfit.quadratic import ViewData, posterior_root
 
 # Stretch that a print may have whatever this board's amplitude is, in units of its extent to each side: one tenth of a
@@ -20,6 +20,21 @@ _PRINTED = 1e-3
 _CLEAR = 3.75
 # Share by which two focal lengths may differ for their lens to be a start for one with square pixels.
 _NEARLY = 0.03
+
+
+def square_pixels(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> bool:
+    """Whether the aspect ratio that a fit with two focal lengths found cannot be told from one.
+
+    Args:
+        rounds: of the fit.
+        hyperprior: of its amplitudes.
+        never: (S,) unknowns that were held.
+    """
+    # Amplitudes are taken as they are to be expected, where those of largest evidence would tell the ratio from one.
+    return any(
+        pixels_are_square(*aspect_of(rounds._replace(estimate=estimate()), never))
+        for estimate in (lambda: rounds.estimate, lambda: expected_estimate(rounds, hyperprior))
+    )
 
 
 def aspect_of(rounds: Rounds, never: Tensor) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.views import among
-from kcal.calibrate.lensfit.aspect import aspect_of, pixels_are_square, with_square_pixels
+from kcal.calibrate.lensfit.aspect import square_pixels, with_square_pixels
 from kcal.calibrate.lensfit.base_fit import Estimate, fit_base
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
 from kcal.calibrate.lensfit.board_prior import BoardPrior
@@ -251,7 +251,7 @@ def fit_hybrid(
         rounds, never = run(capture, estimate, start.iterations, False)
     else:
         rounds, never = begin(capture)
-        if square is None and lens is None and pixels_are_square(*aspect_of(rounds, never)):
+        if square is None and lens is None and square_pixels(rounds, hyperprior, never):
             # Motion along columns and the aspect of pixels look alike: with square pixels it is looked for anew.
             one = dataclasses.replace(rounds.capture, square=True, readout=rounds.readout)
             near = with_square_pixels(rounds.estimate, shown)
