@@ -155,16 +155,17 @@ def test_names_priors_and_peaks_are_of_the_weights(kind: str) -> None:
 
 def test_priors_of_zernike_modes() -> None:
     modes = ZernikeModes(radial=7, decentered=4, astigmatic=3, other=2)
-    assert [round(math.exp(mean), 6) for mean, _, _ in modes.hyperprior] == [5e-4, 3e-4, 5e-5, 4e-5, 0.5, 0.6]
-    assert [sd for _, sd, _ in modes.hyperprior] == [1.75, 1.5, 1.75, 1.75, 0.7, 0.5]
+    assert [round(math.exp(mean), 6) for mean, _, _ in modes.hyperprior] == [5e-4, 3e-4, 5e-5, 4e-5, 3e-4, 0.5, 0.6]
+    assert [sd for _, sd, _ in modes.hyperprior] == [1.75, 1.5, 1.75, 1.75, 1.5, 0.7, 0.5]
     # Radial modes cannot stand for the focal length.
-    assert [round(math.exp(most), 6) for *_, most in modes.hyperprior] == [0.01, *5 * [math.inf]]
+    assert [round(math.exp(most), 6) for *_, most in modes.hyperprior] == [0.01, *6 * [math.inf]]
     found = dict(zip(modes.names, modes.weight_priors, strict=True))
-    assert found["z5+1"] == (0, 4, 0)
-    assert found["z7+1"] == (0, 4, 2)
-    assert found["z2+0"] == (1, 5, 0)
+    assert found["z5+1"] == (0, 5, 0)
+    assert found["z7+1"] == (0, 5, 2)
+    assert found["z2+0"] == (4, 6, 0)
+    assert found["z4+0"] == (1, 6, 2)
     assert found["z1-1"] == (None, None, 0.0)
-    assert found["z3+1i"] == (3, 5, 1)
+    assert found["z3+1i"] == (3, 6, 1)
     names = {name for name, (*_, family, _) in zip(modes.names, modes.real_modes, strict=True) if family == RADIAL}
     assert modes.radial_names == names == {"z5+1", "z7+1"}
 

@@ -43,20 +43,20 @@ def expected_amplitudes(
         >>> [round(float(value), 2) for value in found]
         [0.25, 0.0]
     """
-    covariance = _covariance(loss, at)
+    covariance = _inverse_hessian(loss, at)
     found = at.copy()
-    least = loss(at)[0]
     for i in which:
         sigma = math.sqrt(covariance[i, i])
         low, high = bounds[i]
         places = np.array([t for t in sigma * _PLACES if low <= at[i] + t <= (math.inf if high is None else high)])
         along = covariance[:, i] / covariance[i, i]
-        share = np.exp([least - loss(at + t * along)[0] for t in places])
+        losses = np.array([loss(at + t * along)[0] for t in places])
+        share = np.exp(losses.min() - losses)
         found[i] += 0.5 * math.log(float(share @ np.exp(2.0 * places)) / float(share.sum()))
     return found
 
 
-def _covariance(loss: Loss, at: np.ndarray) -> np.ndarray:
+def _inverse_hessian(loss: Loss, at: np.ndarray) -> np.ndarray:
     """The inverse of the Hessian; where it does not bend upward, the widest."""
     steps = _STEP * np.eye(len(at))
     bend = np.stack([loss(at + step)[1] - loss(at - step)[1] for step in steps]) / (2.0 * _STEP)

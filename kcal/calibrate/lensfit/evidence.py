@@ -25,6 +25,9 @@ from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies, typical_h
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
 from kcal.calibrate.lensfit.readout import LARGEST, MEDIAN, SMALLEST, SPREAD
 
+# ln σ² beyond which numbers overflow.
+_HIGHEST = 300.0
+
 
 class _Root(NamedTuple):
     """The same without squares: chi²(x) = |rows x - target|² + rest.
@@ -188,9 +191,11 @@ def evidence_loss(
             value, slope = _still_evidence(root, data.freedom / tempering, families, v)
             return value + 0.5 * float(z @ z), slope + np.append(z / sd, 0.0)
         integrated = data.integrated(ratio)
-        found = _moving_evidence(integrated.data.tempered(tempering), families, here, log_variance)
+        tempered = integrated.data.tempered(tempering)
+        found = _moving_evidence(tempered, families, here, log_variance) if log_variance < _HIGHEST else None
         if found is None:
-            # Priors are far too wide for this precision: worse than any trial before, so that a shorter step follows.
+            # Priors are far too wide for this precision, or a first step was far too long: worse than any trial before,
+            # so that a shorter step follows.
             return max(values, default=1e30) + 1.0, np.zeros_like(v)
         # The prior of the motions' amplitudes is about these, not about their ratios to the noise.
         w = (ratio + 0.5 * log_variance - math.log(MEDIAN)) / SPREAD

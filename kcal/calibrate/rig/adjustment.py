@@ -163,15 +163,20 @@ class Adjustment:
         return found
 
     def fit_motion(self, masks: PerKind) -> None:
-        """Find how boards move while the cameras' rows are read, from residuals at the present state."""
+        """Find how boards move while the cameras' rows are read, from residuals at the present state.
+
+        Not before cameras of parametric models: what their lenses cannot show would be taken for motion.
+        """
         boards, state = self.data.boards, self.state
+        self.motion = [None] * len(self.data.cameras)
+        trusted = [c for c, one in enumerate(self.data.cameras) if one.model.hybrid or one.calibration is None]
         if boards is None or not bool(masks.boards.any()):
             return
         everything = masks._replace(boards=torch.ones_like(masks.boards))
         # Boards that are off by far are wrong, not moved.
         square = self.squares(masks).boards / self.freedom(masks).boards.clamp_min(1)
         good = masks.boards & (square <= _WRONG * square[masks.boards].median())
-        for c in list(range(len(self.data.cameras))) * _TURNS:
+        for c in trusted * _TURNS:
             self.motion[c] = None
             problem = self.problem(everything)
             block = next(block for block in problem.blocks if isinstance(block, BoardBlock))

@@ -29,6 +29,8 @@ from kcal.solve.schur import without_local
 # sigmas, below which corners have no noise.
 _GAIN, _GAIN_OF_OTHERS, _EXACT = 3.0, 1.0, 0.01
 _POSE = 6
+# A motion is worth a stand if it moves corners by so many standard deviations of their noise.
+_FELT = 5.0
 # Of what boards share, in standard deviations of the noise: they tell it.
 _WIDE = 1e3
 # Of fewer boards, one that is wrong cannot be told from motion.
@@ -159,12 +161,14 @@ class WithoutMotion:
         return rows + along @ self._inner @ self._columns
 
 
-def motion_warnings(names: Sequence[str], focal: Sequence[float], motions: Sequence[BoardMotion | None]) -> list[str]:
-    """One warning for each camera before which boards moved."""
+def moved_warnings(
+    names: Sequence[str], focal: Sequence[float], motions: Sequence[BoardMotion | None], noise: float
+) -> list[str]:
+    """One warning for each camera before which boards moved by much more than the noise of a corner, in pixels."""
     found = []
     for name, length, motion in zip(names, focal, motions, strict=True):
-        if motion is not None:
-            moved = motion.sigma.moved(length, motion.reach)
+        moved = 0.0 if motion is None else motion.sigma.moved(length, motion.reach)
+        if moved > _FELT * noise:
             found.append(
                 f"the boards or {name} moved while rows were read (rolling shutter), by some {moved:.1f} px from the "
                 "first row to the last: this is taken out, and the covariance allows for it; stands make it smaller "

@@ -16,7 +16,7 @@ from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
 from kcal.calibrate.rig.knowledge import gathered, joint_unknowns
 from kcal.calibrate.rig.mixups import cost_of_features_behind, refuse_same_camera, swap_warnings
-from kcal.calibrate.rig.motion import motion_warnings
+from kcal.calibrate.rig.motion import moved_warnings
 from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible, without_wrong
 from kcal.calibrate.rig.records import Reasons, item_records, places, source_records
 from kcal.calibrate.rig.repeated_views import without_repeated
@@ -127,12 +127,13 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     # With lenses among the unknowns digits are dear, and what is wrong shows without them.
     looking = ROUGHLY if unknowns.refine_lenses else options.solver
     if options.reject:
-        masks = without_wrong(work, masks, looking)
+        masks = kept = without_wrong(work, masks, looking)
     else:
         masks = possible(work, masks)
-        warnings += _suspicions(work, masks, reasons, looking)
+        kept, doubts = _suspicions(work, masks, reasons, looking)
+        warnings += doubts
     if options.motion:
-        work.fit_motion(masks)
+        work.fit_motion(kept)
     for _ in range(3):
         work.solve(masks, options.solver)
         before = work.sigma_corner
@@ -244,15 +245,15 @@ def _robust(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> 
     return work
 
 
-def _suspicions(work: Adjustment, masks: PerKind, reasons: Reasons, solver: LMOptions) -> list[str]:
-    """Warnings that name what would be left out, were it not to be kept."""
+def _suspicions(work: Adjustment, masks: PerKind, reasons: Reasons, solver: LMOptions) -> tuple[PerKind, list[str]]:
+    """What agrees, and warnings that name what would be left out, were it not to be kept."""
     trial = copy.copy(work)
     try:
         kept = without_wrong(trial, masks, solver)
     except InputError as error:
-        return [str(error)]
+        return masks, [str(error)]
     named = {(kind, work.names(kind)[i]) for kind in KINDS for i in reasons[kind]}
-    return [
+    return kept, [
         f"{item.label}: {item.reason}; it was kept"
         for item in item_records(trial, kept, reasons)
         if not item.used and (item.source, item.name) not in named
@@ -313,7 +314,8 @@ def _rig_result(
         warnings.append(f"RMS {rms:.2f} px is high: were both views of each pair taken at the same moment?")
     if status not in (SolverStatus.CONVERGED, SolverStatus.EXACT):
         warnings.append(f"the solver {status.message}")
-    warnings += motion_warnings(data.names, [float(camera.params[0]) for camera in data.cameras], work.motion)
+    focal = [float(camera.params[0]) for camera in data.cameras]
+    warnings += moved_warnings(data.names, focal, work.motion, work.sigma_corner)
     warnings += doubts
     warnings += [f"not determined by the data: {text}" for text in undetermined]
     whole = [parameter_rows(problem, c) for c in range(len(data.cameras))]
