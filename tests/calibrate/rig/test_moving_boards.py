@@ -1,0 +1,114 @@
+"""Boards held by hand before rolling shutters: rigs find the motion and take it out; on stands there is none."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcal.calibrate.rig.from_boards import calibrate_rig
+from kcal.calibrate.rig.motion import WithoutMotion
+from kcal.calibrate.rig.result import RigResult
+from kcal.calibrate.rig.solve import RigOptions
+from kcal.corners.board import Board
+from kcal.corners.observations import Observations, View
+from kcal.lens.calibration import CameraCalibration
+from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.sim.board import BoardPose, BoardSize
+from kcal.sim.moving_captures import Hands, moving_capture
+from kcal.sim.poses import sample_board_poses
+
+F64 = torch.float64
+BOARD, SIZE = Board(columns=9, rows=6, square=0.05), BoardSize(9, 6, 0.05)
+CAMERA = Camera.build(focal=(1100, 1100), center=(639.5, 479.5), size=(1280, 960), coefficients=[-0.1])
+TURN = rotation_from_vector(torch.tensor([0.0, -0.15, 0.0], dtype=F64))
+SHIFT = torch.tensor([-0.25, 0.0, 0.0], dtype=F64)
+HANDS = Hands(turning=(0.4, 0.4), speed=(0.1, 0.1), readout=(0.02, 0.02), exposure=(0.005, 0.005))
+
+
+@functools.cache
+def captured(by_hand: bool, seed: int) -> tuple[Observations, Observations]:
+    poses = sample_board_poses(CAMERA, SIZE, 10, torch.Generator().manual_seed(seed), fill=(0.25, 0.4))
+    right = [BoardPose(TURN @ pose.rotation, TURN @ pose.translation + SHIFT) for pose in poses]
+    hands = HANDS if by_hand else None
+    sides = [
+        moving_capture(CAMERA, own, sigma=0.1, seed=2 * seed + k, hands=hands, board=SIZE).pixels
+        for k, own in enumerate((poses, right))
+    ]
+    seen = [CAMERA.inside(pixels) & pixels.isfinite().all(-1) for pixels in sides]
+    kept = (torch.stack(seen).sum(-1) >= 12).all(0).nonzero()[:, 0].tolist()
+    files = []
+    for pixels, inside in zip(sides, seen, strict=True):
+        corners = torch.where(inside[..., None], pixels, torch.nan).tolist()
+        views = [View(name=str(i), pixels=[p if p[0] == p[0] else None for p in corners[i]]) for i in kept]
+        files.append(Observations(board=BOARD, image_size=CAMERA.size, views=tuple(views)))
+    return files[0], files[1]
+
+
+def solve(by_hand: bool, seed: int, camera: Camera = CAMERA, *, motion: bool = True) -> RigResult:
+    left, right = captured(by_hand, seed)
+    pairs = [(name, name) for name in left.names]
+    return calibrate_rig(camera, camera, left, right, pairs, RigOptions(motion=motion))
+
+
+def error(result: RigResult) -> Tensor:
+    rig = result.stereo()
+    turn = vector_from_rotation(rig.right_from_left_rotation @ TURN.T)
+    return torch.cat([turn, rig.right_from_left_translation - SHIFT])
+
+
+def surprise(result: RigResult) -> float:
+    """The squared error over what the covariance states: one on the average."""
+    off = error(result)
+    return float(off @ torch.linalg.solve(result.relative_covariance(), off)) / 6.0
+
+
+def test_whitening_is_that_of_the_dense_covariance() -> None:
+    generator = torch.Generator().manual_seed(5)
+    columns = torch.randn(3, 12, 2, 7, generator=generator, dtype=F64)
+    whitening = torch.randn(3, 2, 2, 7, generator=generator, dtype=F64)
+    rows = torch.randn(3, 4, 14, generator=generator, dtype=F64)
+    found = WithoutMotion(columns, whitening)(rows)
+    white = torch.einsum("vuwn,vpwn->vpun", whitening, columns).flatten(-2)
+    covariance = torch.eye(14, dtype=F64) + white.transpose(1, 2) @ white
+    dense = rows @ torch.linalg.solve(covariance, rows.transpose(1, 2))
+    # A condition of some thousands.
+    torch.testing.assert_close(found @ found.transpose(1, 2), dense, rtol=1e-9, atol=1e-9)
+
+
+def test_motion_is_found_and_taken_out() -> None:
+    moving = [solve(True, seed) for seed in range(5)]
+    still = [solve(True, seed, motion=False) for seed in range(5)]
+    found, without = (sum(surprise(result) for result in results) / 5 for results in (moving, still))
+    # Thirty numbers whose squares are one on the average, or twice that where amplitudes are hardly known.
+    assert found < 3.0
+    assert without > 10.0 * found
+    turns, others = (sum(float(error(result)[:3].square().sum()) for result in results) for results in (moving, still))
+    assert turns < 0.5 * others
+    assert all(result.sigma_corner == pytest.approx(0.1, rel=0.35) for result in moving)
+    told = [text for result in moving for text in result.warnings if "moved while rows were read" in text]
+    assert len(told) >= 8
+
+
+def test_nothing_moves_on_a_stand() -> None:
+    for seed in range(3):
+        found, still = solve(False, seed), solve(False, seed, motion=False)
+        assert found.warnings == still.warnings == ()
+        # To the last digit: where no motion is found, nothing else happens.
+        assert torch.equal(error(found), error(still))
+        assert torch.equal(found.relative_covariance(), still.relative_covariance())
+
+
+def test_not_before_a_lens_that_is_calibrated_with_few_coefficients() -> None:
+    """What it cannot show would be taken for motion."""
+    camera = Camera(CAMERA.params, size=CAMERA.size, model=CAMERA.model)
+    camera.calibration = CameraCalibration(covariance=1e-12 * torch.eye(len(CAMERA.params), dtype=F64))
+    found = solve(True, 0, camera)
+    assert not any("moved while rows were read" in text for text in found.warnings)
+    assert found.sigma_corner is not None
+    assert math.isfinite(found.rms)
+    assert found.sigma_corner > 0.2
