@@ -9,6 +9,8 @@ from kcal.calibrate.lensfit.readout import LARGEST
 
 # A motion is worth a stand if it moves corners by so many standard deviations of their noise.
 _FELT = 5.0
+# Of fewer views that moved, error bars of 95 % contain the truth in some 80 to 90 % (`scripts.check.handheld`).
+_FEW = 8
 # A share of the largest motion, from which it is at its limit.
 _LIMIT = 0.9
 
@@ -28,10 +30,16 @@ def motion_warnings(fit: HybridFit) -> list[str]:
     moved = fit.motion_sigma.moved(float(fit.camera.params[0]), reach)
     if moved < _FELT * fit.sigma:
         return []
+    views, few = len(fit.state.motion), []
+    if views < _FEW:
+        few = [
+            f"{views} views that moved are few: error bars are somewhat too small; use a stand, or {_FEW} views or more"
+        ]
     return [
+        *few,
         f"the camera or the board moved while {lines}s were read (rolling shutter), by some {moved:.1f} px from the "
         f"first {lines} to the last: this is taken out, and error bars allow for it; put both on a stand, or take the "
-        "still moments of a video, for smaller error bars"
+        "still moments of a video, for smaller error bars",
     ]
 
 
