@@ -9,7 +9,7 @@ from kcal.calibrate.lensfit.readout import LARGEST
 
 # A motion is worth a stand if it moves corners by so many standard deviations of their noise.
 _FELT = 5.0
-# Of fewer views that moved, error bars of 95 % contain the truth in some 80 to 90 % (`scripts.check.handheld`).
+# Of fewer views that moved, 95 % ellipses contain the truth in 75 to 93 % (`scripts.check.handheld`).
 _FEW = 8
 # A share of the largest motion, from which it is at its limit.
 _LIMIT = 0.9
