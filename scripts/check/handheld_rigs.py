@@ -22,7 +22,7 @@ from torch import Tensor
 from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.solve import RigOptions
 from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
+from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
@@ -31,6 +31,7 @@ from kcal.sim.moving_captures import Hands, MovingCapture, moving_capture
 from kcal.sim.poses import sample_board_poses
 from scripts.shared.page import table, write_section
 from scripts.shared.records import Record, finish, read, seeds
+from scripts.shared.simulated import view_of
 from scripts.shared.timing import show
 
 PAGE = "ordinary.md"
@@ -72,18 +73,9 @@ def captured(held_by: str, seed: int, fit: str) -> Record:
 
 def observed(side: MovingCapture, inside: Tensor, kept: list[int]) -> Observations:
     """What one camera saw of the boards that both saw, with the corners' covariances."""
-    views = []
-    for i in kept:
-        good = inside[i].tolist()
-        pixels, spread = side.pixels[i].tolist(), side.covariance[i].flatten(-2)[:, [0, 1, 3]].tolist()
-        views.append(
-            View(
-                name=str(i),
-                pixels=tuple((u, v) if ok else None for (u, v), ok in zip(pixels, good, strict=True)),
-                covariance=tuple((a, b, c) if ok else None for (a, b, c), ok in zip(spread, good, strict=True)),
-            )
-        )
-    return Observations(board=BOARD, image_size=CAMERA.size, views=tuple(views))
+    pixels = torch.where(inside[..., None], side.pixels, torch.nan)
+    views = tuple(view_of(str(i), pixels[i], side.covariance[i]) for i in kept)
+    return Observations(board=BOARD, image_size=CAMERA.size, views=views)
 
 
 def line(record: Record) -> str:

@@ -85,19 +85,20 @@ def stretched(pixels: Tensor, covariance: Tensor, size: tuple[int, int], factor:
     scale = torch.tensor([1.0, factor], dtype=torch.float64)
     height = round(size[1] * factor)
     # The edge of the image stays where it is, half a pixel before the first center.
-    corners = ((pixels + 0.5) * scale - 0.5).tolist()
-    spread = (covariance * scale[:, None] * scale).flatten(-2)[..., [0, 1, 3]].tolist()
-    views = []
-    for name, (own, own_spread) in enumerate(zip(corners, spread, strict=True)):
-        good = [u == u for u, _ in own]
-        views.append(
-            View(
-                name=f"{name:03d}",
-                pixels=tuple((u, v) if ok else None for (u, v), ok in zip(own, good, strict=True)),
-                covariance=tuple((a, b, c) if ok else None for (a, b, c), ok in zip(own_spread, good, strict=True)),
-            )
-        )
+    corners, spread = (pixels + 0.5) * scale - 0.5, covariance * scale[:, None] * scale
+    views = [view_of(f"{i:03d}", *seen) for i, seen in enumerate(zip(corners, spread, strict=True))]
     return Observations(board=BOARD, image_size=(size[0], height), views=tuple(views))
+
+
+def view_of(name: str, pixels: Tensor, covariance: Tensor) -> View:
+    """A view from its corners (N, 2), NaN where not seen, and their covariances (N, 2, 2)."""
+    good = pixels.isfinite().all(-1).tolist()
+    spread = covariance.flatten(-2)[:, [0, 1, 3]].tolist()
+    return View(
+        name=name,
+        pixels=tuple((u, v) if ok else None for (u, v), ok in zip(pixels.tolist(), good, strict=True)),
+        covariance=tuple((a, b, c) if ok else None for (a, b, c), ok in zip(spread, good, strict=True)),
+    )
 
 
 def default_options(still: bool) -> CalibrationOptions:

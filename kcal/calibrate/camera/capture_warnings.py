@@ -5,10 +5,8 @@ from __future__ import annotations
 import torch
 
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
-from kcal.calibrate.lensfit.readout import LARGEST
+from kcal.calibrate.lensfit.readout import FELT, LARGEST
 
-# A motion is worth a stand if it moves corners by so many standard deviations of their noise.
-_FELT = 5.0
 # Of fewer views that moved, 95 % ellipses contain the truth in 75 to 93 % (`scripts.check.handheld`).
 _FEW = 8
 # A share of the largest motion, from which it is at its limit.
@@ -26,9 +24,8 @@ def motion_warnings(fit: HybridFit) -> list[str]:
             "and photograph a stiff board on a stand"
         ]
     lines = "column" if fit.readout.columns else "row"
-    reach = float((fit.board_points - fit.readout.center).norm(dim=-1).max()) / fit.readout.distance
-    moved = fit.motion_sigma.moved(float(fit.camera.params[0]), reach)
-    if moved < _FELT * fit.sigma:
+    moved = fit.motion_sigma.moved(float(fit.camera.params[0]), fit.readout.reach(fit.board_points))
+    if moved < FELT * fit.sigma:
         return []
     views, few = len(fit.state.motion), []
     if views < _FEW:

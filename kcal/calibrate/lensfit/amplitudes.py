@@ -14,6 +14,11 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+import torch
+
+from kcal.calibrate.lensfit.evidence import Maximum, evidence_loss, hyper_bounds
+from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
+from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
 
 Loss = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
@@ -23,6 +28,30 @@ _STEP = 0.02
 _PLACES = np.arange(-2.25, 4.0, 0.75)
 # Directions in which -ln p does not bend are followed by no more than this standard deviation.
 _WIDEST = 2.0
+
+
+def expected_maximum(
+    data: Quadratic | ViewData, families: PriorFamilies, best: Maximum, hyperprior: Hyperprior, tempering: float = 1.0
+) -> Maximum:
+    """The maximum of the evidence with all amplitudes in use, those of motions too, replaced by √<A²>.
+
+    Args:
+        data: what the views say.
+        families: the priors.
+        best: where the evidence is largest.
+        hyperprior: of the hyperparameters.
+        tempering: by which the data counted less there.
+    """
+    count, log_variance = len(best.h), math.log(best.variance)
+    used = families.amplitude
+    which = [*used[used >= 0].unique().tolist(), *range(count, count + len(best.log_ratio))]
+    found = expected_amplitudes(
+        evidence_loss(data, families, hyperprior, tempering),
+        np.concatenate([best.h.numpy(), best.log_ratio, [log_variance]]),
+        which,
+        hyper_bounds(hyperprior, len(best.log_ratio), log_variance),
+    )
+    return best._replace(h=torch.from_numpy(found[:count].copy()), log_ratio=found[count:-1].copy())
 
 
 def expected_amplitudes(

@@ -30,11 +30,11 @@ def square_pixels(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> bool
         hyperprior: of its amplitudes.
         never: (S,) unknowns that were held.
     """
-    # Amplitudes are taken as they are to be expected, where those of largest evidence would tell the ratio from one.
-    return any(
-        pixels_are_square(*aspect_of(rounds._replace(estimate=estimate()), never))
-        for estimate in (lambda: rounds.estimate, lambda: expected_estimate(rounds, hyperprior))
-    )
+    if pixels_are_square(*aspect_of(rounds, never)):
+        return True
+    # Amplitudes as they are to be expected: those of largest evidence may state the ratio too surely.
+    expected = rounds._replace(estimate=expected_estimate(rounds, hyperprior))
+    return pixels_are_square(*aspect_of(expected, never))
 
 
 def aspect_of(rounds: Rounds, never: Tensor) -> tuple[float, float]:

@@ -25,6 +25,8 @@ from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies, typical_h
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
 from kcal.calibrate.lensfit.readout import LARGEST, MEDIAN, SMALLEST, SPREAD
 
+# Nats by which motions must raise the evidence to be taken for real.
+WORTH = 3.0
 # ln σ² beyond which numbers overflow.
 _HIGHEST = 300.0
 

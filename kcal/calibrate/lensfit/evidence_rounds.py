@@ -11,16 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.amplitudes import expected_amplitudes
+from kcal.calibrate.lensfit.amplitudes import expected_maximum
 from kcal.calibrate.lensfit.base_fit import NO_MOTION, Estimate, cauchy_weights
 from kcal.calibrate.lensfit.board_modes import BoardModes
-from kcal.calibrate.lensfit.evidence import (
-    Maximum,
-    evidence_loss,
-    evidence_of_motion,
-    hyper_bounds,
-    maximize_evidence,
-)
+from kcal.calibrate.lensfit.evidence import WORTH, Maximum, evidence_of_motion, maximize_evidence
 from kcal.calibrate.lensfit.families import Hyperprior
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, overdispersion, quadratic_of, view_data
@@ -28,8 +22,8 @@ from kcal.calibrate.lensfit.readout import AMPLITUDES, LARGEST, MOTION, Readout,
 from kcal.solve.lm import LMOptions, minimize
 
 _ROUNDS = 12
-# Rounds after which views stand still if motion gains nothing, and what it must gain to stay, in nats.
-_SETTLED, _GAIN = 1, 3.0
+# Rounds after which views stand still if motion gains nothing.
+_SETTLED = 1
 # Steps of the solver, and squared standard deviations by which one must lower chi² to be worth the next: in the first
 # round, in the others, and at the end.
 _FIRST, _LATER, LAST = (8, 0.1), (12, 0.02), (10, 0.01)
@@ -214,7 +208,7 @@ def run_rounds(
         progress(f"evidence, round {turn + 1}")
         if isinstance(data, ViewData) and turn >= _SETTLED:
             gained = evidence_of_motion(data, best, estimate.families, tempering)
-            if gained < _GAIN:
+            if gained < WORTH:
                 capture = dataclasses.replace(capture, readout=None)
                 estimate = begin_motion(capture, estimate)
                 continue
@@ -241,17 +235,12 @@ def run_rounds(
 def expected_estimate(rounds: Rounds, hyperprior: Hyperprior) -> Estimate:
     """The estimate with the amplitudes that are to be expected in place of the most likely ones."""
     estimate, data = rounds.estimate, rounds.data
-    count = len(estimate.hyperparameters)
-    log_variance = math.log(estimate.variance / estimate.tempering)
+    variance = estimate.variance / estimate.tempering
+    best = Maximum(estimate.hyperparameters, estimate.log_ratio, variance, rounds.loss)
     # Views that move were tempered after their amplitudes were found.
     tempering = 1.0 if isinstance(data, ViewData) else estimate.tempering
-    loss = evidence_loss(data, estimate.families, hyperprior, tempering)
-    bounds = hyper_bounds(hyperprior, len(estimate.log_ratio), log_variance)
-    used = estimate.families.amplitude
-    which = [*used[used >= 0].unique().tolist(), *range(count, count + len(estimate.log_ratio))]
-    at = np.concatenate([estimate.hyperparameters.numpy(), estimate.log_ratio, [log_variance]])
-    found = expected_amplitudes(loss, at, which, bounds)
-    return estimate._replace(hyperparameters=torch.from_numpy(found[:count].copy()), log_ratio=found[count:-1].copy())
+    found = expected_maximum(data, estimate.families, best, hyperprior, tempering)
+    return estimate._replace(hyperparameters=found.h, log_ratio=found.log_ratio)
 
 
 def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> bool:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.readout import AMPLITUDES, MOTION
+from kcal.calibrate.lensfit.readout import AMPLITUDES, MOTION, stillness
 
 Array = npt.NDArray[np.float64]
 
@@ -76,8 +76,7 @@ class ViewData(NamedTuple):
 
     def scores(self, log_ratio: Array) -> Tensor:
         """(V, S) derivatives of each view's -½ chi² by the shared unknowns, motions integrated out."""
-        ratio = np.repeat(np.exp(log_ratio), MOTION // AMPLITUDES)
-        matrix = self.own + torch.diag(torch.from_numpy(ratio**-2.0))
+        matrix = self.own + torch.diag(stillness(log_ratio))
         best = torch.linalg.solve(matrix, self.residual[..., None])
         return self.score - (self.cross[..., :-1].transpose(1, 2) @ best)[..., 0]
 

@@ -29,6 +29,8 @@ AMPLITUDES = 4
 # while an image is read. A hand that turns by 1 rad/s moves by 0.03 in 30 ms: beyond it is no motion. Below the
 # smallest no pixel feels it.
 MEDIAN, SPREAD, SMALLEST, LARGEST = 2e-4, 2.0, 1e-6, 0.03
+# A motion is worth a stand if it moves corners by so many standard deviations of their noise.
+FELT = 5.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,6 +58,10 @@ class Readout:
         """(...) when pixels (..., 2) were read: -½ at the first edge of the image, ½ at the last; 0 where NaN."""
         axis = 0 if self.columns else 1
         return ((pixels[..., axis] + 0.5) / self.size[axis] - 0.5).nan_to_num(0.0)
+
+    def reach(self, points: Tensor) -> float:
+        """How far corners (N, 3) of the board, meters, are from its middle at most, in distances of the board."""
+        return float((points - self.center).norm(dim=-1).max()) / self.distance
 
     def moved(self, motion: Tensor, time: Tensor, points: Tensor) -> MovedBoard:
         """Boards as they stand when their corners are read.

@@ -170,7 +170,7 @@ class Adjustment:
         boards, state = self.data.boards, self.state
         self.motion = [None] * len(self.data.cameras)
         trusted = [c for c, one in enumerate(self.data.cameras) if one.model.hybrid or one.calibration is None]
-        if boards is None or not bool(masks.boards.any()):
+        if boards is None or not trusted or not bool(masks.boards.any()):
             return
         everything = masks._replace(boards=torch.ones_like(masks.boards))
         # Boards that are off by far are wrong, not moved.

@@ -15,23 +15,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.amplitudes import expected_amplitudes
-from kcal.calibrate.lensfit.evidence import evidence_loss, evidence_of_motion, hyper_bounds, maximize_evidence
+from kcal.calibrate.lensfit.amplitudes import expected_maximum
+from kcal.calibrate.lensfit.evidence import WORTH, evidence_of_motion, maximize_evidence
 from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
 from kcal.calibrate.lensfit.quadratic import ViewData, view_data
-from kcal.calibrate.lensfit.readout import AMPLITUDES, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
+from kcal.calibrate.lensfit.readout import AMPLITUDES, FELT, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.solve.schur import without_local
 
-# Nats by which motions must raise the evidence to be taken for real, as in the calibration of a single camera; of which
-# those boards must tell a part that are left without the board that tells most. And the mean square of residuals, in
-# sigmas, below which corners have no noise.
-_GAIN, _GAIN_OF_OTHERS, _EXACT = 3.0, 1.0, 0.01
+# Nats by which motions must raise the evidence without the board that tells most of them.
+_WORTH_OF_OTHERS = 1.0
+# Mean square of residuals, in standard deviations, below which corners have no noise.
+_EXACT = 0.01
 _POSE = 6
-# A motion is worth a stand if it moves corners by so many standard deviations of their noise.
-_FELT = 5.0
-# Of what boards share, in standard deviations of the noise: they tell it.
+# How far what boards share may move their corners, in standard deviations of the noise: nothing is known beforehand.
 _WIDE = 1e3
 # Of fewer boards, one that is wrong cannot be told from motion.
 _FEWEST = 3
@@ -120,17 +118,13 @@ def board_motion(seen: SeenBoards, rows: Tensor, start: int, good: Tensor) -> Bo
     explained = data.integrated(best.log_ratio).half[..., -1].square().sum(-1)
     others = every.clone()
     others[int(explained.argmax())] = False
-    gain, without_one = (evidence_of_motion(told_by(views), best, families, 1.0) for views in (every, others))
-    if gain < _GAIN or without_one < _GAIN_OF_OTHERS:
+    if evidence_of_motion(data, best, families, 1.0) < WORTH:
         return None
-    log_variance = math.log(best.variance)
-    at, bounds = np.array([0.0, *best.log_ratio, log_variance]), hyper_bounds(_NO_PRIOR, AMPLITUDES, log_variance)
-    which = list(range(1, 1 + AMPLITUDES))
-    expected = expected_amplitudes(evidence_loss(data, families, _NO_PRIOR, 1.0), at, which, bounds)
-    sigma = motion_sigma(expected[1:-1], best.variance)
+    if evidence_of_motion(told_by(others), best, families, 1.0) < _WORTH_OF_OTHERS:
+        return None
+    sigma = motion_sigma(expected_maximum(data, families, best, _NO_PRIOR).log_ratio, best.variance)
     each = torch.tensor(sigma, dtype=torch.float64).repeat_interleave(MOTION // AMPLITUDES)
-    reach = float((seen.points.T - readout.center).norm(dim=-1).max()) / distance
-    return BoardMotion(columns * each[:, None, None], sigma, reach)
+    return BoardMotion(columns * each[:, None, None], sigma, readout.reach(seen.points.T))
 
 
 def _hardly_known(deviation: Tensor) -> PriorFamilies:
@@ -168,10 +162,10 @@ def moved_warnings(
     found = []
     for name, length, motion in zip(names, focal, motions, strict=True):
         moved = 0.0 if motion is None else motion.sigma.moved(length, motion.reach)
-        if moved > _FELT * noise:
+        if moved > FELT * noise:
             found.append(
-                f"the boards or {name} moved while rows were read (rolling shutter), by some {moved:.1f} px from the "
-                "first row to the last: this is taken out, and the covariance allows for it; stands make it smaller "
-                "(if nothing moved, pairs are mixed up or a camera is wrong)"
+                f"the boards or the {name} camera moved while rows were read (rolling shutter), by some {moved:.1f} px "
+                "from the first row to the last: this is taken out, and the covariance allows for it; stands make it "
+                "smaller (if nothing moved, pairs are mixed up or a camera is wrong)"
             )
     return found

@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from calibrate_scenes import observe
 from torch import Tensor
 
 from kcal.calibrate.rig.from_boards import calibrate_rig
@@ -14,7 +15,7 @@ from kcal.calibrate.rig.motion import WithoutMotion
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions
 from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
+from kcal.corners.observations import Observations
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
@@ -41,12 +42,10 @@ def captured(by_hand: bool, seed: int) -> tuple[Observations, Observations]:
     ]
     seen = [CAMERA.inside(pixels) & pixels.isfinite().all(-1) for pixels in sides]
     kept = (torch.stack(seen).sum(-1) >= 12).all(0).nonzero()[:, 0].tolist()
-    files = []
-    for pixels, inside in zip(sides, seen, strict=True):
-        corners = torch.where(inside[..., None], pixels, torch.nan).tolist()
-        views = [View(name=str(i), pixels=[p if p[0] == p[0] else None for p in corners[i]]) for i in kept]
-        files.append(Observations(board=BOARD, image_size=CAMERA.size, views=tuple(views)))
-    return files[0], files[1]
+    names = [str(i) for i in kept]
+    corners = (torch.where(inside[..., None], own, torch.nan)[kept] for own, inside in zip(sides, seen, strict=True))
+    left_seen, right_seen = (observe(own, board=BOARD, size=CAMERA.size, names=names) for own in corners)
+    return left_seen, right_seen
 
 
 def solve(by_hand: bool, seed: int, camera: Camera = CAMERA, *, motion: bool = True) -> RigResult:
