@@ -37,7 +37,6 @@ LOOKS = {
     "locate": (1.0, "pixels to positions"),
     "calibrate/camera": (2.8, "one camera"),
     "calibrate/rig": (1.0, "several cameras"),
-    "calibrate/search": (3.03, "several minima"),
     "nets": (4.0, "the paper's networks"),
     "sim": (0.0, "simulated truth"),
     "io": (1.0, "files"),

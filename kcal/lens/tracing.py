@@ -72,17 +72,6 @@ def may_overwrite(*tensors: Tensor) -> bool:
     return may_branch(*tensors) and not is_differentiated(*tensors)
 
 
-def plain_on_host(*tensors: Tensor) -> bool:
-    """Whether NumPy may do the work: on the CPU, with nothing differentiated, traced or mapped."""
-    if torch.is_grad_enabled() or is_traced() or any(tensor.device.type != "cpu" for tensor in tensors):
-        return False
-    try:
-        # Tensors that `torch.func` wraps have no memory of their own.
-        return not is_differentiated(*tensors) and all(tensor.data_ptr() >= 0 for tensor in tensors)
-    except RuntimeError:
-        return False
-
-
 def in_chunks(
     function: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor, batch: int, *, differentiated: bool
 ) -> tuple[Tensor, Tensor]:

@@ -7,10 +7,9 @@ import math
 from collections.abc import Sequence
 
 from kcal.calibrate.camera.advice import what_to_photograph
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.options import CalibrationOptions, Progress
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.trust import Examination, examine
-from kcal.calibrate.search.model_ladder import Progress
 from kcal.lens.camera import Camera
 from kcal.lens.paraxial import paraxial_focal
 from kcal.lens.uncertainty import image_sigma

@@ -24,10 +24,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from kcal.calibrate.bundle.closed_form import homographies, intrinsics_candidates, poses_from_homographies
 from kcal.calibrate.bundle.poses import poses_under
 from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.lensfit.base_fit import fit_projection
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.nets.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
@@ -159,19 +159,18 @@ def main() -> None:
     data, more = simulate(VIEWS), simulate(HELD_OUT, seed=1000)
     board, pixels, others = (torch.from_numpy(a) for a in (data["board"], data["pixels"], more["pixels"]))
     true_poses = torch.from_numpy(more["rotation"]), torch.from_numpy(more["translation"])
-    homography = homographies(board, pixels)
-    intrinsics = intrinsics_candidates(homography, SIZE)[0]
-    poses = poses_from_homographies(homography, intrinsics)
+    base = fit_projection(board, pixels, SIZE, torch.ones_like(pixels[..., 0])).state
+    intrinsics, poses = base.params[:4], (base.rotation, base.translation)
     lines = [
         "## A lens that is only a network",
         "",
         f"Made by `scripts/paper/train_net_lens.py`: the pure network lens of the paper's Section 4.3.1 and Fig. 5 "
         f"(`PureLensNet`, four layers), with intrinsics and poses, on {VIEWS} simulated views of a {COLUMNS}x{ROWS} "
-        f"board through a lens of 14 coefficients, noise {NOISE} px an axis (RMS {NOISE * math.sqrt(2):.3f}); start in "
-        f"closed form. *As in the figure*: it replaces x, y, beginning with random weights; *with a skip*: it adds to "
-        "them, beginning with nothing. First-order methods: every parameter in units of its column of the Jacobian at "
-        f"the start, the best of {len(RATES)} decades of learning rates by runs of a tenth of the length (not timed). "
-        f"RMS: the lowest on the way. Held out: {HELD_OUT} other views, poses alone solved, from the true. Medians "
+        f"board through a lens of 14 coefficients, noise {NOISE} px an axis (RMS {NOISE * math.sqrt(2):.3f}); start at "
+        "the base projection. *As in the figure*: it replaces x, y, beginning with random weights; *with a skip*: it "
+        "adds to them, beginning with nothing. First-order methods: every parameter in units of its column of the "
+        f"Jacobian at the start, the best of {len(RATES)} decades of learning rates by runs of a tenth of the length "
+        f"(not timed). RMS: the lowest on the way. Held out: {HELD_OUT} other views, poses alone solved, from the true. Medians "
         f"over {arguments.seeds} seeds (smallest to largest).",
         "",
         f"![RMS over steps]({PICTURE})",

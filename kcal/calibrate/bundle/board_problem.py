@@ -6,23 +6,20 @@ Shared parameters: the camera's free parameters and the board's warp. Local ones
 from __future__ import annotations
 
 import copy
-import dataclasses
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.numpy_rows import board_rows, on_host
-from kcal.calibrate.bundle.padding import joined_terms, lengthened, part_of
 from kcal.calibrate.bundle.parameters import FreeParameters
 from kcal.calibrate.bundle.priors import GaussianPrior, Term
 from kcal.calibrate.bundle.twist import apply_twist
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import project_components
-from kcal.solve.result import Result, State
+from kcal.solve.result import State
 from kcal.solve.robust import RobustLoss
 from kcal.solve.schur import SchurLinearization, SchurProblem, without_local
 
@@ -140,27 +137,9 @@ class BoardProblem(SchurProblem[BoardState]):
         return math.prod(self.batch)
 
     @property
-    def corner_slots(self) -> int:
-        """Places for corners in each of them."""
-        return math.prod(self.seen.shape[-2:])
-
-    @property
-    def alike(self) -> Hashable:
-        """Problems for which this is equal can be joined into one batch."""
-        terms = tuple(term.alike for term in self.terms)
-        board = tuple(self.board_points.flatten().tolist())
-        return board, self.model, self.free, self.free_warp, self.whitening is not None, self.loss, terms
-
-    @property
     def prior_count(self) -> int:
         """Number of scalar residuals that are priors."""
         return sum(len(term.index) for term in self.terms if isinstance(term, GaussianPrior))
-
-    def repeated(self, count: int) -> BoardProblem:
-        """A batch of this problem, which is none yet."""
-        batch = copy.copy(self)
-        batch.batch = (count,)
-        return batch
 
     def select(self, elements: Tensor) -> BoardProblem | None:
         """See `Problem.select`."""
@@ -168,65 +147,12 @@ class BoardProblem(SchurProblem[BoardState]):
             return None
         part = copy.copy(self)
         part.batch = (len(elements),)
-        part.terms = tuple(term.select(elements) for term in self.terms)
         if self.seen.ndim > 2:
             part.seen, part._target = self.seen[elements], self._target[elements]
             part._all_seen = bool(part.seen.all())
         if self.whitening is not None and self.whitening.ndim > 4:
             part.whitening = self.whitening[elements]
         return part
-
-    @classmethod
-    def joined(
-        cls, problems: Sequence[BoardProblem], starts: Sequence[BoardState], device: torch.device
-    ) -> tuple[BoardProblem, BoardState]:
-        """One batch of all elements of problems that are `alike`, and its start.
-
-        Views are padded with some in which no corner is seen: these add nothing, and their poses never move.
-        """
-        first, longest = problems[0], max(problem.seen.shape[-2] for problem in problems)
-        counts = [problem.elements for problem in problems]
-
-        def by_view(tensors: Sequence[Tensor], tail: int, fill: float | None = None) -> Tensor:
-            """Tensors whose last `tail` dimensions begin with the views, element after element."""
-            parts = []
-            for problem, tensor in zip(problems, tensors, strict=True):
-                shape = tensor.shape[-tail:]
-                parts.append(lengthened(tensor.expand(*problem.batch, *shape).reshape(-1, *shape), longest))
-                if fill is not None:
-                    parts[-1][:, shape[0] :] = fill
-            return torch.cat(parts).to(device)
-
-        whitening = [p.whitening.movedim(-1, -3) for p in problems if p.whitening is not None]
-        terms = joined_terms([problem.terms for problem in problems], counts, (sum(counts),))
-        joined = cls(
-            first.board_points.to(device),
-            by_view([problem.pixels for problem in problems], 3, torch.nan),
-            first.model,
-            first.free,
-            free_warp=first.free_warp,
-            whitening=by_view(whitening, 4) if whitening else None,
-            loss=first.loss,
-            terms=[term.to(device) for term in terms],
-            batch=(sum(counts),),
-        )
-        parameters, warp = (
-            torch.cat([state[k].reshape(-1, state[k].shape[-1]) for state in starts]).to(device) for k in (0, 1)
-        )
-        rotation = by_view([state.rotation for state in starts], 3)
-        return joined, BoardState(parameters, warp, rotation, by_view([state.translation for state in starts], 2))
-
-    @staticmethod
-    def split(result: Result[BoardState], problems: Sequence[BoardProblem]) -> list[Result[BoardState]]:
-        """The result of each problem of a batch made by `joined`, on the CPU."""
-        out, begin = [], 0
-        for problem in problems:
-            one = part_of(result, slice(begin, begin + problem.elements) if problem.batch else begin)
-            state = one.state.views(slice(problem.seen.shape[-2]))
-            state = state._replace(rotation=state.rotation.clone(), translation=state.translation.clone())
-            out.append(dataclasses.replace(one, state=state))
-            begin += problem.elements
-        return out
 
     def points(self, state: BoardState) -> tuple[Tensor, Tensor]:
         """Board points rotated into the camera's frame (..., V, 3, N), and moved there."""
@@ -310,17 +236,13 @@ class BoardProblem(SchurProblem[BoardState]):
         seen, target = self.seen[..., views, :], self._target[..., views, :, :]
         rotated, points = self.points(state)
         normal = state.rotation[..., 2]  # along which a warped board bulges
-        if on_host(self.model, points, state.parameters):
-            bend = normal[..., None, :, None] * self._shape[:, None] if self.free_warp else None
-            rows = board_rows(rotated, points, state.parameters, self.model, self.free, target, bend)
-        else:
-            projected = project_components(points, state.parameters[..., None, :], self.model, self.free.indices)
-            parts = [step_rows(projected.by_point, rotated), self.free.collapse(projected.by_camera, -3)]
-            if self.free_warp:
-                along = torch.einsum("...vkun,...vk->...vun", projected.by_point, normal)
-                parts.append(along[..., None, :, :] * self._shape[:, None])
-            bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
-            rows = torch.cat([*parts, (projected.pixels - target + bad)[..., None, :, :]], -3)
+        projected = project_components(points, state.parameters[..., None, :], self.model, self.free.indices)
+        parts = [step_rows(projected.by_point, rotated), self.free.collapse(projected.by_camera, -3)]
+        if self.free_warp:
+            along = torch.einsum("...vkun,...vk->...vun", projected.by_point, normal)
+            parts.append(along[..., None, :, :] * self._shape[:, None])
+        bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
+        rows = torch.cat([*parts, (projected.pixels - target + bad)[..., None, :, :]], -3)
         if not self._all_seen:
             rows = torch.where(seen[..., None, None, :], rows, 0.0)
         rows = self.whiten(rows, views)

@@ -1,4 +1,4 @@
-"""Closed-form initial values for calibration: Zhang's steps 1 to 4 (Algorithm 1 of the paper)."""
+"""Closed forms for calibration: homographies and the poses that follow from them (Algorithm 1 of the paper)."""
 
 from __future__ import annotations
 
@@ -49,72 +49,6 @@ def spread_out(board_points: Tensor, pixels: Tensor) -> Tensor:
     return values[..., 7] > 1e-9 * values[..., 0]
 
 
-def _rows(h: Tensor) -> tuple[Tensor, Tensor]:
-    """Zhang's two constraints on the image of the absolute conic, from the first two columns of H (V, 3, 3)."""
-
-    def v(i: int, j: int) -> Tensor:
-        a, b = h[..., i], h[..., j]
-        return torch.stack(
-            [
-                a[:, 0] * b[:, 0],
-                a[:, 0] * b[:, 1] + a[:, 1] * b[:, 0],
-                a[:, 1] * b[:, 1],
-                a[:, 2] * b[:, 0] + a[:, 0] * b[:, 2],
-                a[:, 2] * b[:, 1] + a[:, 1] * b[:, 2],
-                a[:, 2] * b[:, 2],
-            ],
-            -1,
-        )
-
-    return v(0, 1), v(0, 0) - v(1, 1)
-
-
-def intrinsics_candidates(homography: Tensor, size: tuple[int, int]) -> list[Tensor]:
-    """Initial values for (fx, fy, cx, cy), best first (Algorithm 1, step 2).
-
-    First the closed form with the principal point in the image's center, which two tilted views determine and which is
-    robust to noise; then Zhang's with a free principal point (skew 0), where it is real; then fixed fields of view, for
-    data on which the closed forms fail.
-
-    Args:
-        homography: (V, 3, 3) board → image.
-        size: (width, height).
-    """
-    width, height = size
-    center = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
-    # In units of the image's half width, so that the rows of both equations have similar scales.
-    unit = width / 2
-    normalize = torch.tensor([[1 / unit, 0, -center[0] / unit], [0, 1 / unit, -center[1] / unit], [0, 0, 1]])
-    h = normalize.to(torch.float64) @ homography
-    h = h / torch.linalg.vector_norm(h, dim=(-2, -1), keepdim=True)
-    first, second = _rows(h)
-    rows = torch.cat([first, second])
-    candidates = []
-
-    # Center known: B = diag(1/fx², 1/fy², 1), two unknowns.
-    solution = torch.linalg.lstsq(rows[:, [0, 2]], -rows[:, 5:6]).solution[:, 0]
-    if bool((solution > 0).all()):
-        focal = unit / torch.sqrt(solution)
-        candidates.append(torch.cat([focal, center]))
-
-    # Center free, skew zero: B has five entries up to scale.
-    kept = rows[:, [0, 2, 3, 4, 5]]
-    b = torch.linalg.svd(kept)[2][-1]
-    b = b * torch.sign(b[0])
-    b11, b22, b13, b23, b33 = b.unbind()
-    if bool((b11 > 0) & (b22 > 0)):
-        cx, cy = -b13 / b11, -b23 / b22
-        scale = b33 - b13**2 / b11 - b23**2 / b22
-        if bool(scale > 0) and bool(torch.hypot(cx, cy) < 1.0):
-            focal = unit * torch.sqrt(scale / torch.stack([b11, b22]))
-            candidates.append(torch.cat([focal, center + unit * torch.stack([cx, cy])]))
-
-    for factor in (1.0, 0.5, 2.0, 4.0):
-        focal = torch.full((2,), factor * width, dtype=torch.float64)
-        candidates.append(torch.cat([focal, center]))
-    return candidates
-
-
 def poses_from_homographies(homography: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     """Board poses (Algorithm 1, step 3): cam_from_board rotation (V, 3, 3) and translation (V, 3).
 
@@ -132,20 +66,6 @@ def poses_from_homographies(homography: Tensor, intrinsics: Tensor) -> tuple[Ten
     m = m * scale[:, None, None]
     third = torch.linalg.cross(m[..., 0], m[..., 1])
     return nearest_rotation(torch.stack([m[..., 0], m[..., 1], third], -1)), m[..., 2]
-
-
-def radial_start(
-    board_points: Tensor, pixels: Tensor, intrinsics: Tensor, rotation: Tensor, translation: Tensor
-) -> Tensor:
-    """k1, k2 by linear least squares under known intrinsics and poses (Algorithm 1, step 4; Zhang 2000, Eq. 13)."""
-    points = board_points @ rotation.transpose(-1, -2) + translation[:, None]
-    ideal = points[..., :2] / points[..., 2:]
-    s = (ideal * ideal).sum(-1, keepdim=True)
-    seen = torch.isfinite(pixels).all(-1)
-    error = pixels - (ideal * intrinsics[:2] + intrinsics[2:])
-    columns = torch.stack([ideal * s, ideal * s * s], -1) * intrinsics[:2, None]
-    solution = torch.linalg.lstsq(columns[seen].reshape(-1, 2), error[seen].reshape(-1, 1)).solution
-    return solution[:, 0]
 
 
 def flipped_poses(board_points: Tensor, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:

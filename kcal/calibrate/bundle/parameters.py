@@ -113,13 +113,6 @@ class ParameterConstraints:
             if not (math.isfinite(mean) and math.isfinite(sigma) and sigma > 0):
                 raise InputError(f"prior of {name} is {mean} ± {sigma}; it needs a positive standard deviation")
 
-    def allows(self, model: LensModel) -> bool:
-        """Whether a smaller model, its missing coefficients taken as zero, satisfies the constraints."""
-        names = parameter_names(model)
-        if any(name not in names and value != 0 for name, value in self.fixed.items()):
-            return False
-        return all(len({name in names for name in group}) == 1 for group in self.tied)
-
     def free_parameters(self, model: LensModel) -> FreeParameters:
         """The free parameters of a model."""
         names = parameter_names(model)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.batching import minimize
 from kcal.calibrate.bundle.board_problem import BoardState
 from kcal.calibrate.bundle.closed_form import flipped_poses, homographies, poses_from_homographies, spread_out
 from kcal.calibrate.bundle.views import Views
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
-from kcal.solve.lm import LMOptions
+from kcal.solve.lm import LMOptions, minimize
 
 # Enough to tell which of two tilts fits; the chosen one is refined with everything else afterwards.
 _ROUGH = LMOptions(max_iterations=10, tolerance=1e-4)

@@ -2,20 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
-
-from kcal.lens.tracing import plain_on_host
-
-Array = npt.NDArray[np.float64]
-# ω @ this is [ω]× row by row.
-_LEVI_CIVITA = np.array([
-    [0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0],
-    [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0],
-    [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-])  # fmt: skip
 
 
 def apply_twist(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
@@ -39,9 +27,6 @@ def apply_twist(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Te
         >>> [round(x, 12) + 0.0 for x in apply_twist(*start, quarter)[1].tolist()]  # a quarter turn about the origin
         [-1.0, 0.0, 0.0]
     """
-    if plain_on_host(rotation, translation, step):
-        moved = _apply_twist_on_host(rotation.numpy(), translation.numpy(), step.numpy())
-        return torch.from_numpy(moved[..., :3]), torch.from_numpy(moved[..., 3])
     turn, shift = step[..., :3], step[..., 3:]
     along = shift - torch.linalg.cross(turn, translation)
     square = (turn * turn).sum(-1, keepdim=True)
@@ -59,25 +44,3 @@ def apply_twist(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Te
     moved = columns + sine[..., None] * turned + first[..., None] * twice
     screwed = along + first * turned[..., 4] + second * twice[..., 4]
     return moved[..., :3], moved[..., 3] + screwed
-
-
-def _apply_twist_on_host(rotation: Array, translation: Array, step: Array) -> Array:
-    """The same by NumPy, which has less overhead per operation: (..., 3, 4), rotation and translation."""
-    turn, shift = step[..., :3], step[..., 3:]
-    square = (turn * turn).sum(-1)[..., None, None]
-    near = square < 1e-4
-    far = np.where(near, 1.0, square)
-    angle = np.sqrt(far)
-    sine, first = np.sin(angle) / angle, (1.0 - np.cos(angle)) / far
-    second = (1.0 - sine) / far
-    if near.any():
-        sine = np.where(near, 1.0 - square * (1.0 - square / 20.0) / 6.0, sine)
-        first = np.where(near, 0.5 - square * (1.0 - square / 30.0) / 24.0, first)
-        second = np.where(near, (1.0 - square * (1.0 - square / 42.0) / 20.0) / 6.0, second)
-    cross = (turn @ _LEVI_CIVITA).reshape(*turn.shape[:-1], 3, 3)
-    twice = cross @ cross
-    along = shift[..., None] - cross @ translation[..., None]
-    columns = np.concatenate([rotation, translation[..., None]], -1)
-    moved: Array = columns + (sine * cross + first * twice) @ columns
-    moved[..., 3:] += along + (first * cross + second * twice) @ along
-    return moved

@@ -21,8 +21,8 @@ from kcal.solve.robust import RobustLoss
 LEAST_NOISE = 1e-3
 # A lens must be regular this far beyond the outermost point; the image's corners move a little with the lens.
 _MARGIN = 1.05
-# Where `CameraViews.fold_penalty` looks: directions of the disc, points per side of the image, steps from the axis.
-_DIRECTIONS, _SIDE, _STEPS = 16, 8, 250
+# Points per side of the image's border.
+_SIDE = 8
 # Stretches in which the image's border is unprojected: Newton's method from afar may leave a strongly distorting lens.
 _SHARES = (0.5, 0.8, 1.0)
 
@@ -83,11 +83,6 @@ class Views:
         weights = None if self.whitening is None else self.whitening[chosen]
         return dataclasses.replace(self, pixels=self.pixels[chosen], whitening=weights)
 
-    @property
-    def corner_count(self) -> int:
-        """How many corners were seen."""
-        return int(torch.isfinite(self.pixels).all(-1).sum())
-
     def noise(self, state: BoardState, model: LensModel) -> float:
         """Standard deviation (pixels) of the residuals along an axis."""
         problem = self.problem(model)
@@ -102,7 +97,7 @@ class Views:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CameraViews(Views):
-    """Views with what is known about the camera, for the search of its lens.
+    """Views with what is known about the camera, for the fit of its lens.
 
     Args:
         size: (width, height) of the image.
@@ -114,10 +109,10 @@ class CameraViews(Views):
     constraints: ParameterConstraints = dataclasses.field(default_factory=ParameterConstraints)
     prior_noise: float = 0.3
 
-    def lens_problem(self, model: LensModel, batch: tuple[int, ...] = (), terms: Sequence[Term] = ()) -> BoardProblem:
+    def lens_problem(self, model: LensModel, terms: Sequence[Term] = ()) -> BoardProblem:
         """The least-squares problem of a lens model under the constraints, with their priors."""
         terms = (*terms, *self.prior_terms(model))
-        return self.problem(model, self.constraints.free_parameters(model), terms=terms, batch=batch)
+        return self.problem(model, self.constraints.free_parameters(model), terms=terms)
 
     def prior_terms(self, model: LensModel) -> tuple[Term, ...]:
         """The priors of the constraints."""
@@ -126,11 +121,6 @@ class CameraViews(Views):
     def with_noise_of(self, state: BoardState, model: LensModel) -> CameraViews:
         """The same with priors in proportion to the noise of a solution."""
         return dataclasses.replace(self, prior_noise=max(self.noise(state, model), LEAST_NOISE))
-
-    def rms(self, state: BoardState, model: LensModel) -> float:
-        """Root mean square distance (pixels) between corners and their projections, priors included."""
-        problem = self.lens_problem(model)
-        return math.sqrt(4.0 * float(problem.cost(state)) / problem.residual_count)
 
     def seen_radius(self, state: BoardState) -> float:
         """Radius on the plane z = 1 around all corners that were seen, with a margin."""
@@ -141,27 +131,6 @@ class CameraViews(Views):
         border = _border(state.parameters, model, self.size)
         seen = self.seen_radius(state)
         return seen if border is None else max(seen, _MARGIN * float(torch.hypot(*border).max()))
-
-    def fold_penalty(self, state: BoardState, model: LensModel) -> float:
-        """0 for a lens that is regular in the whole image, 1 if it folds outside the observed radius, else infinity.
-
-        Checked along some directions, in small steps, because a search has many candidates. The chosen lens is checked
-        in full (`kcal.lens.region`) when its camera is made.
-        """
-        angle = torch.arange(_DIRECTIONS, dtype=torch.float64) * (2.0 * math.pi / _DIRECTIONS)
-        disc = self.observed_radius(state) * torch.stack([torch.cos(angle), torch.sin(angle)])
-        if not _regular_up_to(disc, state.parameters, model):
-            return math.inf
-        border = _border(state.parameters, model, self.size)
-        return 0.0 if border is not None and _regular_up_to(border, state.parameters, model) else 1.0
-
-
-def _regular_up_to(ends: Tensor, parameters: Tensor, model: LensModel) -> bool:
-    """Whether a lens is regular on the straight lines from the axis to points (2, K) of the plane z = 1."""
-    steps = torch.linspace(0.0, 1.0, _STEPS + 1, dtype=torch.float64)[1:]
-    places = (ends[..., None] * steps).flatten(1)
-    points = torch.cat([places, torch.ones_like(places[:1])])
-    return bool(project_components(points, parameters, model).regular.all())
 
 
 def _border(parameters: Tensor, model: LensModel, size: tuple[int, int]) -> Tensor | None:

@@ -71,7 +71,6 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
         # Unknown is not the same as undetermined by the views.
         doubts, lost = [NO_ERROR_BARS], []
     weighted = problem.corner_residuals(solved.state, weighted=True)
-    minimum, noise = solution.minimum, solution.views.prior_noise
     return CameraCalibrationResult(
         camera=camera,
         observations=observations,
@@ -94,8 +93,8 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
         warnings=(
             *general_warnings(observations.names, camera, rms, per_view, lost, status),
             *doubts,
-            *rival_warnings(camera, sigma, minimum, solution.plain_cost, problem.residual_count),
-            *prior_warnings(minimum.terms, solved.state, noise),
+            *rival_warnings(camera, sigma, solution.rivals, solution.plain_cost, problem.residual_count),
+            *prior_warnings(solution.terms, solved.state, solution.views.prior_noise),
             *outlier_warnings(observations.names, weighted),
         ),
     )
@@ -109,7 +108,7 @@ def _uncertainty(
         # Under a known camera and a flat board nothing is shared by the views.
         return Uncertainty(state.parameters.new_zeros(0, 0), torch.zeros(0, dtype=torch.bool)), None
     # Barriers before folds are no information about the lens.
-    known = [term for term in solution.minimum.terms if isinstance(term, GaussianPrior)]
+    known = [term for term in solution.terms if isinstance(term, GaussianPrior)]
     plain = solution.problem_for(observations.pixels(), observations.covariances(), loss, known)
     linear = plain.linearize(state)
     count, residuals = plain.shared_size + 6 * len(state.translation), plain.residual_count + plain.prior_count
@@ -156,7 +155,7 @@ def _led_by_prior(
 ) -> tuple[str, ...]:
     """Parameters whose variance would more than double without their prior."""
     led = []
-    for term in solution.minimum.terms:
+    for term in solution.terms:
         if isinstance(term, GaussianPrior):
             spread = solution.views.prior_noise / term.weight
             for index, sigma in zip(term.index.tolist(), spread.tolist(), strict=True):

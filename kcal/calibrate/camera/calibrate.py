@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
 
 import torch
 
-from kcal.calibrate.bundle.batching import together
 from kcal.calibrate.camera.assess import assess
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, unusable_views
 from kcal.calibrate.camera.leave_out import calibrate_what_fits, listed_views, without_views
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.options import CalibrationOptions, Progress
 from kcal.calibrate.camera.outliers import solve_without_outliers
 from kcal.calibrate.camera.repeats import copied_views, copy_warnings, pose_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedView
 from kcal.calibrate.camera.sharing import ALONE, sharing
 from kcal.calibrate.camera.solve import solve
-from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError
 
@@ -38,10 +35,10 @@ def calibrate_camera(
     much of each of its terms, of the entrance pupil's movement and of the board's errors there is
     (`kcal.calibrate.camera.hybrid`).
 
-    A parametric model (`CalibrationOptions.model`) is solved by Zhang's method (2000): homographies, closed-form
-    intrinsics, poses and radial terms, then Levenberg-Marquardt on the reprojection error of all corners over all
-    parameters, with board poses eliminated by the Schur complement. Board poses with the wrong one of two tilts are
-    found and solved again.
+    A parametric model (`CalibrationOptions.model`) begins at the hybrid lens's base projection, whose curve its radial
+    terms follow; then Levenberg-Marquardt minimizes the reprojection error of all corners over all parameters, with
+    board poses eliminated by the Schur complement. Board poses with the wrong one of two tilts are found and solved
+    again.
 
     Args:
         observations: the views of one camera. Left out with a warning that names them are copies of other views,
@@ -141,7 +138,6 @@ def calibrate_cameras(
     progress: Progress = _silent,
     *,
     one_type: bool = False,
-    device: torch.device | str = "cpu",
 ) -> list[CameraCalibrationResult | KcalError]:
     """Calibrate several cameras with the same options.
 
@@ -149,21 +145,15 @@ def calibrate_cameras(
     what they know of its bending and print errors; the evidence tells which of them saw one
     (`CameraCalibrationResult.shared_board`). Five views of a camera are worth more with the board that others measured.
 
-    Alike minimizations of several cameras are solved as one batch (`kcal.calibrate.bundle.batching`). Cameras with few
-    views, where most time is overhead of operations on small tensors, take a fraction of the time of single calls.
-    Only cameras that saw equal boards share a batch.
-
     Args:
         observations: the views of each camera; numbers of views, image sizes and missing corners may differ.
         options: for all of them.
         progress: called with how many are finished.
         one_type: the cameras are of one type: from four cameras on, each learns from the others what its lens is like.
-        device: where batches are minimized. Results are on the CPU.
 
     Returns:
         for each camera what `calibrate_camera` returns, or the error that it would have raised: one bad set does not
-        affect the others. Parametric models agree within the solver's tolerance; where a rich one has several minima
-        with nearly equal cost, rounding may lead to another one.
+        affect the others.
 
     Raises:
         InputError: `one_type` with a parametric model, or with images of several sizes.
@@ -181,12 +171,13 @@ def calibrate_cameras(
         raise InputError("cameras of one type learn from each other with the hybrid lens only; leave the model out")
     if one_type and len({seen.image_size for seen in observations}) > 1:
         raise InputError("cameras of one type have images of one size; these have several")
-    count = len(observations)
-    alone = together(
-        [functools.partial(calibrate_camera, seen, options) for seen in observations],
-        torch.device(device),
-        lambda done: progress(f"{done} of {count} cameras"),
-    )
+    alone: list[CameraCalibrationResult | KcalError] = []
+    for seen in observations:
+        try:
+            alone.append(calibrate_camera(seen, options))
+        except KcalError as error:
+            alone.append(error)
+        progress(f"{len(alone)} of {len(observations)} cameras")
     try:
         return sharing(
             alone, options, one_type=one_type, advance=lambda name: progress(f"camera {name} with the others")

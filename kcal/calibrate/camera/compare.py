@@ -19,10 +19,9 @@ from kcal.calibrate.bundle.poses import poses_under
 from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.options import HYBRID, CalibrationOptions
+from kcal.calibrate.camera.options import HYBRID, CalibrationOptions, Progress
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.calibrate.lensfit.moving_poses import moving_residuals
-from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
 from kcal.lens.model import LensModel

@@ -19,7 +19,7 @@ from kcal.calibrate.camera.advice import roll_warnings, what_to_photograph
 from kcal.calibrate.camera.capture_warnings import motion_warnings, pixel_warnings
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
 from kcal.calibrate.camera.determined import check_directions
-from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection
+from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection, Progress
 from kcal.calibrate.camera.outliers import (
     check_share,
     corner_limits,
@@ -32,7 +32,6 @@ from kcal.calibrate.camera.pupil_check import pupil_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
 from kcal.calibrate.camera.warnings import general_warnings, hybrid_warnings, outlier_warnings
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
-from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.solve.result import SolverStatus
 

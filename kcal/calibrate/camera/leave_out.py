@@ -14,11 +14,10 @@ import torch
 
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views, least_planar
 from kcal.calibrate.camera.hybrid import calibrate_hybrid
-from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.camera.options import CalibrationOptions, Progress
 from kcal.calibrate.camera.outliers import corners_beyond, views_beyond
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedView
 from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
-from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Literal
 
 from kcal.calibrate.bundle.parameters import ParameterConstraints, natural_value
@@ -15,6 +15,7 @@ from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions
 from kcal.solve.robust import RobustLoss
 
+Progress = Callable[[str], None]
 HYBRID = "hybrid"
 # Degrees across the image from which lenses are nearer to an equidistant image than to a perspective one.
 _WIDE = 90.0

@@ -9,16 +9,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.batching import minimize
 from kcal.calibrate.bundle.closed_form import spread_out
 from kcal.calibrate.bundle.views import LEAST_NOISE
-from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection
+from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection, Progress
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
 from kcal.calibrate.camera.solve import Solution, solve
-from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
-from kcal.solve.lm import LMOptions
+from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import SolverStatus
 from kcal.solve.robust import RobustLoss
 

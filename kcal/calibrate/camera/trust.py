@@ -18,10 +18,9 @@ from torch import Tensor
 from kcal.calibrate.bundle.poses import poses_under
 from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection
+from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection, Progress
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.lensfit.moving_poses import moving_residuals
-from kcal.calibrate.search.model_ladder import Progress
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -11,7 +11,6 @@ from kcal.calibrate.bundle.board_problem import BoardState
 from kcal.calibrate.bundle.priors import GaussianPrior, Term
 from kcal.calibrate.camera.outliers import corners_beyond
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
-from kcal.calibrate.search.model_ladder import Minimum
 from kcal.lens.camera import Camera
 from kcal.solve.result import SolverStatus
 
@@ -51,12 +50,16 @@ def prior_warnings(terms: Sequence[Term], state: BoardState, noise: float) -> li
 
 
 def rival_warnings(
-    camera: Camera, sigma: dict[str, float | None], minimum: Minimum, cost: float, residual_count: int
+    camera: Camera,
+    sigma: Mapping[str, float | None],
+    rivals: Sequence[tuple[float, BoardState]],
+    cost: float,
+    residual_count: int,
 ) -> list[str]:
-    """A warning where another solution fits almost as well and lies outside the error bars."""
+    """A warning where another solution, of (cost, state), fits almost as well and lies outside the error bars."""
     variance = max(2.0 * cost / residual_count, 1e-300)
     here = dict(zip(camera.names, camera.params.tolist(), strict=True))
-    for other, state in minimum.rivals:
+    for other, state in rivals:
         if not 2.0 * (other - cost) / variance < _CLOSE_RIVAL:
             continue
         there = dict(zip(camera.names, state.parameters.tolist(), strict=True))

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
 from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.board_modes import BoardModes
-from kcal.calibrate.lensfit.families import PriorFamilies, prior_families
+from kcal.calibrate.lensfit.families import PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.fleet import LensPrior
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, hybrid_unknowns
 from kcal.errors import DegenerateError, InputError
@@ -20,7 +20,9 @@ from kcal.lens.base_map import angle_over_radius, radius_over_angle
 from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
+from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions, minimize
+from kcal.solve.result import Result
 from kcal.solve.robust import RobustLoss
 
 # R in half diagonals: the disc on which fields live reaches a little beyond the image's corners.
@@ -28,8 +30,8 @@ _REACH = 1.08
 # Shapes and angles of the image's corner from which the base projection is begun.
 _SHAPES = (1.0, 0.25, 0.0)
 _CORNERS = (12.0, 20.0, 30.0, 42.0, 55.0, 68.0, 80.0)
-
-
+# A field that is held at zero, as small as there is one.
+_NO_FIELD = ZernikeModes(radial=0, decentered=0, astigmatic=1, other=0)
 # The logarithms of motions' standard deviations over the noise, of views that stand still.
 NO_MOTION = np.zeros(0)
 
@@ -46,6 +48,106 @@ class Estimate(NamedTuple):
     tempering: float
 
 
+class Base(NamedTuple):
+    """A base projection with the poses of the views under it.
+
+    Attributes:
+        focal: F, pixels.
+        shape: s of the projection.
+        aspect: f_y / f_x; None: pixels are square.
+        state: the camera's parameters, the board as it was, and poses.
+        variance: of residuals along an axis, px².
+        steps: trial steps.
+    """
+
+    focal: float
+    shape: float
+    aspect: float | None
+    state: HybridState
+    variance: float
+    steps: int
+
+    @property
+    def distance(self) -> float:
+        """Typical distance of the board, meters."""
+        return float(self.state.translation.norm(dim=-1).median())
+
+
+def fit_projection(
+    points: Tensor,
+    pixels: Tensor,
+    size: tuple[int, int],
+    weights: Tensor,
+    square: bool = True,
+    known_focal: float | None = None,
+    robust: bool = False,
+    *,
+    exact_focal: bool = False,
+) -> Base:
+    """Fit focal length, principal point and shape of the base projection, for any lens from narrow to fisheye.
+
+    Pixels that are not square have two focal lengths here already: between square and stretched ones, amplitudes of the
+    board have other local maxima of the evidence.
+
+    Args:
+        points: (N, 3) of the board, meters.
+        pixels: (V, N, 2), NaN where not seen.
+        size: (width, height) of the image.
+        weights: (V, N) by which residuals are multiplied.
+        square: whether pixels are square.
+        known_focal: roughly, pixels; None: it is found.
+        robust: bound the weight of corners that are far off.
+        exact_focal: `known_focal` is not changed.
+
+    Raises:
+        InputError: no projection explains the corners.
+        DegenerateError: the views do not determine the focal length.
+
+    Example:
+        >>> from kcal.lens.camera import Camera
+        >>> from kcal.lens.pose import rotation_from_vector
+        >>> points = torch.cartesian_prod(torch.arange(6.0), torch.arange(7.0), torch.zeros(1)).double() * 0.05
+        >>> truth = Camera.build(focal=(800, 800), center=(322, 238), size=(640, 480), model="pinhole")
+        >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)
+        >>> shift = torch.tensor([-0.12, -0.15, 0.6], dtype=torch.float64)
+        >>> pixels = truth.project(points @ rotation_from_vector(tilts).transpose(-1, -2) + shift)[0]
+        >>> base = fit_projection(points, pixels, (640, 480), torch.ones(4, 42))
+        >>> round(base.focal, 1), abs(base.shape - 1.0) < 1e-2  # a perspective image
+        (800.0, True)
+    """
+    focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal, None)
+    still = rotation.new_zeros(len(rotation), 0)
+    flat = BoardModes(points.new_zeros(0, 3, len(points)), points.new_zeros(0), torch.zeros(0, dtype=torch.long))
+    state = HybridState(points.new_zeros(0), flat.unit, rotation, translation, still)
+    base = Base(focal, shape, None if square else 1.0, state, 0.0, 0)
+    h = typical_hyperprior(_NO_FIELD).mean
+    for _ in range(6):
+        model, families = _with_constants(base, size, _NO_FIELD, flat)
+        state = base.state
+        if not len(state.params):
+            state = state._replace(params=_leading(model, base.focal, families))
+        held = _held(families, flat, square, exact_focal)
+        problem, result = _solve_base(points, pixels, weights, (model, families), state, h, held, robust, flat)
+        state = HybridState(*result.state)
+        scale, bend = float(state.params[0]) / base.focal - 1.0, float(state.params[5])
+        base = Base(
+            float(state.params[0]),
+            base.shape + min(max(bend, -1.0), 1.0),
+            None if square else float(state.params[1]) / float(state.params[0]),
+            state._replace(params=torch.cat([state.params[:5], torch.zeros_like(state.params[5:])])),
+            _residual_variance(problem, result),
+            base.steps + int(result.iterations),
+        )
+        if not (0 < base.focal < math.inf and abs(base.shape) <= 10 and 0.1 < (base.aspect or 1.0) < 10):
+            raise DegenerateError(
+                "the views do not determine the focal length: they are parallel to the image or too similar; add views "
+                "with the board tilted by 30 to 45 degrees in different directions"
+            )
+        if not robust and abs(scale) < 1e-3 and abs(bend) < 1e-3 * (1 + abs(base.shape)):
+            break
+    return base
+
+
 def fit_base(
     points: Tensor,
     pixels: Tensor,
@@ -59,63 +161,96 @@ def fit_base(
     h: Tensor,
     lens: LensPrior | None,
 ) -> tuple[Estimate, int]:
-    """Fit the base projection alone: its focal length and shape become constants of the lens. Also the trial steps.
-
-    Pixels that are not square have two focal lengths here already: between square and stretched ones, amplitudes of the
-    board have other local maxima of the evidence.
-    """
-    focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal, lens)
-    aspect = None if square else 1.0
-    radius = _REACH * 0.5 * math.hypot(*size)
-    distance = float(translation.norm(dim=-1).median())
-    spent = 0
-
-    def constants(focal: float, shape: float, aspect: float | None) -> tuple[LensModel, PriorFamilies]:
-        if lens is not None:
-            usual = prior_families(lens.form, lens.focal, board, size, distance, aspect)
-            return LensModel(hybrid=lens.form), lens.families(usual)
-        form = HybridForm(shape=shape, radius=radius / focal, modes=modes)
-        return LensModel(hybrid=form), prior_families(form, focal, board, size, distance, aspect)
-
-    model, families = constants(focal, shape, aspect)
-    held = torch.ones(len(families.mean), dtype=torch.bool)
-    held[:4] = False
-    if not square:
-        held[-1 - len(board.unit)] = False
-    params = torch.zeros(5 + model.size, dtype=torch.float64)
-    params[:4] = torch.tensor([focal, focal, families.mean[1], families.mean[2]])
+    """Fit the base projection alone: its focal length and shape become constants of the lens. Also the trial steps."""
     if lens is not None:
-        unknowns = hybrid_unknowns(model, square)
-        params[list(unknowns.indices)] = unknowns.expand(lens.mean)
+        return _fit_known(points, pixels, size, weights, board, square, robust, h, lens)
+    base = fit_projection(points, pixels, size, weights, square, known_focal, robust)
+    model, families = _with_constants(base, size, modes, board)
+    params = torch.zeros(5 + model.size, dtype=torch.float64)
+    params[:5] = base.state.params[:5]
+    state = base.state._replace(params=params, board=torch.zeros_like(board.unit))
+    return Estimate(model, families, state, h, NO_MOTION, base.variance, 1.0), base.steps
+
+
+def _fit_known(
+    points: Tensor,
+    pixels: Tensor,
+    size: tuple[int, int],
+    weights: Tensor,
+    board: BoardModes,
+    square: bool,
+    robust: bool,
+    h: Tensor,
+    lens: LensPrior,
+) -> tuple[Estimate, int]:
+    """Likewise for a camera of a known type, whose constants and typical field are given."""
+    _, _, rotation, translation = _base_start(points, pixels, size, weights, None, lens)
+    aspect = None if square else 1.0
+    distance = float(translation.norm(dim=-1).median())
+    families = lens.families(prior_families(lens.form, lens.focal, board, size, distance, aspect))
+    model = LensModel(hybrid=lens.form)
+    params = _leading(model, lens.focal, families)
+    unknowns = hybrid_unknowns(model, square)
+    params[list(unknowns.indices)] = unknowns.expand(lens.mean)
     still = rotation.new_zeros(len(rotation), 0)
     state = HybridState(params, torch.zeros_like(board.unit), rotation, translation, still)
-    for _ in range(6):
-        precision = torch.where(held, torch.inf, families.deviation(h).square().reciprocal())
-        problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision, square=square)
-        if robust:
-            problem = problem.with_weights(cauchy_weights(problem, state, weights))
-        result = minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
-        spent += int(result.iterations)
-        state = HybridState(*result.state)
-        if lens is not None:
-            break
-        scale, bend = float(state.params[0]) / focal - 1.0, float(state.params[5])
-        focal, shape = float(state.params[0]), shape + min(max(bend, -1.0), 1.0)
-        aspect = None if square else float(state.params[1]) / focal
-        if not (0 < focal < math.inf and abs(shape) <= 10 and (aspect is None or 0.1 < aspect < 10)):
-            raise DegenerateError(
-                "the views do not determine the focal length: they are parallel to the image or too similar; add views "
-                "with the board tilted by 30 to 45 degrees in different directions"
-            )
-        model, families = constants(focal, shape, aspect)
-        params = state.params.clone()
-        params[5] = 0.0
-        state = state._replace(params=params)
-        if not robust and abs(scale) < 1e-3 and abs(bend) < 1e-3 * (1 + abs(shape)):
-            break
-    freedom = 2 * int(problem.seen.sum()) - 6 * len(pixels)
-    variance = max(2.0 * float(result.cost) / freedom, LEAST_NOISE**2)
-    return Estimate(model, families, state, h, NO_MOTION, variance, 1.0), spent
+    held = _held(families, board, square, False)
+    problem, result = _solve_base(points, pixels, weights, (model, families), state, h, held, robust, board)
+    estimate = Estimate(
+        model, families, HybridState(*result.state), h, NO_MOTION, _residual_variance(problem, result), 1.0
+    )
+    return estimate, int(result.iterations)
+
+
+def _with_constants(
+    base: Base, size: tuple[int, int], modes: FieldModes, board: BoardModes
+) -> tuple[LensModel, PriorFamilies]:
+    """A lens on a base projection, and its priors."""
+    form = HybridForm(shape=base.shape, radius=_REACH * 0.5 * math.hypot(*size) / base.focal, modes=modes)
+    families = prior_families(form, base.focal, board, size, base.distance, base.aspect)
+    return LensModel(hybrid=form), families
+
+
+def _leading(model: LensModel, focal: float, families: PriorFamilies) -> Tensor:
+    """(5 + P,) parameters of the base projection alone."""
+    params = torch.zeros(5 + model.size, dtype=torch.float64)
+    params[:4] = torch.tensor([focal, focal, families.mean[1], families.mean[2]])
+    return params
+
+
+def _held(families: PriorFamilies, board: BoardModes, square: bool, focal: bool) -> Tensor:
+    """(S,) all unknowns but focal length, principal point and shape: field, pupil and board are held."""
+    held = torch.ones(len(families.mean), dtype=torch.bool)
+    held[int(focal) : 4] = False
+    if not square:
+        held[-1 - len(board.unit)] = False
+    return held
+
+
+def _solve_base(
+    points: Tensor,
+    pixels: Tensor,
+    weights: Tensor,
+    lens: tuple[LensModel, PriorFamilies],
+    state: HybridState,
+    h: Tensor,
+    held: Tensor,
+    robust: bool,
+    board: BoardModes,
+) -> tuple[HybridProblem, Result[HybridState]]:
+    """Solve for what is not held, and for poses; pixels are square if the lens has no focal length of the rows."""
+    model, families = lens
+    square = len(families.mean) == len(hybrid_unknowns(model)) + len(board.unit)
+    precision = torch.where(held, torch.inf, families.deviation(h).square().reciprocal())
+    problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision, square=square)
+    if robust:
+        problem = problem.with_weights(cauchy_weights(problem, state, weights))
+    return problem, minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
+
+
+def _residual_variance(problem: HybridProblem, result: Result[HybridState]) -> float:
+    freedom = 2 * int(problem.seen.sum()) - 6 * len(problem.seen)
+    return max(2.0 * float(result.cost) / freedom, LEAST_NOISE**2)
 
 
 def cauchy_weights(problem: HybridProblem, state: HybridState, weights: Tensor) -> Tensor:

@@ -11,9 +11,7 @@ from kcal.calibrate.bundle.board_problem import BoardState
 from kcal.calibrate.bundle.closed_form import (
     flipped_poses,
     homographies,
-    intrinsics_candidates,
     poses_from_homographies,
-    radial_start,
     spread_out,
 )
 from kcal.calibrate.bundle.poses import poses_under, refine_poses, unflip
@@ -87,38 +85,6 @@ class TestSpreadOut:
         assert spread_out(board.points, pixels).tolist() == [True, False, True]
 
 
-class TestIntrinsics:
-    @pytest.mark.parametrize("views", [2, 6])
-    def test_exact_with_the_principal_point_in_the_middle(self, views: int) -> None:
-        found = intrinsics_candidates(true_homographies(CENTERED, motions(CENTERED, views, 4)), SIZE)[0]
-        expected = CENTERED.params[:4]
-        torch.testing.assert_close(found, expected, rtol=1e-9, atol=0)
-
-    @pytest.mark.parametrize("views", [3, 6])
-    def test_second_is_exact_with_it_elsewhere(self, views: int) -> None:
-        homography = true_homographies(OFF_CENTER, motions(OFF_CENTER, views, 4))
-        found = intrinsics_candidates(homography, SIZE)
-        torch.testing.assert_close(found[1], OFF_CENTER.params[:4], rtol=1e-8, atol=0)
-        # The first is a compromise, near enough to start from.
-        assert 0.5 < float(found[0][0]) / 500 < 2.0
-
-    def test_scale_and_sign_of_homographies_do_not_matter(self) -> None:
-        homography = true_homographies(OFF_CENTER, motions(OFF_CENTER, 5, 4))
-        scaled = homography * torch.tensor([-1e4, 1e-4, 1.0, 7.0, -2.0], dtype=torch.float64)[:, None, None]
-        plain, other = intrinsics_candidates(homography, SIZE), intrinsics_candidates(scaled, SIZE)
-        for a, b in zip(plain, other, strict=True):
-            torch.testing.assert_close(a, b, rtol=1e-9, atol=0)
-
-    def test_boards_parallel_to_the_image_leave_only_guesses(self) -> None:
-        rotation = torch.eye(3).double().expand(4, 3, 3)
-        translation = torch.tensor([[-0.1, -0.1, 0.6], [0, 0, 0.8], [-0.2, 0.0, 1.0], [-0.1, -0.2, 1.2]]).double()
-        candidates = intrinsics_candidates(true_homographies(CENTERED, (rotation, translation)), SIZE)
-        guesses = torch.stack(candidates[-4:])
-        assert (guesses[:, 0] / SIZE[0]).tolist() == [1.0, 0.5, 2.0, 4.0]
-        assert bool((guesses[:, 2:] == torch.tensor([319.5, 239.5]).double()).all())
-        assert all(bool(torch.isfinite(candidate).all()) for candidate in candidates)
-
-
 class TestPoses:
     @pytest.mark.parametrize("truth", [CENTERED, OFF_CENTER], ids=["centered", "off center"])
     def test_exact(self, truth: Camera) -> None:
@@ -133,19 +99,6 @@ class TestPoses:
         rotation, translation = poses_from_homographies(homography, CENTERED.params[:4])
         torch.testing.assert_close(rotation, poses[0], rtol=0, atol=1e-12)
         torch.testing.assert_close(translation, poses[1], rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("missing", [False, True])
-def test_radial_terms_are_exact_under_known_poses(missing: bool) -> None:
-    truth = Camera.build(
-        focal=(500, 505), center=(325.8, 235.3), size=SIZE, coefficients=[-0.08, 0.03], model="opencv4"
-    )
-    poses = motions(truth, 4, 3)
-    pixels = pixels_of(truth, poses)
-    if missing:
-        pixels[1, 5:] = torch.nan
-    found = radial_start(BOARD.points, pixels, truth.params[:4], *poses)
-    torch.testing.assert_close(found, torch.tensor([-0.08, 0.03], dtype=torch.float64), rtol=0, atol=1e-11)
 
 
 class TestFlippedPoses:

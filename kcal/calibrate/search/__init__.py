@@ -1,1 +1,0 @@
-"""How a minimum is found where there are several."""
