@@ -169,11 +169,11 @@ from kcal.nets.inverse import InverseFit as InverseFit
 from kcal.nets.inverse import InverseNet as InverseNet
 from kcal.nets.inverse import InverseNetOptions as InverseNetOptions
 from kcal.nets.inverse import train_inverse as train_inverse
-from kcal.pipeline.consider import ClockEstimate as ClockEstimate
-from kcal.pipeline.consider import ClockPrior as ClockPrior
 from kcal.pipeline.estimates import TrackStates as TrackStates
 from kcal.pipeline.motion import Motion as Motion
 from kcal.pipeline.pairs import ObjectPairs as ObjectPairs
+from kcal.pipeline.shared_errors import ClockEstimate as ClockEstimate
+from kcal.pipeline.shared_errors import ClockPrior as ClockPrior
 from kcal.pipeline.smoothing import SmoothedTrack as SmoothedTrack
 from kcal.pipeline.tracks import Tracker as Tracker
 from kcal.pipeline.tracks import TrackOptions as TrackOptions

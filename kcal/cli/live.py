@@ -118,12 +118,12 @@ def live_command(
     from kcal.files import check_writable
     from kcal.io.rig_file import load_rig
     from kcal.lens.mounting import Origin
-    from kcal.locate.locator import Locator
     from kcal.locate.positions import located_by
+    from kcal.locate.tabulate import Locator
     from kcal.pipeline.association import AssociationOptions
-    from kcal.pipeline.consider import ClockPrior
     from kcal.pipeline.lines import read_moment
     from kcal.pipeline.senders import sender_to
+    from kcal.pipeline.shared_errors import ClockPrior
     from kcal.pipeline.stream import Stream, lines_of
     from kcal.pipeline.tracks import Tracker, TrackOptions
 

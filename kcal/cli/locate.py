@@ -157,12 +157,12 @@ def locate_command(
     from kcal.lens.rig import RigCovariance
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import STREAM, check_format, open_writers
-    from kcal.locate.locator import Locator
     from kcal.locate.marks import filled, read_mark_chunks
     from kcal.locate.mounting import mounting_covariance
     from kcal.locate.positions import located_by
     from kcal.locate.sample import PositionSample
     from kcal.locate.survey import read_survey
+    from kcal.locate.tabulate import Locator
     from kcal.locate.truth import read_truth
     from kcal.report.figures import check_picture
     from kcal.report.map_page import check_map_format, save_map

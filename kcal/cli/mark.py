@@ -64,7 +64,7 @@ def mark_command(
 
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import load_rig
-    from kcal.mark.desk import Desk
+    from kcal.mark.marking_service import Desk
     from kcal.mark.pictures import open_pictures
     from kcal.mark.reference import Reference
     from kcal.mark.session import Session

@@ -19,13 +19,13 @@ from kcal.corners.detection import Detection, too_few
 from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness
 from kcal.corners.grid_check import without_false_sides
 from kcal.corners.images import Gray, decode_gray, to_8bit, unique_names
-from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus
 from kcal.corners.search import SEARCH_SIDES, find_board, largest_grid, reduced, refine_through_sizes
 from kcal.corners.seen_instead import seen_instead
 from kcal.corners.sizes import common_size, rescaled, resized_alike
+from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 
@@ -112,7 +112,7 @@ def detect_images(
         refine: see `kcal.corners.refine.refine_corners`.
         progress: called with each image's name when it is done.
         time_limit: seconds after which an image becomes a failure; no limit by default. See
-            `kcal.corners.limited.Limited`.
+            `kcal.corners.time_limit.Limited`.
         note: called with what was done about images of several sizes; a Python warning by default.
         on_failure: called with the name, path and detection of each readable image that shows no board, for example to
             draw why (`kcal.report.gallery.FailedImage`).

@@ -17,9 +17,9 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
 from kcal.corners.detection import Detection
-from kcal.corners.limited import Limited, TookTooLongError
 from kcal.corners.observations import Failure, Observations, View
 from kcal.corners.refine import Refinement
+from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
 from kcal.files import write_atomic
 from kcal.sources import is_stream, source_name

@@ -12,6 +12,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.camera_conversions import ConvertibleCamera
+from kcal.lens.dispatch import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_points import map_points
 from kcal.lens.hybrid_points_fit import FittedPolynomials, worth_fitting
@@ -22,7 +23,6 @@ from kcal.lens.plane import angle_over_distance, plane_from_points, rays_from_pl
 from kcal.lens.projection import from_pixels, to_pixels
 from kcal.lens.pupil import FAR, pupil_depth, ray_starts
 from kcal.lens.region import Region, in_region, surely_in_region
-from kcal.lens.tracing import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
 
 
 class Camera(ConvertibleCamera):

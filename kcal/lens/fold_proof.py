@@ -2,7 +2,8 @@
 
 Between two samples of a determinant any number of folds can hide: where the numerator and the denominator of the radial
 factor nearly cancel, a fold may be as narrow as rounding. So the determinant of the Jacobian is bounded on whole cells,
-intervals of the radius in a sector (`kcal.lens.jets`), and cells that are too large for a decision are cut in four.
+intervals of the radius in a sector (`kcal.lens.taylor_bounds`), and cells that are too large for a decision are cut in
+four.
 
 The tilt is one-to-one wherever it is regular and is left out. Times the third power of the radial denominator D(r²),
 the determinant at radius r and angle φ is, in complex numbers,
@@ -24,8 +25,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.jets import Jet, Span
 from kcal.lens.model import LensModel
+from kcal.lens.taylor_bounds import Jet, Span
 
 # Sectors around a lens that is not symmetric, the narrowest that are told apart.
 SECTORS = 1024

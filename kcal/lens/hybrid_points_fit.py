@@ -9,6 +9,7 @@ import torch
 from numpy.polynomial import chebyshev
 from torch import Tensor
 
+from kcal.lens.dispatch import is_traced, may_overwrite
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_points import FEWEST, Backward, Forward
 from kcal.lens.hybrid_terms import HybridForm
@@ -20,7 +21,6 @@ from kcal.lens.plane_map import Polynomials, chebyshev_nodes, fit_plane_map, pol
 from kcal.lens.projection import INTRINSICS, to_pixels
 from kcal.lens.pupil import pupil_depth, ray_starts
 from kcal.lens.region import SURE, Region
-from kcal.lens.tracing import is_traced, may_overwrite
 from kcal.lens.zernike import ZernikeModes
 
 # Pixels: left out of each polynomial; largest difference to the formulas; what the last step of an inverse may leave.

@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from kcal.checks import as_points
+from kcal.lens.dispatch import finite_or, in_chunks, is_differentiated, known_true, may_branch
 from kcal.lens.distortion import check_coefficients, distort_components
 from kcal.lens.inverse_safeguarded import solve_safeguarded
 from kcal.lens.inverse_start import fit_start, start_from, undo_tilt
 from kcal.lens.model import LensModel
 from kcal.lens.newton import Jacobian, inverse_jacobian, is_solved, newton_step, squared_tolerance
 from kcal.lens.region import Region, in_region, valid_region
-from kcal.lens.tracing import finite_or, in_chunks, is_differentiated, known_true, may_branch
 
 # Steps before a point goes to the safeguarded solver, and steps where all points take the same number.
 _STEPS = 6

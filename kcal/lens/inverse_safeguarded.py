@@ -13,11 +13,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from kcal.lens.dispatch import known_true
 from kcal.lens.distortion import distort_components
 from kcal.lens.model import LensModel
 from kcal.lens.newton import inverse_jacobian, newton_step
 from kcal.lens.region import DIRECTIONS, Region, in_region
-from kcal.lens.tracing import known_true
 
 _RINGS = 16
 # The image of the region's edge is known at 64 directions only. A target this much farther out may still be inside:

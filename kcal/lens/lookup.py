@@ -7,8 +7,8 @@ from torch import Tensor
 
 from kcal.checks import Float64Module, as_points
 from kcal.errors import InputError
+from kcal.lens.dispatch import finite_or, in_chunks, is_differentiated
 from kcal.lens.spline import Spline, evaluate_spline
-from kcal.lens.tracing import finite_or, in_chunks, is_differentiated
 
 _PARTS = Spline._fields
 

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.lens.dispatch import is_differentiated, known_true
 from kcal.lens.plane import angle_over_distance
-from kcal.lens.tracing import is_differentiated, known_true
 from kcal.lens.zernike import unbind_last
 
 # Meters at which a point is as good as infinitely far: an entrance pupil has no effect there. Scaling by a power of two

@@ -25,11 +25,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.lens.dispatch import known_true, may_branch
 from kcal.lens.distortion import Distorted, check_coefficients, distort_components
 from kcal.lens.fold_proof import SECTORS, prove_regular
 from kcal.lens.model import LensModel
 from kcal.lens.plane import largest_radius
-from kcal.lens.tracing import known_true, may_branch
 from kcal.lens.zernike import unbind_last
 
 DIRECTIONS = 64

@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.lens.dispatch import may_overwrite
 from kcal.lens.field_modes import WeightPrior
-from kcal.lens.tracing import may_overwrite
 
 RADIAL, DECENTERED, ASTIGMATIC, OTHER, TILTED, ASPECT = range(6)
 

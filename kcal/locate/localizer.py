@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from kcal.checks import as_covariance, as_points, keep_float64
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
+from kcal.lens.dispatch import is_differentiated
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Origin, check_refraction
 from kcal.lens.rig import RigCovariance, StereoRig
-from kcal.lens.tracing import is_differentiated
 from kcal.locate.ellipsoid import mean_radius
 from kcal.locate.geodesy import anchor, enu_from_cam, place_enu
 from kcal.locate.max_likelihood import by_pose, calibration_effect, position_slope, symmetric

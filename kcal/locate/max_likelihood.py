@@ -23,9 +23,9 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.camera_stack import project_each
+from kcal.lens.dispatch import is_traced, known_true
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection
-from kcal.lens.tracing import is_traced, known_true
 
 # Evaluations. Graphs cannot stop early: with three they err by 4e-6 of the noise where marks are 10 px off, with two by
 # 1e-2.

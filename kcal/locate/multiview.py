@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from kcal.checks import as_points, keep_float64, require_finite
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.tracing import is_differentiated
+from kcal.lens.dispatch import is_differentiated
 from kcal.locate.angular import triangulate_angular
 from kcal.locate.linear import triangulate_linear
 from kcal.locate.max_likelihood import RelativeCamera, inverse_covariances, most_likely, position_slope, symmetric

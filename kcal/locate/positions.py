@@ -15,9 +15,9 @@ from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.columns import NUMBERS, PositionColumns
 from kcal.locate.datum import Geoid
-from kcal.locate.locator import Locator, Viewpoint
 from kcal.locate.stereo import PositionStatus, checked_pairs
 from kcal.locate.tables import CHUNK_ROWS
+from kcal.locate.tabulate import Locator, Viewpoint
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -8,9 +8,9 @@ from collections.abc import Set as AbstractSet
 import numpy as np
 
 from kcal.locate.columns import PositionColumns
-from kcal.locate.locator import Locator
 from kcal.locate.positions import Located, Position, located_by, positions_of
 from kcal.locate.stereo import PositionStatus
+from kcal.locate.tabulate import Locator
 
 # More than anybody reads, and few enough for a picture and a page.
 SAMPLE_ROWS = 1000

@@ -16,8 +16,8 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera_stack import unproject_each
+from kcal.lens.dispatch import CHUNK, is_traced, known_true
 from kcal.lens.rig import StereoRig
-from kcal.lens.tracing import CHUNK, is_traced, known_true
 from kcal.locate.angular import EPIPOLE, triangulate_pairs
 from kcal.locate.max_likelihood import PointFit, RelativeCamera, inverse_covariances, most_likely
 from kcal.locate.ranges import BEARING_SIGMAS, RangeInterval, range_interval

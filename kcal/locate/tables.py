@@ -20,7 +20,7 @@ import orjson
 from numpy.typing import NDArray
 
 from kcal.errors import FileError
-from kcal.lens.tracing import CHUNK
+from kcal.lens.dispatch import CHUNK
 
 # The pieces in which the localizer does many points: a table is located as in one call, to the last bit.
 CHUNK_ROWS = CHUNK

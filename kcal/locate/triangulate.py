@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from kcal.lens.dispatch import is_differentiated
 from kcal.lens.rig import StereoRig
-from kcal.lens.tracing import is_differentiated
 from kcal.locate.stereo import (
     PositionStatus,
     checked_pairs,

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import torch
 
-from kcal.corners.again import find_again
 from kcal.corners.images import Gray
 from kcal.corners.match import MatchStatus
+from kcal.corners.refind import find_again
 from kcal.errors import InputError
 from kcal.locate.marks import Marks, read_marks
 from kcal.mark.guide import Proposal

@@ -14,8 +14,8 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from kcal.corners.point import enlarge
-from kcal.mark.desk import Desk
 from kcal.mark.items import ACTION, Mark, Side
+from kcal.mark.marking_service import Desk
 from kcal.web.gate import local_app, page_files
 
 _Coordinate = Annotated[float, pydantic.Field(allow_inf_nan=False, ge=-1e6, le=1e6)]

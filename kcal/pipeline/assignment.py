@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from kcal.pipeline.beliefs import Beliefs, Timing
-from kcal.pipeline.lanes import product
-from kcal.pipeline.sightings import Anchored, Sightings
+from kcal.pipeline.imm_filter import Beliefs, Timing
+from kcal.pipeline.measurements import Anchored, Sightings
+from kcal.pipeline.small_matrices import product
 
 
 class Scores(NamedTuple):

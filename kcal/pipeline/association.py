@@ -23,9 +23,9 @@ from kcal.errors import InputError
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.max_likelihood import calibration_effect, unreached_direction
 from kcal.locate.stereo import PairFit, PositionStatus, fit_pairs, inverse_range
+from kcal.pipeline.appearance import appearance
 from kcal.pipeline.detections import Anchor, Detections
 from kcal.pipeline.epipolar_band import near_epipolar_lines
-from kcal.pipeline.looks import appearance
 
 # Spread of the logarithm of an object's size between two views, besides what boxes err: it is seen from two sides.
 _SIZE_SPREAD = 0.15

@@ -13,8 +13,8 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.mounting import by_mounting
 from kcal.locate.ranges import BEARING_SIGMAS, range_interval
 from kcal.locate.stereo import PositionStatus, flag_positions
-from kcal.pipeline.beliefs import Summary
-from kcal.pipeline.lanes import congruent, product, squared
+from kcal.pipeline.imm_filter import Summary
+from kcal.pipeline.small_matrices import congruent, product, squared
 
 
 class TrackStates(NamedTuple):

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.pipeline.lanes import outer, product
+from kcal.pipeline.small_matrices import outer, product
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

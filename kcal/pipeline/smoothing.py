@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.beliefs import Summary
 from kcal.pipeline.estimates import TrackStates, track_states
+from kcal.pipeline.imm_filter import Summary
 
 
 class SmoothedTrack(NamedTuple):

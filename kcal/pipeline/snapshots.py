@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import FileError
-from kcal.pipeline.beliefs import Beliefs
+from kcal.pipeline.imm_filter import Beliefs
 from kcal.pipeline.tracks import Tracker, TrackRecord
 
 # Of the tensors: a journal of another one is of no use.

@@ -21,10 +21,10 @@ from kcal.locate.columns import PositionColumns
 from kcal.locate.export import APPENDED, appended
 from kcal.locate.positions import Located
 from kcal.pipeline.handover import Handover
-from kcal.pipeline.ledger import Ledger
 from kcal.pipeline.lines import Moment
 from kcal.pipeline.senders import Sender
 from kcal.pipeline.snapshots import restore, snapshot
+from kcal.pipeline.stream_journal import Ledger
 from kcal.pipeline.track_columns import track_columns
 from kcal.pipeline.tracks import Tracker, Tracks
 

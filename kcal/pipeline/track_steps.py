@@ -15,10 +15,10 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.assignment import Scores, nearby
-from kcal.pipeline.beliefs import Beliefs, Timing, fit_of, innovations, no_beliefs, predicted, updated
 from kcal.pipeline.estimates import TrackStates, track_states
+from kcal.pipeline.imm_filter import Beliefs, Timing, fit_of, innovations, no_beliefs, predicted, updated
+from kcal.pipeline.measurements import Anchored, Sightings, anchored, sightings
 from kcal.pipeline.motion import transition
-from kcal.pipeline.sightings import Anchored, Sightings, anchored, sightings
 
 # Of stand-ins from which graphs are made: sizes that no other axis has, so that none seem to belong together.
 _STAND_INS = _PAIRS, _TRACKS, _MATCHES, _TAKEN, _TOLD = 1009, 1013, 1019, 1021, 1031

@@ -13,7 +13,8 @@ from kcal.errors import InputError
 from kcal.lens.pose import side_axes
 from kcal.locate.localizer import StereoLocalizer
 from kcal.pipeline.assignment import Candidates, assigned, mark_numbers, within
-from kcal.pipeline.beliefs import (
+from kcal.pipeline.estimates import TrackStates
+from kcal.pipeline.imm_filter import (
     Beliefs,
     Timing,
     born,
@@ -21,12 +22,11 @@ from kcal.pipeline.beliefs import (
     no_beliefs,
     predicted,
 )
-from kcal.pipeline.consider import ClockEstimate, ClockPrior, SharedErrors
-from kcal.pipeline.estimates import TrackStates
-from kcal.pipeline.lanes import mahalanobis, product, squared
+from kcal.pipeline.measurements import Sightings, anchored
 from kcal.pipeline.motion import MOTIONS, Motion, step_numbers, transition
 from kcal.pipeline.pairs import ObjectPairs
-from kcal.pipeline.sightings import Sightings, anchored
+from kcal.pipeline.shared_errors import ClockEstimate, ClockPrior, SharedErrors
+from kcal.pipeline.small_matrices import mahalanobis, product, squared
 from kcal.pipeline.smoothing import History, SmoothedTrack
 from kcal.pipeline.track_steps import compiled_steps, track_steps
 

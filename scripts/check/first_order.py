@@ -6,7 +6,8 @@
 The paper (Section 4.3.1) found that first-order optimizers fail on camera calibration. Here all three get the same
 residuals, the same start (base projection, no distortion) and exact gradients. The first-order methods run twice: on
 the parameters as they are (pixels, radians, meters, coefficients), and on parameters scaled by the columns of the
-Jacobian at the start, as Levenberg-Marquardt scales them. Each gets the best of many learning rates, judged by short runs.
+Jacobian at the start, as Levenberg-Marquardt scales them. Each gets the best of many learning rates, judged by short
+runs.
 """
 
 from __future__ import annotations

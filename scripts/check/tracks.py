@@ -22,9 +22,9 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.budget import planned_rig
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.consider import ClockPrior
 from kcal.pipeline.motion import Motion
 from kcal.pipeline.pairs import ObjectPairs
+from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 from scripts.check.track_rivals import CartesianFilters, OfPixels, OfPositions
 from scripts.shared.page import table, write_section

@@ -170,8 +170,8 @@ def main() -> None:
         "the base projection. *As in the figure*: it replaces x, y, beginning with random weights; *with a skip*: it "
         "adds to them, beginning with nothing. First-order methods: every parameter in units of its column of the "
         f"Jacobian at the start, the best of {len(RATES)} decades of learning rates by runs of a tenth of the length "
-        f"(not timed). RMS: the lowest on the way. Held out: {HELD_OUT} other views, poses alone solved, from the true. Medians "
-        f"over {arguments.seeds} seeds (smallest to largest).",
+        f"(not timed). RMS: the lowest on the way. Held out: {HELD_OUT} other views, poses alone solved, from the "
+        f"true. Medians over {arguments.seeds} seeds (smallest to largest).",
         "",
         f"![RMS over steps]({PICTURE})",
         "",

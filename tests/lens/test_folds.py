@@ -13,9 +13,9 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort
-from kcal.lens.jets import Jet, Span
 from kcal.lens.model import LensModel
 from kcal.lens.region import in_region, valid_region
+from kcal.lens.taylor_bounds import Jet, Span
 from scripts.check import folds
 from scripts.check.uncertainty import LENS
 from tests.helpers.lenses import MODELS, strong

@@ -20,17 +20,17 @@ from kcal.errors import FileError, InputError
 from kcal.io.rig_file import save_rig
 from kcal.lens.mounting import Origin
 from kcal.lens.rig import RigCovariance
-from kcal.locate import locator, marks, stereo, tables
+from kcal.locate import marks, stereo, tables, tabulate
 from kcal.locate.cep import circular_error
 from kcal.locate.columns import NUMBERS, number_lines
 from kcal.locate.export import PositionWriter, to_csv
 from kcal.locate.geodesy import azimuth_elevation
-from kcal.locate.locator import Locator
 from kcal.locate.marks import read_mark_chunks, read_marks
 from kcal.locate.mounting import mounting_covariance
 from kcal.locate.positions import columns_of, locate_points, located_by, positions_of
 from kcal.locate.sample import PositionSample
 from kcal.locate.stereo import PositionStatus
+from kcal.locate.tabulate import Locator
 
 ORIGIN = Origin(lat=-33.9, lon=151.2, height=40.0)
 ROWS = 250
@@ -314,14 +314,14 @@ def test_what_is_interrupted_leaves_old_files_as_they_were(
     (folder / "out.csv").write_text("old")
     before = sorted(folder.iterdir())
     calls: Iterator[int] = iter(range(10))
-    explain = locator._explanation
+    explain = tabulate._explanation
 
     def stops(*arguments: object) -> str:
         if next(calls) == 3:
             raise KeyboardInterrupt
         return explain(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(locator, "_explanation", stops)
+    monkeypatch.setattr(tabulate, "_explanation", stops)
     assert run(monkeypatch, "-o", "out.csv", "-o", "out.geojson") == 130
     assert (folder / "out.csv").read_text() == "old"
     assert sorted(folder.iterdir()) == before

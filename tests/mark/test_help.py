@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from kcal.corners.again import find_again
 from kcal.corners.match import MatchStatus
+from kcal.corners.refind import find_again
 from kcal.errors import InputError
 from kcal.io.images import write_png
 from kcal.lens.pose import rotation_from_vector
@@ -17,10 +17,10 @@ from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.marks import Marks, write_marks
 from kcal.locate.relock import check_rig
 from kcal.locate.survey import Survey
-from kcal.mark.desk import Desk
 from kcal.mark.guide import RigBand, at_shape, propose
 from kcal.mark.items import Add, Mark, Place, Put, Side, SurveyPlace
 from kcal.mark.live import Promise, solve_live, verdict
+from kcal.mark.marking_service import Desk
 from kcal.mark.pictures import open_pictures
 from kcal.mark.reference import Reference
 from kcal.mark.session import Session

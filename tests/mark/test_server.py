@@ -13,7 +13,7 @@ pytest.importorskip("httpx", reason="starlette's test client needs httpx")
 from starlette.testclient import TestClient
 
 from kcal.io.images import write_png
-from kcal.mark.desk import Desk
+from kcal.mark.marking_service import Desk
 from kcal.mark.pictures import open_pictures
 from kcal.mark.server import marking_app, marking_files
 from kcal.mark.session import Session

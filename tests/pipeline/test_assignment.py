@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kcal.pipeline.assignment import Candidates, Scores, assigned, mark_numbers
-from kcal.pipeline.sightings import Anchored
+from kcal.pipeline.measurements import Anchored
 
 
 def candidates(track: list[int], pair: list[int], density: list[float]) -> Candidates:

@@ -8,7 +8,7 @@ from track_scenes import pairs_of, seen_by, tracked_site
 
 from kcal.errors import InputError
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.consider import ClockPrior
+from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.track_steps import compiled_steps, track_steps
 from kcal.pipeline.tracks import Tracker
 

@@ -14,8 +14,8 @@ from marking_browser import CHROMIUM
 from track_scenes import pairs_of, tracked_site
 
 pytest.importorskip("uvicorn")
-from kcal.locate.locator import Locator
 from kcal.locate.positions import located_by
+from kcal.locate.tabulate import Locator
 from kcal.pipeline.live_map import LiveMap
 from kcal.pipeline.track_columns import track_columns
 from kcal.pipeline.tracks import Tracker, TrackOptions

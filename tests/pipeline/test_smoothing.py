@@ -7,8 +7,8 @@ import math
 import torch
 from track_scenes import pairs_of, seen_by, tracked_site, yawed_rig
 
-from kcal.pipeline.consider import ClockPrior
 from kcal.pipeline.motion import Motion
+from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.tracks import Tracker, TrackOptions
 
 

@@ -20,12 +20,12 @@ import torch
 from track_scenes import seen_by, tracked_site
 
 from kcal.errors import FileError, InputError
-from kcal.locate.locator import Locator
 from kcal.locate.positions import located_by
+from kcal.locate.tabulate import Locator
 from kcal.pipeline.association import AssociationOptions
-from kcal.pipeline.consider import ClockPrior
 from kcal.pipeline.lines import Moment, read_moment
 from kcal.pipeline.senders import CotSender, sender_to
+from kcal.pipeline.shared_errors import ClockPrior
 from kcal.pipeline.stream import SourceItem, Stream, lines_of
 from kcal.pipeline.tracks import Tracker
 

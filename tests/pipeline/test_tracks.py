@@ -13,11 +13,11 @@ from track_scenes import ORIGIN, pairs_of, seen_by, tracked_site, yawed_rig
 from kcal.errors import InputError
 from kcal.lens.rig import RigCovariance
 from kcal.locate.localizer import StereoLocalizer
-from kcal.pipeline.beliefs import Timing, born
-from kcal.pipeline.consider import ClockPrior, SharedErrors
 from kcal.pipeline.estimates import track_states
+from kcal.pipeline.imm_filter import Timing, born
+from kcal.pipeline.measurements import anchored, sightings
 from kcal.pipeline.motion import Motion
-from kcal.pipeline.sightings import anchored, sightings
+from kcal.pipeline.shared_errors import ClockPrior, SharedErrors
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 
 STEADY = TrackOptions(motions=(Motion(acceleration=1e-4),), speed_mps=10.0, confirm_hits=2)

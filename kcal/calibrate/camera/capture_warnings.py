@@ -24,7 +24,7 @@ def motion_warnings(fit: HybridFit) -> list[str]:
             "and photograph a stiff board on a stand"
         ]
     lines = "column" if fit.readout.columns else "row"
-    moved = fit.motion_sigma.moved(float(fit.camera.params[0]), fit.readout.reach(fit.board_points))
+    moved = fit.motion_sigma.moved(float(fit.state.params[0]), fit.readout.reach(fit.board_points))
     if moved < FELT * fit.sigma:
         return []
     views, few = len(fit.state.motion), []
@@ -42,8 +42,8 @@ def motion_warnings(fit: HybridFit) -> list[str]:
 
 def measured_aspect(fit: HybridFit) -> tuple[float, float]:
     """f_y / f_x of the base projection, and its standard deviation."""
-    fx, fy = fit.camera.params[:2].tolist()
-    slope = torch.zeros(len(fit.camera.params), dtype=torch.float64)
+    fx, fy = fit.state.params[:2].tolist()
+    slope = torch.zeros(len(fit.state.params), dtype=torch.float64)
     slope[0], slope[1] = -fy / fx**2, 1.0 / fx
     return fy / fx, float(slope @ fit.covariance @ slope) ** 0.5
 

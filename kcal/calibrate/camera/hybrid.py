@@ -49,8 +49,10 @@ def calibrate_hybrid(
     check_views(board, pixels, names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
     if options.reject is not None:
         return _without_outliers(observations, options, options.reject, progress)
-    fit = _fit_views(observations, pixels, torch.ones_like(pixels[..., 0]), None, options, progress)
-    if options.weighted and observations.covariances() is not None:
+    weighted = options.weighted and observations.covariances() is not None
+    ones = torch.ones_like(pixels[..., 0])
+    fit = _fit_views(observations, pixels, ones, None, options, progress, expected=not weighted)
+    if weighted:
         fit = _fit_views(observations, pixels, _weights(observations, fit.residuals), fit, options, progress)
     return hybrid_result(observations, fit, options)
 
@@ -63,6 +65,7 @@ def _fit_views(
     options: CalibrationOptions,
     progress: Progress,
     robust: bool = False,
+    expected: bool = True,
 ) -> HybridFit:
     return fit_hybrid(
         observations.board.points,
@@ -74,6 +77,7 @@ def _fit_views(
         focal=options.start_focal(observations.image_size),
         start=start,
         robust=robust,
+        expected=expected,
         progress=progress,
     )
 

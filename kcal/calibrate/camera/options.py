@@ -17,6 +17,9 @@ from kcal.solve.robust import RobustLoss
 
 Progress = Callable[[str], None]
 HYBRID = "hybrid"
+# Of rich parametric models.
+_WEAK = 0.3
+_SOLVER = LMOptions(max_iterations=1000, tolerance=1e-12, flatness=2e-6)
 # Degrees across the image from which lenses are nearer to an equidistant image than to a perspective one.
 _WIDE = 90.0
 
@@ -73,11 +76,11 @@ class CalibrationOptions:
             term would shift the outermost corner by this share of its radius (a thirtieth of it for decentering, prism
             and tilt; `kcal.calibrate.bundle.coefficient_prior`). 0.3, the default, hardly changes what the views
             determine, and leaves rich models a single minimum, found quickly, with a reliable σ
-            (docs/measured/solver.md has figures). None: the corners alone decide, as in OpenCV, and the lowest of their
-            minima is searched for.
+            (docs/measured/solver.md has figures). None: the corners alone decide, as in OpenCV; of the minima next to
+            that of the prior and next to a lens without distortion the lower one is taken.
         camera: a known camera, whose parameters are held except those that `free` names. Only the board's poses (and
             its warp) are found; one view is enough. Its lens model takes the place of `model`.
-        solver: options of the Levenberg-Marquardt solver.
+        solver: options of the Levenberg-Marquardt solver, with a parametric model.
     """
 
     model: LensModel | str = HYBRID
@@ -93,11 +96,9 @@ class CalibrationOptions:
     tied: tuple[tuple[str, ...], ...] = ()
     free: tuple[str, ...] = ()
     priors: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
-    weak_prior: float | None = 0.3
+    weak_prior: float | None = _WEAK
     camera: Camera | None = None
-    solver: LMOptions = dataclasses.field(
-        default_factory=lambda: LMOptions(max_iterations=1000, tolerance=1e-12, flatness=2e-6)
-    )
+    solver: LMOptions = _SOLVER
 
     def __post_init__(self) -> None:
         if self.focal is not None and not 0 < self.focal < float("inf"):
@@ -122,6 +123,8 @@ class CalibrationOptions:
         if self.hybrid:
             self._refuse_parametric()
             return
+        if isinstance(self.board, MeasuredBoard):
+            raise InputError("CalibrationOptions: a measured board is used with the hybrid lens; leave the model out")
         fixed = self._of_camera() or {name: 1.0 if value is None else value for name, value in self.fixed.items()}
         self._constraints(fixed).check(self.lens)
 
@@ -134,7 +137,9 @@ class CalibrationOptions:
         names = ("board_warp", "loss", "fixed", "tied", "free", "priors")
         if isinstance(self.model, LensModel):
             raise InputError('CalibrationOptions: write model="hybrid"; its constants follow from the views')
-        if given := [name for name in names if getattr(self, name)]:
+        given = [name for name in names if getattr(self, name)]
+        given += [name for name, own in (("weak_prior", _WEAK), ("solver", _SOLVER)) if getattr(self, name) != own]
+        if given:
             raise InputError(
                 f"CalibrationOptions: {', '.join(given)} cannot be combined with the hybrid lens, whose parameters and "
                 'board the views determine; name a parametric model, for example model="opencv5"'

@@ -187,18 +187,16 @@ def run_rounds(
             # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
             tempering = math.sqrt(tempering * found) if tempered else found
             tempered = True
-        best = maximize_evidence(
-            data,
-            estimate.families,
-            estimate.hyperparameters,
-            estimate.variance / former,
-            hyperprior,
-            estimate.log_ratio,
-            tempering,
-        )
-        change = _moved_by(estimate, best)
-        change = max(change, abs(math.log(tempering / former)))
-        resting = not first and change < _AT_REST and steps <= 2
+        best = Maximum(estimate.hyperparameters, estimate.log_ratio, estimate.variance / former, math.inf)
+        for rough in (True, False):
+            best = maximize_evidence(
+                data, estimate.families, best.h, best.variance, hyperprior, best.log_ratio, tempering, rough
+            )
+            change = max(_moved_by(estimate, best), abs(math.log(tempering / former)))
+            resting = not first and change < _AT_REST and steps <= 2
+            # To the end where nothing will change any more.
+            if not resting:
+                break
         estimate = estimate._replace(
             hyperparameters=best.h,
             log_ratio=best.log_ratio,
@@ -266,6 +264,7 @@ def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -
             estimate.variance / estimate.tempering,
             hyperprior,
             estimate.log_ratio,
+            rough=True,
         )
         losses.append(best.loss)
     return losses[1] < losses[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -36,6 +37,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import LEADING
 from kcal.lens.information import CameraInformation, triangular
+from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
 
 # Pixels that a mode can move any point by, below which it is left out.
@@ -47,7 +49,8 @@ class HybridFit:
     """A camera, its board, and what is not known of both.
 
     Args:
-        camera: the camera.
+        model: of the lens.
+        size: (width, height) of the image.
         state: parameters, board, poses, motions.
         half: (S, S); halfᵀ half is the covariance of parameters and board.
         information: the same before anything was inverted, with data and priors apart.
@@ -81,7 +84,8 @@ class HybridFit:
         (True, True, True)
     """
 
-    camera: Camera
+    model: LensModel
+    size: tuple[int, int]
     state: HybridState
     half: Tensor
     information: CameraInformation
@@ -102,6 +106,11 @@ class HybridFit:
     weighted_rms: float
     iterations: int
     converged: bool
+
+    @functools.cached_property
+    def camera(self) -> Camera:
+        """The camera; made when it is asked for, because it measures its lens."""
+        return Camera(self.state.params, size=self.size, model=self.model)
 
     @property
     def rms(self) -> float:
@@ -147,7 +156,7 @@ class HybridFit:
     @property
     def covariance(self) -> Tensor:
         """(5 + P, 5 + P) of the camera's parameters in the order of `Camera.names`: fx and fy alike, skew held."""
-        unknowns = hybrid_unknowns(self.camera.model, self.square)
+        unknowns = hybrid_unknowns(self.model, self.square)
         count = len(self.state.params)
         onto = self.half.new_zeros(len(self.half), count)
         onto[list(unknowns.slots), list(unknowns.indices)] = 1.0
@@ -169,6 +178,7 @@ def fit_hybrid(
     robust: bool = False,
     hyperprior: Hyperprior | None = None,
     lens: LensPrior | None = None,
+    expected: bool = True,
     progress: Callable[[str], object] = lambda _: None,
 ) -> HybridFit:
     """Fit one camera.
@@ -188,6 +198,8 @@ def fit_hybrid(
             such a fit mean nothing; it tells which corners to leave out.
         hyperprior: of the amplitudes; the typical one if not given.
         lens: what is known of it from cameras of its type; its modes are used.
+        expected: state error bars for amplitudes as they are to be expected (`kcal.calibrate.lensfit.amplitudes`);
+            False: for the most likely ones, where another fit begins at this one.
         progress: called after each step.
 
     Raises:
@@ -196,7 +208,7 @@ def fit_hybrid(
     """
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     if start is not None:
-        form = start.camera.model.hybrid
+        form = start.model.hybrid
         assert form is not None
         modes = form.modes
     elif lens is not None:
@@ -240,7 +252,7 @@ def fit_hybrid(
         if isinstance(board, BoardPrior):
             state = state._replace(board=torch.zeros_like(board.mean))
         estimate = Estimate(
-            start.camera.model,
+            start.model,
             start.families.with_board(shown),
             state,
             start.hyperparameters,
@@ -262,7 +274,7 @@ def fit_hybrid(
             if other[0].loss < rounds.loss:
                 rounds, never = other
     capture, likely = rounds.capture, rounds.estimate
-    estimate = likely if robust else expected_estimate(rounds, hyperprior)
+    estimate = expected_estimate(rounds, hyperprior) if expected and not robust else likely
     model, families, state, h, _, variance, tempering = estimate
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
     peaks = torch.tensor(modes.peaks, dtype=torch.float64)
@@ -291,7 +303,8 @@ def fit_hybrid(
         information = board.in_modes(information, state.board)
         half = torch.cat([half[:, : -len(board.mean)], half[:, -len(board.mean) :] @ board.half], 1)
     return HybridFit(
-        camera=Camera(state.params, size=size, model=model),
+        model=model,
+        size=size,
         state=state,
         half=half,
         information=information,

@@ -122,7 +122,7 @@ def _absolute_rows(fit: HybridFit, points: Tensor, pixels: Tensor, weights: Tens
         fit.board_shapes.shapes,
         pixels,
         weights,
-        fit.camera.model,
+        fit.model,
         mean,
         torch.zeros_like(mean),
         fit.readout,

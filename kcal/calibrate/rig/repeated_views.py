@@ -11,7 +11,7 @@ from torch import Tensor
 from kcal.calibrate.lensfit.board_modes import board_modes
 from kcal.calibrate.rig.blocks import BoardBlock, PosedCamera, RigState
 from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, pose_alone
-from kcal.calibrate.rig.knowledge import less
+from kcal.calibrate.rig.prior_information import less
 from kcal.calibrate.rig.sources import Boards
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation, triangular

@@ -14,10 +14,10 @@ from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import KINDS, PerKind
 from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
-from kcal.calibrate.rig.knowledge import gathered, joint_unknowns
 from kcal.calibrate.rig.mixups import cost_of_features_behind, refuse_same_camera, swap_warnings
 from kcal.calibrate.rig.motion import moved_warnings
 from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible, without_wrong
+from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
 from kcal.calibrate.rig.records import Reasons, item_records, places, source_records
 from kcal.calibrate.rig.repeated_views import without_repeated
 from kcal.calibrate.rig.result import RigResult

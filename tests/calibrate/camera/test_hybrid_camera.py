@@ -19,6 +19,7 @@ from kcal.io.camera_file import load_camera
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.sim.infinity import error_at_infinity
+from kcal.solve.lm import LMOptions
 
 NOISE = 0.1
 
@@ -152,6 +153,9 @@ def test_too_few_views() -> None:
         {"tied": (("fx", "fy"),)},
         {"free": ("skew",)},
         {"priors": {"fx": (500.0, 5.0)}},
+        {"weak_prior": 0.1},
+        {"weak_prior": None},
+        {"solver": LMOptions(max_iterations=7)},
     ],
 )
 def test_options_of_parametric_models_are_refused(given: dict[str, object]) -> None:

@@ -21,7 +21,7 @@ from kcal.calibrate.camera.calibrate import (
 )
 from kcal.calibrate.camera.options import OutlierRejection
 from kcal.calibrate.lensfit.board_orders import turned_corners
-from kcal.calibrate.rig.knowledge import gathered, joint_unknowns
+from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations

@@ -7,10 +7,10 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from kcal.pipeline.consider import CLOCK_TERMS
-from kcal.pipeline.lanes import congruent, eliminate, mahalanobis, outer, product, solved, squared
+from kcal.pipeline.measurements import Anchored
 from kcal.pipeline.motion import Transition, moved, rates
-from kcal.pipeline.sightings import Anchored
+from kcal.pipeline.shared_errors import CLOCK_TERMS
+from kcal.pipeline.small_matrices import congruent, eliminate, mahalanobis, outer, product, solved, squared
 
 # The clock's errors times the components of a velocity.
 _CLOCK_COLUMNS = 3 * CLOCK_TERMS
@@ -35,7 +35,7 @@ class Summary(NamedTuple):
 
 
 class Beliefs(NamedTuple):
-    """T tracks under J models; see `kcal.pipeline.motion` for the state and `kcal.pipeline.consider` for b.
+    """T tracks under J models; see `kcal.pipeline.motion` for the state and `kcal.pipeline.shared_errors` for b.
 
     The errors of a state have 6 + K + 9 columns: of `noise`, `shared` and `late`.
 

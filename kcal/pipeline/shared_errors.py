@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.pipeline.lanes import eliminate, solved
+from kcal.pipeline.small_matrices import eliminate, solved
 
 # Offset, drift, slope over the rows.
 CLOCK_TERMS = 3

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.rig.from_boards import calibrate_rig
-from kcal.calibrate.rig.knowledge import gathered, joint_unknowns, less
+from kcal.calibrate.rig.prior_information import gathered, joint_unknowns, less
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions
 from kcal.corners.board import Board

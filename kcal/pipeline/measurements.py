@@ -15,7 +15,7 @@ from torch import Tensor
 from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.max_likelihood import PointFit, calibration_effect, symmetric, unreached_direction
 from kcal.locate.stereo import PositionStatus, fit_pairs
-from kcal.pipeline.lanes import congruent, eliminate, outer, product, solved
+from kcal.pipeline.small_matrices import congruent, eliminate, outer, product, solved
 
 
 class Sightings(NamedTuple):

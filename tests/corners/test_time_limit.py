@@ -8,7 +8,7 @@ from board_render import homography, render
 from kcal.corners import detect
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_images
-from kcal.corners.limited import Limited, TookTooLongError
+from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import InputError
 
 BOARD = Board(columns=6, rows=5, square=0.02)
