@@ -52,6 +52,14 @@ class SchurLinearization:
             total = total + shared_rows @ shared_rows.transpose(-1, -2)
         return cls(gram[..., :L, :L], gram[..., :L, L:], total)
 
+    def solve(self, shared: Tensor, local: Tensor) -> State:
+        """The solution of the system for another right side ((..., S), (..., V, L)), which is not damped."""
+        out = copy.copy(self)
+        out._right = torch.cat([self._right[..., :-1], (local * self._local_scale)[..., None]], -1)
+        out._shared_gradient = shared * self._shared_scale
+        (by_shared, by_local), _ = out.step(torch.zeros_like(self.cost))
+        return -by_shared, -by_local
+
     def blend(self, mask: Tensor, other: SchurLinearization) -> SchurLinearization:
         """See `Linearization.blend`."""
         out = copy.copy(self)

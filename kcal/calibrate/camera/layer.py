@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +12,7 @@ from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior, is_overparameterized
 from kcal.calibrate.bundle.priors import GaussianPrior, Term
 from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.camera.differentiated import Backward, HybridViews, differentiated, hybrid_views
 from kcal.calibrate.camera.exact_minimum import exact_minimum
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.solve import solve_corners
@@ -21,14 +21,10 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names, project_components
-from kcal.solve.implicit import implicit_step
 from kcal.solve.result import map_state
 
-Backward = Literal["implicit", "unroll", "none"]
-
-# Steps that are recorded by backward="unroll"; each multiplies the error of the derivative by the share of the
-# curvature that the Gauss-Newton approximation omits.
-_UNROLLED = 8
+# Pixels of a corner's noise along an axis, against which priors of parametric models count.
+_CORNER_SIGMA = 0.2
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,6 +40,7 @@ class CalibratedViews:
         model: the lens model.
         size: (width, height) of the image.
         reach: radius on the plane z = 1 of the outermost corner, to which a weak prior refers.
+        hybrid: with the default lens, also its board and motions, and the fit that set its amplitudes.
     """
 
     parameters: Tensor
@@ -54,6 +51,7 @@ class CalibratedViews:
     model: LensModel
     size: tuple[int, int]
     reach: float
+    hybrid: HybridViews | None = None
 
     def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (..., N, 2) of points (..., N, 3) of the camera's frame, and whether the lens is regular there.
@@ -83,30 +81,34 @@ def calibrate_views(
     *,
     mask: Tensor | None = None,
     prior_means: Tensor | None = None,
-    corner_sigma: float = 0.2,
+    corner_sigma: float | None = None,
     start: CalibratedViews | None = None,
     backward: Backward = "implicit",
 ) -> CalibratedViews:
     """Calibrate one camera, with gradients by the corners, the board's points and the means of the priors.
 
-    The solution x minimizes c(x) = ½ Σ ρ(‖projected - observed‖²) + ½ Σ (corner_sigma / σ_k)² (x_k - mean_k)², where
-    all corners count alike; a weak prior adds such terms for the coefficients, for the outermost corner that the search
-    found. "implicit" differentiates the condition ∂c/∂x = 0: dx/dd = -H⁻¹ ∂²c/∂x∂d with the exact Hessian H of c,
-    which includes the curvature of residuals and of the robust loss, in the blocks of the Schur complement. Work and
-    memory grow linearly with the views, and nothing is computed before a gradient is requested. "unroll" records eight
-    Gauss-Newton steps at the solution: nearly the same derivatives, and of any order. "none" carries no gradient.
+    With the default lens, the corners themselves tell amplitudes of lens, board and motion, and the noise; these count
+    as constants of the gradient, and a start keeps them.
+
+    With a parametric model the solution x minimizes
+    c(x) = ½ Σ ρ(‖projected - observed‖²) + ½ Σ (corner_sigma / σ_k)² (x_k - mean_k)², where all corners count alike; a
+    weak prior adds such terms for the coefficients, for the outermost corner that was found.
+
+    "implicit" differentiates the condition ∂c/∂x = 0: dx/dd = -H⁻¹ ∂²c/∂x∂d with the exact Hessian H of c, which
+    includes the curvature of residuals and of the robust loss; systems with it are solved by conjugate gradients. Work and memory grow linearly with the views, and nothing is computed before a gradient is requested. "unroll"
+    records eight Gauss-Newton steps at the solution: nearly the same derivatives, and of any order. "none" carries no
+    gradient.
 
     Args:
         pixels: (V, N, 2) corners; NaN where not seen.
         board_points: (N, 3) meters, in the order of the corners, near the plane z = 0. A board's warp is as wide as
             its outermost corners; where several tie, they share the derivative of that width.
         size: (width, height) of the image in pixels.
-        options: as for `calibrate_camera`, with a parametric model (by default opencv5); `reject` is refused, because
-            leaving out corners is not continuous.
+        options: as for `calibrate_camera`; `reject` is refused, because leaving out corners is not continuous.
         mask: (V, N) bool, which corners count; None: those that are finite.
         prior_means: (Q,) in the order of `options.priors`, in place of their means.
-        corner_sigma: pixels of a corner's noise along an axis, against which priors count. Given, not measured, so
-            that the cost is a function of the data alone.
+        corner_sigma: with a parametric model, pixels of a corner's noise along an axis, against which priors count, 0.2
+            if left out. Given, not measured, so that the cost is a function of the data alone.
         start: an earlier solution of nearly the same data, in place of the search, for training loops. The result is
             the minimum next to it.
         backward: see above.
@@ -133,18 +135,22 @@ def calibrate_views(
         >>> [round(float(value), 9) + 0.0 for value in by_pixels.sum((0, 1))]  # all corners one pixel to the right
         [1.0, 0.0]
     """
-    options = options or CalibrationOptions(model="opencv5")
+    options = options or CalibrationOptions()
     pixels, board_points, means = _checked(pixels, board_points, options, mask, prior_means, corner_sigma, backward)
+    if start is not None and (start.hybrid is not None) != options.hybrid:
+        raise InputError("calibrate_views: the start is of another lens model")
+    if options.hybrid:
+        return _default_views(pixels, board_points, size, options, start, backward)
+    sigma = _CORNER_SIGMA if corner_sigma is None else corner_sigma
     constraints = options.constraints(size)
     known = [parameter_names(options.lens).index(name) for name in options.priors]
-    weights = torch.tensor([corner_sigma / sigma for _, sigma in options.priors.values()], dtype=torch.float64)
+    weights = torch.tensor([sigma / spread for _, spread in options.priors.values()], dtype=torch.float64)
 
-    def problem_of(values: Sequence[Tensor]) -> BoardProblem:
-        corners, board, mean = values
+    def problem_of(corners: Tensor, board: Tensor, mean: Tensor) -> BoardProblem:
         terms: list[Term] = [GaussianPrior(torch.tensor(known), mean, weights)] if known else []
         if options.weak_prior is not None and options.camera is None and is_overparameterized(options.lens):
             prior = CoefficientPrior(options.weak_prior, reach)
-            terms.append(prior.term(options.lens, corner_sigma, {*options.fixed, *options.priors}))
+            terms.append(prior.term(options.lens, sigma, {*options.fixed, *options.priors}))
         views = Views(board_points=board, pixels=corners, loss=options.loss, free_warp=options.board_warp)
         return views.problem(options.lens, constraints.free_parameters(options.lens), terms=terms)
 
@@ -159,22 +165,10 @@ def calibrate_views(
         begin, reach = start.state(), start.reach
         if start.model != options.lens or len(begin.translation) != len(pixels):
             raise InputError("calibrate_views: the start is of another lens model or another number of views")
-    problem = problem_of(fixed)
+    problem = problem_of(*fixed)
     state, found = exact_minimum(problem, problem.tidy(begin))
-
-    if backward == "unroll":
-        recorded = problem_of(data)
-        for _ in range(_UNROLLED):
-            step, _ = recorded.linearize(state).step(state.parameters.new_zeros(()))
-            state = recorded.retract(state, step)
-    elif backward == "implicit" and torch.is_grad_enabled() and any(tensor.requires_grad for tensor in data):
-        here = state
-
-        def cost(shared: Tensor, local: Tensor, *values: Tensor) -> Tensor:
-            return problem_of(values).cost(problem.retract(here, (shared, local)))
-
-        state = problem.retract(state, implicit_step(cost, found, data))
-    at = problem if backward == "none" else problem_of(data)
+    state = differentiated(problem_of, data, state, found, backward)
+    at = problem if backward == "none" else problem_of(*data)
     return CalibratedViews(
         parameters=state.parameters,
         board_warp=state.warp,
@@ -187,14 +181,43 @@ def calibrate_views(
     )
 
 
+def _default_views(
+    pixels: Tensor,
+    board_points: Tensor,
+    size: tuple[int, int],
+    options: CalibrationOptions,
+    start: CalibratedViews | None,
+    backward: Backward,
+) -> CalibratedViews:
+    """`calibrate_views` with the default lens."""
+    before = None if start is None else start.hybrid
+    if before is not None and len(before.state.translation) != len(pixels):
+        raise InputError("calibrate_views: the start is of another number of views")
+    found = hybrid_views(pixels, board_points, size, options, before, backward)
+    state = found.state
+    placed = board_points.detach() @ state.rotation.detach().mT + state.translation.detach()[:, None]
+    angle = torch.atan2(placed[..., :2].norm(dim=-1), placed[..., 2])
+    return CalibratedViews(
+        parameters=state.params,
+        board_warp=state.params.new_zeros(2),
+        cam_from_board_rotation=state.rotation,
+        cam_from_board_translation=state.translation,
+        residuals=found.residuals,
+        model=found.fit.model,
+        size=size,
+        reach=float(torch.where(torch.isfinite(pixels).all(-1), angle, 0.0).max()),
+        hybrid=found,
+    )
+
+
 class CalibrationLayer(nn.Module):
     """`calibrate_views` as a module: calibrates in its forward pass, carries gradients in its backward pass.
 
     Args:
         size: (width, height) of the image in pixels.
-        options: as for `calibrate_camera`, with a parametric model; opencv5 by default.
+        options: as for `calibrate_camera`; the default lens if left out.
         backward: "implicit" (exact first derivatives), "unroll" (derivatives of any order, more memory) or "none".
-        corner_sigma: pixels of a corner's noise along an axis, against which priors count.
+        corner_sigma: with a parametric model, pixels of a corner's noise along an axis, against which priors count.
 
     Convention: float64 whatever comes in; half precision of the network around it stays outside.
 
@@ -210,10 +233,10 @@ class CalibrationLayer(nn.Module):
         options: CalibrationOptions | None = None,
         *,
         backward: Backward = "implicit",
-        corner_sigma: float = 0.2,
+        corner_sigma: float | None = None,
     ) -> None:
         super().__init__()
-        self.size, self.options = size, options or CalibrationOptions(model="opencv5")
+        self.size, self.options = size, options or CalibrationOptions()
         self.backward, self.corner_sigma = backward, corner_sigma
 
     def forward(
@@ -244,7 +267,7 @@ class CalibrationLayer(nn.Module):
 
     def extra_repr(self) -> str:
         """One line for people."""
-        return f"size={self.size}, model={self.options.lens}, backward={self.backward}"
+        return f"size={self.size}, model={self.options.model}, backward={self.backward}"
 
 
 def _checked(
@@ -253,7 +276,7 @@ def _checked(
     options: CalibrationOptions,
     mask: Tensor | None,
     prior_means: Tensor | None,
-    corner_sigma: float,
+    corner_sigma: float | None,
     backward: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Corners (NaN where they do not count), board points and prior means as float64."""
@@ -261,7 +284,9 @@ def _checked(
         raise InputError(f"calibrate_views: backward must be implicit, unroll or none, got {backward!r}")
     if options.reject is not None:
         raise InputError("calibrate_views: `reject` is not continuous; use a robust loss or a mask")
-    if not 0 < corner_sigma < float("inf"):
+    if corner_sigma is not None and options.hybrid:
+        raise InputError("calibrate_views: the default lens measures the noise of corners; leave corner_sigma out")
+    if corner_sigma is not None and not 0 < corner_sigma < float("inf"):
         raise InputError(f"calibrate_views: corner_sigma must be positive pixels, got {corner_sigma}")
     pixels, board_points = as_points("pixels", pixels, 2), as_points("board_points", board_points, 3)
     if pixels.ndim != 3 or board_points.ndim != 2 or pixels.shape[1] != len(board_points):

@@ -108,6 +108,7 @@ class HybridProblem:
         self.free = torch.isfinite(precision)
         self.precision = torch.where(self.free, precision, 0.0)
         self.residual_count = 2 * int(self.seen.sum())
+        self.shared_size = int(self.free.sum())
 
     def with_weights(self, weights: Tensor) -> HybridProblem:
         """The same problem with other weights (V, N) of its corners."""
@@ -179,25 +180,27 @@ class HybridProblem:
         return [slice(start, start + size) for start in range(0, len(self.target), size)]
 
     def linearize(self, state: HybridState) -> SchurLinearization:
-        """See `Problem.linearize`."""
-        S, L = len(self.mean), self.local_size
+        """See `Problem.linearize`; by the unknowns that are not held."""
+        chosen, L = self.free.nonzero()[:, 0], self.local_size
+        S, columns = len(chosen), [*(L + chosen).tolist(), -1]
         local, right, total = [], [], state.params.new_zeros(S + 1, S + 1)
         for views in self._chunks():
             rows = self._rows_with_stillness(state, views)
-            own, others = rows[:, :L], rows[:, L:]
+            own, others = rows[:, :L], rows[:, L:] if len(self.free) == S else rows[:, columns]
             local.append(own @ own.transpose(-1, -2))
             right.append(own @ others.transpose(-1, -2))
             flat = others.transpose(0, 1).flatten(1)
             total = total + flat @ flat.T
-        x = self.shared(state)
-        prior = torch.diag(torch.cat([self.precision, (self.precision * x * x).sum()[None]]))
-        prior[:-1, -1] = prior[-1, :-1] = self.precision * x
+        x, precision = self.shared(state)[chosen], self.precision[chosen]
+        prior = torch.diag(torch.cat([precision, (precision * x * x).sum()[None]]))
+        prior[:-1, -1] = prior[-1, :-1] = precision * x
         return SchurLinearization(torch.cat(local), torch.cat(right), total + prior)
 
     def retract(self, state: HybridState, step: State) -> HybridState:
         """See `Problem.retract`."""
-        shared, local = step
+        free, local = step
         count = len(self.unknowns)
+        shared = torch.zeros_like(self.mean).masked_scatter(self.free, free)
         params = state.params.index_add(0, torch.tensor(self.unknowns.indices), self.unknowns.expand(shared[:count]))
         rotation, translation = apply_twist(state.rotation, state.translation, local[:, :_POSE])
         motion = state.motion if self.readout is None else state.motion + local[:, _POSE:]

@@ -116,6 +116,73 @@ def test_values_do_not_depend_on_backward_and_none_carries_nothing() -> None:
     assert [one.parameters.requires_grad for one in found] == [True, True, False]
 
 
+class TestDefaultLens:
+    """The hybrid lens, with printed boards and motion: gradients at amplitudes that are held."""
+
+    def base(self) -> CalibratedViews:
+        return calibrate_views(CORNERS, BOARD.points, SIZE, backward="none")
+
+    def test_it_is_the_default(self) -> None:
+        from calibrate_scenes import observe
+
+        from kcal.calibrate.camera.calibrate import calibrate_camera
+
+        found, result = self.base(), calibrate_camera(observe(CORNERS))
+        assert found.model.hybrid
+        for name, ours, theirs in zip(
+            result.camera.names, found.parameters.tolist(), result.camera.params.tolist(), strict=True
+        ):
+            # The fit stops where steps lower chi² by less than a hundredth: a tenth of a standard deviation. Modes that
+            # move no pixel are left out of it, and are zero here to rounding.
+            assert abs(ours - theirs) <= 0.1 * (result.sigma.get(name) or 0.0) + 1e-12
+        assert torch.equal(found.camera().params, found.parameters)
+
+    def test_derivatives_are_those_of_solving_anew(self) -> None:
+        base = self.base()
+        assert base.hybrid is not None
+        generator = torch.Generator().manual_seed(2)
+        along = torch.randn(2, *CORNERS.shape, generator=generator, dtype=torch.float64)
+        board = 1e-3 * torch.randn(2, *BOARD.points.shape, generator=generator, dtype=torch.float64)
+
+        def solve(amount: Tensor) -> Tensor:
+            corners = CORNERS + torch.tensordot(amount, along, 1)
+            points = BOARD.points + torch.tensordot(amount, board, 1)
+            return summary(calibrate_views(corners, points, SIZE, start=base))
+
+        zero = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(solve, (zero,), eps=1e-4, atol=2e-5, rtol=2e-5)
+
+    def test_recorded_steps_have_the_same_derivatives(self) -> None:
+        base, gradients = self.base(), []
+        for backward in ("implicit", "unroll"):
+            corners = CORNERS.clone().requires_grad_(True)
+            found = CalibrationLayer(SIZE, backward=backward)(corners, BOARD.points, start=base)
+            gradients.append(torch.autograd.grad(summary(found).sum(), corners)[0])
+        # Eight steps, each of which leaves a few percent.
+        scale = float(gradients[0].abs().max())
+        torch.testing.assert_close(gradients[1], gradients[0], rtol=0, atol=1e-6 * scale)
+
+    def test_a_start_keeps_the_amplitudes(self) -> None:
+        base = self.base()
+        again = calibrate_views(CORNERS + 1e-3, BOARD.points, SIZE, start=base, backward="none")
+        assert base.hybrid is not None
+        assert again.hybrid is not None
+        assert again.hybrid.fit is base.hybrid.fit
+        # All corners one thousandth of a pixel to the right and down: the principal point follows nearly, since the
+        # middle of the field stays where it is.
+        moved = (again.parameters - base.parameters)[2:4]
+        torch.testing.assert_close(moved, torch.full((2,), 1e-3).double(), rtol=0.1, atol=0)
+
+    def test_refusals(self) -> None:
+        base = self.base()
+        with pytest.raises(InputError, match="measures the noise"):
+            calibrate_views(CORNERS, BOARD.points, SIZE, corner_sigma=0.1)
+        with pytest.raises(InputError, match="another lens model"):
+            calibrate_views(CORNERS, BOARD.points, SIZE, CalibrationOptions(model="opencv4"), start=base)
+        with pytest.raises(InputError, match="another number of views"):
+            calibrate_views(CORNERS[1:], BOARD.points, SIZE, start=base)
+
+
 def test_it_is_calibrate_cameras_solution() -> None:
     from calibrate_scenes import observe
 

@@ -1,4 +1,4 @@
-"""The exact Hessian of a cost with local blocks, and the system it makes."""
+"""Systems with the exact Hessian of a cost with local blocks, and minima to rounding."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.solve.implicit import curvature
+from kcal.errors import DegenerateError
+from kcal.solve.hessian import HessianSolve
 from kcal.solve.schur import SchurLinearization
 
 
@@ -30,17 +31,33 @@ def test_a_quadratic_gives_its_matrix_back_and_newton_its_minimum(shared: int, v
         x = torch.cat([s, own.flatten()])
         return slope @ x + 0.5 * x @ matrix @ x
 
-    (by_shared, by_local), found = curvature(cost, torch.zeros(shared).double(), torch.zeros(views, local).double())
-    torch.testing.assert_close(torch.cat([by_shared, by_local.flatten()]), slope, rtol=1e-13, atol=1e-13)
-    torch.testing.assert_close(found.shared, matrix[:shared, :shared], rtol=1e-13, atol=1e-13)
+    # A preconditioner that is a tenth off.
+    near = matrix + 0.1 * torch.diag(matrix.diagonal())
+    gram = torch.zeros(views, local + shared + 1, local + shared + 1, dtype=torch.float64)
     for v in range(views):
-        own = slice(shared + v * local, shared + (v + 1) * local)
-        torch.testing.assert_close(found.local[v], matrix[own, own], rtol=1e-13, atol=1e-13)
-        torch.testing.assert_close(found.coupling[v], matrix[own, :shared], rtol=1e-13, atol=1e-13)
-    (step, own_step), _ = found.system(by_shared, by_local).step(torch.zeros((), dtype=torch.float64))
+        own = torch.arange(shared + v * local, shared + (v + 1) * local)
+        gram[v, :local, :local] = near[own[:, None], own]
+        gram[v, :local, local:-1] = near[own[:, None], torch.arange(shared)]
+    gram[0, local:-1, local:-1] = near[:shared, :shared]
+    zero = torch.zeros(shared, dtype=torch.float64), torch.zeros(views, local, dtype=torch.float64)
+    solve = HessianSolve(cost, SchurLinearization.of_gram(gram, local), zero)
+    gradient = solve.gradient()
+    torch.testing.assert_close(torch.cat([part.flatten() for part in gradient]), slope, rtol=1e-13, atol=1e-13)
+    step = torch.cat([part.flatten() for part in solve(gradient)])
     # As well as the matrix is conditioned.
-    whole = torch.cat([step, own_step.flatten()])
-    torch.testing.assert_close(whole, -torch.linalg.solve(matrix, slope), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(step, torch.linalg.solve(matrix, slope), rtol=1e-9, atol=1e-9)
+
+
+def test_a_saddle_has_no_minimum() -> None:
+    gram = torch.diag(torch.tensor([2.0, 2.0, 0.0], dtype=torch.float64))[None]
+    zero = torch.zeros(1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+
+    def cost(s: Tensor, own: Tensor) -> Tensor:
+        return s.square().sum() - own.square().sum()
+
+    solve = HessianSolve(cost, SchurLinearization.of_gram(gram, 1), zero)
+    with pytest.raises(DegenerateError, match="no minimum"):
+        solve((zero[0] + 1.0, zero[1] + 2.0))
 
 
 def test_rows_of_the_shared_parameters_alone_count_once() -> None:
