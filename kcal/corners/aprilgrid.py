@@ -20,16 +20,18 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import TAGS, Board
-from kcal.corners.charuco import MIN_CORNERS, enough, opencv_dictionary
+from kcal.corners.charuco import FEW, MIN_CORNERS, Markers, enough, read_enlarged, read_markers
 from kcal.corners.erf_fit import SHARE
 from kcal.corners.layout import agreeing, board_homography
+from kcal.corners.saddle import CornerStatus, inside_image, saddle
 
 BORDERS = (2, 1)  # cells: Kalibr's own tags, and those of other makers
 _CELLS = 6  # of a tag of this family, without its border
 _FREE_SHARE = 0.85  # of the distance from a corner to what else is printed; the rest is left for blur
 _TOLERANCE = 0.3  # of a tag: distance from where its neighbors put it; a wrong tag is 1.3 off
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 0.05)
-_MOST_ENLARGED = 3_000_000  # pixels: larger images are not searched twice
+_SHARPEN = 1.5  # small and blurred tags are read where what blur takes away is added so many times
+_MIN_SEEN = 3, 2  # corners that must be where its neighbors put them: of a tag inside the image, and of one cut by it
 _NEIGHBORS = 4  # tags that tell where one should be: few, because lenses bend the board
 # Quarter turns of the tags against OpenCV's dictionary: those of the AprilTag library are turned by half a turn.
 _TURNS = (2, 0, 1, 3)
@@ -88,10 +90,13 @@ def find_aprilgrid(image: npt.NDArray[np.uint8], board: Board) -> FoundTags:
     pixels = torch.full((board.corners, 2), float("nan"), dtype=torch.float64)
     side = nothing.clone()
     share = _FREE_SHARE / SHARE * min(math.sqrt(2.0) * border / (_CELLS + 2 * border), board.gap / board.square)
-    for number, corners in placed.items():
+    for number, corners in _with_unread(image, placed, board, turn, share).items():
         places = _tag_places(number, board, turn)
         edge = float(np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1).min())
-        pixels[places] = torch.from_numpy(_nearer(image, corners, edge))
+        moved = torch.from_numpy(_nearer(image, corners, edge))
+        # Corners whose window leaves the image would spoil what the others tell of the light.
+        inside = inside_image(moved, torch.full((4,), SHARE * share * edge), image.shape[1], image.shape[0])
+        pixels[places] = torch.where(inside[:, None], moved, torch.nan)
         side[places] = share * edge
     if not enough(pixels, board):
         return FoundTags(None, nothing, f"fewer than {MIN_CORNERS} corners of the AprilGrid's tags found")
@@ -104,44 +109,28 @@ def _most_tags(
     """The border with which most tags are read, the board's tags by number, and other numbers that were seen."""
     best: tuple[int, dict[int, list[npt.NDArray[np.float64]]], list[int]] = (BORDERS[0], {}, [])
     for border in BORDERS:
-        tags, others = _read_tags(image, board, border)
+        tags, others = read_markers(image, board, TAGS, border)
         if (len(tags), len(others)) > (len(best[1]), len(best[2])):
             best = border, tags, others
     border, tags, others = best
-    if image.size <= _MOST_ENLARGED and len(tags) < board.markers:
-        # OpenCV reads tags of 20 px and less in an image twice as large only.
-        # More wrong bits are corrected there: a tag that is read wrongly does not lie where it should.
-        double = np.asarray(cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), np.uint8)
-        large, more = _read_tags(double, board, border, correction=1.0)
-        tags |= {n: [(found[0] + 0.5) / 2 - 0.5] for n, found in large.items() if n not in tags and len(found) == 1}
+    for sharpen, enough_tags in ((0.0, 1.0), (_SHARPEN, FEW)):
+        if len(tags) >= enough_tags * board.markers:
+            break
+        large, more = read_enlarged(image, board, TAGS, border, sharpen)
+        tags |= {number: [corners] for number, corners in large.items() if number not in tags}
         others += more
     return border, tags, others
 
 
-def _read_tags(
-    image: npt.NDArray[np.uint8], board: Board, border: int, correction: float = 0.6
-) -> tuple[dict[int, list[npt.NDArray[np.float64]]], list[int]]:
-    options = cv2.aruco.DetectorParameters()
-    options.markerBorderBits, options.errorCorrectionRate = border, correction
-    options.perspectiveRemovePixelPerCell = 8
-    found, numbers, _ = cv2.aruco.ArucoDetector(opencv_dictionary(TAGS), options).detectMarkers(image)
-    tags: dict[int, list[npt.NDArray[np.float64]]] = {}
-    others: list[int] = []
-    for corners, number in zip(found, [] if numbers is None else map(int, numbers.reshape(-1)), strict=True):
-        if board.first <= number < board.first + board.markers:
-            tags.setdefault(number, []).append(np.asarray(corners, np.float64).reshape(4, 2))
-        else:
-            others.append(number)
-    return tags, others
-
-
 def _nearer(image: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64], edge: float) -> npt.NDArray[np.float64]:
-    """Corners moved near enough for kcal's refinement, in windows that reach no cell inside the tag."""
+    """Corners moved near enough for kcal's refinement, in windows that reach no cell inside the tag; NaN outside."""
+    limit = np.array(image.shape[::-1]) - 1.0
+    inside = ((corners >= 0) & (corners <= limit)).all(1, keepdims=True)
     half = int(np.clip(0.12 * edge, 2, 5))
-    start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2)
+    start = np.ascontiguousarray(corners.clip(0, limit), np.float32).reshape(-1, 1, 2)
     moved = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), _STOP).reshape(-1, 2).astype(np.float64)
     near = np.linalg.norm(moved - corners, axis=1, keepdims=True) < half
-    return np.where(near, moved, corners)
+    return np.where(inside, np.where(near, moved, corners), np.nan)
 
 
 def _tag_places(number: int, board: Board, turn: int) -> list[int]:
@@ -182,3 +171,45 @@ def _in_place(seen: dict[int, npt.NDArray[np.float64]], board: Board, turn: int)
         )
         kept[number] = corners if both is None else cv2.perspectiveTransform(own[None], np.linalg.inv(both))[0]
     return kept
+
+
+def _with_unread(image: npt.NDArray[np.uint8], placed: Markers, board: Board, turn: int, share: float) -> Markers:
+    """Tags, and those that were not read but have corners where the tags beside them put them.
+
+    Args:
+        image: (H, W).
+        placed: tags by number.
+        board: an AprilGrid.
+        turn: of the tags.
+        share: of a tag's edge, the side to pass to refinement.
+    """
+    points, light = board.points[:, :2].numpy(), torch.from_numpy(image)
+    cells = {board.first + n: np.array(divmod(n, board.columns // 2)) for n in range(board.markers)}
+    tags = dict(placed)
+    while True:
+        guessed = {}
+        for number in cells.keys() - tags:
+            away = {other: float(np.abs(cells[other] - cells[number]).max()) for other in tags}
+            near = sorted(tags, key=lambda other: away[other])[:_NEIGHBORS]
+            if away[near[0]] > 1:
+                continue
+            board_from_image = board_homography(
+                np.concatenate([points[_tag_places(other, board, turn)] for other in near]),
+                np.concatenate([tags[other] for other in near]),
+            )
+            if board_from_image is not None:
+                own = points[_tag_places(number, board, turn)]
+                guessed[number] = cv2.perspectiveTransform(own[None], np.linalg.inv(board_from_image))[0]
+        if not guessed:
+            return tags
+        starts = torch.from_numpy(np.stack(list(guessed.values())))
+        edges = torch.linalg.vector_norm(starts - starts.roll(1, 1), dim=-1).amin(1).clamp_min(1.0)
+        found = saddle(light, starts.reshape(-1, 2), (share * edges).repeat_interleave(4))
+        good = (found.status == CornerStatus.GOOD).reshape(-1, 4)
+        corners = torch.where(good[..., None], found.pixels.reshape(-1, 4, 2), starts)
+        whole = inside_image(starts, torch.zeros(starts.shape[:2]), image.shape[1], image.shape[0]).all(-1)
+        enough_seen = good.sum(-1) >= torch.where(whole, *_MIN_SEEN)
+        new = {n: c.numpy() for n, c, is_there in zip(guessed, corners, enough_seen.tolist(), strict=True) if is_there}
+        if not new:
+            return tags
+        tags |= new

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+_NEIGHBORS = 4  # markers that tell where one should be: few, because lenses bend the board
 _TRIES = 60  # pairs; nearly all of a board's markers agree, or hardly any
 
 
@@ -49,6 +50,27 @@ def inliers(
         if good.sum() > best.sum():
             best = good
     return best
+
+
+def in_place(
+    placed: npt.NDArray[np.floating], seen: npt.NDArray[np.floating], tolerance: float
+) -> npt.NDArray[np.bool_]:
+    """Which markers lie where those near them put them, (M,).
+
+    It begins with those of one homography (`inliers`) and goes on from neighbor to neighbor, as far as a lens bends the
+    board.
+    """
+    good = inliers(placed, seen, tolerance)
+    tried = good.copy()
+    while good.sum() >= 2 and not tried.all():
+        away = np.linalg.norm(seen.mean(1)[:, None] - seen[good].mean(1)[None], axis=-1)
+        away[tried] = np.inf
+        other = int(np.argmin(away.min(1)))
+        near = np.flatnonzero(good)[np.argsort(away[other])[:_NEIGHBORS]]
+        found = board_homography(placed[near].reshape(-1, 2), seen[near].reshape(-1, 2))
+        good[other] = found is not None and _misses(found, placed[[other]], seen[[other]])[0] < tolerance
+        tried[other] = True
+    return good
 
 
 def board_homography(

@@ -18,21 +18,18 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.corners.grid_check import (
     MIN_OUTER,
-    MIN_SQUARE,
     levels_beside,
     skips,
     step_along,
     uneven,
     without_false_sides,
 )
+from kcal.corners.grow import checkered, grown_grid, local_steps, sides
 from kcal.corners.order import handedness, uprightness
-from kcal.corners.saddle import CornerStatus, saddle
 
 MIN_CORNERS = 12
 MIN_FILLED = 0.5  # share of the places of the grown grid at which corners were found
 MIN_LINES = 3  # each way
-MAX_MISS = 0.25  # of the square: distance of a corner from where its neighbors predict it
-MIN_CONTRAST = 0.15  # of the corners beside it; a hard shadow leaves a quarter
 MIN_END, MIN_END_SHARE = 3, 0.8  # corners that must show the board's end on one side, and their share
 OUTER_SQUARE = 0.5  # of its contrast at the corner that the outer square must have up to the board's end
 SIDES = ("top", "bottom", "left", "right")  # of a grid
@@ -116,45 +113,14 @@ def _is_anchored(image: npt.NDArray[np.uint8], grid: Tensor, ends: tuple[bool, b
     return all((ends[i] and ends[i + 1]) or sure[i] or sure[i + 1] for i in (0, 2))
 
 
-def grown_grid(image: npt.NDArray[np.generic], grid: Tensor, most: int) -> Tensor:
-    """Extend a grid of corners (rows, columns, 2) to its neighbors in the image, up to `most` lines each way.
-
-    Each neighbor is predicted from the corners beside it and refined; squares must alternate on all its four sides.
-    """
-    light = torch.from_numpy(image.astype(np.float32))
-    while True:
-        grid = torch.nn.functional.pad(grid, (0, 0, 1, 1, 1, 1), value=torch.nan)
-        before = torch.isfinite(grid).all(-1)
-        predicted, (along, down) = _predicted(grid), _local_steps(grid)
-        new = ~before & torch.isfinite(predicted + along + down).all(-1)
-        if bool(new.any()):
-            places, along, down = predicted[new], along[new], down[new]
-            side = torch.minimum(torch.linalg.vector_norm(along, dim=-1), torch.linalg.vector_norm(down, dim=-1))
-            refined = saddle(light, places, side.clamp_min(1.0))
-            apart = torch.linalg.vector_norm(refined.pixels - places, dim=-1)
-            good = (refined.status == CornerStatus.GOOD) & (side >= MIN_SQUARE) & (apart < MAX_MISS * side)
-            good &= _are_corners(image, grid, refined.pixels, along, down, new)
-            grid[new] = torch.where(good[:, None], refined.pixels, torch.nan)
-        known = torch.isfinite(grid).all(-1)
-        rows, columns = known.any(1).nonzero()[:, 0], known.any(0).nonzero()[:, 0]
-        grid = grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        if bool((known == before).all()) or max(grid.shape[:2]) > most:
-            return grid
-
-
 def board_ends(image: npt.NDArray[np.generic], grid: Tensor, paper: bool = False) -> tuple[bool, bool, bool, bool]:
     """At which sides (top, bottom, left, right) of a grid (rows, columns, 2) the board's end is visible.
 
     The outer squares must alternate up to one step outside the outer corners, and nothing may alternate beyond. With
     `paper` it must be light there as well: what covers a board along a straight line seldom is.
     """
-    top, bottom, left, right = (_is_end(image, side, paper) for side in _sides(grid))
+    top, bottom, left, right = (_is_end(image, side, paper) for side in sides(grid))
     return top, bottom, left, right
-
-
-def _sides(grid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The grid, turned or mirrored so that each side in turn is its first row."""
-    return grid, grid.flip(0), grid.transpose(0, 1), grid.transpose(0, 1).flip(0)
 
 
 def _is_end(image: npt.NDArray[np.generic], grid: Tensor, paper: bool) -> bool:
@@ -173,7 +139,7 @@ def _is_end(image: npt.NDArray[np.generic], grid: Tensor, paper: bool) -> bool:
 
 def _next_line(grid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Where the next line above the first would be (columns, 2), the step to it, and the step along it."""
-    along = _local_steps(grid)[0][0]
+    along = local_steps(grid)[0][0]
     beyond = 3 * grid[0] - 3 * grid[1] + grid[2]
     beyond = torch.where(torch.isfinite(beyond), beyond, 2 * grid[0] - grid[1])
     return beyond, beyond - grid[0], along
@@ -184,63 +150,6 @@ def _is_inside(image: npt.NDArray[np.generic], places: Tensor) -> Tensor:
     return ((places >= 0) & (places <= limit)).all(-1)  # False for NaN
 
 
-def _local_steps(grid: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean steps along rows and down columns near each corner (rows, columns, 2), NaN where none is known nearby."""
-    steps = []
-    for dim in (1, 0):
-        step = grid.diff(dim=dim)
-        pad = (0, 0, 1, 1, 0, 0) if dim == 1 else (0, 0, 0, 0, 1, 1)
-        step = torch.nn.functional.pad(step, pad, value=torch.nan)
-        both = torch.stack([step.narrow(dim, 0, grid.shape[dim]), step.narrow(dim, 1, grid.shape[dim])]).nanmean(0)
-        around = torch.nn.functional.pad(both, (0, 0, 1, 1, 1, 1), value=torch.nan)
-        near = [around[i : i + grid.shape[0], j : j + grid.shape[1]] for i in range(3) for j in range(3)]
-        steps.append(torch.stack(near).nanmean(0))
-    return steps[0], steps[1]
-
-
-def _predicted(grid: Tensor) -> Tensor:
-    """Where the corners beside each place predict it: by quadratics along lines, or straight ones where too few are."""
-    third: list[Tensor] = []
-    second: list[Tensor] = []
-    for side in range(4):
-        turned = _sides(grid)[side]
-        padded = torch.nn.functional.pad(turned, (0, 0, 0, 0, 0, 3), value=torch.nan)
-        one, two, three = (padded[k : k + len(turned)] for k in (1, 2, 3))
-        for values, guess in ((third, 3 * one - 3 * two + three), (second, 2 * one - two)):
-            guess = guess if side in (0, 2) else guess.flip(0)
-            values.append(guess if side < 2 else guess.transpose(0, 1))
-    straight = torch.stack(second).nanmean(0)
-    curved = torch.stack(third).nanmean(0)
-    return torch.where(torch.isfinite(curved), curved, straight)
-
-
-def _checkered(grid: Tensor) -> Tensor:
-    """1 and -1 in turn, (rows, columns)."""
-    i, j = torch.meshgrid(torch.arange(grid.shape[0]), torch.arange(grid.shape[1]), indexing="ij")
-    return 1.0 - 2.0 * ((i + j) % 2)
-
-
-def _are_corners(
-    image: npt.NDArray[np.generic], grid: Tensor, places: Tensor, along: Tensor, down: Tensor, new: Tensor
-) -> Tensor:
-    """Whether squares alternate on all four sides of new places (N, 2), in step with the corners known in `grid`."""
-    own_along, own_down = _local_steps(grid)
-    known = (step_along(image, grid, own_along, own_down) - step_along(image, grid, own_along, -own_down)) / 2
-    known = known * _checkered(grid)
-    around = torch.nn.functional.pad(known, (2, 2, 2, 2), value=torch.nan)
-    near = [around[i : i + known.shape[0], j : j + known.shape[1]] for i in range(5) for j in range(5)]
-    typical = torch.stack(near).nanmedian(0).values[new] * _checkered(grid)[new]
-    four = torch.stack(
-        [
-            step_along(image, places, along, down),
-            -step_along(image, places, along, -down),
-            step_along(image, places, down, along),
-            -step_along(image, places, down, -along),
-        ]
-    ) / torch.where(typical == 0, torch.nan, typical)
-    return (four.amin(0) > MIN_OUTER * four.amax(0)) & (four.mean(0) > MIN_CONTRAST)
-
-
 def _placements(
     image: npt.NDArray[np.generic], grid: Tensor, ends: tuple[bool, bool, bool, bool], board: Board
 ) -> list[Tensor]:
@@ -249,8 +158,8 @@ def _placements(
     top, bottom, left, right = ends
     for _ in range(4):
         high, wide = grid.shape[:2]
-        along, down = _local_steps(grid)
-        lighter = (step_along(image, grid, along, down) - step_along(image, grid, along, -down)) * _checkered(grid)
+        along, down = local_steps(grid)
+        lighter = (step_along(image, grid, along, down) - step_along(image, grid, along, -down)) * checkered(grid)
         dark = bool(lighter.nanmedian() < 0)  # the square diagonally outside the grid's first corner
         for row in range(board.rows - high + 1):
             for column in range(board.columns - wide + 1):
@@ -277,7 +186,7 @@ def _hidden_sides(image: npt.NDArray[np.generic], grid: Tensor, ends: tuple[bool
     middle = grid.nanmean((0, 1))
     cut: list[str] = []
     unclear: list[str] = []
-    for side, end in zip(_sides(grid), ends, strict=True):
+    for side, end in zip(sides(grid), ends, strict=True):
         if end:
             continue
         beyond, out, _ = _next_line(side)

@@ -1,14 +1,13 @@
 """Render boards that are hard to find, with known corners: blurred, moving, overexposed, cut by the image's edge, ...
 
-Each kind changes one thing of a plain picture of a 9x6 board. `NOT_THE_BOARD` are pictures without a 9x6 board (other
-boards, stripes), in which anything found is a false grid.
+Each kind changes one thing of a plain picture, of a 9x6 board if no other scene is given. `NOT_THE_BOARD` are pictures
+without a 9x6 board (other boards, stripes), in which anything found is a false grid.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -18,47 +17,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.lens.camera import Camera
-from kcal.sim.board import BoardPose, BoardSize, project_board
-from kcal.sim.poses import PoseOptions, sample_board_poses
-from kcal.sim.render import RenderOptions, render_light
+from kcal.sim.board import BoardPose
+from scripts.bench.hard_scenes import SIZE, Light, Scene
 
 BOARD = Board(columns=9, rows=6, square=0.025)
-SIZE = 640, 480
+CHECKERS = Scene(BOARD)
 _GRAY = 0.114, 0.587, 0.299  # OpenCV's weights of blue, green and red
-Light = NDArray[Any]
 
 
 class Picture(NamedTuple):
-    """An image, and the true corners (N, 2) of the board in its order, NaN where outside the image; None without."""
+    """An image, and the true corners (N, 2) of the board in its order, NaN where not visible; None without."""
 
     image: NDArray[Any]
     truth: Tensor | None
-
-
-def camera(size: tuple[int, int] = SIZE, focal: float = 0.9) -> Camera:
-    """A camera with barrel distortion; the focal length is a share of the width."""
-    width, height = size
-    f = focal * width
-    return Camera.build(
-        focal=(f, f), center=((width - 1) / 2 + 1.3, (height - 1) / 2 - 0.7), size=size,
-        coefficients=[-0.2, 0.06, 0.0005, -0.0003],
-    )  # fmt: skip
-
-
-def _scene(
-    generator: torch.Generator,
-    board: Board = BOARD,
-    size: tuple[int, int] = SIZE,
-    fill: tuple[float, float] = (0.45, 0.85),
-    tilt: float = 40.0,
-    **look: float,
-) -> tuple[Light, Tensor, BoardPose]:
-    lens, extent = camera(size), BoardSize(board.columns, board.rows, board.square)
-    options = PoseOptions(max_tilt=math.radians(tilt))
-    pose = sample_board_poses(lens, extent, 1, generator, fill=fill, options=options)[0]
-    light = render_light(lens, pose, extent, replace(RenderOptions(gamma=2.2, noise=0.0), **look))  # type: ignore[arg-type]
-    return light.numpy(), project_board(lens, pose, extent)[0], pose
 
 
 def _sensor(light: Light, generator: torch.Generator, noise: float = 2.0, quality: int = 92) -> NDArray[np.uint8]:
@@ -70,12 +41,6 @@ def _sensor(light: Light, generator: torch.Generator, noise: float = 2.0, qualit
 
 def _random(generator: torch.Generator, low: float, high: float) -> float:
     return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
-
-
-def _square(truth: Tensor) -> float:
-    """The smallest square, px."""
-    grid = truth.reshape(BOARD.rows, BOARD.columns, 2)
-    return float(min(torch.linalg.vector_norm(grid.diff(dim=dim), dim=-1).min() for dim in (0, 1)))
 
 
 def _axes(light: Light) -> tuple[Light, Light]:
@@ -95,66 +60,68 @@ def motion_kernel(length: float, angle: float) -> Light:
     return np.asarray(0.25 * (drawn + drawn[::-1, ::-1]) * 2.0 / drawn.sum())
 
 
-def plain(generator: torch.Generator) -> Picture:
-    light, truth, _ = _scene(generator)
+def plain(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
+    light, truth = scene.draw(generator)
     return Picture(_sensor(light, generator), truth)
 
 
-def blurred(generator: torch.Generator) -> Picture:
+def blurred(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """Out of focus: sigma of 0.1 to 0.2 of the smallest square."""
-    light, truth, _ = _scene(generator, gamma=1.0)
-    sigma = _random(generator, 0.1, 0.2) * _square(truth)
+    light, truth = scene.draw(generator, gamma=1.0)
+    sigma = _random(generator, 0.1, 0.2) * scene.sharp(truth)
     return Picture(_sensor(cv2.GaussianBlur(light, (0, 0), sigma), generator), truth)
 
 
-def moving(generator: torch.Generator) -> Picture:
+def moving(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """Smeared along one direction by 0.2 to 0.6 of the smallest square."""
-    light, truth, _ = _scene(generator, gamma=1.0)
-    kernel = motion_kernel(_random(generator, 0.2, 0.6) * _square(truth), _random(generator, 0, math.pi))
+    light, truth = scene.draw(generator, gamma=1.0)
+    kernel = motion_kernel(_random(generator, 0.2, 0.6) * scene.sharp(truth), _random(generator, 0, math.pi))
     return Picture(_sensor(cv2.filter2D(light, -1, kernel, borderType=cv2.BORDER_REPLICATE), generator), truth)
 
 
-def overexposed(generator: torch.Generator) -> Picture:
+def overexposed(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """White clips, blooms into the black squares, and black is raised."""
-    light, truth, _ = _scene(generator, gamma=1.0, blur=1.2)
+    light, truth = scene.draw(generator, gamma=1.0, blur=1.2)
     levels = light * _random(generator, 1.8, 2.6) + 20.0
     bloom = np.clip(levels - 255.0, 0, None)
     levels = levels + 0.5 * cv2.GaussianBlur(bloom, (0, 0), 3.0)
     return Picture(_sensor(255.0 * (np.clip(levels, 0, 255) / 255.0) ** (1 / 1.8), generator), truth)
 
 
-def screen(generator: torch.Generator) -> Picture:
+def screen(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """Shown on a screen: its raster beats with the camera's pixels (moire), and lines of its refresh run across."""
-    light, truth, _pose = _scene(generator, black=8.0, background=30.0)
+    light, truth = scene.draw(generator, black=8.0, background=30.0)
     x, y = _axes(light)
-    points = truth.reshape(BOARD.rows, BOARD.columns, 2).numpy()
+    points = truth.reshape(scene.board.rows, scene.board.columns, 2).numpy()
     first, far, low = points[0, 0], points[0, -1], points[-1, 0]
     dots = _random(generator, 12, 40)  # of the screen in a square
     a = ((x - first[0]) * (far - first)[0] + (y - first[1]) * (far - first)[1]) / ((far - first) ** 2).sum()
     b = ((x - first[0]) * (low - first)[0] + (y - first[1]) * (low - first)[1]) / ((low - first) ** 2).sum()
-    raster = np.cos(2 * math.pi * a * (BOARD.columns - 1) * dots) + np.cos(2 * math.pi * b * (BOARD.rows - 1) * dots)
+    raster = np.cos(2 * math.pi * a * (scene.board.columns - 1) * dots) + np.cos(
+        2 * math.pi * b * (scene.board.rows - 1) * dots
+    )
     bands = 1.0 + 0.15 * np.sin(2 * math.pi * y / _random(generator, 60, 160))
     return Picture(_sensor(light * (1.0 + 0.2 * raster) * bands, generator), truth)
 
 
-def small(generator: torch.Generator) -> Picture:
-    """Squares of about 10 px."""
-    light, truth, _ = _scene(generator, fill=(0.165, 0.185), tilt=30.0)
+def small(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
+    """Squares of about 10 px; of boards with markers 16."""
+    light, truth = scene.draw(generator, fill=scene.small, tilt=30.0)
     return Picture(_sensor(light, generator), truth)
 
 
-def sixteen_bits(generator: torch.Generator) -> Picture:
+def sixteen_bits(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """12 bits in 16, most of them unused: a dark scene, with a few hot pixels."""
-    light, truth, _ = _scene(generator, gamma=1.0)
+    light, truth = scene.draw(generator, gamma=1.0)
     levels = light * 1.5 + 64.0 + 3.0 * torch.randn(light.shape, generator=generator, dtype=torch.float64).numpy()
     hot = torch.randint(0, light.size, (20,), generator=generator).numpy()
     levels.reshape(-1)[hot] = 4095.0
     return Picture(np.clip(np.rint(levels), 0, 4095).astype(np.uint16), truth)
 
 
-def fringed(generator: torch.Generator) -> Picture:
+def fringed(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """Red and blue are magnified differently (lateral color), by up to 2 px in the corners."""
-    light, truth, _ = _scene(generator)
+    light, truth = scene.draw(generator)
     middle = torch.tensor([(SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2], dtype=torch.float64)
     gray, place = np.zeros_like(light), torch.zeros_like(truth)
     for weight, scale in zip(_GRAY, (1.005, 1.0, 0.996), strict=True):
@@ -164,19 +131,19 @@ def fringed(generator: torch.Generator) -> Picture:
     return Picture(_sensor(gray, generator), place)
 
 
-def glaring(generator: torch.Generator) -> Picture:
+def glaring(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """A lamp's reflection: about six squares are white."""
-    light, truth, _ = _scene(generator)
+    light, truth = scene.draw(generator)
     x, y = _axes(light)
-    u, v = truth[int(torch.randint(0, BOARD.corners, (1,), generator=generator))].tolist()
-    reach = 1.0 * _square(truth)
+    u, v = truth[int(torch.randint(0, scene.board.corners, (1,), generator=generator))].tolist()
+    reach = scene.side(truth)
     spot = np.exp(-0.5 * (((x - u) / (1.4 * reach)) ** 2 + ((y - v) / reach) ** 2))
     return Picture(_sensor(light + 400.0 * spot, generator), truth)
 
 
-def shaded(generator: torch.Generator) -> Picture:
+def shaded(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """A hard shadow across the board, and light that falls off."""
-    light, truth, _ = _scene(generator)
+    light, truth = scene.draw(generator)
     x, y = _axes(light)
     u, v = truth.mean(0).tolist()
     angle = _random(generator, 0, 2 * math.pi)
@@ -185,25 +152,25 @@ def shaded(generator: torch.Generator) -> Picture:
     return Picture(_sensor(light * shade * (1.0 - 0.4 * x / SIZE[0]), generator), truth)
 
 
-def noisy(generator: torch.Generator) -> Picture:
+def noisy(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """Little light: contrast of 40 levels, noise of 10, JPEG of low quality."""
-    light, truth, _ = _scene(generator, blur=1.0)
+    light, truth = scene.draw(generator, blur=1.0)
     return Picture(_sensor(30.0 + 0.23 * light, generator, noise=10.0, quality=60), truth)
 
 
-def sharpened(generator: torch.Generator) -> Picture:
+def sharpened(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """The camera's sharpening leaves halos and jagged edges."""
-    light, truth, _ = _scene(generator, blur=0.4)
+    light, truth = scene.draw(generator, blur=0.4)
     soft = cv2.GaussianBlur(light, (0, 0), 1.2)
     return Picture(_sensor(40.0 + 0.5 * (light + 1.5 * (light - soft)), generator, quality=75), truth)
 
 
-def textured(generator: torch.Generator) -> Picture:
+def textured(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """Stripes around the board."""
     state = generator.get_state()
-    dark, truth, _ = _scene(generator, background=0.0)
+    dark, truth = scene.draw(generator, background=0.0)
     generator.set_state(state)
-    lit, _, _ = _scene(generator, background=255.0)
+    lit, _ = scene.draw(generator, background=255.0)
     share = np.clip((lit - dark) / np.maximum(lit, 1.0) * 1.1, 0, 1)
     x, y = _axes(dark)
     angle, period = _random(generator, 0, math.pi), _random(generator, 6, 14)
@@ -211,30 +178,44 @@ def textured(generator: torch.Generator) -> Picture:
     return Picture(_sensor(dark * (1 - share) + stripes * share, generator), truth)
 
 
-def cut(generator: torch.Generator) -> Picture:
+def cut(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
     """One to three columns or rows are outside the image."""
-    size = SIZE
-    light, truth, pose = _scene(generator, fill=(0.6, 0.8), tilt=25.0)
-    lens, extent = camera(size), BoardSize(BOARD.columns, BOARD.rows, BOARD.square)
+    pose = scene.pose(generator, fill=(0.6, 0.8), tilt=25.0)
     side = int(torch.randint(0, 4, (1,), generator=generator))
     axis, sign = side % 2, 1 if side < 2 else -1
-    limit = torch.tensor([size[0] - 1.0, size[1] - 1.0], dtype=torch.float64)
+    limit = torch.tensor([SIZE[0] - 1.0, SIZE[1] - 1.0], dtype=torch.float64)
     step = torch.zeros(3, dtype=torch.float64)
     step[axis] = 0.002 * sign
     lost = _random(generator, 0.12, 0.3)
     for _ in range(400):
+        truth = scene.places(pose)
         inside = ((truth > 0) & (truth < limit)).all(-1)
         if float((~inside).double().mean()) >= lost:
             break
         pose = BoardPose(pose.rotation, pose.translation + step)
-        truth = project_board(lens, pose, extent)[0]
-    light = render_light(lens, pose, extent, RenderOptions(gamma=2.2, noise=0.0)).numpy()
+    light = scene.light(pose)
     return Picture(_sensor(light, generator), torch.where(inside[:, None], truth, math.nan))
+
+
+def covered(generator: torch.Generator, scene: Scene = CHECKERS) -> Picture:
+    """A finger, two squares wide, reaches from outside to a corner of the board and over it."""
+    light, truth = scene.draw(generator)
+    u, v = truth[int(torch.randint(0, scene.board.corners, (1,), generator=generator))].tolist()
+    angle, reach = _random(generator, 0, 2 * math.pi), scene.side(truth)
+
+    def away(x: Light, y: Light) -> Light:
+        along = (x - u) * math.cos(angle) + (y - v) * math.sin(angle)
+        across = (y - v) * math.cos(angle) - (x - u) * math.sin(angle)
+        return np.asarray(np.hypot(np.minimum(along, 0), across) - reach)
+
+    share = 1.0 / (1.0 + np.exp(np.clip(away(*_axes(light)) / 0.7, -50, 50)))
+    hidden = torch.from_numpy(away(*truth.numpy().T) < 0)
+    return Picture(_sensor(light + share * (90.0 - light), generator), truth.masked_fill(hidden[:, None], math.nan))
 
 
 def large(generator: torch.Generator) -> Picture:
     """100 megapixels, not quite in focus."""
-    light, truth, _ = _scene(generator, size=(11600, 8700), blur=4.0)
+    light, truth = Scene(BOARD, (11600, 8700)).draw(generator, blur=4.0)
     return Picture(np.clip(np.rint(light + 1.0), 0, 255).astype(np.uint8), truth)
 
 
@@ -244,13 +225,14 @@ def other_board(generator: torch.Generator) -> Picture:
         columns, rows = (int(n) for n in torch.randint(4, 13, (2,), generator=generator))
         if {columns, rows} != {BOARD.columns, BOARD.rows}:
             break
-    light, _, _ = _scene(generator, board=Board(columns=columns, rows=rows, square=BOARD.square))
+    light, _ = Scene(Board(columns=columns, rows=rows, square=BOARD.square)).draw(generator)
     return Picture(_sensor(light, generator), None)
 
 
 def lacking_a_line(generator: torch.Generator) -> Picture:
     """An 8x6 board whose narrow margin and the ground beside it pass for a ninth column."""
-    light, truth, _ = _scene(generator, board=Board(columns=8, rows=6, square=BOARD.square), background=60.0, tilt=20.0)
+    narrow = Scene(Board(columns=8, rows=6, square=BOARD.square))
+    light, truth = narrow.draw(generator, background=60.0, tilt=20.0)
     corners = truth.reshape(6, 8, 2).numpy()
     # Paper ends a tenth of a square outside the outer squares: dark ground is painted over the rest of the margin.
     right, left = 1.1 * (corners[:, -1] - corners[:, -2]), 1.1 * (corners[:, 0] - corners[:, 1])
@@ -264,21 +246,21 @@ def lacking_a_line(generator: torch.Generator) -> Picture:
 
 def stripes_and_tiles(generator: torch.Generator) -> Picture:
     """A checkered floor without an end, seen at a slant."""
-    light, _, _ = _scene(generator, board=Board(columns=40, rows=40, square=0.025), fill=(0.9, 1.0), tilt=30.0)
+    light, _ = Scene(Board(columns=40, rows=40, square=0.025)).draw(generator, fill=(0.9, 1.0), tilt=30.0)
     u, v = int(_random(generator, 40, 200)), int(_random(generator, 40, 120))
     part = cv2.resize(light[v : v + 200, u : u + 260], SIZE, interpolation=cv2.INTER_CUBIC)
     return Picture(_sensor(part, generator), None)
 
 
-Kind = Callable[[torch.Generator], Picture]
+Kind = Callable[..., Picture]  # of a generator, and of a scene where another board can be shown
 HARD: tuple[Kind, ...] = (
     plain, blurred, moving, overexposed, screen, small, sixteen_bits, fringed, glaring, shaded, noisy, sharpened,
-    textured, cut,
+    textured, cut, covered,
 )  # fmt: skip
 NOT_THE_BOARD: tuple[Kind, ...] = (other_board, lacking_a_line, stripes_and_tiles)
 
 
-def pictures(kind: Kind, count: int) -> Iterator[Picture]:
+def pictures(kind: Kind, count: int, *scene: Scene) -> Iterator[Picture]:
     """The same `count` pictures each time."""
     for number in range(count):
-        yield kind(torch.Generator().manual_seed(1000 * number + 7))
+        yield kind(torch.Generator().manual_seed(1000 * number + 7), *scene)

@@ -2,7 +2,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from target_render import Paper, add, errors, expose, light_of, points_of, pose
 
 from kcal.corners.aprilgrid import find_aprilgrid
 from kcal.corners.board import Board
@@ -11,6 +10,7 @@ from kcal.corners.detect import detect_board, detect_images
 from kcal.corners.pattern_shapes import pattern_shapes
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from scripts.shared.printed_board import Paper, add, errors, expose, light_of, points_of, pose
 
 CAMERA = Camera.build(focal=(430, 430), center=(243, 177), size=(480, 360), coefficients=[-0.1, 0.02])
 BOARD = Board.parse("aprilgrid:4x3", "35mm")

@@ -4,13 +4,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from target_render import Paper, errors, expose, light_of, points_of, pose
 
 from kcal.corners.board import Board
 from kcal.corners.charuco import _opencv_board, find_charuco
 from kcal.corners.detect import detect_board, detect_images
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from scripts.shared.printed_board import Paper, errors, expose, light_of, points_of, pose
 
 SIDE, MARGIN = 40, 40
 CAMERA = Camera.build(focal=(430, 430), center=(243, 177), size=(480, 360), coefficients=[-0.1, 0.02])

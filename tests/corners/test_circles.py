@@ -2,7 +2,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from target_render import Paper, errors, pose
 
 from kcal.corners.board import Board
 from kcal.corners.circle_bias import center_shift, homography, local_maps
@@ -11,6 +10,7 @@ from kcal.corners.detect import detect_board, detect_images
 from kcal.corners.ellipse import fit_ellipses
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from scripts.shared.printed_board import Paper, errors, pose
 
 CAMERA = Camera.build(focal=(430, 430), center=(243, 177), size=(480, 360), coefficients=[-0.1, 0.02])
 ASYMMETRIC = Board.parse("asymmetric:4x11", "20mm")

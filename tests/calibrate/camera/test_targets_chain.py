@@ -3,7 +3,6 @@
 import cv2
 import pytest
 import torch
-from target_render import Paper, pose
 from typer.testing import CliRunner
 
 from kcal.calibrate.camera.next_view import possible_views
@@ -15,6 +14,7 @@ from kcal.io.camera_file import load_camera
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
 from kcal.lens.paraxial import paraxial_focal
+from scripts.shared.printed_board import Paper, pose
 
 CAMERA = Camera.build(focal=(430, 430), center=(243, 177), size=(480, 360), coefficients=[-0.1, 0.02])
 TILTS = (
@@ -95,7 +95,7 @@ def test_old_charuco_boards_calibrate(tmp_path):
 
 
 def test_two_boards_are_detected_one_after_the_other(tmp_path):
-    from target_render import expose, light_of
+    from scripts.shared.printed_board import expose, light_of
 
     boards = Board.parse("aprilgrid:3x3", "30mm"), Board.parse("aprilgrid:3x3:id9", "30mm")
     papers = [Paper(board, 0.25) for board in boards]

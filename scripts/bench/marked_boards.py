@@ -1,0 +1,131 @@
+"""Boards with markers, found under hard conditions: section "Boards with markers" of docs/measured/corners.md.
+
+kcal beside OpenCV's ArUco module and AprilTag's own library (`marker_peers`), on rendered ChArUco boards and Kalibr's
+AprilGrid in the scenes of `hard_boards`. An image is found if 6 corners are right, as many as a pose needs. A corner is
+wrong if it is more than 2 px from the truth, or where no corner is visible. RMS is over the others.
+
+    python -m scripts.bench.marked_boards --write
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcal.corners.board import Board
+from kcal.corners.charuco import MIN_CORNERS
+from kcal.corners.detect import detect_board, limit_threads
+from scripts.bench.hard_boards import (
+    Picture,
+    blurred,
+    covered,
+    cut,
+    glaring,
+    moving,
+    noisy,
+    overexposed,
+    pictures,
+    plain,
+    shaded,
+    small,
+)
+from scripts.bench.hard_scenes import Marked
+from scripts.bench.marker_peers import (
+    HAS_APRILTAG,
+    Detector,
+    apriltag_grid,
+    aruco_grid,
+    charuco,
+    charuco_of_apriltag,
+    kalibr_grid,
+)
+from scripts.shared.page import table, write_section
+
+WRONG = 2.0  # pixels
+KINDS = (plain, blurred, moving, overexposed, noisy, small, cut, covered, glaring, shaded)
+
+
+def own(image: NDArray[np.uint8], board: Board) -> Tensor:
+    """The default of kcal."""
+    pixels = detect_board(image, board).pixels
+    return torch.full((board.corners, 2), torch.nan, dtype=torch.float64) if pixels is None else pixels
+
+
+CHARUCO: dict[str, Detector] = {
+    "kcal": own,
+    "CharucoDetector": charuco(),
+    "CharucoDetector, tryRefineMarkers, SUBPIX": charuco(cv2.aruco.CORNER_REFINE_SUBPIX, again=True),
+}
+GRID: dict[str, Detector] = {
+    "kcal": own,
+    "ArucoDetector, SUBPIX": aruco_grid(cv2.aruco.CORNER_REFINE_SUBPIX),
+    "ArucoDetector, APRILTAG": aruco_grid(cv2.aruco.CORNER_REFINE_APRILTAG),
+}
+TAGGED: dict[str, Detector] = dict(CHARUCO)
+if HAS_APRILTAG:
+    TAGGED["AprilTag, CharucoDetector"] = charuco_of_apriltag
+    GRID |= {"AprilTag": apriltag_grid, "AprilTag, cornerSubPix 2 (Kalibr's)": kalibr_grid}
+BOARDS = (("charuco:9x6", CHARUCO), ("charuco:9x6:apriltag_36h11", TAGGED), ("aprilgrid:6x6", GRID))
+
+
+def score(find: Detector, images: Iterable[Picture], board: Board) -> str:
+    """A cell: images found, share of the visible corners found rightly, wrong corners, RMS in px, CPU seconds."""
+    count = found = visible = right = wrong = 0
+    seconds, squares = 0.0, []
+    for image, truth in images:
+        assert truth is not None
+        start = time.process_time()
+        pixels = find(image, board)
+        seconds += time.process_time() - start
+        away = torch.linalg.vector_norm(pixels - truth, dim=-1)
+        good = away <= WRONG  # False for NaN
+        count += 1
+        found += int(good.sum()) >= MIN_CORNERS
+        visible += int(torch.isfinite(truth).all(-1).sum())
+        right += int(good.sum())
+        wrong += int((torch.isfinite(pixels).all(-1) & ~good).sum())
+        squares.append((pixels - truth)[good].square().reshape(-1))
+    mean = torch.cat(squares).mean()
+    parts = [f"{found}", f"{100 * right / visible:.0f} %"]
+    parts += [f"**{wrong} wrong**"] * bool(wrong) + [f"{float(mean.sqrt()):.4f} px"] * bool(right)
+    return ", ".join([*parts, f"{seconds / count:.2f} s"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Boards with markers under hard conditions.")
+    parser.add_argument("--images", type=int, default=10, help="rendered images of each kind")
+    parser.add_argument("--write", action="store_true", help="write the section of docs/measured/corners.md")
+    arguments = parser.parse_args()
+    limit_threads(1)
+    text = [
+        "## Boards with markers",
+        "",
+        f"Rendered, {arguments.images} images of each kind, one thread: images found, share of the visible corners",
+        f"found rightly, wrong corners (more than {WRONG:g} px off, or not visible), RMS per axis of the others, CPU",
+        "seconds an image. `python -m scripts.bench.marked_boards --write`",
+    ]
+    if not HAS_APRILTAG:
+        missing = "AprilTag's own library is left out: `pip install --target DIR pupil-apriltags`, DIR in PYTHONPATH."
+        print(missing)
+        text += ["", missing]
+    for name, detectors in BOARDS:
+        board = Board.parse(name, "30mm")
+        scene, rows = Marked(board), []
+        for kind in KINDS:
+            some = list(pictures(kind, arguments.images, scene))
+            rows.append([kind.__name__, *(score(find, some, board) for find in detectors.values())])
+            print(name, *rows[-1], sep=" | ", flush=True)
+        text += ["", f"`{name}`:", "", *table(["", *detectors], rows)]
+    if arguments.write:
+        write_section("corners.md", "bench_marked_boards.py", "\n".join(text))
+
+
+if __name__ == "__main__":
+    main()
