@@ -95,9 +95,10 @@ def calibrate_views(
     weak prior adds such terms for the coefficients, for the outermost corner that was found.
 
     "implicit" differentiates the condition ∂c/∂x = 0: dx/dd = -H⁻¹ ∂²c/∂x∂d with the exact Hessian H of c, which
-    includes the curvature of residuals and of the robust loss; systems with it are solved by conjugate gradients. Work and memory grow linearly with the views, and nothing is computed before a gradient is requested. "unroll"
-    records eight Gauss-Newton steps at the solution: nearly the same derivatives, and of any order. "none" carries no
-    gradient.
+    includes the curvature of residuals and of the robust loss; systems with it are solved by conjugate gradients. Work
+    and memory grow linearly with the views, and nothing is computed before a gradient is requested.
+    "unroll" records eight Gauss-Newton steps at the solution: nearly the same derivatives, and of any order. "none"
+    carries no gradient.
 
     Args:
         pixels: (V, N, 2) corners; NaN where not seen.
