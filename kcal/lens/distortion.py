@@ -31,16 +31,17 @@ from kcal.lens.zernike import unbind_last
 
 
 class Distorted(NamedTuple):
-    """Distorted coordinates with what validity and derivatives need; every tensor is (..., N).
+    """Distorted coordinates with what validity and derivatives need; tensors are (..., N).
 
-    `point` is the Jacobian ∂x/∂x, ∂x/∂y, ∂y/∂x, ∂y/∂y, or () if it was not asked for. `positive` is true before any
-    pole: where both the radial denominator and the tilt's w are positive.
+    `coefficients` (..., K, 2, N) are the derivatives of x and y by the K coefficients that were asked for. `point` is
+    the Jacobian ∂x/∂x, ∂x/∂y, ∂y/∂x, ∂y/∂y, or () if it was not asked for. `positive` is true before any pole: where
+    both the radial denominator and the tilt's w are positive.
     """
 
     x: Tensor
     y: Tensor
     point: tuple[Tensor, ...]
-    coefficients: list[tuple[Tensor, Tensor]]
+    coefficients: Tensor
     positive: Tensor
 
     @property
@@ -126,7 +127,7 @@ def distort_components(
 
     columns = _coefficient_columns(x, y, s, xx, xy, yy, g, inverse, model, wanted)
     if not model.tilt:
-        return Distorted(u, v, point, [pair for pair in columns if pair is not None], positive)
+        return Distorted(u, v, point, as_columns([pair for pair in columns if pair is not None], u), positive)
 
     tau_x, tau_y = c[model.names.index("tau_x")], c[model.names.index("tau_y")]
     cos_x, sin_x, cos_y, sin_y = torch.cos(tau_x), torch.sin(tau_x), torch.cos(tau_y), torch.sin(tau_y)
@@ -156,7 +157,15 @@ def distort_components(
         else:
             du, dv = pair
             tilted.append((m00 * du + m01 * dv, m10 * du + m11 * dv))
-    return Distorted(x_tilted, y_tilted, point, tilted, positive & (w > 0))
+    return Distorted(x_tilted, y_tilted, point, as_columns(tilted, x_tilted), positive & (w > 0))
+
+
+def as_columns(pairs: Sequence[tuple[Tensor, Tensor]], like: Tensor) -> Tensor:
+    """Pairs of tensors that broadcast against (..., N) as one (..., K, 2, N)."""
+    if not pairs:
+        return like.new_zeros((*like.shape[:-1], 0, 2, like.shape[-1]))
+    flat = torch.broadcast_tensors(*(part for pair in pairs for part in pair))
+    return torch.stack(flat, -2).unflatten(-2, (len(pairs), 2))
 
 
 def _coefficient_columns(

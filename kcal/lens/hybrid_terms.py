@@ -80,7 +80,7 @@ class HybridForm:
 
 def hybrid_terms(
     x: Tensor, y: Tensor, coefficients: Tensor, form: HybridForm, wanted: Sequence[int], slopes: bool
-) -> tuple[Tensor, Tensor, tuple[Tensor, ...], list[tuple[Tensor, Tensor]], Tensor]:
+) -> tuple[Tensor, Tensor, tuple[Tensor, ...], Tensor, Tensor]:
     """Distort points (..., N) of the plane of the base projection.
 
     Args:
@@ -108,11 +108,14 @@ def hybrid_terms(
         f_x, f_y, g_x, g_y = (slope * to_disc for slope in by_place)
         cross = rate * x * y
         point = (scale + rate * x * x + f_x, cross + f_y, cross + g_x, scale + rate * y * y + g_y)
-    columns: list[tuple[Tensor, Tensor]] = []
+    columns = x.new_zeros((*x.shape[:-1], len(wanted), 2, x.shape[-1]))
     if wanted:
-        fields = form.modes.columns(x * to_disc, y * to_disc)
-        zero, by_bend = torch.zeros_like(x), square * growth
         # The entrance pupil acts before this plane.
-        leading = [(by_bend * x, by_bend * y), (zero, zero), (zero, zero)]
-        columns = [leading[i] if i < offset else (fields[i - offset, 0], fields[i - offset, 1]) for i in wanted]
+        by_bend = square * growth
+        lead = torch.stack([by_bend * x, by_bend * y], -2)[..., None, :, :]
+        leading = torch.cat([lead, torch.zeros_like(lead).expand(*(-1,) * (lead.ndim - 3), offset - 1, -1, -1)], -3)
+        fields = form.modes.columns(x * to_disc, y * to_disc).movedim((0, 1), (-3, -2))
+        columns = torch.cat([leading, fields], -3)
+        if list(wanted) != list(range(offset + len(form.modes))):
+            columns = columns[..., list(wanted), :, :]
     return x * scale + f, y * scale + g, point, columns, square <= form.reach**2

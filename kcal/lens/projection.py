@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.lens.distortion import distort_components
+from kcal.lens.distortion import as_columns, distort_components
 from kcal.lens.model import LensModel
 from kcal.lens.plane import plane_with_slopes
 from kcal.lens.pupil import entrance_pupil
@@ -120,18 +120,16 @@ def project_components(
 
     zero, one = torch.zeros_like(lens.x), torch.ones_like(lens.x)
     intrinsic = [(lens.x, zero), (zero, lens.y), (one, zero), (zero, one), (lens.y, zero)]
-    lens_columns = iter(lens.coefficients)
-    flat: list[Tensor] = []
-    for i in wanted:
-        if i < offset:
-            flat.extend(intrinsic[i])
-        else:
-            du, dv = next(lens_columns)
-            flat.extend((fx * du + skew * dv, fy * dv))
-    if flat:
-        by_camera = torch.stack(torch.broadcast_tensors(*flat), -2).unflatten(-2, (len(wanted), 2))
-    else:
-        by_camera = pixels.new_zeros((*pixels.shape[:-2], 0, *pixels.shape[-2:]))
+    du, dv = lens.coefficients.unbind(-2)
+    across, along, down = (value[..., None] if value.ndim else value for value in (fx, skew, fy))
+    by_lens = torch.stack([across * du + along * dv, down * dv], -2)
+    # In the order of `wanted`: intrinsics come first as a rule.
+    first = as_columns([intrinsic[i] for i in wanted if i < offset], pixels[..., 0, :])
+    whole = pixels.shape[:-2]
+    by_camera = torch.cat([part.expand(*whole, -1, -1, -1) for part in (first, by_lens)], -3)
+    order = sorted(range(len(wanted)), key=lambda k: wanted[k] >= offset)
+    if order != list(range(len(wanted))):
+        by_camera = by_camera[..., [order.index(k) for k in range(len(wanted))], :, :]
     if pupil:
         for place, rate in enumerate(pupil.by_coefficients(), offset + 1):
             if place in wanted:

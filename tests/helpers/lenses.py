@@ -74,8 +74,6 @@ def distort_with_jacobian(normalized: Tensor, lens: Tensor, model: str | LensMod
     """Distorted positions (..., N, 2), and derivatives by point (..., N, 2, 2) and coefficients (..., N, 2, P)."""
     model = LensModel.named(model)
     found = distort_components(normalized[..., 0], normalized[..., 1], lens, model, range(model.size))
-    by_lens = found.x.new_empty((*found.x.shape, 2, model.size))
-    for i, (du, dv) in enumerate(found.coefficients):
-        by_lens[..., 0, i], by_lens[..., 1, i] = du, dv
+    by_lens = found.coefficients.movedim(-1, -3).transpose(-1, -2)
     by_point = torch.stack(found.point, -1).unflatten(-1, (2, 2))
     return torch.stack([found.x, found.y], -1), by_point, by_lens

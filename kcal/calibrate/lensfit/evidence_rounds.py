@@ -33,6 +33,8 @@ _DRIFT = 5.0
 _TOO_MUCH = 0.5 * LARGEST
 # Hyperparameters have come to rest when none, nor the logarithm of the tempering, moves by more.
 _AT_REST = 0.1
+# The same for a fit from which another begins.
+_NEAR_REST = 0.3
 # With which motions begin: as a hand moves. From that of still views, field and board explain the motion first, and
 # the evidence has another maximum there (one of sixty simulated captures by hand).
 _MOVING = 3e-3
@@ -156,6 +158,7 @@ def run_rounds(
     *,
     cold: bool,
     spent: int,
+    rough: bool,
     progress: Callable[[str], object],
 ) -> Rounds:
     """Solve and set amplitudes in turn.
@@ -167,6 +170,7 @@ def run_rounds(
         never: (S,) unknowns that are held.
         cold: the estimate is that of the base projection, so that its amplitudes mean nothing yet.
         spent: trial steps before.
+        rough: another fit will begin where this one ends, so that it need not come to rest entirely.
         progress: called after each round.
     """
     readout, converged, tempered = capture.readout, False, False
@@ -188,12 +192,12 @@ def run_rounds(
             tempering = math.sqrt(tempering * found) if tempered else found
             tempered = True
         best = Maximum(estimate.hyperparameters, estimate.log_ratio, estimate.variance / former, math.inf)
-        for rough in (True, False):
+        for roughly in (True,) if rough else (True, False):
             best = maximize_evidence(
-                data, estimate.families, best.h, best.variance, hyperprior, best.log_ratio, tempering, rough
+                data, estimate.families, best.h, best.variance, hyperprior, best.log_ratio, tempering, roughly
             )
             change = max(_moved_by(estimate, best), abs(math.log(tempering / former)))
-            resting = not first and change < _AT_REST and steps <= 2
+            resting = not first and (change < _NEAR_REST if rough else change < _AT_REST and steps <= 2)
             # To the end where nothing will change any more.
             if not resting:
                 break

@@ -198,8 +198,8 @@ def fit_hybrid(
             such a fit mean nothing; it tells which corners to leave out.
         hyperprior: of the amplitudes; the typical one if not given.
         lens: what is known of it from cameras of its type; its modes are used.
-        expected: state error bars for amplitudes as they are to be expected (`kcal.calibrate.lensfit.amplitudes`);
-            False: for the most likely ones, where another fit begins at this one.
+        expected: state error bars for amplitudes as they are to be expected (`kcal.calibrate.lensfit.amplitudes`).
+            False: another fit will begin at this one, which then needs neither these nor to come to rest entirely.
         progress: called after each step.
 
     Raises:
@@ -234,7 +234,10 @@ def fit_hybrid(
         held = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
         if capture.exact:
             held[-len(shown.unit) :] = True
-        return run_rounds(capture, estimate, hyperprior, held, cold=cold, spent=spent, progress=progress), held
+        rounds = run_rounds(
+            capture, estimate, hyperprior, held, cold=cold, spent=spent, rough=not expected, progress=progress
+        )
+        return rounds, held
 
     def begin(capture: FittedViews) -> tuple[Rounds, Tensor]:
         estimate, steps = fit_base(
