@@ -1,5 +1,6 @@
 # make demo   the whole chain on a simulated site; results in demo-output/
-# make test   linters, type check and all tests
+# make test   linters, type check and all tests but the slow ones
+# make test-all  the same with the slow ones, as CI does
 # make test-cpus  the tests as other makes of CPU round: six times as long
 # make check  linters and type check only
 # make docs   the documentation site, in site/; it opens without a server and can be searched offline
@@ -17,7 +18,7 @@ export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := demo
-.PHONY: demo test test-cpus check docs clean
+.PHONY: demo test test-all test-cpus check docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/kcal demo --output $(OUT)
@@ -30,9 +31,13 @@ check: $(VENV)/.installed-dev
 
 # The folder kcal is there for the examples in its docstrings. One thread in each of the processes, or they would wait
 # for each other.
-test: export OMP_NUM_THREADS = 1
-test: export OPENBLAS_NUM_THREADS = 1
+test test-all: export OMP_NUM_THREADS = 1
+test test-all: export OPENBLAS_NUM_THREADS = 1
 test: check
+	$(BIN)/python -m pytest -n 2 -m "not slow" kcal tests
+	@echo "left out: $$(grep -rh '^ *@pytest.mark.slow' tests | wc -l) slow tests; make test-all runs them, too"
+
+test-all: check
 	$(BIN)/python -m pytest -n 2 kcal tests
 
 test-cpus: $(VENV)/.installed-dev

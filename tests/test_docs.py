@@ -114,6 +114,7 @@ def test_the_commands_page_has_every_option() -> None:
     assert "`--output`, `-o` `PATH` | Rig file to write. | required |" in page
 
 
+@pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     """Broken links and anchors are warnings."""
     pytest.importorskip("mkdocs")

@@ -78,12 +78,14 @@ def _observations(seed: str) -> Observations:
     return Observations(board=board, image_size=(640, 480), views=views)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", PYTHON)
 def test_python_runs(source: str, files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(files)
     exec(compile(source, "page", "exec"), {})
 
 
+@pytest.mark.slow
 def test_python_passes_a_strict_type_check(tmp_path: Path) -> None:
     package = tmp_path / "examples"
     package.mkdir()

@@ -46,6 +46,7 @@ def test_useful_frames_are_kept_and_on_the_disk(tmp_path: Path) -> None:
         CaptureSession(tmp_path / "left.obs.json", Board(columns=7, rows=5, square=0.02))
 
 
+@pytest.mark.slow
 def test_from_the_first_view_to_the_goal(tmp_path: Path) -> None:
     session = CaptureSession(tmp_path / "left.obs.json", BOARD, CaptureOptions(until=50.0))
     assert not session.think()
@@ -121,6 +122,7 @@ def test_a_slow_reader_gets_the_newest_frame() -> None:
         list(newest(broken()))
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path: Path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()

@@ -305,6 +305,7 @@ class TestCalibrate:
 
 
 class TestRig:
+    @pytest.mark.slow
     def test_writes_a_rig_file(
         self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -322,6 +323,7 @@ class TestRig:
         side = float(next(line for line in printed.out.splitlines() if "triangulated" in line).split()[2])
         assert side == pytest.approx(50.0, rel=2e-3)
 
+    @pytest.mark.slow
     def test_boards_in_the_joint_adjustment(
         self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -344,6 +346,7 @@ class TestRig:
         assert file.mounting is None
         assert file.joint_covariance() is not None
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("keep_all", [False, True])
     @pytest.mark.parametrize("shift", [1.5, 40.0])
     def test_pictures_change_nothing_and_all_can_be_kept(
@@ -373,6 +376,7 @@ class TestRig:
         assert ("warning: board left04.png right04.png: " in printed.err) == keep_all
         assert ("left out: board left04.png right04.png: " in printed.err) != keep_all
 
+    @pytest.mark.slow
     def test_a_failure_leaves_no_file(
         self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -383,6 +387,7 @@ class TestRig:
         arguments = ["rig", "left.camera.json", "right.camera.json", *PAIRS, "-o", "rig.json"]
         assert "no side of a square" in refuse(cameras, monkeypatch, capsys, *arguments)
 
+    @pytest.mark.slow
     def test_swapped_throughout(
         self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -413,6 +418,7 @@ class TestRig:
         text = refuse(cameras, monkeypatch, capsys, "rig", *arguments)
         assert "pairs.csv: line 2: no view of the right camera is named 'right77.png'" in text
 
+    @pytest.mark.slow
     def test_turned_and_wrong_pairs_are_listed(
         self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -431,6 +437,7 @@ class TestRig:
         assert [entry.name for entry in record.excluded] == ["left04.png right04.png"]
         assert record.baseline_m == pytest.approx(float(RIG.baseline), rel=0.02)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
@@ -458,6 +465,7 @@ class TestRig:
     ) -> None:
         assert message in refuse(cameras, monkeypatch, capsys, "rig", *arguments, "-o", "rig.json")
 
+    @pytest.mark.slow
     def test_a_rig_file_is_no_camera_file(
         self, cameras: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:

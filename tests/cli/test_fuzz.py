@@ -22,6 +22,7 @@ def test_nothing_is_found(case: int, whole: dict[str, bytes]) -> None:
     assert fuzz.run_case(case, whole, 60.0) == []
 
 
+@pytest.mark.slow
 def test_whole_files_are_accepted(
     whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -192,6 +192,7 @@ def slow_spots(image: np.ndarray) -> np.ndarray:
     return bright_spots(image)
 
 
+@pytest.mark.slow
 def test_two_rtsp_streams_whose_newest_frames_are_taken(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = small_rig()
     table = [film(rig, side, [1.0] * 7) for side in (0, 1)]

@@ -74,6 +74,7 @@ def assert_the_printed_command_gives_the_same(run: Run, text: str) -> None:
 
 
 class TestRealImages:
+    @pytest.mark.slow
     def test_from_images_to_positions(self, run: Run, kcal_data: Path, tmp_path: Path) -> None:
         folder = kcal_data / "opencv_stereo"
         for side in ("left", "right"):
@@ -127,6 +128,7 @@ class TestRealImages:
         assert math.isclose(latitude, -33.9, abs_tol=1e-4)
         assert math.isclose(longitude, 151.2, abs_tol=1e-4)
 
+    @pytest.mark.slow
     def test_demo_on_a_folder_of_pairs(self, run: Run, kcal_data: Path) -> None:
         code, text, error = run("demo", "--images", kcal_data / "opencv_stereo", "-o", "out")
         assert code == 0
@@ -141,6 +143,7 @@ class TestRealImages:
 
 
 class TestDemo:
+    @pytest.mark.slow
     def test_simulated_site(self, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         # A third of the images, so that the test takes seconds.
         small = functools.partial(kcal.sim.scene.DemoScene, near_views=7)
@@ -233,6 +236,7 @@ class TestBadInput:
         refused(run("calibrate", "one.obs.json", "-o", "c.json"), "1 view", "at least 3")
         assert not Path("c.json").exists()
 
+    @pytest.mark.slow
     def test_all_views_parallel_to_the_image(self, run: Run) -> None:
         observations(8, tilt=0.0).save("flat.obs.json")
         refused(run("calibrate", "flat.obs.json", "-o", "c.json"), "focal length", "tilted")

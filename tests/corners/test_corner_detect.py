@@ -45,6 +45,7 @@ def pictures(tmp_path_factory):
     return folder, image, truth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "square"), [((240, 180), 8), ((320, 240), 24), ((1500, 1000), 100), ((2500, 1250), 35)]
 )
@@ -94,6 +95,7 @@ def test_a_part_of_the_board_is_not_the_board():
     assert found.reason == "a board of 9x6 inner corners was found, not 8x6: give --board 9x6"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("columns", "rows"), [(8, 6), (7, 6), (5, 5)])
 def test_a_part_of_a_real_board_is_not_the_board(stereo, columns, rows):
     part = Board(columns=columns, rows=rows, square=0.025)
@@ -226,6 +228,7 @@ def test_real_images_all_found_and_three_methods_agree(stereo):
         assert float(apart[seen].square().mean().sqrt()) < limit
 
 
+@pytest.mark.slow
 def test_real_calibration_reaches_the_known_residual(stereo):
     for side in ("left", "right"):
         seen = detect_images([path for path in stereo if path.name.startswith(side)], BOARD)

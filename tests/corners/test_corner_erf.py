@@ -249,6 +249,7 @@ class TestFit:
 
 
 class TestGradient:
+    @pytest.mark.slow
     def test_with_respect_to_the_image(self):
         image = ideal([0.2, -0.1, 0.1, 1.5, 0.2, 120.0, 70.0, 0.0, 0.0, 3.0], 33)
         image = image + 3.0 * torch.randn(33, 33, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -418,6 +419,7 @@ class TestNeighbors:
         assert bool(torch.isfinite(around.change).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_real_images_calibrate_to_sixteen_hundredths(side):
     data = os.environ.get("KCAL_DATA")

@@ -134,6 +134,7 @@ class TestMatch:
         assert float(found.score.min()) > 0.99
         assert float(found.off_line.max()) < 0.02
 
+    @pytest.mark.slow
     def test_covariance_is_the_spread(self):
         errors, predicted = [], []
         for seed in range(12):

@@ -13,6 +13,7 @@ SCENES = {name: Marked(Board.parse(name, "30mm")) for name in ("charuco:9x6", "a
 
 
 # Remarks: the share that was found when only corners beside markers without wrong bits were.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind", "least"),
     [

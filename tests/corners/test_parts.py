@@ -116,6 +116,7 @@ def test_sharpened_edges_lose_no_corners():
     assert rms(found.pixels, truth) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("folder", "columns", "rows"), [("pi640", 7, 7), ("gloworm960", 8, 6)])
 def test_real_boards_are_all_found(folder, columns, rows):
     data = os.environ.get("KCAL_DATA")

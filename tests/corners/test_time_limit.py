@@ -47,6 +47,7 @@ def test_no_limit_and_bad_limit():
         Limited(0.0)
 
 
+@pytest.mark.slow
 def test_a_slow_image_is_a_failure_and_the_rest_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(detect, "detect_board", slow_if_upright)
     for k in range(3):

@@ -62,6 +62,7 @@ def assert_same(got: tuple[Tensor, Tensor], wanted: tuple[Tensor, Tensor]) -> No
     torch.testing.assert_close(got[0], wanted[0], **ROUNDING)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", DIRECTIONS)
 @pytest.mark.parametrize("preset", NAMED)
 def test_compiles_as_one_graph_and_exports(preset: str, direction: str) -> None:
@@ -76,6 +77,7 @@ def test_compiles_as_one_graph_and_exports(preset: str, direction: str) -> None:
         assert_same(program(many), module(many))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", DIRECTIONS)
 @pytest.mark.parametrize("preset", ["opencv5", "opencv14", "fisheye4", "hybrid"])
 def test_onnx(preset: str, direction: str, tmp_path: Path) -> None:

@@ -102,6 +102,7 @@ def test_round_trip_and_batches(kind: str) -> None:
     torch.testing.assert_close(values.transpose(-1, -2), found, rtol=1e-12, atol=1e-9)
 
 
+@pytest.mark.slow
 @both
 def test_state_and_compiled_graph(kind: str) -> None:
     own = camera(kind)

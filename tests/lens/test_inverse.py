@@ -69,6 +69,7 @@ class TestRoundTrip:
         # A residual of 1e-13 divided by the smallest singular value of J, 0.3 here.
         torch.testing.assert_close(back, normalized, rtol=0, atol=1e-12)
 
+    @pytest.mark.slow
     @settings(max_examples=15, deadline=None)
     @given(seed=st.integers(0, 2**31), scale=st.floats(0.01, 3.0), model=st.sampled_from(MODELS))
     def test_any_coefficients(self, seed: int, scale: float, model: str) -> None:
@@ -88,6 +89,7 @@ class TestRoundTrip:
         error = torch.linalg.vector_norm(again - pixels, dim=-1)
         assert bool((error < allowed_error(camera, camera.normalize(pixels)[0]))[valid].all())
 
+    @pytest.mark.slow
     @settings(max_examples=15, deadline=None)
     @given(seed=st.integers(0, 2**31), scale=st.floats(0.01, 1.0), model=st.sampled_from(MODELS))
     def test_what_was_projected_is_found(self, seed: int, scale: float, model: str) -> None:

@@ -10,6 +10,7 @@ from kcal.lens.inverse import undistort
 from scripts.check import inverse
 
 
+@pytest.mark.slow
 def test_random_lenses() -> None:
     tally = inverse.sweep(lenses=320, seed=1, points=100)
     assert tally.points > 20_000

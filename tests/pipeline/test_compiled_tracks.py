@@ -26,6 +26,7 @@ def scene(localize: StereoLocalizer, frame: int) -> tuple[torch.Tensor, torch.Te
     return seen_by(localize.rig, torch.stack([x, 0.01 * z, z], -1)[seen], 0.2, generator)
 
 
+@pytest.mark.slow
 def test_compiled_tracks_are_the_same() -> None:
     localize = tracked_site(0.002)
     clock = ClockPrior(offset_sigma_s=0.01)

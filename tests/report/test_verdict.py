@@ -174,6 +174,7 @@ def test_blur_is_named_by_noise_and_by_what_corners_say(poses: tuple[Tensor, Ten
     assert blur(observed(pixels, spread=0.1)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prefixed", [True, False], ids=["by name", "by order"])
 def test_images_of_two_cameras_are_noticed(poses: tuple[Tensor, Tensor], prefixed: bool) -> None:
     one = camera("opencv5")

@@ -81,6 +81,7 @@ def test_squares_are_large_enough_to_be_found():
     assert smallest["near"] > 30
 
 
+@pytest.mark.slow
 def test_rendered_demo():
     scene, told = DemoScene(seed=2, **SMALL), []
     views = list(render_demo(scene, told.append))

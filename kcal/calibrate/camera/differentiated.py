@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, Literal, TypeVar
 
@@ -56,29 +55,14 @@ def differentiated(
     return state
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class HybridViews:
-    """What `hybrid_views` finds.
-
-    Args:
-        state: camera, board, poses and motions.
-        residuals: (V, N, 2) projected minus observed, pixels; 0 where a corner was not seen.
-        fit: whose amplitudes and noise were held.
-    """
-
-    state: HybridState
-    residuals: Tensor
-    fit: HybridFit
-
-
 def hybrid_views(
     pixels: Tensor,
     board_points: Tensor,
     size: tuple[int, int],
     options: CalibrationOptions,
-    start: HybridViews | None,
+    start: tuple[HybridFit, HybridState] | None,
     backward: Backward,
-) -> HybridViews:
+) -> tuple[HybridState, Tensor, HybridFit]:
     """The default camera, with gradients by the corners and the board's points.
 
     Amplitudes of lens, board and motions, and the noise, come from the evidence of the corners, or from the start; they
@@ -89,8 +73,12 @@ def hybrid_views(
         board_points: (N, 3) meters.
         size: (width, height) of the image.
         options: with the hybrid lens.
-        start: an earlier result of nearly the same data, whose amplitudes are kept.
+        start: fit and state of nearly the same data, whose amplitudes are kept.
         backward: see `differentiated`.
+
+    Returns:
+        the state; residuals (V, N, 2) projected minus observed, pixels, 0 where a corner was not seen; and the fit
+        whose amplitudes and noise were held.
     """
     if isinstance(options.board, MeasuredBoard):
         raise InputError("calibrate_views: a measured board has no gradients; give its corners as board_points")
@@ -102,7 +90,7 @@ def hybrid_views(
         )
         begin = fit.state
     else:
-        fit, begin = start.fit, HybridState(*(part.detach() for part in start.state))
+        fit, begin = start[0], HybridState(*(part.detach() for part in start[1]))
     families, shapes = fit.families, fit.board_shapes.shapes
     precision = fit.sigma**2 / families.deviation(fit.expected).square()
     if options.board == "exact":
@@ -126,4 +114,4 @@ def hybrid_views(
     state, found = newton_minimum(problem_of(*fixed), begin, _POLISH)
     state = differentiated(problem_of, data, HybridState(*state), found, backward)
     at = problem_of(*(fixed if backward == "none" else data))
-    return HybridViews(state=state, residuals=at.errors(state).transpose(-1, -2), fit=fit)
+    return state, at.errors(state).transpose(-1, -2), fit

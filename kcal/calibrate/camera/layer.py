@@ -12,10 +12,12 @@ from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior, is_overparameterized
 from kcal.calibrate.bundle.priors import GaussianPrior, Term
 from kcal.calibrate.bundle.views import Views
-from kcal.calibrate.camera.differentiated import Backward, HybridViews, differentiated, hybrid_views
+from kcal.calibrate.camera.differentiated import Backward, differentiated, hybrid_views
 from kcal.calibrate.camera.exact_minimum import exact_minimum
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.solve import solve_corners
+from kcal.calibrate.lensfit.hybrid_fit import HybridFit
+from kcal.calibrate.lensfit.hybrid_problem import HybridState
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -40,7 +42,8 @@ class CalibratedViews:
         model: the lens model.
         size: (width, height) of the image.
         reach: radius on the plane z = 1 of the outermost corner, to which a weak prior refers.
-        hybrid: with the default lens, also its board and motions, and the fit that set its amplitudes.
+        fit: with the default lens, the fit that set its amplitudes.
+        hybrid: likewise, the state of camera, board, poses and motions under these.
     """
 
     parameters: Tensor
@@ -51,7 +54,8 @@ class CalibratedViews:
     model: LensModel
     size: tuple[int, int]
     reach: float
-    hybrid: HybridViews | None = None
+    fit: HybridFit | None = None
+    hybrid: HybridState | None = None
 
     def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (..., N, 2) of points (..., N, 3) of the camera's frame, and whether the lens is regular there.
@@ -191,11 +195,12 @@ def _default_views(
     backward: Backward,
 ) -> CalibratedViews:
     """`calibrate_views` with the default lens."""
-    before = None if start is None else start.hybrid
-    if before is not None and len(before.state.translation) != len(pixels):
-        raise InputError("calibrate_views: the start is of another number of views")
-    found = hybrid_views(pixels, board_points, size, options, before, backward)
-    state = found.state
+    before = None
+    if start is not None and start.fit is not None and start.hybrid is not None:
+        before = start.fit, start.hybrid
+        if len(start.hybrid.translation) != len(pixels):
+            raise InputError("calibrate_views: the start is of another number of views")
+    state, residuals, fit = hybrid_views(pixels, board_points, size, options, before, backward)
     placed = board_points.detach() @ state.rotation.detach().mT + state.translation.detach()[:, None]
     angle = torch.atan2(placed[..., :2].norm(dim=-1), placed[..., 2])
     return CalibratedViews(
@@ -203,11 +208,12 @@ def _default_views(
         board_warp=state.params.new_zeros(2),
         cam_from_board_rotation=state.rotation,
         cam_from_board_translation=state.translation,
-        residuals=found.residuals,
-        model=found.fit.model,
+        residuals=residuals,
+        model=fit.model,
         size=size,
         reach=float(torch.where(torch.isfinite(pixels).all(-1), angle, 0.0).max()),
-        hybrid=found,
+        fit=fit,
+        hybrid=state,
     )
 
 

@@ -108,7 +108,10 @@ def solve_corners(
 
     rich = options.camera is None and is_overparameterized(model)
     if options.camera is None:
-        starts, noise, spent = first_states(views, model, options.start_focal(size), barrier=rich)
+        try:
+            starts, noise, spent = first_states(views, model, options.start_focal(size), barrier=rich)
+        except InputError as error:
+            raise InputError(f"{error} Look first at {least_planar(board_points, pixels, names)}") from error
         progress("base projection")
         views = dataclasses.replace(views, prior_noise=min(noise, views.prior_noise))
     else:

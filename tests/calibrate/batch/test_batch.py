@@ -212,6 +212,7 @@ class TestSharing:
         assert len(done) == pieces(results.jobs) == 8 + 2 + 2
         return results
 
+    @pytest.mark.slow
     def test_it_is_what_python_gives(self, folder, tmp_path):
         crew = Here()
         self.batch(folder, tmp_path, crew)
@@ -224,6 +225,7 @@ class TestSharing:
         self.batch(folder, tmp_path, crew)
         assert len(crew.tasks) == before
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("kind", [WorkerDiedError, DegenerateError])
     def test_a_worker_that_fails_leaves_cameras_as_they_are_alone(self, folder, tmp_path, monkeypatch, kind):
         def dies(*_):
@@ -295,6 +297,7 @@ class TestJobs:
             read_jobs(folder / "none.csv", BOARD, "opencv5")
 
 
+@pytest.mark.slow
 def test_every_piece_comes_back_when_workers_die(folder):
     # os._exit stands for a crash in a C++ library; the last one goes beyond its time limit.
     slow = detect_image, (str(folder / "east" / "0.png"), BOARD, BatchOptions(time_limit=1e-3))
@@ -315,6 +318,7 @@ def test_every_piece_comes_back_when_workers_die(folder):
     assert isinstance(found[4], ZeroDivisionError)
 
 
+@pytest.mark.slow
 def test_a_killed_run_continues_and_gives_the_same_table(folder, tmp_path):
     out, whole = tmp_path / "out", tmp_path / "whole"
     command = [sys.executable, "-m", "kcal", "batch", str(folder), *WHAT, "--model", "opencv5", "--workers", "1", "-o"]
@@ -349,6 +353,7 @@ def test_a_killed_run_continues_and_gives_the_same_table(folder, tmp_path):
                 assert row[key] == ("" if value is None else str(value))
 
 
+@pytest.mark.slow
 def test_command_line(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(Pool, "submit", lambda _, task: Here().submit(task))
     (folder / "empty").mkdir()
@@ -371,6 +376,7 @@ def test_command_line(folder, tmp_path, monkeypatch):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.slow
 def test_dask(folder, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
@@ -406,6 +412,7 @@ def dask_processes(tmp_path):
             process.wait()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("killed", ["scheduler", "worker"])
 def test_a_scheduler_or_its_last_worker_that_dies_is_an_error(dask_processes, monkeypatch, killed):
     address, scheduler, worker = dask_processes

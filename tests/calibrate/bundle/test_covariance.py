@@ -133,6 +133,7 @@ class TestProjection:
         assert bool(found[1].isnan().all())
 
 
+@pytest.mark.slow
 def test_monte_carlo_of_projections_and_a_pose() -> None:
     """80 repetitions of one capture: scatter against prediction, by χ².
 

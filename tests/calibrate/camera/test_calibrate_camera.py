@@ -132,6 +132,7 @@ class TestNumbers:
         expected = 0.3 * (2 * (1 - (9 + 48) / count)) ** 0.5
         assert result.rms == pytest.approx(expected, rel=4 / (2 * count) ** 0.5)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("seed", [0, 1])
     def test_nested_models_never_end_higher(self, seed: int) -> None:
         truth = camera("opencv14")
@@ -202,6 +203,7 @@ def as_state(result: CameraCalibrationResult) -> BoardState:
 
 
 class TestSigmaTells:
+    @pytest.mark.slow
     def test_monte_carlo(self) -> None:
         """60 repetitions of one capture: spread and predicted σ agree, and the mean is the truth.
 
@@ -221,6 +223,7 @@ class TestSigmaTells:
             assert 0.423 < float(values.var()) / variance < 1.915, name
             assert abs(float(values.mean()) - true) < 4.5 * (variance / 60) ** 0.5, name
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("seed", [1, 2, 3, 4])
     def test_more_coefficients_than_the_lens_has(self, seed: int) -> None:
         """Trap 2: 8 and 14 coefficients on a lens of five fit better and know less, and σ or a warning says so.

@@ -85,6 +85,7 @@ def test_the_message_names_the_view_that_is_tilted_most() -> None:
     check_directions(lens.params.detach(), LensModel(), points, seen, spread / 4.0, rotation)
 
 
+@pytest.mark.slow
 def test_a_fisheye_whose_parameter_is_open_calibrates(kcal_data) -> None:
     """Its fx is known to 29 %, its directions to a thousandth, its focal length on the axis to a quarter pixel."""
     found = calibrate_camera(Observations.load(kcal_data / "captures" / "fish_l.obs.json"))
@@ -94,6 +95,7 @@ def test_a_fisheye_whose_parameter_is_open_calibrates(kcal_data) -> None:
     assert 226.0 < focal < 230.0
 
 
+@pytest.mark.slow
 def test_the_focal_length_of_a_simulated_capture() -> None:
     """With its σ, over several captures of one camera; the parameter's σ is larger than that of the lens."""
     truth, pulls = camera("opencv4"), []

@@ -42,6 +42,7 @@ def reasons(result: CameraCalibrationResult) -> dict[str, str]:
     return {view.view: view.reason for view in result.rejected_views}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [[3], [3, 7]])
 def test_a_few_views_that_no_lens_fits(wrong: list[int]) -> None:
     pixels = shuffled(corners(), wrong)
@@ -58,6 +59,7 @@ def test_a_few_views_that_no_lens_fits(wrong: list[int]) -> None:
     assert len(found.observations.views) == VIEWS
 
 
+@pytest.mark.slow
 def test_many_such_views_are_refused_by_name() -> None:
     with pytest.raises(InputError, match=r"no lens shows all corners.* 3 of 12 views .* v02 \(.* v05 \(.* v08 \("):
         calibrate_camera(observe(shuffled(corners(), [2, 5, 8], seed=3)))
@@ -119,6 +121,7 @@ def test_copies_among_what_is_left() -> None:
     assert found.camera.calibration is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["opencv5", "hybrid"])
 def test_views_without_a_board_at_all(model: str) -> None:
     """Corners anywhere: whatever is refused names the views to look at."""

@@ -32,6 +32,7 @@ def seen() -> torch.Tensor:
     return pixels_of(TRUTH, motions(TRUTH, 6, 3), noise=NOISE, seed=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [0.0, 0.01], ids=["same", "compressed"])
 @pytest.mark.parametrize("options", [FIVE, CalibrationOptions()], ids=["opencv5", "hybrid"])
 def test_copies_change_nothing_and_are_named(seen: torch.Tensor, options: CalibrationOptions, change: float) -> None:

@@ -73,6 +73,7 @@ def result_of(outcome: object) -> CameraCalibrationResult:
     return outcome
 
 
+@pytest.mark.slow
 def test_a_shared_board_is_better_known() -> None:
     """Five views each: errors of the board fall to less than 0.8, and σ of the camera tells."""
     found = pair()
@@ -141,6 +142,7 @@ def joint_half(cameras: list[Camera]) -> Tensor:
     return torch.cat([onto.square().sum(1).sqrt()[[0, 2, 3]] for onto in unknowns.cameras])
 
 
+@pytest.mark.slow
 def test_cameras_with_nothing_in_common_stay_as_they_are() -> None:
     """Another print, another kind of board, a set that fails, exact boards, a parametric lens."""
     other = seen_by(2, printed_points(BOARD, 4))
@@ -156,6 +158,7 @@ def test_cameras_with_nothing_in_common_stay_as_they_are() -> None:
         assert all(result_of(one).shared_board is None for one in both)
 
 
+@pytest.mark.slow
 def test_views_read_from_the_other_end_and_views_left_out() -> None:
     """The result holds the views in one order, and what was left out of the camera alone stays out."""
     wrong = seen_by(1, count=6)
@@ -209,6 +212,7 @@ def test_cameras_that_cannot_be_fitted_together_stay_as_they_are_alone(monkeypat
     assert found[0].warnings[-1].endswith("what other cameras tell of the board: nothing fits")
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path: Path) -> None:
     for name, number in (("left", 1), ("right", 2)):
         seen_by(number).save(tmp_path / f"{name}.obs.json")

@@ -39,6 +39,7 @@ def run(*arguments):
     return result.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "square", "distance", "shift"),
     [

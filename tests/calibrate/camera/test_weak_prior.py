@@ -56,6 +56,7 @@ def test_ellipses_of_rich_models_hold_the_truth(weak: list[CameraCalibrationResu
     assert sum(squared_distance(result) < 5.991 for result in weak) >= 6
 
 
+@pytest.mark.slow
 def test_a_weak_prior_ends_nearer_to_the_truth(
     plain: list[CameraCalibrationResult], weak: list[CameraCalibrationResult]
 ) -> None:

@@ -126,6 +126,7 @@ def far_error(found: Camera, true: Camera) -> float:
     return float(true.focal[0]) * float((here @ (u @ vh).T - there).square().sum(-1).mean().sqrt())
 
 
+@pytest.mark.slow
 def test_a_measured_board_helps_the_next_camera() -> None:
     """Five views with the board that two others measured, against five views alone and against a wrong board."""
     (board,) = shared(1).boards
@@ -144,6 +145,7 @@ def test_a_measured_board_helps_the_next_camera() -> None:
     assert fit_cameras([wrong], modes=MODES, board=board).cameras[0].nats < -100.0
 
 
+@pytest.mark.slow
 def test_sigma_of_the_board() -> None:
     """Over 20 cameras and prints, 95 % intervals of the amplitudes contain 95 %."""
     inside, chi2 = [], []
@@ -162,6 +164,7 @@ def test_sigma_of_the_board() -> None:
     assert 0.85 < sum(chi2) / 20 < 1.2
 
 
+@pytest.mark.slow
 def test_a_fleet_knows_its_lens() -> None:
     """Five views of a camera whose type is known from five others, against five views alone."""
     flat = BOARD.points

@@ -79,6 +79,7 @@ def test_whitening_is_that_of_the_dense_covariance() -> None:
     torch.testing.assert_close(found @ found.transpose(1, 2), dense, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_motion_is_found_and_taken_out() -> None:
     moving = [solve(True, seed) for seed in range(5)]
     still = [solve(True, seed, motion=False) for seed in range(5)]

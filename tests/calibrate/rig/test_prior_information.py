@@ -71,6 +71,7 @@ def rig(model: str, calibrated: int, paired: int, **options: object) -> RigResul
     return calibrate_rig(*both, *pairs(14), [(n, n) for n in names[:paired]], RigOptions(reject=False, **options))  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_views_in_both_count_once() -> None:
     """Cameras calibrated from the rig's own views know nothing more: refining them is solving everything at once."""
     prior, free = rig("opencv5", 14, 14), rig("opencv5", 14, 14, intrinsics="free")
@@ -90,6 +91,7 @@ def test_further_views_help() -> None:
     assert bend[2] < bend[1] < 1.2 * bend[2]
 
 
+@pytest.mark.slow
 def test_hybrid_cameras_are_refined_with_their_board() -> None:
     """The default of all: lenses, board and pose from 14 pairs, better than with the cameras as they were."""
     prior, held = rig("hybrid", 14, 14), rig("hybrid", 14, 14, intrinsics="fixed")

@@ -129,6 +129,7 @@ class TestTruth:
         # The error of the focal length shows in the σ of the pose.
         assert bool((refined.sigma_translation > solve(pixels).sigma_translation).all())
 
+    @pytest.mark.slow
     def test_sigma_is_the_spread(self) -> None:
         """40 repetitions: 39 s² / σ² is χ²; s² / σ² lies in 0.332 to 2.17 but for 6e-5 (4 standard deviations)."""
         results = [solve(views(4, 5, noise=0.2, noise_seed=seed)) for seed in range(40)]
@@ -194,6 +195,7 @@ class TestBoardWarp:
 
 
 class TestWeights:
+    @pytest.mark.slow
     def test_corners_count_by_their_covariances(self) -> None:
         """Half the corners five times worse, and known to be: the scatter of the yaw falls."""
         noise = torch.where(torch.arange(BOARD.corners) % 2 == 0, 0.05, 0.4)[:, None]
@@ -260,6 +262,7 @@ class TestTurned:
         assert result.flipped == tuple((label, "right") for label in labels(5))
         assert float(result.stereo().baseline) == pytest.approx(float(plain.stereo().baseline), rel=1e-6)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("count", [1, 2])
     def test_one_or_two_pairs_are_taken_as_read(self, count: int) -> None:
         """A single pair fits both ways; chance must not decide."""
@@ -312,6 +315,7 @@ class TestWrongPairs:
         assert off(result)[0] < 5 * float(result.sigma_rotation.norm())
         assert off(result)[1] < 5 * float(result.sigma_translation.norm())
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("shift", [(1.0, 0.0), (0.0, 1.0), (0.5, 0.5)])
     def test_a_pixel_is_noticed_and_can_be_left_out(self, shift: tuple[float, float]) -> None:
         """Each camera alone fits such a pair well, and the joint RMS hardly rises: what joining it costs tells."""

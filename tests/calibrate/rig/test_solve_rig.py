@@ -235,6 +235,7 @@ def test_features_of_hybrid_cameras_are_seen_where_they_are(distance: float) -> 
 
 
 class TestRecovery:
+    @pytest.mark.slow
     @pytest.mark.parametrize("count", [2, 3])
     @pytest.mark.parametrize("kind", list(SOURCES))
     def test_exact_data_give_the_truth(self, kind: str, count: int) -> None:
