@@ -30,6 +30,8 @@ _REACH = 1.08
 # Shapes and angles of the image's corner from which the base projection is begun.
 _SHAPES = (1.0, 0.25, 0.0)
 _CORNERS = (12.0, 20.0, 30.0, 42.0, 55.0, 68.0, 80.0)
+# How many times smaller the squared misfit of another focal length must be than that of the one that was given.
+_DOUBT = 2.0
 # A field that is held at zero, as small as there is one.
 _NO_FIELD = ZernikeModes(radial=0, decentered=0, astigmatic=1, other=0)
 # The logarithms of motions' standard deviations over the noise, of views that stand still.
@@ -115,7 +117,7 @@ def fit_projection(
         >>> round(base.focal, 1), abs(base.shape - 1.0) < 1e-2  # a perspective image
         (800.0, True)
     """
-    focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal, None)
+    focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal, None, exact_focal)
     still = rotation.new_zeros(len(rotation), 0)
     flat = BoardModes(points.new_zeros(0, 3, len(points)), points.new_zeros(0), torch.zeros(0, dtype=torch.long))
     state = HybridState(points.new_zeros(0), flat.unit, rotation, translation, still)
@@ -263,9 +265,18 @@ def cauchy_weights(problem: HybridProblem, state: HybridState, weights: Tensor) 
 
 
 def _base_start(
-    points: Tensor, pixels: Tensor, size: tuple[int, int], weights: Tensor, known: float | None, lens: LensPrior | None
+    points: Tensor,
+    pixels: Tensor,
+    size: tuple[int, int],
+    weights: Tensor,
+    known: float | None,
+    lens: LensPrior | None,
+    exact: bool = False,
 ) -> tuple[float, float, Tensor, Tensor]:
-    """Focal length, shape and poses: the base projection, among several, under which homographies fit best."""
+    """Focal length, shape and poses: the base projection, among several, under which homographies fit best.
+
+    A roughly known focal length is taken unless another one fits clearly better; an exact one is taken.
+    """
     seen = torch.isfinite(pixels).all(-1) & (weights > 0)
     middle = torch.tensor([(size[0] - 1) / 2, (size[1] - 1) / 2], dtype=torch.float64)
     offset = torch.where(seen[..., None], pixels - middle, 0.0)
@@ -275,8 +286,10 @@ def _base_start(
     best: tuple[float, float, float, Tensor, Tensor] | None = None
     angles = torch.tensor(_CORNERS, dtype=torch.float64).deg2rad()
     radii = [(s, m) for s in _SHAPES for m in (angles * radius_over_angle(s * angles**2)).tolist()]
-    usual = dict.fromkeys((s, known or half / m) for s, m in radii)
-    for shape, focal in usual if lens is None else [(lens.form.shape, lens.focal)]:
+    usual = [(s, half / m) for s, m in radii]
+    told = [] if known is None else [(s, known) for s in _SHAPES]
+    tried = [*told, *([] if exact else usual)] if lens is None else [(lens.form.shape, lens.focal)]
+    for shape, focal in tried:
         s = torch.tensor(shape, dtype=torch.float64)
         theta = away / focal * angle_over_radius(s * (away / focal) ** 2)
         usable = seen & (theta < math.radians(80.0))
@@ -293,6 +306,7 @@ def _base_start(
         error = torch.where(usable, (found - offset).norm(dim=-1), 0.0)
         # By the median view: a few wrong views do not decide.
         value = float((error.square().sum(-1) / usable.sum(-1)).median())
+        value *= 1.0 if known is None or focal == known else _DOUBT
         if math.isfinite(value) and (best is None or value < best[0]):
             best = value, focal, shape, rotation, translation
     if best is None:

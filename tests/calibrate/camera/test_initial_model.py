@@ -87,6 +87,19 @@ def test_a_simulated_wide_lens_without_a_guess(weak_prior: float | None) -> None
     assert float(result.camera.focal[0]) == pytest.approx(330, rel=0.01)
 
 
+@pytest.mark.parametrize("model", ["hybrid", "opencv8"])
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_wrong_focal_length_of_a_wide_lens_is_not_believed(model: str, factor: float) -> None:
+    lens = follow_base(0.0, math.radians(84), LensModel.named("opencv8"), {})
+    truth = Camera.build(
+        focal=(330, 331), center=(318, 243), size=(640, 480), coefficients=lens.tolist(), model="opencv8"
+    )
+    seen = observe(pixels_of(truth, motions(truth, 8, 3, fill=0.7), noise=0.1, seed=3), board=BOARD)
+    alone, told = (calibrate_camera(seen, CalibrationOptions(model=model, focal=f)) for f in (None, 330 * factor))
+    assert told.rms == pytest.approx(alone.rms, rel=1e-3)
+    assert float(told.camera.focal[0]) == pytest.approx(float(alone.camera.focal[0]), rel=1e-3)
+
+
 def test_a_real_lens_of_150_degrees(kcal_data: Path) -> None:
     data = np.load(kcal_data / "wide_lens_corners.npz")
     views = []
