@@ -31,7 +31,7 @@ from kcal.calibrate.lensfit.fleet import LensPrior
 from kcal.calibrate.lensfit.hybrid_problem import HybridState, hybrid_unknowns
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.calibrate.lensfit.quadratic import posterior_root, quadratic_of
-from kcal.calibrate.lensfit.readout import MotionSigma, Readout, motion_sigma, stillness
+from kcal.calibrate.lensfit.readout import MotionSigma, Readout, motion_sigma, stillness, widening
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
@@ -299,8 +299,11 @@ def fit_hybrid(
             "the lens cannot show all corners where they are: are all views of this board and this camera? Rejection "
             "of outliers leaves wrong views out"
         )
-    half = inverse * deviation
-    information = _from_rows(off, problem.shared(state), families.mean, deviation, variance, problem.unknowns)
+    wider = widening(len(pixels)) if capture.readout is not None else 1.0
+    half = math.sqrt(wider) * inverse * deviation
+    information = _from_rows(
+        off, problem.shared(state), families.mean, math.sqrt(wider) * deviation, wider * variance, problem.unknowns
+    )
     if isinstance(board, BoardPrior):
         state = state._replace(board=board.mean + state.board @ board.half)
         information = board.in_modes(information, state.board)

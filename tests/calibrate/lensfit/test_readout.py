@@ -16,7 +16,17 @@ from kcal.calibrate.lensfit.families import prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, unknown_values
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, view_data
-from kcal.calibrate.lensfit.readout import AMPLITUDES, LARGEST, MEDIAN, MOTION, SMALLEST, SPREAD, Readout, stillness
+from kcal.calibrate.lensfit.readout import (
+    AMPLITUDES,
+    LARGEST,
+    MEDIAN,
+    MOTION,
+    SMALLEST,
+    SPREAD,
+    Readout,
+    stillness,
+    widening,
+)
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
@@ -233,6 +243,22 @@ def test_motion_is_found_and_taken_out() -> None:
     assert still.sigma > 2.0 * NOISE
     # Residuals of corners that are given again are those of the fit.
     torch.testing.assert_close(found.residuals_of(capture(2e-3)), found.residuals, rtol=0, atol=1e-9)
+
+
+def test_few_views_that_moved_are_less_sure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All variances alike, in the covariance and in what other fits take of the camera."""
+    found = fitted(2e-3)
+    monkeypatch.setattr("kcal.calibrate.lensfit.hybrid_fit.widening", lambda _: 1.0)
+    plain = fit_hybrid(BOARD.points, capture(2e-3), SIZE, modes=MODES)
+    wider = widening(12)
+    assert 1.05 < wider < 1.2
+    torch.testing.assert_close(found.covariance, wider * plain.covariance, rtol=1e-9, atol=0)
+    ours, theirs = found.information, plain.information
+    # By another way to the same: the triangle of rows is rounded.
+    both = (one.covariance().diagonal() for one in (ours, theirs))
+    torch.testing.assert_close(next(both), wider * next(both), rtol=1e-9, atol=0)
+    torch.testing.assert_close(ours.estimate, theirs.estimate, rtol=1e-12, atol=0)
+    assert [widening(n) > widening(n + 1) for n in (3, 5, 8, 30)] == [True] * 4
 
 
 def test_nothing_moves_on_a_stand() -> None:
