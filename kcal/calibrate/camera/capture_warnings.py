@@ -7,8 +7,8 @@ import torch
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.calibrate.lensfit.readout import FELT, LARGEST
 
-# Of fewer views that moved, 95 % ellipses contain the truth in 75 to 93 % (`scripts.check.handheld`).
-_FEW = 8
+# Of fewer views that moved, 95 % ellipses contain the truth in 84 to 94 % (`scripts.check.handheld`).
+_FEW = 6
 # A share of the largest motion, from which it is at its limit.
 _LIMIT = 0.9
 
@@ -30,7 +30,8 @@ def motion_warnings(fit: HybridFit) -> list[str]:
     views, few = len(fit.state.motion), []
     if views < _FEW:
         few = [
-            f"{views} views that moved are few: error bars are somewhat too small; use a stand, or {_FEW} views or more"
+            f"{views} views that moved are few: error bars are wide, and may still be too small; use a stand, or "
+            f"{_FEW} views or more"
         ]
     return [
         *few,
