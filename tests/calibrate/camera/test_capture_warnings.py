@@ -34,6 +34,6 @@ def test_motion_is_told_in_pixels() -> None:
 
 
 def test_few_views_that_moved() -> None:
-    """Their error bars are too small, which no other warning says."""
-    few = motion_warnings(fitted(6, HANDS))
-    assert [text.startswith("6 views that moved are few") for text in few] == [True, False]
+    """Their error bars are wide, and may still be too small, which no other warning says."""
+    few = motion_warnings(fitted(5, HANDS))
+    assert [text.startswith("5 views that moved are few") for text in few] == [True, False]
