@@ -163,7 +163,8 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
         camera.model,
         fit.board_points @ fit.state.rotation.transpose(-1, -2) + fit.state.translation[:, None],
         fit.residuals.isfinite().all(-1),
-        covariance,
+        # What views leave open is a matter of where boards were, not of how well motions are known.
+        covariance / fit.wider,
         fit.state.rotation,
         observations.names,
     )

@@ -26,6 +26,8 @@ _FAILED = (InputError, ArithmeticError, torch.linalg.LinAlgError)
 # Largest share of the views that is left out without being asked.
 _FEW = 0.2
 # In warnings about what was not used: they concern the views, not the fit, and stay with another fit of the same views.
+# How many times larger or smaller a focal length is that was given wrongly.
+_FAR = 1.5
 _LEFT_OUT, _START = "views were left out:", "was given for the start"
 # Names and reasons in one message, at most.
 _SHOWN = 5
@@ -44,22 +46,23 @@ def calibrate_what_fits(
     """
     # What these refuse, leaving out views does not mend.
     check_views(observations.board.points, observations.pixels(), observations.names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
+    given = options.start_focal(observations.image_size)
     try:
-        return calibrate_hybrid(observations, options, progress)
+        return _with_start(calibrate_hybrid(observations, options, progress), given)
     except _FAILED as error:
         if options.reject is not None:
             raise
         failure = error
     except DegenerateError as error:
         # Wrong views can leave the others open, too.
-        if options.reject is None and options.start_focal(observations.image_size) is None:
+        if options.reject is None and given is None:
             wrong = _wrong_views(observations, options)
             if wrong and _few(wrong, observations):
                 return _without(observations, options, wrong, error, progress)
         if any(name in str(error) for name in observations.names):
             raise
         raise DegenerateError(f"{error}; the views are {_few_names(observations.names)}") from error
-    if (given := options.start_focal(observations.image_size)) is not None:
+    if given is not None:
         return _without_start(observations, options, given, failure, progress)
     wrong = _wrong_views(observations, options)
     listed = listed_views(observations, wrong)
@@ -99,6 +102,18 @@ def _without(
         listed = listed_views(observations, wrong)
         raise InputError(f"without {len(wrong)} views that no lens fits ({listed}): {error}") from failure
     return without_views(result, observations, wrong)
+
+
+def _with_start(result: CameraCalibrationResult, given: float | None) -> CameraCalibrationResult:
+    """A result, and what is to say of a focal length that was given."""
+    found = float(result.camera.focal[0])
+    if given is None or 1.0 / _FAR < found / given < _FAR:
+        return result
+    note = (
+        f"the focal length that {_START} ({given:.4g} px) is far from the camera's ({found:.4g} px): it was not used; "
+        "leave it out, or correct it"
+    )
+    return dataclasses.replace(result, warnings=(note, *result.warnings))
 
 
 def _without_start(

@@ -55,6 +55,7 @@ class HybridFit:
         half: (S, S); halfᵀ half is the covariance of parameters and board.
         information: the same before anything was inverted, with data and priors apart.
         sigma: px, of a corner of weight one, tempering included.
+        wider: by which variances are larger than the posterior's, where few views moved (`widening`); else 1.
         tempering: T, by which the data count less because residuals repeat within views.
         hyperparameters: (H,) of largest evidence.
         expected: (H,) the same with the mean squares of amplitudes, which set the priors.
@@ -90,6 +91,7 @@ class HybridFit:
     half: Tensor
     information: CameraInformation
     sigma: float
+    wider: float
     tempering: float
     hyperparameters: Tensor
     expected: Tensor
@@ -315,6 +317,7 @@ def fit_hybrid(
         half=half,
         information=information,
         sigma=math.sqrt(variance),
+        wider=wider,
         tempering=tempering,
         hyperparameters=likely.hyperparameters,
         expected=h,

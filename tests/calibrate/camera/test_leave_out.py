@@ -80,7 +80,10 @@ def test_a_start_that_shows_nothing_is_not_used() -> None:
     plain = calibrate_camera(observe(corners()))
     given = calibrate_camera(observe(corners()), CalibrationOptions(focal=5.0))
     assert "focal length that was given for the start (5 px)" in given.warnings[0]
+    assert "not used" in given.warnings[0]
     assert given.warnings[1:] == plain.warnings
+    near = calibrate_camera(observe(corners()), CalibrationOptions(focal=420.0))
+    assert near.warnings == plain.warnings
     assert given.rms == pytest.approx(plain.rms, rel=1e-3)
 
 
