@@ -7,7 +7,7 @@ import torch
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.calibrate.lensfit.readout import FELT, LARGEST
 
-# Of fewer views that moved, 95 % ellipses contain the truth in 84 to 94 % (`scripts.check.handheld`).
+# Of fewer views that moved, 95 % ellipses contain the truth in 86 to 93 % (`scripts.check.handheld`).
 _FEW = 6
 # A share of the largest motion, from which it is at its limit.
 _LIMIT = 0.9
