@@ -30,6 +30,8 @@ _REACH = 1.08
 # Shapes and angles of the image's corner from which the base projection is begun.
 _SHAPES = (1.0, 0.25, 0.0)
 _CORNERS = (12.0, 20.0, 30.0, 42.0, 55.0, 68.0, 80.0)
+# Views by which the start is chosen.
+_VIEWS = 60
 # How many times smaller the squared misfit of another focal length must be than that of the one that was given.
 _DOUBT = 2.0
 # A field that is held at zero, as small as there is one.
@@ -283,7 +285,9 @@ def _base_start(
     away = offset.norm(dim=-1)
     half = 0.5 * math.hypot(*size)
     pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    best: tuple[float, float, float, Tensor, Tensor] | None = None
+    # Of many views some tell which projection it is.
+    some = slice(None, None, 1 + (len(pixels) - 1) // _VIEWS)
+    best: tuple[float, float, float, Tensor] | None = None
     angles = torch.tensor(_CORNERS, dtype=torch.float64).deg2rad()
     radii = [(s, m) for s in _SHAPES for m in (angles * radius_over_angle(s * angles**2)).tolist()]
     usual = [(s, half / m) for s, m in radii]
@@ -293,22 +297,23 @@ def _base_start(
         s = torch.tensor(shape, dtype=torch.float64)
         theta = away / focal * angle_over_radius(s * (away / focal) ** 2)
         usable = seen & (theta < math.radians(80.0))
-        ideal = offset * (torch.tan(theta) / away.clamp_min(1e-9))[..., None]
-        ideal = torch.where(usable[..., None], ideal, torch.nan)
         if bool((usable.sum(-1) < 6).any()):
             continue
-        rotation, translation = poses_from_homographies(homographies(points, ideal), pinhole)
+        ideal = offset * (torch.tan(theta) / away.clamp_min(1e-9))[..., None]
+        ideal = torch.where(usable[..., None], ideal, torch.nan)
+        rotation, translation = poses_from_homographies(homographies(points, ideal[some]), pinhole)
         cam = points @ rotation.transpose(-1, -2) + translation[:, None]
         there = torch.atan2(cam[..., :2].norm(dim=-1), cam[..., 2])
         direction = cam[..., :2] / cam[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-12)
         # In pixels: angles near 80 degrees hardly differ, and such a projection would win for a narrow lens.
         found = (focal * there * radius_over_angle(s * there**2))[..., None] * direction
-        error = torch.where(usable, (found - offset).norm(dim=-1), 0.0)
+        error = torch.where(usable[some], (found - offset[some]).norm(dim=-1), 0.0)
         # By the median view: a few wrong views do not decide.
-        value = float((error.square().sum(-1) / usable.sum(-1)).median())
+        value = float((error.square().sum(-1) / usable[some].sum(-1)).median())
         value *= 1.0 if known is None or focal == known else _DOUBT
         if math.isfinite(value) and (best is None or value < best[0]):
-            best = value, focal, shape, rotation, translation
+            best = value, focal, shape, ideal
     if best is None:
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
-    return best[1:]
+    _, focal, shape, ideal = best
+    return focal, shape, *poses_from_homographies(homographies(points, ideal), pinhole)
