@@ -33,13 +33,13 @@ def mirrored_views(board_points: Tensor, pixels: Tensor) -> Tensor:
         >>> mirrored_views(points, torch.stack([points[:, :2], -points[:, :2], points[:, :2].flip(1)])).tolist()
         [False, False, True]
     """
-    flipped = []
-    for view in pixels:
-        seen = view.isfinite().all(-1)
-        rows = torch.cat([board_points[seen, :2], torch.ones(int(seen.sum()), 1, dtype=torch.float64)], 1)
-        affine = torch.linalg.lstsq(rows, view[seen], driver="gelsd").solution[:2]
-        flipped.append(float(torch.linalg.det(affine)) < 0)
-    return torch.tensor(flipped, dtype=torch.bool)
+    seen = pixels.isfinite().all(-1, keepdim=True)
+    count = seen.sum(1, keepdim=True).clamp_min(1)
+    flat = torch.where(seen, board_points[:, :2], 0.0)
+    shown = torch.where(seen, pixels, 0.0)
+    # The sign of an affine map's determinant is that of the moments between both sides.
+    flat = torch.where(seen, flat - flat.sum(1, keepdim=True) / count, 0.0)
+    return torch.linalg.det(flat.transpose(1, 2) @ shown) < 0
 
 
 def unusable_views(board_points: Tensor, pixels: Tensor) -> dict[int, str]:

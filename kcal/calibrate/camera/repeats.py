@@ -8,7 +8,7 @@ by the noise of the image: that averages, but errors of lens model and board are
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -23,6 +23,8 @@ _COPY_PIXELS = 0.03
 _POSE_SHARE = 0.05
 # Two views are compared if they have this share of their corners in common.
 _COMMON = 0.5
+# Distances of so many views to all others are formed at a time; they are exact to this share of the sum of squares.
+_AT_A_TIME, _ROUNDING = 256, 1e-12
 
 
 def copied_views(pixels: Tensor, noise: float) -> dict[int, int]:
@@ -59,15 +61,33 @@ def _alike(pixels: Tensor, limit: Tensor) -> dict[int, int]:
     """Views whose corners have an RMS distance of at most `limit` (V,) from those of an earlier view, in no group."""
     seen = torch.isfinite(pixels).all(-1)
     first: dict[int, int] = {}
-    for i in range(1, len(pixels)):
-        others = [k for k in range(i) if k not in first]
+    for i, near in enumerate(_nearby(pixels, seen, limit)):
+        others = [k for k in near if k not in first]
+        if not others:
+            continue
         common = (seen[i] & seen[others]).sum(-1)
         squared = (pixels[i] - pixels[others]).square().sum(-1).nansum(-1) / common
         comparable = common >= _COMMON * torch.maximum(seen[i].sum(), seen[others].sum(-1))
-        near = (comparable & (squared.sqrt() <= limit[i])).nonzero()[:, 0].tolist()
-        if near:
-            first[i] = others[near[0]]
+        alike = (comparable & (squared.sqrt() <= limit[i])).nonzero()[:, 0].tolist()
+        if alike:
+            first[i] = others[alike[0]]
     return first
+
+
+def _nearby(pixels: Tensor, seen: Tensor, limit: Tensor) -> Iterator[list[int]]:
+    """For each view the earlier ones that may be that near: none is missed, but rounding lets some through."""
+    filled = torch.where(seen[..., None], pixels, 0.0)
+    middle = filled.sum((0, 1)) / seen.sum()
+    filled = torch.where(seen[..., None], pixels - middle, 0.0)
+    mask, flat, square = seen.to(pixels.dtype), filled.flatten(1), filled.square().sum(-1)
+    slack = _ROUNDING * square.sum(-1).max()
+    for start in range(0, len(pixels), _AT_A_TIME):
+        some = slice(start, start + _AT_A_TIME)
+        squared = square[some] @ mask.T + mask[some] @ square.T - 2.0 * flat[some] @ flat.T
+        common = mask[some] @ mask.T
+        near = (common > 0) & (squared <= limit[some, None].square() * common + slack)
+        for i, row in enumerate(near, start=start):
+            yield row[:i].nonzero()[:, 0].tolist()
 
 
 def copy_warnings(names: Sequence[str], copied: Mapping[int, int]) -> list[str]:

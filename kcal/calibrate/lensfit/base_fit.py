@@ -32,6 +32,9 @@ _SHAPES = (1.0, 0.25, 0.0)
 _CORNERS = (12.0, 20.0, 30.0, 42.0, 55.0, 68.0, 80.0)
 # Views by which the start is chosen.
 _VIEWS = 60
+# Corners that a view needs at least, and how far off the axis they are at most, radians.
+_FEWEST, _STEEPEST = 6, math.radians(80.0)
+_PINHOLE = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
 # How many times smaller the squared misfit of another focal length must be than that of the one that was given.
 _DOUBT = 2.0
 # A field that is held at zero, as small as there is one.
@@ -119,6 +122,34 @@ def fit_projection(
         >>> round(base.focal, 1), abs(base.shape - 1.0) < 1e-2  # a perspective image
         (800.0, True)
     """
+    # Of many views some tell which projection it is; the poses of all follow from it.
+    some = slice(None, None, 1 + (len(pixels) - 1) // _VIEWS)
+    base = _fit_some(points, pixels[some], size, weights[some], square, known_focal, robust, exact_focal)
+    if len(base.state.rotation) == len(pixels):
+        return base
+    seen = torch.isfinite(pixels).all(-1) & (weights > 0)
+    params = base.state.params
+    offset = torch.where(seen[..., None], pixels - params[2:4], 0.0)
+    if base.aspect is not None:
+        offset = offset / torch.tensor([1.0, base.aspect], dtype=torch.float64)
+    ideal, usable = _through_base(offset, seen, base.focal, base.shape)
+    if bool((usable.sum(-1) < _FEWEST).any()):
+        return _fit_some(points, pixels, size, weights, square, known_focal, robust, exact_focal)
+    poses = poses_from_homographies(homographies(points, ideal), _PINHOLE)
+    state = base.state._replace(rotation=poses[0], translation=poses[1], motion=pixels.new_zeros(len(pixels), 0))
+    return base._replace(state=state)
+
+
+def _fit_some(
+    points: Tensor,
+    pixels: Tensor,
+    size: tuple[int, int],
+    weights: Tensor,
+    square: bool,
+    known_focal: float | None,
+    robust: bool,
+    exact_focal: bool,
+) -> Base:
     focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal, None, exact_focal)
     still = rotation.new_zeros(len(rotation), 0)
     flat = BoardModes(points.new_zeros(0, 3, len(points)), points.new_zeros(0), torch.zeros(0, dtype=torch.long))
@@ -282,11 +313,7 @@ def _base_start(
     seen = torch.isfinite(pixels).all(-1) & (weights > 0)
     middle = torch.tensor([(size[0] - 1) / 2, (size[1] - 1) / 2], dtype=torch.float64)
     offset = torch.where(seen[..., None], pixels - middle, 0.0)
-    away = offset.norm(dim=-1)
     half = 0.5 * math.hypot(*size)
-    pinhole = torch.tensor([1.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    # Of many views some tell which projection it is.
-    some = slice(None, None, 1 + (len(pixels) - 1) // _VIEWS)
     best: tuple[float, float, float, Tensor] | None = None
     angles = torch.tensor(_CORNERS, dtype=torch.float64).deg2rad()
     radii = [(s, m) for s in _SHAPES for m in (angles * radius_over_angle(s * angles**2)).tolist()]
@@ -295,25 +322,35 @@ def _base_start(
     tried = [*told, *([] if exact else usual)] if lens is None else [(lens.form.shape, lens.focal)]
     for shape, focal in tried:
         s = torch.tensor(shape, dtype=torch.float64)
-        theta = away / focal * angle_over_radius(s * (away / focal) ** 2)
-        usable = seen & (theta < math.radians(80.0))
-        if bool((usable.sum(-1) < 6).any()):
+        ideal, usable = _through_base(offset, seen, focal, shape)
+        if bool((usable.sum(-1) < _FEWEST).any()):
             continue
-        ideal = offset * (torch.tan(theta) / away.clamp_min(1e-9))[..., None]
-        ideal = torch.where(usable[..., None], ideal, torch.nan)
-        rotation, translation = poses_from_homographies(homographies(points, ideal[some]), pinhole)
+        rotation, translation = poses_from_homographies(homographies(points, ideal), _PINHOLE)
         cam = points @ rotation.transpose(-1, -2) + translation[:, None]
         there = torch.atan2(cam[..., :2].norm(dim=-1), cam[..., 2])
         direction = cam[..., :2] / cam[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-12)
         # In pixels: angles near 80 degrees hardly differ, and such a projection would win for a narrow lens.
         found = (focal * there * radius_over_angle(s * there**2))[..., None] * direction
-        error = torch.where(usable[some], (found - offset[some]).norm(dim=-1), 0.0)
+        error = torch.where(usable, (found - offset).norm(dim=-1), 0.0)
         # By the median view: a few wrong views do not decide.
-        value = float((error.square().sum(-1) / usable[some].sum(-1)).median())
+        value = float((error.square().sum(-1) / usable.sum(-1)).median())
         value *= 1.0 if known is None or focal == known else _DOUBT
         if math.isfinite(value) and (best is None or value < best[0]):
             best = value, focal, shape, ideal
     if best is None:
         raise InputError("no start explains the corners: are all views of this board and from this camera?")
     _, focal, shape, ideal = best
-    return focal, shape, *poses_from_homographies(homographies(points, ideal), pinhole)
+    return focal, shape, *poses_from_homographies(homographies(points, ideal), _PINHOLE)
+
+
+def _through_base(offset: Tensor, seen: Tensor, focal: float, shape: float) -> tuple[Tensor, Tensor]:
+    """Corners (V, N, 2) on the plane z = 1 from their offsets to the principal point, pixels; NaN where not usable.
+
+    Also which are usable: seen, and not so far off the axis that the plane shows them poorly.
+    """
+    away = offset.norm(dim=-1)
+    s = torch.tensor(shape, dtype=torch.float64)
+    theta = away / focal * angle_over_radius(s * (away / focal) ** 2)
+    usable = seen & (theta < _STEEPEST)
+    ideal = offset * (torch.tan(theta) / away.clamp_min(1e-9))[..., None]
+    return torch.where(usable[..., None], ideal, torch.nan), usable

@@ -135,3 +135,13 @@ def test_real_captures_repeat_nothing_and_their_copies_are_found(kcal_data: Path
     assert repeated_poses(observations.pixels()[:13]) == {}
     result = calibrate_camera(observations, FIVE)
     assert [view.view for view in result.rejected_views] == [file.name for file in again]
+
+
+def test_of_many_views_each_copy_names_the_first_of_its_group() -> None:
+    rng = torch.Generator().manual_seed(3)
+    views = 900 * torch.rand(700, 12, 2, dtype=torch.float64, generator=rng)
+    views[torch.rand(700, 12, generator=rng) < 0.1] = torch.nan
+    # Copies stand within a block of comparisons, in the next one, and after another copy.
+    for copy, original in ((3, 1), (300, 2), (699, 3), (650, 255), (256, 0)):
+        views[copy] = views[original]
+    assert copied_views(views, 0.0) == {3: 1, 256: 0, 300: 2, 650: 255, 699: 1}
