@@ -1,6 +1,5 @@
 # The names of `kcal`, and where each is at home: the one table, for type checkers here and for `kcal.__getattr__`.
 
-from kcal.calibrate.bundle.covariance import projection_covariance as projection_covariance
 from kcal.calibrate.camera.calibrate import calibrate_camera as calibrate_camera
 from kcal.calibrate.camera.calibrate import calibrate_cameras as calibrate_cameras
 from kcal.calibrate.camera.compare import ComparisonResult as ComparisonResult
@@ -28,11 +27,11 @@ from kcal.calibrate.lensfit.board_modes import BoardModes as BoardModes
 from kcal.calibrate.lensfit.cameras_fit import measure_board as measure_board
 from kcal.calibrate.lensfit.families import PriorFamilies as PriorFamilies
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit as HybridFit
-from kcal.calibrate.lensfit.hybrid_problem import HybridState as HybridState
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard as MeasuredBoard
 from kcal.calibrate.lensfit.measured_board import load_measured_board as load_measured_board
 from kcal.calibrate.lensfit.measured_board import save_measured_board as save_measured_board
-from kcal.calibrate.lensfit.readout import Readout as Readout
+from kcal.calibrate.problem.readout import Readout as Readout
+from kcal.calibrate.problem.state import BoardState as BoardState
 from kcal.calibrate.rig.drift import Drift as Drift
 from kcal.calibrate.rig.drift import measure_drift as measure_drift
 from kcal.calibrate.rig.from_boards import calibrate_rig as calibrate_rig

@@ -41,7 +41,7 @@ LOOKS = {
     "sim": (0.0, "simulated truth"),
     "io": (1.0, "files"),
     "corners": (2.15, "boards, detection"),
-    "calibrate/bundle": (3.4, "what is minimized"),
+    "calibrate/problem": (3.4, "what is minimized"),
     "lens": (2.15, "cameras and rigs"),
     "solve": (4.2, "least squares"),
 }

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kcal.calibrate.bundle.twist import apply_twist
+from kcal.calibrate.problem.twist import apply_twist
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.pose import step_rows

@@ -13,7 +13,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.state import BoardState
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.projection import INTRINSICS
@@ -121,10 +122,10 @@ class ResidualProblem(SchurProblem):
         chain = self._chain(state, self.local_size)
         return chain.T @ self._board.gram(BoardState(*state[1:])) @ chain
 
-    def shared_rows(self, state: State) -> Tensor | None:
-        """See `SchurProblem.shared_rows`."""
-        rows = self._board.shared_rows(BoardState(*state[1:]))
-        return None if rows is None else self._chain(state, 0).T @ rows
+    def shared_gram(self, state: State) -> Tensor:
+        """See `SchurProblem.shared_gram`."""
+        chain = self._chain(state, 0)
+        return chain.T @ self._board.shared_gram(BoardState(*state[1:])) @ chain
 
     def retract(self, state: State, step: State) -> State:
         """See `SchurProblem.retract`."""

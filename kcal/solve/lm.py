@@ -76,7 +76,7 @@ def minimize(
 
     Args:
         problem: anything that follows `kcal.solve.problem.Problem`. Ready-made: `kcal.solve.dense.DenseProblem` for a
-            residual function, `kcal.calibrate.bundle.board_problem.BoardProblem` for views of a board (example there).
+            residual function, `kcal.calibrate.problem.board_problem.BoardProblem` for views of a board (example there).
         start: the state to begin with: a tuple of tensors, for a `BoardProblem` a `BoardState`.
         options: see `LMOptions`.
         callback: called after each trial with the trial's number and the best cost; return True to stop.

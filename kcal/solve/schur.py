@@ -38,18 +38,19 @@ class SchurLinearization:
         self.cost = 0.5 * total[..., -1, -1]
 
     @classmethod
-    def of_gram(cls, gram: Tensor, local_size: int, shared_rows: Tensor | None = None) -> SchurLinearization:
+    def of_gram(cls, gram: Tensor, local_size: int, shared_gram: Tensor | None = None) -> SchurLinearization:
         """From what each view contributes.
 
         Args:
             gram: (..., V, L + S + 1, L + S + 1): for each view the products of its rows, see `SchurProblem.rows`.
             local_size: L.
-            shared_rows: (..., S + 1, Q): rows of Q residuals that depend on the shared parameters alone, or None.
+            shared_gram: (..., S + 1, S + 1): such products of residuals that depend on the shared parameters alone, or
+                None.
         """
         L = local_size
         total = gram[..., L:, L:].sum(-3)
-        if shared_rows is not None:
-            total = total + shared_rows @ shared_rows.transpose(-1, -2)
+        if shared_gram is not None:
+            total = total + shared_gram
         return cls(gram[..., :L, :L], gram[..., :L, L:], total)
 
     def solve(self, shared: Tensor, local: Tensor) -> State:
@@ -166,9 +167,14 @@ class SchurProblem(ABC, Generic[S]):
         """See `Problem.select`; None unless a subclass overrides it."""
         return None
 
-    def shared_rows(self, state: S) -> Tensor | None:
-        """(..., S + 1, Q), see `SchurLinearization`: priors and barriers; None without any."""
+    def shared_gram(self, state: S) -> Tensor | None:
+        """(..., S + 1, S + 1), see `SchurLinearization.of_gram`: of priors and barriers; None without any."""
         return None
+
+    def shared_cost(self, state: S) -> Tensor | None:
+        """(...) the cost of these; None without any."""
+        gram = self.shared_gram(state)
+        return None if gram is None else 0.5 * gram[..., -1, -1]
 
     def view_cost(self, state: S) -> Tensor:
         """(..., V) the cost of each view."""
@@ -177,9 +183,8 @@ class SchurProblem(ABC, Generic[S]):
 
     def cost(self, state: S) -> Tensor:
         """See `Problem.cost`."""
-        cost = self.view_cost(state).sum(-1)
-        shared = self.shared_rows(state)
-        return cost if shared is None else cost + 0.5 * (shared[..., -1, :] ** 2).sum(-1)
+        cost, shared = self.view_cost(state).sum(-1), self.shared_cost(state)
+        return cost if shared is None else cost + shared
 
     def gram(self, state: S) -> Tensor:
         """(..., V, L + S + 1, L + S + 1) products of the rows of each view."""
@@ -188,4 +193,4 @@ class SchurProblem(ABC, Generic[S]):
 
     def linearize(self, state: S) -> SchurLinearization:
         """See `Problem.linearize`."""
-        return SchurLinearization.of_gram(self.gram(state), self.local_size, self.shared_rows(state))
+        return SchurLinearization.of_gram(self.gram(state), self.local_size, self.shared_gram(state))

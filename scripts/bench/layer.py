@@ -14,9 +14,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
 from kcal.calibrate.camera.layer import CalibratedViews, calibrate_views
 from kcal.calibrate.camera.options import CalibrationOptions
+from kcal.calibrate.problem.board_problem import BoardProblem
 from scripts.shared.page import write_section
 from scripts.shared.timing import row, show
 from scripts.shared.views import MODELS, NOISE, SIZE, simulate

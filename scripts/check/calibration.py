@@ -20,9 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import free_parameters
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_images
 from kcal.corners.observations import Observations, View

@@ -23,9 +23,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.lensfit.base_fit import fit_projection
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import free_parameters
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import LMOptions, minimize
@@ -55,7 +56,7 @@ def set_up(coefficients: int) -> tuple[BoardProblem, BoardState]:
     model = LensModel.named(MODELS[coefficients])
     base = fit_projection(board, pixels, SIZE, torch.ones_like(pixels[..., 0])).state
     parameters = torch.zeros(len(INTRINSICS) + model.size, dtype=torch.float64)
-    parameters[:4] = base.params[:4]
+    parameters[:4] = base.parameters[:4]
     problem = BoardProblem(board, pixels, model, free_parameters(model))
     return problem, BoardState.flat(parameters, base.rotation, base.translation)
 

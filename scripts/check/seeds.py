@@ -17,9 +17,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import free_parameters
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimize

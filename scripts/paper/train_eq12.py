@@ -25,9 +25,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.state import BoardState
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -143,10 +144,10 @@ def parametric(data: Data) -> tuple[Fitted, BoardProblem, BoardState]:
     free = ResidualNet(camera).corrected
     problem = BoardProblem(
         data.seen.board.points, data.seen.pixels(), camera.model, free,
-        free_warp=True, whitening=data.whitening,
+        free_board=True, weights=data.whitening,
     )  # fmt: skip
     assert result.board_warp is not None
-    start = BoardState(
+    start = BoardState.still(
         camera.params.detach(),
         result.board_warp,
         result.cam_from_board_rotation,
@@ -154,7 +155,7 @@ def parametric(data: Data) -> tuple[Fitted, BoardProblem, BoardState]:
     )
     state = minimize(problem, start, REFIT).state
     camera = Camera(state.parameters, size=camera.size, model=MODEL)
-    return Fitted(camera, warped(data.seen, state.warp), time.process_time() - clock), problem, state
+    return Fitted(camera, warped(data.seen, state.board), time.process_time() - clock), problem, state
 
 
 def fit_all(data: Data, steps: int, rates: dict[str, float]) -> dict[str, Fitted]:

@@ -24,10 +24,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from kcal.calibrate.bundle.poses import poses_under
-from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.lensfit.base_fit import fit_projection
+from kcal.calibrate.problem.poses import poses_under
+from kcal.calibrate.problem.views import Views
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.nets.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
@@ -160,7 +160,7 @@ def main() -> None:
     board, pixels, others = (torch.from_numpy(a) for a in (data["board"], data["pixels"], more["pixels"]))
     true_poses = torch.from_numpy(more["rotation"]), torch.from_numpy(more["translation"])
     base = fit_projection(board, pixels, SIZE, torch.ones_like(pixels[..., 0])).state
-    intrinsics, poses = base.params[:4], (base.rotation, base.translation)
+    intrinsics, poses = base.parameters[:4], (base.rotation, base.translation)
     lines = [
         "## A lens that is only a network",
         "",

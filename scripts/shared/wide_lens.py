@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kcal.calibrate.bundle.board_problem import warp_shape
-from kcal.calibrate.bundle.poses import poses_under
-from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.problem.poses import poses_under
+from kcal.calibrate.problem.state import warp_modes
+from kcal.calibrate.problem.views import Views
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
@@ -50,7 +50,7 @@ def folds(split: str, views: int) -> list[np.ndarray]:
 def warped(seen: Observations, warp: torch.Tensor) -> torch.Tensor:
     """Corners (N, 3) of a board that bulges."""
     points = seen.board.points.clone()
-    points[:, 2] = warp @ warp_shape(points)
+    points[:, 2] = warp @ warp_modes(points)[:, 2]
     return points
 
 

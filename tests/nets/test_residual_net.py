@@ -7,7 +7,8 @@ import torch
 from calibrate_scenes import BOARD, camera, motions, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.state import BoardState
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.nets.mlp import initial_weights
@@ -25,7 +26,7 @@ def scene(model: str = "opencv5", free_warp: bool = True) -> tuple[BoardProblem,
     start[5] += 0.01
     wrong = Camera(start, size=truth.size, model=model)
     residual = ResidualNet(wrong)
-    problem = BoardProblem(BOARD.points, pixels, truth.model, residual.corrected, free_warp=free_warp)
+    problem = BoardProblem(BOARD.points, pixels, truth.model, residual.corrected, free_board=free_warp)
     return problem, BoardState.flat(start, *poses), wrong
 
 

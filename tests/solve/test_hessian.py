@@ -65,7 +65,7 @@ def test_rows_of_the_shared_parameters_alone_count_once() -> None:
     generator = torch.Generator().manual_seed(5)
     rows = torch.randn(3, 2 + 3 + 1, 12, generator=generator, dtype=torch.float64)
     alone = torch.randn(3 + 1, 7, generator=generator, dtype=torch.float64)
-    found = SchurLinearization.of_gram(rows @ rows.mT, 2, alone)
+    found = SchurLinearization.of_gram(rows @ rows.mT, 2, alone @ alone.T)
     # The same residuals in the first view, whose own parameters do not touch them.
     wider = torch.zeros(3, 6, 12 + 7, dtype=torch.float64)
     wider[..., :12], wider[0, 2:, 12:] = rows, alone

@@ -8,10 +8,6 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.covariance import Uncertainty, noise_variance, uncertainty_of
-from kcal.calibrate.bundle.parameters import FreeParameters
-from kcal.calibrate.bundle.priors import GaussianPrior
 from kcal.calibrate.camera.determined import check_directions
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.result import CameraCalibrationResult
@@ -23,9 +19,14 @@ from kcal.calibrate.camera.warnings import (
     prior_warnings,
     rival_warnings,
 )
+from kcal.calibrate.problem.covariance import Uncertainty, noise_variance, uncertainty_of
+from kcal.calibrate.problem.information import information_of
+from kcal.calibrate.problem.parameters import FreeParameters
+from kcal.calibrate.problem.priors import GaussianPrior
+from kcal.calibrate.problem.state import BoardState
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
-from kcal.lens.information import CameraInformation, triangular
+from kcal.lens.information import CameraInformation
 from kcal.solve.result import SolverStatus
 from kcal.solve.robust import RobustLoss
 
@@ -60,7 +61,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
         check_directions(
             state.parameters,
             problem.model,
-            problem.points(state)[1].transpose(-1, -2),
+            problem.points(state),
             problem.seen,
             torch.full_like(spread, torch.inf) if open_focal else spread,
             state.rotation,
@@ -76,13 +77,13 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
         observations=observations,
         rms=rms,
         weighted_rms=None
-        if problem.whitening is None and problem.loss is None
+        if problem.weights is None and problem.loss is None
         else float(torch.sqrt(2.0 * solved.cost / count.sum())),
         per_view_rms=per_view,
         residuals=problem.corner_residuals(state),
         cam_from_board_rotation=state.rotation,
         cam_from_board_translation=state.translation,
-        board_warp=state.warp if problem.free_warp else None,
+        board_warp=state.board if problem.free_board else None,
         sigma=sigma,
         fixed=fixed,
         led_by_prior=_led_by_prior(solution, camera.names, slot, uncertainty),
@@ -116,38 +117,9 @@ def _uncertainty(
     variance = float(noise_variance(linear, residuals, count))
     if not found.computed or not variance > 0:
         return found, None
-    return found, _from_corners(plain, state, known, math.sqrt(variance))
-
-
-def _from_corners(
-    problem: BoardProblem, state: BoardState, priors: Sequence[GaussianPrior], noise: float
-) -> CameraInformation | None:
-    """What the corners, with `noise` px, and priors say of the camera."""
-    free, size = problem.free, problem.shared_size
-    if not len(free):
-        return None
-    slot = dict(zip(free.indices, free.slots, strict=True))
-    estimate, mean = state.parameters.new_zeros(2, size)
-    for index, place in slot.items():
-        estimate[place] = state.parameters[index]
-    estimate[len(free) :] = state.warp[: size - len(free)]
-    precision = torch.zeros_like(mean)
-    for term in priors:
-        for index, at, weight in zip(term.index.tolist(), term.mean.tolist(), term.weight.tolist(), strict=True):
-            # Parameters that are equal may have a prior each: the product of both.
-            precision[slot[index]] += (weight / noise) ** 2
-            mean[slot[index]] += at * (weight / noise) ** 2
-    mean = torch.where(precision > 0, mean / precision, 0.0)
-    triangle = triangular(problem.rows_off_poses(state) / noise)[:-1]
-    known = CameraInformation(
-        slots=tuple(slot.get(i, -1) for i in range(len(state.parameters))),
-        estimate=estimate,
-        rows=triangle[:, :-1],
-        residuals=triangle[:, -1],
-        mean=mean,
-        sigma=precision.rsqrt(),
-    )
-    return known.without_board()
+    if not len(plain.free):
+        return found, None
+    return found, information_of(plain, state, math.sqrt(variance)).without_board()
 
 
 def _led_by_prior(

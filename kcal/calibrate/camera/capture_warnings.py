@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
-from kcal.calibrate.lensfit.readout import FELT, LARGEST
+from kcal.calibrate.problem.readout import FELT, LARGEST
 
 # Of fewer views that moved, 95 % ellipses contain the truth in 86 to 93 % (`scripts.check.handheld`).
 _FEW = 6
@@ -24,7 +24,7 @@ def motion_warnings(fit: HybridFit) -> list[str]:
             "and photograph a stiff board on a stand"
         ]
     lines = "column" if fit.readout.columns else "row"
-    moved = fit.motion_sigma.moved(float(fit.state.params[0]), fit.readout.reach(fit.board_points))
+    moved = fit.motion_sigma.moved(float(fit.state.parameters[0]), fit.readout.reach(fit.board_points))
     if moved < FELT * fit.sigma:
         return []
     views, few = len(fit.state.motion), []
@@ -43,8 +43,8 @@ def motion_warnings(fit: HybridFit) -> list[str]:
 
 def measured_aspect(fit: HybridFit) -> tuple[float, float]:
     """f_y / f_x of the base projection, and its standard deviation."""
-    fx, fy = fit.state.params[:2].tolist()
-    slope = torch.zeros(len(fit.state.params), dtype=torch.float64)
+    fx, fy = fit.state.parameters[:2].tolist()
+    slope = torch.zeros(len(fit.state.parameters), dtype=torch.float64)
     slope[0], slope[1] = -fy / fx**2, 1.0 / fx
     return fy / fx, float(slope @ fit.covariance @ slope) ** 0.5
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.closed_form import homographies, spread_out
 from kcal.calibrate.camera.repeats import repeated_poses
+from kcal.calibrate.problem.closed_form import homographies, spread_out
 from kcal.errors import DegenerateError, InputError
 
 MINIMUM_VIEWS = 3

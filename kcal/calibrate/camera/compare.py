@@ -15,13 +15,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.poses import poses_under
-from kcal.calibrate.bundle.views import Views
-from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.options import HYBRID, CalibrationOptions, Progress
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.calibrate.lensfit.moving_poses import moving_residuals
+from kcal.calibrate.problem.poses import poses_under
+from kcal.calibrate.problem.views import Views
+from kcal.calibrate.problem.weights import whitening
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
 from kcal.lens.model import LensModel

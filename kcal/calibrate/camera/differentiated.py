@@ -10,8 +10,10 @@ from torch import Tensor
 
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
-from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
+from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.state import BoardState
 from kcal.errors import InputError
 from kcal.solve.hessian import HessianSolve, implicit_step, newton_minimum
 from kcal.solve.lm import LMOptions
@@ -60,9 +62,9 @@ def hybrid_views(
     board_points: Tensor,
     size: tuple[int, int],
     options: CalibrationOptions,
-    start: tuple[HybridFit, HybridState] | None,
+    start: tuple[HybridFit, BoardState] | None,
     backward: Backward,
-) -> tuple[HybridState, Tensor, HybridFit]:
+) -> tuple[BoardState, Tensor, HybridFit]:
     """The default camera, with gradients by the corners and the board's points.
 
     Amplitudes of lens, board and motions, and the noise, come from the evidence of the corners, or from the start; they
@@ -90,15 +92,15 @@ def hybrid_views(
         )
         begin = fit.state
     else:
-        fit, begin = start[0], HybridState(*(part.detach() for part in start[1]))
+        fit, begin = start[0], BoardState(*(part.detach() for part in start[1]))
     families, shapes = fit.families, fit.board_shapes.shapes
     precision = fit.sigma**2 / families.deviation(fit.expected).square()
     if options.board == "exact":
         precision[-len(shapes) :] = torch.inf
 
-    def problem_of(corners: Tensor, points: Tensor) -> HybridProblem:
+    def problem_of(corners: Tensor, points: Tensor) -> BoardProblem:
         weights = torch.ones_like(corners[..., 0])
-        return HybridProblem(
+        return hybrid_problem(
             points,
             shapes,
             corners,
@@ -112,6 +114,6 @@ def hybrid_views(
         )
 
     state, found = newton_minimum(problem_of(*fixed), begin, _POLISH)
-    state = differentiated(problem_of, data, HybridState(*state), found, backward)
+    state = differentiated(problem_of, data, state, found, backward)
     at = problem_of(*(fixed if backward == "none" else data))
-    return state, at.errors(state).transpose(-1, -2), fit
+    return state, at.pixel_errors(state).transpose(-1, -2), fit

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.covariance import uncertainty_of
 from kcal.calibrate.camera.determined import check_directions
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.covariance import uncertainty_of
+from kcal.calibrate.problem.state import BoardState
 from kcal.errors import DegenerateError
 from kcal.lens.projection import parameter_names
 from kcal.solve.hessian import HessianSolve, newton_minimum
@@ -35,8 +36,7 @@ def exact_minimum(problem: BoardProblem, state: BoardState) -> tuple[BoardState,
         slots, places = torch.tensor(problem.free.slots), torch.tensor(problem.free.indices)
         spread = state.parameters.new_zeros(2 * (len(state.parameters),))
         spread[places[:, None], places] = known.covariance[slots[:, None], slots]
-        points = problem.points(state)[1].transpose(-1, -2)
-        check_directions(state.parameters, problem.model, points, problem.seen, spread, state.rotation)
+        check_directions(state.parameters, problem.model, problem.points(state), problem.seen, spread, state.rotation)
     return state, found
 
 

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardState
-from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior
-from kcal.calibrate.bundle.poses import poses_under
-from kcal.calibrate.bundle.priors import FoldBarrier, Term
-from kcal.calibrate.bundle.views import CameraViews
 from kcal.calibrate.lensfit.base_fit import fit_projection
+from kcal.calibrate.problem.coefficient_prior import CoefficientPrior
+from kcal.calibrate.problem.poses import poses_under
+from kcal.calibrate.problem.priors import FoldBarrier, Term
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import CameraViews
 from kcal.errors import InputError
 from kcal.lens.base_map import radius_over_angle
 from kcal.lens.camera import Camera
@@ -73,7 +73,7 @@ def first_states(
     noise = math.sqrt(base.variance)
     states = []
     for own in (lens, torch.zeros_like(lens)):
-        parameters = views.constraints.impose(torch.cat([base.state.params[:5], own]), model)
+        parameters = views.constraints.impose(torch.cat([base.state.parameters[:5], own]), model)
         states.append(BoardState.flat(parameters, base.state.rotation, base.state.translation))
     shown = [state for state in states if math.isfinite(float(views.problem(model).cost(state)))] or states[1:]
     height = _BARRIER * noise
@@ -82,7 +82,7 @@ def first_states(
 
 def _barrier(views: CameraViews, state: BoardState, model: LensModel, weight: float) -> tuple[Term, ...]:
     """A barrier before folds in the image, else around the corners that were seen; none where the state folds there."""
-    values = torch.cat([state.parameters, state.warp])
+    values = torch.cat([state.parameters, state.board])
     for radius in (views.regular_radius(state, model), views.seen_radius(state)):
         term = FoldBarrier(model, radius, weight)
         if bool(term.rows(values).isfinite().all()):

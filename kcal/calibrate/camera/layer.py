@@ -8,16 +8,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior, is_overparameterized
-from kcal.calibrate.bundle.priors import GaussianPrior, Term
-from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.camera.differentiated import Backward, differentiated, hybrid_views
 from kcal.calibrate.camera.exact_minimum import exact_minimum
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.solve import solve_corners
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
-from kcal.calibrate.lensfit.hybrid_problem import HybridState
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.coefficient_prior import CoefficientPrior, is_overparameterized
+from kcal.calibrate.problem.priors import GaussianPrior, Term
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import Views
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -55,7 +55,7 @@ class CalibratedViews:
     size: tuple[int, int]
     reach: float
     fit: HybridFit | None = None
-    hybrid: HybridState | None = None
+    hybrid: BoardState | None = None
 
     def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (..., N, 2) of points (..., N, 3) of the camera's frame, and whether the lens is regular there.
@@ -74,7 +74,7 @@ class CalibratedViews:
     def state(self) -> BoardState:
         """As a state of `BoardProblem`, out of the graph."""
         pose = self.cam_from_board_rotation, self.cam_from_board_translation
-        return map_state(torch.detach, BoardState(self.parameters, self.board_warp, *pose))
+        return map_state(torch.detach, BoardState.still(self.parameters, self.board_warp, *pose))
 
 
 def calibrate_views(
@@ -176,7 +176,7 @@ def calibrate_views(
     at = problem if backward == "none" else problem_of(*data)
     return CalibratedViews(
         parameters=state.parameters,
-        board_warp=state.warp,
+        board_warp=state.board,
         cam_from_board_rotation=state.rotation,
         cam_from_board_translation=state.translation,
         residuals=at.pixel_errors(state).transpose(-1, -2),
@@ -204,8 +204,8 @@ def _default_views(
     placed = board_points.detach() @ state.rotation.detach().mT + state.translation.detach()[:, None]
     angle = torch.atan2(placed[..., :2].norm(dim=-1), placed[..., 2])
     return CalibratedViews(
-        parameters=state.params,
-        board_warp=state.params.new_zeros(2),
+        parameters=state.parameters,
+        board_warp=state.parameters.new_zeros(2),
         cam_from_board_rotation=state.rotation,
         cam_from_board_translation=state.translation,
         residuals=residuals,

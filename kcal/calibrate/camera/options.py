@@ -7,8 +7,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Literal
 
-from kcal.calibrate.bundle.parameters import ParameterConstraints, natural_value
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
+from kcal.calibrate.problem.parameters import ParameterConstraints, natural_value
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -54,7 +54,7 @@ class CalibrationOptions:
         motion: with the hybrid lens, views may move while their rows are read, as with a rolling shutter and a board or
             camera that is held by hand; the views tell how much. False: nothing moved, or all rows were read at once.
         board_warp: with a parametric model, estimate how the board bends (two more parameters).
-        weighted: weight corners by their covariances where all views have them (`kcal.calibrate.bundle.weights`);
+        weighted: weight corners by their covariances where all views have them (`kcal.calibrate.problem.weights`);
             False minimizes the plain RMS, as OpenCV does.
         loss: a robust loss of each corner's residual in pixels, for data with wrong corners, or None. It is used after
             a plain solution has been found; choose a scale of about three times the noise.
@@ -74,7 +74,7 @@ class CalibrationOptions:
         weak_prior: with a parametric model, how far a rich lens (with a denominator, prism or tilt) is expected to be
             from a pinhole. Every coefficient gets a prior with mean zero, and with the standard deviation at which its
             term would shift the outermost corner by this share of its radius (a thirtieth of it for decentering, prism
-            and tilt; `kcal.calibrate.bundle.coefficient_prior`). 0.3, the default, hardly changes what the views
+            and tilt; `kcal.calibrate.problem.coefficient_prior`). 0.3, the default, hardly changes what the views
             determine, and leaves rich models a single minimum, found quickly, with a reliable σ
             (docs/measured/solver.md has figures). None: the corners alone decide, as in OpenCV; of the minima next to
             that of the prior and next to a lens without distortion the lower one is taken.

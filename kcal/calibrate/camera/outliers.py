@@ -9,11 +9,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.closed_form import spread_out
-from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection, Progress
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
 from kcal.calibrate.camera.solve import Solution, solve
+from kcal.calibrate.problem.closed_form import spread_out
+from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.solve.lm import LMOptions, minimize

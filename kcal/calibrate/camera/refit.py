@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior
+from kcal.calibrate.problem.coefficient_prior import CoefficientPrior
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel

@@ -10,10 +10,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import warp_shape
-from kcal.calibrate.bundle.views import among
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
+from kcal.calibrate.problem.state import warp_modes
+from kcal.calibrate.problem.views import among
 from kcal.corners.observations import Observations
 from kcal.io.camera_file import CameraFile, camera_to_file, provenance
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration, Exclusion
@@ -182,7 +182,7 @@ class CameraCalibrationResult:
             return self.hybrid.board_points
         points = self.observations.board.points.clone()
         if self.board_warp is not None:
-            points[:, 2] = self.board_warp @ warp_shape(points)
+            points[:, 2] = self.board_warp @ warp_modes(points)[:, 2]
         return points
 
     @property

@@ -9,15 +9,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior, is_overparameterized
-from kcal.calibrate.bundle.poses import unflip
-from kcal.calibrate.bundle.priors import Term
-from kcal.calibrate.bundle.views import CameraViews
-from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views, least_planar
 from kcal.calibrate.camera.initial_model import LensStart, first_states, known_model
 from kcal.calibrate.camera.options import CalibrationOptions, Progress
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.coefficient_prior import CoefficientPrior, is_overparameterized
+from kcal.calibrate.problem.poses import unflip
+from kcal.calibrate.problem.priors import Term
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import CameraViews
+from kcal.calibrate.problem.weights import whitening
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.lens.model import LensModel

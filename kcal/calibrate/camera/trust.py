@@ -15,12 +15,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.poses import poses_under
-from kcal.calibrate.bundle.views import Views
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection, Progress
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.lensfit.moving_poses import moving_residuals
+from kcal.calibrate.problem.poses import poses_under
+from kcal.calibrate.problem.views import Views
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardState
-from kcal.calibrate.bundle.priors import GaussianPrior, Term
 from kcal.calibrate.camera.outliers import corners_beyond
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit
+from kcal.calibrate.problem.priors import GaussianPrior, Term
+from kcal.calibrate.problem.state import BoardState
 from kcal.lens.camera import Camera
 from kcal.solve.result import SolverStatus
 
@@ -37,7 +37,7 @@ def prior_warnings(terms: Sequence[Term], state: BoardState, noise: float) -> li
         state: the solution.
         noise: pixels, in proportion to which the priors counted.
     """
-    values = torch.cat([state.parameters, state.warp])
+    values = torch.cat([state.parameters, state.board])
     rows = [term.rows(values)[-1] for term in terms if isinstance(term, GaussianPrior)]
     squared = sum(float((row / noise).square().sum()) for row in rows)
     count = sum(len(row) for row in rows)
@@ -86,9 +86,9 @@ def hybrid_warnings(fit: HybridFit) -> list[str]:
             f"residuals repeat within views (tempering {fit.tempering:.1f}, where noise alone gives 1): blur, motion "
             "or a board that flexes; error bars are widened for it; use a stiff board, a stand and a short exposure"
         )
-    off = (fit.state.params[2:4] - fit.families.mean[1:3]).norm() / fit.families.log_unit[1].exp()
+    off = (fit.state.parameters[2:4] - fit.families.mean[1:3]).norm() / fit.families.log_unit[1].exp()
     if float(off) > _FAR_CENTER:
-        cx, cy = (float(value) for value in fit.state.params[2:4])
+        cx, cy = (float(value) for value in fit.state.parameters[2:4])
         found.append(
             f"the principal point ({cx:.0f}, {cy:.0f}) is far from the middle of the image: give images that are not "
             "cropped, and turn the board by 90 degrees in a third of the views"

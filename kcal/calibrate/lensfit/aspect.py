@@ -65,10 +65,10 @@ def pixels_are_square(aspect: float, sigma: float) -> bool:
 
 def with_square_pixels(estimate: Estimate, board: BoardModes) -> Estimate | None:
     """An estimate with two focal lengths as one with a single one; None where they differ by more than a little."""
-    params = estimate.state.params.clone()
+    params = estimate.state.parameters.clone()
     if not abs(float(params[1] / params[0]) - 1.0) < _NEARLY:
         return None
     params[:2] = params[:2].mean()
     rows = len(estimate.families.mean) - len(board.unit) - 1
     families = PriorFamilies(*(torch.cat([part[:rows], part[rows + 1 :]]) for part in estimate.families))
-    return estimate._replace(families=families, state=estimate.state._replace(params=params))
+    return estimate._replace(families=families, state=estimate.state._replace(parameters=params))

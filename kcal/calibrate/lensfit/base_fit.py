@@ -9,12 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.closed_form import homographies, poses_from_homographies
-from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.board_modes import BoardModes
 from kcal.calibrate.lensfit.families import PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.fleet import LensPrior
-from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, hybrid_unknowns
+from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem, hybrid_unknowns
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.closed_form import homographies, poses_from_homographies
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.base_map import angle_over_radius, radius_over_angle
 from kcal.lens.field_modes import FieldModes
@@ -48,7 +50,7 @@ class Estimate(NamedTuple):
 
     model: LensModel
     families: PriorFamilies
-    state: HybridState
+    state: BoardState
     hyperparameters: Tensor
     log_ratio: np.ndarray
     variance: float
@@ -70,7 +72,7 @@ class Base(NamedTuple):
     focal: float
     shape: float
     aspect: float | None
-    state: HybridState
+    state: BoardState
     variance: float
     steps: int
 
@@ -128,7 +130,7 @@ def fit_projection(
     if len(base.state.rotation) == len(pixels):
         return base
     seen = torch.isfinite(pixels).all(-1) & (weights > 0)
-    params = base.state.params
+    params = base.state.parameters
     offset = torch.where(seen[..., None], pixels - params[2:4], 0.0)
     if base.aspect is not None:
         offset = offset / torch.tensor([1.0, base.aspect], dtype=torch.float64)
@@ -151,25 +153,24 @@ def _fit_some(
     exact_focal: bool,
 ) -> Base:
     focal, shape, rotation, translation = _base_start(points, pixels, size, weights, known_focal, None, exact_focal)
-    still = rotation.new_zeros(len(rotation), 0)
     flat = BoardModes(points.new_zeros(0, 3, len(points)), points.new_zeros(0), torch.zeros(0, dtype=torch.long))
-    state = HybridState(points.new_zeros(0), flat.unit, rotation, translation, still)
+    state = BoardState.still(points.new_zeros(0), flat.unit, rotation, translation)
     base = Base(focal, shape, None if square else 1.0, state, 0.0, 0)
     h = typical_hyperprior(_NO_FIELD).mean
     for _ in range(6):
         model, families = _with_constants(base, size, _NO_FIELD, flat)
         state = base.state
-        if not len(state.params):
-            state = state._replace(params=_leading(model, base.focal, families))
+        if not len(state.parameters):
+            state = state._replace(parameters=_leading(model, base.focal, families))
         held = _held(families, flat, square, exact_focal)
         problem, result = _solve_base(points, pixels, weights, (model, families), state, h, held, robust, flat)
-        state = HybridState(*result.state)
-        scale, bend = float(state.params[0]) / base.focal - 1.0, float(state.params[5])
+        state = result.state
+        scale, bend = float(state.parameters[0]) / base.focal - 1.0, float(state.parameters[5])
         base = Base(
-            float(state.params[0]),
+            float(state.parameters[0]),
             base.shape + min(max(bend, -1.0), 1.0),
-            None if square else float(state.params[1]) / float(state.params[0]),
-            state._replace(params=torch.cat([state.params[:5], torch.zeros_like(state.params[5:])])),
+            None if square else float(state.parameters[1]) / float(state.parameters[0]),
+            state._replace(parameters=torch.cat([state.parameters[:5], torch.zeros_like(state.parameters[5:])])),
             _residual_variance(problem, result),
             base.steps + int(result.iterations),
         )
@@ -202,8 +203,8 @@ def fit_base(
     base = fit_projection(points, pixels, size, weights, square, known_focal, robust)
     model, families = _with_constants(base, size, modes, board)
     params = torch.zeros(5 + model.size, dtype=torch.float64)
-    params[:5] = base.state.params[:5]
-    state = base.state._replace(params=params, board=torch.zeros_like(board.unit))
+    params[:5] = base.state.parameters[:5]
+    state = base.state._replace(parameters=params, board=torch.zeros_like(board.unit))
     return Estimate(model, families, state, h, NO_MOTION, base.variance, 1.0), base.steps
 
 
@@ -227,13 +228,10 @@ def _fit_known(
     params = _leading(model, lens.focal, families)
     unknowns = hybrid_unknowns(model, square)
     params[list(unknowns.indices)] = unknowns.expand(lens.mean)
-    still = rotation.new_zeros(len(rotation), 0)
-    state = HybridState(params, torch.zeros_like(board.unit), rotation, translation, still)
+    state = BoardState.still(params, torch.zeros_like(board.unit), rotation, translation)
     held = _held(families, board, square, False)
     problem, result = _solve_base(points, pixels, weights, (model, families), state, h, held, robust, board)
-    estimate = Estimate(
-        model, families, HybridState(*result.state), h, NO_MOTION, _residual_variance(problem, result), 1.0
-    )
+    estimate = Estimate(model, families, result.state, h, NO_MOTION, _residual_variance(problem, result), 1.0)
     return estimate, int(result.iterations)
 
 
@@ -267,30 +265,30 @@ def _solve_base(
     pixels: Tensor,
     weights: Tensor,
     lens: tuple[LensModel, PriorFamilies],
-    state: HybridState,
+    state: BoardState,
     h: Tensor,
     held: Tensor,
     robust: bool,
     board: BoardModes,
-) -> tuple[HybridProblem, Result[HybridState]]:
+) -> tuple[BoardProblem, Result[BoardState]]:
     """Solve for what is not held, and for poses; pixels are square if the lens has no focal length of the rows."""
     model, families = lens
     square = len(families.mean) == len(hybrid_unknowns(model)) + len(board.unit)
     precision = torch.where(held, torch.inf, families.deviation(h).square().reciprocal())
-    problem = HybridProblem(points, board.shapes, pixels, weights, model, families.mean, precision, square=square)
+    problem = hybrid_problem(points, board.shapes, pixels, weights, model, families.mean, precision, square=square)
     if robust:
         problem = problem.with_weights(cauchy_weights(problem, state, weights))
     return problem, minimize(problem, state, LMOptions(max_iterations=15, tolerance=1e-6, initial_damping=1e-6))
 
 
-def _residual_variance(problem: HybridProblem, result: Result[HybridState]) -> float:
+def _residual_variance(problem: BoardProblem, result: Result[BoardState]) -> float:
     freedom = 2 * int(problem.seen.sum()) - 6 * len(problem.seen)
     return max(2.0 * float(result.cost) / freedom, LEAST_NOISE**2)
 
 
-def cauchy_weights(problem: HybridProblem, state: HybridState, weights: Tensor) -> Tensor:
+def cauchy_weights(problem: BoardProblem, state: BoardState, weights: Tensor) -> Tensor:
     """(V, N) weights of a Cauchy loss at a state, its scale three robust standard deviations; 0 without an image."""
-    length = (problem.errors(state) * weights[:, None]).norm(dim=1)
+    length = (problem.pixel_errors(state) * weights[:, None]).norm(dim=1)
     shown = torch.isfinite(length) & problem.seen
     # Of two normal components, the median length is 1.18 standard deviations.
     scale = max(3.0 * float(length[shown].median()) / 1.18, LEAST_NOISE)

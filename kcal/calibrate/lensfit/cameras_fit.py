@@ -184,7 +184,7 @@ def _begun_fleet(cameras: Sequence[CameraFit]) -> LensPrior:
     Where pixels of one camera are not square, those of its type need not be.
     """
     stretched = [camera for camera in cameras if not camera.fit.square] or cameras
-    middle = sorted(stretched, key=lambda camera: float(camera.fit.state.params[0]))[len(stretched) // 2].fit
+    middle = sorted(stretched, key=lambda camera: float(camera.fit.state.parameters[0]))[len(stretched) // 2].fit
     form = middle.camera.model.hybrid
     assert form is not None
     hyperprior, _ = fleet_priors([camera.hyper for camera in cameras], typical_hyperprior())

@@ -20,10 +20,10 @@ import torch
 from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
-from kcal.calibrate.bundle.views import LEAST_NOISE
 from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
-from kcal.calibrate.lensfit.readout import LARGEST, MEDIAN, SMALLEST, SPREAD
+from kcal.calibrate.problem.readout import LARGEST, MEDIAN, SMALLEST, SPREAD
+from kcal.calibrate.problem.views import LEAST_NOISE
 
 # Nats by which motions must raise the evidence to be taken for real.
 WORTH = 3.0

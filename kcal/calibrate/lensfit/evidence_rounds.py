@@ -16,9 +16,10 @@ from kcal.calibrate.lensfit.base_fit import NO_MOTION, Estimate, cauchy_weights
 from kcal.calibrate.lensfit.board_modes import BoardModes
 from kcal.calibrate.lensfit.evidence import WORTH, Maximum, evidence_of_motion, maximize_evidence
 from kcal.calibrate.lensfit.families import Hyperprior
-from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
+from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, overdispersion, quadratic_of, view_data
-from kcal.calibrate.lensfit.readout import AMPLITUDES, LARGEST, MOTION, Readout, motion_sigma, stillness
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.readout import AMPLITUDES, LARGEST, MOTION, Readout, motion_sigma, stillness
 from kcal.solve.lm import LMOptions, minimize
 
 _ROUNDS = 12
@@ -74,11 +75,11 @@ class FittedViews:
         """Residuals without those that poses take up."""
         return 2 * int(self.seen.sum()) - 6 * len(self.pixels)
 
-    def problem(self, estimate: Estimate, never: Tensor) -> HybridProblem:
+    def problem(self, estimate: Estimate, never: Tensor) -> BoardProblem:
         """The least squares at amplitudes of an estimate; unknowns of which `never` is true are held."""
         deviation = estimate.families.deviation(estimate.hyperparameters)
         precision = torch.where(never, torch.inf, estimate.variance / deviation.square())
-        problem = HybridProblem(
+        problem = hybrid_problem(
             self.points,
             self.board.shapes,
             self.pixels,
@@ -96,24 +97,26 @@ class FittedViews:
 
     def solved(
         self, estimate: Estimate, never: Tensor, effort: tuple[int, float]
-    ) -> tuple[HybridProblem, Estimate, int]:
+    ) -> tuple[BoardProblem, Estimate, int]:
         """The problem, the estimate with its solution, and the trial steps."""
         problem = self.problem(estimate, never)
         steps, gain = effort
         options = LMOptions(max_iterations=steps, tolerance=gain / self.freedom, initial_damping=1e-6)
         result = minimize(problem, estimate.state, options)
-        return problem, estimate._replace(state=HybridState(*result.state)), int(result.iterations)
+        return problem, estimate._replace(state=result.state), int(result.iterations)
 
-    def data(self, problem: HybridProblem, state: HybridState, never: Tensor) -> tuple[Quadratic | ViewData, Tensor]:
-        """What the views say near a state, and the scores (V, S) of views as if they stood still."""
+    def data(self, problem: BoardProblem, estimate: Estimate, never: Tensor) -> tuple[Quadratic | ViewData, Tensor]:
+        """What the views say near an estimate, and the scores (V, S) of views as if they stood still."""
+        state = estimate.state
+        x = problem.unknowns(state) - estimate.families.mean
         if problem.readout is None:
-            off = problem.without_poses(state)
+            off = problem.off_poses(state)
             off[:, :-1][:, never] = 0.0
             score = (off[:, :-1] @ off[:, -1, :, None])[..., 0]
-            return quadratic_of(off, problem.shared(state), self.freedom), score
-        off = problem.motion_without_poses(state)
+            return quadratic_of(off, x, self.freedom), score
+        off = problem.motion_off_poses(state)
         off[:, MOTION:-1][:, never] = 0.0
-        found = view_data(off, problem.shared(state), state.motion, self.freedom)
+        found = view_data(off, x, state.motion, self.freedom)
         return found, found.score
 
 
@@ -183,7 +186,7 @@ def run_rounds(
         first = turn == 0 and cold
         problem, estimate, steps = capture.solved(estimate, never, _FIRST if first else _LATER)
         spent += steps
-        data, score = capture.data(problem, estimate.state, never)
+        data, score = capture.data(problem, estimate, never)
         former = tempering = estimate.tempering
         if not first and problem.readout is None:
             found = _overdispersion(data, score, estimate, never)
@@ -257,7 +260,7 @@ def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -
     if not rounds.converged or max(found.turn, found.shift) > _TOO_MUCH:
         return True
     losses = []
-    still = estimate.state._replace(motion=torch.zeros_like(estimate.state.motion))
+    still = estimate._replace(state=estimate.state._replace(motion=torch.zeros_like(estimate.state.motion)))
     for columns in (False, True):
         capture = dataclasses.replace(rounds.capture, readout=dataclasses.replace(readout, columns=columns))
         data, _ = capture.data(capture.problem(estimate, never), still, never)

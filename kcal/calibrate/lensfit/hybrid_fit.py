@@ -12,8 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.parameters import FreeParameters
-from kcal.calibrate.bundle.views import among
 from kcal.calibrate.lensfit.aspect import square_pixels, with_square_pixels
 from kcal.calibrate.lensfit.base_fit import Estimate, fit_base
 from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
@@ -28,15 +26,18 @@ from kcal.calibrate.lensfit.evidence_rounds import (
 )
 from kcal.calibrate.lensfit.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.lensfit.fleet import LensPrior
-from kcal.calibrate.lensfit.hybrid_problem import HybridState, hybrid_unknowns
+from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_unknowns
 from kcal.calibrate.lensfit.measured_board import MeasuredBoard
 from kcal.calibrate.lensfit.quadratic import posterior_root, quadratic_of
-from kcal.calibrate.lensfit.readout import MotionSigma, Readout, motion_sigma, stillness, widening
+from kcal.calibrate.problem.information import information_of
+from kcal.calibrate.problem.readout import MotionSigma, Readout, motion_sigma, stillness, widening
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import among
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import LEADING
-from kcal.lens.information import CameraInformation, triangular
+from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
 
@@ -87,7 +88,7 @@ class HybridFit:
 
     model: LensModel
     size: tuple[int, int]
-    state: HybridState
+    state: BoardState
     half: Tensor
     information: CameraInformation
     sigma: float
@@ -112,7 +113,7 @@ class HybridFit:
     @functools.cached_property
     def camera(self) -> Camera:
         """The camera; made when it is asked for, because it measures its lens."""
-        return Camera(self.state.params, size=self.size, model=self.model)
+        return Camera(self.state.parameters, size=self.size, model=self.model)
 
     @property
     def rms(self) -> float:
@@ -159,7 +160,7 @@ class HybridFit:
     def covariance(self) -> Tensor:
         """(5 + P, 5 + P) of the camera's parameters in the order of `Camera.names`: fx and fy alike, skew held."""
         unknowns = hybrid_unknowns(self.model, self.square)
-        count = len(self.state.params)
+        count = len(self.state.parameters)
         onto = self.half.new_zeros(len(self.half), count)
         onto[list(unknowns.slots), list(unknowns.indices)] = 1.0
         root = self.half @ onto
@@ -284,18 +285,20 @@ def fit_hybrid(
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
     peaks = torch.tensor(modes.peaks, dtype=torch.float64)
     field = slice(LEADING_UNKNOWNS, LEADING_UNKNOWNS + len(modes))
-    unfelt = families.deviation(h)[field] * float(state.params[0]) * peaks < _UNFELT
+    unfelt = families.deviation(h)[field] * float(state.parameters[0]) * peaks < _UNFELT
     never[field] |= unfelt
-    state.params[5 + len(LEADING) :] = torch.where(unfelt, families.mean[field], state.params[5 + len(LEADING) :])
+    state.parameters[5 + len(LEADING) :] = torch.where(
+        unfelt, families.mean[field], state.parameters[5 + len(LEADING) :]
+    )
     # A fit that drifts stays where its evidence was largest.
     drifts = capture.readout is not None and not rounds.converged
     problem, estimate, steps = capture.solved(estimate, never, (1, LAST[1]) if drifts else LAST)
     state = estimate.state
-    off = problem.without_poses(state)
-    K = quadratic_of(off, problem.shared(state), capture.freedom).K
+    off, x = problem.off_poses(state), problem.unknowns(state)
+    K = quadratic_of(off, x - families.mean, capture.freedom).K
     deviation = torch.where(never, 0.0, families.deviation(h))
     inverse = posterior_root(K, deviation, variance)
-    errors = problem.errors(state)
+    errors, weighted = problem.pixel_errors(state), problem.corner_residuals(state, weighted=True)
     if not robust and not bool(torch.isfinite(errors).all()):
         raise InputError(
             "the lens cannot show all corners where they are: are all views of this board and this camera? Rejection "
@@ -303,9 +306,7 @@ def fit_hybrid(
         )
     wider = widening(len(pixels)) if capture.readout is not None else 1.0
     half = math.sqrt(wider) * inverse * deviation
-    information = _from_rows(
-        off, problem.shared(state), families.mean, math.sqrt(wider) * deviation, wider * variance, problem.unknowns
-    )
+    information = information_of(problem, state, math.sqrt(wider * variance), off)
     if isinstance(board, BoardPrior):
         state = state._replace(board=board.mean + state.board @ board.half)
         information = board.in_modes(information, state.board)
@@ -331,7 +332,7 @@ def fit_hybrid(
         board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),
         residuals=torch.where(capture.seen[..., None], errors.transpose(-1, -2), torch.nan),
         weights=weights,
-        weighted_rms=math.sqrt(float((errors * problem.weights).square().sum()) / int(capture.seen.sum())),
+        weighted_rms=math.sqrt(float(weighted.square().nansum()) / int(capture.seen.sum())),
         iterations=rounds.steps + steps,
         converged=rounds.converged,
     )
@@ -339,22 +340,3 @@ def fit_hybrid(
 
 def _readout(points: Tensor, size: tuple[int, int]) -> Readout:
     return Readout(center=points.mean(0), distance=1.0, size=size)
-
-
-def _from_rows(
-    off: Tensor, x: Tensor, mean: Tensor, deviation: Tensor, variance: float, unknowns: FreeParameters
-) -> CameraInformation:
-    """What rows off the poses (V, S + 1, R), at unknowns x (S,) less their mean, say of all that is not held."""
-    kept = deviation.nonzero()[:, 0]
-    rows = off.transpose(0, 1).flatten(1)[[*kept.tolist(), -1]].T / math.sqrt(variance)
-    triangle = triangular(rows)[:-1]
-    place = {int(k): slot for slot, k in enumerate(kept)}
-    slots = dict(zip(unknowns.indices, unknowns.slots, strict=True))
-    return CameraInformation(
-        slots=tuple(place.get(slots.get(i, -1), -1) for i in range(max(unknowns.indices) + 1)),
-        estimate=(x + mean)[kept],
-        rows=triangle[:, :-1],
-        residuals=triangle[:, -1],
-        mean=mean[kept],
-        sigma=deviation[kept],
-    )

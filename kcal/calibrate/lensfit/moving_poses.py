@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
-from kcal.calibrate.lensfit.readout import MOTION, Readout
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.readout import MOTION, Readout
+from kcal.calibrate.problem.state import BoardState
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions, minimize
 
@@ -44,21 +45,15 @@ def moving_residuals(
     if not bool(posed.any()):
         return out
     params = camera.params.detach()
-    held = torch.full((len(params) - 2,), torch.inf, dtype=torch.float64)
     some = pixels[posed]
-    problem = HybridProblem(
+    problem = BoardProblem(
         board_points,
-        board_points.new_zeros(0, 3, len(board_points)),
         some,
-        torch.ones_like(some[..., 0]),
         camera.model,
-        torch.zeros_like(held),
-        held,
-        readout,
-        stillness,
+        readout=readout,
+        stillness=stillness,
     )
     motion = rotation.new_zeros(len(some), MOTION)
-    state = HybridState(params, params.new_zeros(0), rotation[posed], translation[posed], motion)
-    errors = problem.errors(HybridState(*minimize(problem, state, _EFFORT).state)).transpose(-1, -2)
-    out[posed] = torch.where(problem.seen[..., None], errors, torch.nan)
+    state = BoardState.flat(params, rotation[posed], translation[posed])._replace(motion=motion)
+    out[posed] = problem.corner_residuals(minimize(problem, state, _EFFORT).state)
     return out

@@ -1,7 +1,7 @@
 """Data near a solution as a quadratic form of lens and board, with poses and motions eliminated.
 
 Near a solution residuals are linear in the unknowns: chi²(x) = c - 2 gᵀx + xᵀKx, poses eliminated. Motions of views
-(`kcal.calibrate.lensfit.readout`) are integrated out under a normal prior: with U their columns off the poses, R their
+(`kcal.calibrate.problem.readout`) are integrated out under a normal prior: with U their columns off the poses, R their
 prior standard deviations in units of the noise, and M = (UᵀU + R⁻²)⁻¹, a view's AᵀA becomes AᵀA - AᵀU M UᵀA, and
 ln det(R UᵀU R + I) is added to -2 ln p.
 """
@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.readout import AMPLITUDES, MOTION, stillness
+from kcal.calibrate.problem.readout import AMPLITUDES, MOTION, stillness
 
 Array = npt.NDArray[np.float64]
 

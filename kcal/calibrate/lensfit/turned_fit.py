@@ -14,7 +14,7 @@ from kcal.calibrate.lensfit.board_prior import BoardMessage, BoardPrior, message
 from kcal.calibrate.lensfit.families import BOARD
 from kcal.calibrate.lensfit.fleet import LensPrior, Likelihood, hyper_likelihood
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
-from kcal.calibrate.lensfit.hybrid_problem import HybridProblem
+from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem
 from kcal.calibrate.lensfit.quadratic import Quadratic
 from kcal.corners.observations import Observations
 from kcal.lens.zernike import ZernikeModes
@@ -117,7 +117,7 @@ def _absolute_rows(fit: HybridFit, points: Tensor, pixels: Tensor, weights: Tens
     """(V, S + 1, R) derivatives by lens and board off poses and motions, and the target of these rows, pixels."""
     count = len(fit.state.board)
     mean = torch.cat([fit.families.mean[:-count], torch.zeros_like(fit.state.board)])
-    problem = HybridProblem(
+    problem = hybrid_problem(
         points,
         fit.board_shapes.shapes,
         pixels,
@@ -129,8 +129,8 @@ def _absolute_rows(fit: HybridFit, points: Tensor, pixels: Tensor, weights: Tens
         fit.stillness,
         fit.square,
     )
-    rows = problem.without_poses(fit.state)
-    rows[:, -1] = torch.einsum("s,vsn->vn", problem.shared(fit.state), rows[:, :-1]) - rows[:, -1]
+    rows = problem.off_poses(fit.state)
+    rows[:, -1] = torch.einsum("s,vsn->vn", problem.unknowns(fit.state) - mean, rows[:, :-1]) - rows[:, -1]
     return rows
 
 

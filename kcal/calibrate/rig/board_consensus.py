@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.poses import poses_under
-from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.problem.poses import poses_under
+from kcal.calibrate.problem.views import Views
 from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError
 from kcal.lens.camera import Camera

@@ -43,7 +43,7 @@ class Drift:
         left: (3,) turn of the left camera; None where only the relative attitude can be told.
         right: (3,) of the right camera; likewise.
         relative: (3,) of right_from_left about the right camera's axes, as in
-            `kcal.calibrate.bundle.twist.apply_twist`.
+            `kcal.calibrate.problem.twist.apply_twist`.
         left_covariance: (3, 3), None as above.
         right_covariance: (3, 3), None as above.
         relative_covariance: (3, 3).

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from kcal.calibrate.bundle.closed_form import spread_out
+from kcal.calibrate.problem.closed_form import spread_out
 from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS
 from kcal.calibrate.rig.pairs import Pair, paired_boards
 from kcal.calibrate.rig.result import RigResult

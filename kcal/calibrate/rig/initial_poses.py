@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.closed_form import spread_out
+from kcal.calibrate.problem.closed_form import spread_out
 from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, Poses, check_cameras, consensus, half_turn, pose_alone
 from kcal.calibrate.rig.resection import consensus_pose, consensus_rotation, rotation_between
 from kcal.calibrate.rig.sources import Boards, RigData

@@ -1,6 +1,6 @@
 """Boards that move while the rows of a rig's images are read: how much by evidence, and taken out of the residuals.
 
-Each board has, in each camera, a motion of its own beside its pose (`kcal.calibrate.lensfit.readout`). Integrated out
+Each board has, in each camera, a motion of its own beside its pose (`kcal.calibrate.problem.readout`). Integrated out
 under a normal prior, whitened residuals r have the covariance I + U Uᵀ, U being their derivatives by the motion times
 its standard deviations, and (I + U Uᵀ)^-½ r takes the place of r.
 """
@@ -19,7 +19,7 @@ from kcal.calibrate.lensfit.amplitudes import expected_maximum
 from kcal.calibrate.lensfit.evidence import WORTH, evidence_of_motion, maximize_evidence
 from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
 from kcal.calibrate.lensfit.quadratic import ViewData, view_data
-from kcal.calibrate.lensfit.readout import AMPLITUDES, FELT, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
+from kcal.calibrate.problem.readout import AMPLITUDES, FELT, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components
 from kcal.solve.schur import without_local

@@ -180,7 +180,8 @@ class RigProblem:
     def linearize(self, state: State) -> SchurLinearization:
         """See `Problem.linearize`."""
         state = RigState(*state)
-        linear = SchurLinearization.of_gram(self._gram(state), LOCAL_SIZE, self.term_rows(state))
+        terms = self.term_rows(state)
+        linear = SchurLinearization.of_gram(self._gram(state), LOCAL_SIZE, terms @ terms.T)
         if self.loss is not None:
             linear.cost = self.cost(state)
         return linear

@@ -92,7 +92,7 @@ class RigResult:
         rotation: (C, 3, 3).
         center: (C, 3) meters.
         board_warp: (2,) meters along rows and columns, if it was estimated
-            (`kcal.calibrate.bundle.board_problem.warp_shape`).
+            (`kcal.calibrate.problem.state.warp_modes`).
         sources: residuals by source.
         items: residuals by item, those left out included.
         flipped: boards that had been read from the other end and were turned.

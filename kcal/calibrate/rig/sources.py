@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.weights import whitening
+from kcal.calibrate.problem.weights import whitening
 from kcal.checks import as_points, require_finite
 from kcal.corners.board import Board
 from kcal.errors import InputError

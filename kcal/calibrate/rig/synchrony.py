@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.poses import poses_under
-from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.problem.poses import poses_under
+from kcal.calibrate.problem.views import Views
 from kcal.lens.camera import Camera
 from kcal.lens.pose import step_rows, vector_from_rotation
 from kcal.lens.projection import project_components

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import warp_shape
-from kcal.calibrate.bundle.views import free_parameters
+from kcal.calibrate.problem.state import warp_modes
+from kcal.calibrate.problem.views import free_parameters
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import check_refraction
@@ -50,8 +50,7 @@ class SharedUnknowns:
 
     def and_warp(self, board_points: Tensor) -> SharedUnknowns:
         """These, and two parabolas by which the board bends."""
-        shapes = torch.zeros(2, 3, len(board_points), dtype=torch.float64)
-        shapes[:, 2] = warp_shape(board_points)
+        shapes = warp_modes(board_points)
         board = torch.cat([torch.zeros(2, len(self), dtype=torch.float64), torch.eye(2, dtype=torch.float64)], 1)
         more = self._and("the board's warp along its rows", "the board's warp along its columns", known=False)
         return dataclasses.replace(more, shapes=shapes, board=board)

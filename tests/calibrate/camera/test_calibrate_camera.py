@@ -10,10 +10,11 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState, warp_shape
-from kcal.calibrate.bundle.covariance import uncertainty_of
-from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.covariance import uncertainty_of
+from kcal.calibrate.problem.state import BoardState, warp_modes
+from kcal.calibrate.problem.views import free_parameters
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions, minimize
@@ -77,7 +78,7 @@ class TestNoiseFree:
         truth = camera()
         rotation, translation = motions(truth, 8, 1)
         bent = BOARD.points.clone()
-        bent[:, 2] = torch.tensor([0.002, -0.001], dtype=torch.float64) @ warp_shape(BOARD.points)
+        bent[:, 2] = torch.tensor([0.002, -0.001], dtype=torch.float64) @ warp_modes(BOARD.points)[:, 2]
         pixels, _ = truth.project(bent @ rotation.transpose(-1, -2) + translation[:, None])
         result = solve(pixels, board_warp=True)
         assert result.board_warp is not None

@@ -10,9 +10,9 @@ import pytest
 import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 
-from kcal.calibrate.bundle.views import CameraViews
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.initial_model import first_states, follow_base
+from kcal.calibrate.problem.views import CameraViews
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.lens.base_map import radius_over_angle

@@ -9,10 +9,10 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, pixels_of
 from torch import Tensor, nn
 
-from kcal.calibrate.bundle.board_problem import BoardProblem
 from kcal.calibrate.camera.layer import CalibratedViews, CalibrationLayer, calibrate_views
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.outliers import OutlierRejection
+from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel

@@ -14,8 +14,9 @@ from kcal.calibrate.lensfit.board_modes import BENDING, PRINT, STRETCH, TRAPEZOI
 from kcal.calibrate.lensfit.evidence import maximize_evidence, negative_log_evidence
 from kcal.calibrate.lensfit.families import prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
-from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState
+from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem
 from kcal.calibrate.lensfit.quadratic import Quadratic
+from kcal.calibrate.problem.state import BoardState
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -123,7 +124,7 @@ def test_errors_are_as_large_as_predicted() -> None:
     pixels = seen_pixels(true)
     rays = true.unproject(pixels)[0]
     camera, model = found.camera, found.camera.model
-    from kcal.calibrate.lensfit.hybrid_problem import hybrid_unknowns
+    from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_unknowns
     from kcal.lens.pose import step_rows
     from kcal.lens.projection import project_components
 
@@ -299,11 +300,11 @@ def test_rows_are_derivatives_of_residuals() -> None:
     pixels = views(truth(), 4, 7)
     model = found.camera.model
     count = 3 + model.size + 28
-    problem = HybridProblem(
+    problem = hybrid_problem(
         BOARD.points, found.board_shapes.shapes, pixels, torch.ones(4, BOARD.corners, dtype=torch.float64), model,
         torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64),
     )  # fmt: skip
-    state = HybridState(state.params, state.board, state.rotation[:4], state.translation[:4])
+    state = BoardState.still(state.parameters, state.board, state.rotation[:4], state.translation[:4])
     rows = problem.rows(state)
     for index in (0, 1, 3, 4, 5, 8, 40, count - 28, count - 1):
         step = torch.zeros(count, dtype=torch.float64)
@@ -321,14 +322,14 @@ def test_normal_equations_without_poses() -> None:
     pixels = views(truth(), 5, 8)
     model = found.camera.model
     count = 3 + model.size + 28
-    problem = HybridProblem(
+    problem = hybrid_problem(
         BOARD.points, found.board_shapes.shapes, pixels, torch.ones(5, BOARD.corners, dtype=torch.float64), model,
         torch.zeros(count, dtype=torch.float64), torch.full((count,), 1e-3, dtype=torch.float64),
     )  # fmt: skip
     start = found.state
-    state = HybridState(start.params, start.board, start.rotation[:5], start.translation[:5])
-    state = HybridState(*minimize(problem, state, LMOptions(max_iterations=5)).state)
-    off = problem.without_poses(state)[:, :-1].transpose(0, 1).flatten(1)
+    state = BoardState.still(start.parameters, start.board, start.rotation[:5], start.translation[:5])
+    state = minimize(problem, state, LMOptions(max_iterations=5)).state
+    off = problem.off_poses(state)[:, :-1].transpose(0, 1).flatten(1)
     matrix, scale = problem.linearize(state).information()
     reduced = matrix / scale[:, None] / scale - 1e-3 * torch.eye(count, dtype=torch.float64)
     torch.testing.assert_close(off @ off.T, reduced, rtol=1e-6, atol=1e-6 * float(reduced.diagonal().max()))

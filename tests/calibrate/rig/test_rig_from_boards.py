@@ -13,7 +13,7 @@ from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, observe, pix
 from rig_scenes import CAMERAS, landmarks, tensor
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import warp_shape
+from kcal.calibrate.problem.state import warp_modes
 from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.pairs import pair_by_name, read_pairs
 from kcal.calibrate.rig.result import RigResult
@@ -174,7 +174,7 @@ class TestBoardWarp:
         """A board that bulges by 3 mm along its rows and is flat along its columns."""
         rotation, translation = poses(8, 3, BOARD)
         bent = BOARD.points.clone()
-        bent[:, 2] += tensor(0.003, 0.0) @ warp_shape(BOARD.points)
+        bent[:, 2] += tensor(0.003, 0.0) @ warp_modes(BOARD.points)[:, 2]
         points = bent @ rotation.transpose(-1, -2) + translation[:, None]
         pixels = torch.stack([LEFT.project(points)[0], RIGHT.project(points @ ROTATION.T + TRANSLATION)[0]], 1)
         flat = solve(pixels, reject=False)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardState
-from kcal.calibrate.bundle.closed_form import flipped_poses, homographies, poses_from_homographies, spread_out
-from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.problem.closed_form import flipped_poses, homographies, poses_from_homographies, spread_out
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import Views
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.solve.lm import LMOptions, minimize
@@ -68,8 +68,8 @@ def refine_poses(views: Views, model: LensModel, state: BoardState, options: LMO
         pixels=views.pixels[:, None],
         whitening=None if weights is None else weights[:, None],
     )
-    camera = state.parameters.expand(count, -1), state.warp.expand(count, -1)
-    start = BoardState(*camera, state.rotation[:, None], state.translation[:, None])
+    camera = state.parameters.expand(count, -1), state.board.expand(count, -1)
+    start = BoardState.still(*camera, state.rotation[:, None], state.translation[:, None])
     result = minimize(each.problem(model, batch=(count,)), start, options)
     poses = result.state
     return state._replace(rotation=poses.rotation[:, 0], translation=poses.translation[:, 0]), result.cost

@@ -7,15 +7,15 @@ import torch
 from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, pixels_of
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardState
-from kcal.calibrate.bundle.closed_form import (
+from kcal.calibrate.problem.closed_form import (
     flipped_poses,
     homographies,
     poses_from_homographies,
     spread_out,
 )
-from kcal.calibrate.bundle.poses import poses_under, refine_poses, unflip
-from kcal.calibrate.bundle.views import Views
+from kcal.calibrate.problem.poses import poses_under, refine_poses, unflip
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import Views
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.solve.lm import LMOptions
@@ -174,7 +174,7 @@ class TestUnflip:
         views = Views(board_points=BOARD.points, pixels=pixels)
         refined, cost = refine_poses(views, truth.model, state, LMOptions())
         assert torch.equal(refined.parameters, state.parameters)
-        assert torch.equal(refined.warp, state.warp)
+        assert torch.equal(refined.board, state.board)
         assert cost.shape == (4,)
         assert bool((cost[[0, 1, 3]] < 1e-18).all())
         assert float(cost[2]) > 1e-4

@@ -14,9 +14,10 @@ from kcal.calibrate.lensfit.board_modes import board_modes
 from kcal.calibrate.lensfit.evidence import maximize_evidence
 from kcal.calibrate.lensfit.families import prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
-from kcal.calibrate.lensfit.hybrid_problem import HybridProblem, HybridState, unknown_values
+from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem
 from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, view_data
-from kcal.calibrate.lensfit.readout import (
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.readout import (
     AMPLITUDES,
     LARGEST,
     MEDIAN,
@@ -27,6 +28,7 @@ from kcal.calibrate.lensfit.readout import (
     stillness,
     widening,
 )
+from kcal.calibrate.problem.state import BoardState
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.hybrid_terms import HybridForm
@@ -94,7 +96,7 @@ def test_time_runs_from_the_first_edge_to_the_last() -> None:
     assert columns.time(pixels[:, [0, 1]] * torch.tensor([1.0, 0.0])).tolist() == [-0.5, 0.5, 0.0, 0.0]
 
 
-def moving_problem(square: bool) -> tuple[HybridProblem, HybridState]:
+def moving_problem(square: bool) -> tuple[BoardProblem, BoardState]:
     """A problem at a state where views move and the board is bent."""
     generator = torch.Generator().manual_seed(2)
     pixels = capture(2e-3, 4)
@@ -102,7 +104,7 @@ def moving_problem(square: bool) -> tuple[HybridProblem, HybridState]:
     shapes = board_modes(BOARD.points).shapes
     count = 3 + model.size + len(shapes) + (0 if square else 1)
     readout = Readout(center=BOARD.points.mean(0), distance=0.6, size=SIZE)
-    problem = HybridProblem(
+    problem = hybrid_problem(
         BOARD.points, shapes, pixels, torch.ones(4, BOARD.corners, dtype=F64), model, torch.zeros(count, dtype=F64),
         torch.zeros(count, dtype=F64), readout, stillness(np.array([-3.0, -2.0, -4.0, -2.5])), square,
     )  # fmt: skip
@@ -112,7 +114,7 @@ def moving_problem(square: bool) -> tuple[HybridProblem, HybridState]:
     base = fitted(2e-3).state
     motion = 5e-3 * torch.randn(4, MOTION, generator=generator, dtype=F64)
     board = 1e-3 * torch.randn(len(shapes), generator=generator, dtype=F64)
-    return problem, HybridState(params, board, base.rotation[:4], base.translation[:4], motion)
+    return problem, BoardState(params, board, base.rotation[:4], base.translation[:4], motion)
 
 
 @pytest.mark.parametrize("square", [True, False])
@@ -120,7 +122,7 @@ def test_rows_are_derivatives_of_residuals(square: bool) -> None:
     """By pose, motion, lens, focal lengths and board, where views move and the board is bent."""
     problem, state = moving_problem(square)
     rows, local = problem.rows(state), problem.local_size
-    shared = len(problem.mean)
+    shared = problem.shared_size
     for index in (0, 1, 3, 5, 6, 8, 10, 13, 16, 17, 18, 19, 21, 22, 30, local + shared - 29, local + shared - 1):
         step = 1e-4 if index in (local, local + 1, local + 2, local + shared - 29) else 1e-6
         both = []
@@ -138,18 +140,18 @@ def test_rows_are_derivatives_of_residuals(square: bool) -> None:
 def test_motions_are_eliminated_like_poses() -> None:
     """By QR with the rows of their prior, by the Schur complement, and by integrating the Gaussian model."""
     problem, state = moving_problem(True)
-    x = problem.shared(state)
-    off_all = problem.without_poses(state)
+    x = problem.unknowns(state)
+    off_all = problem.off_poses(state)
     flat = off_all.transpose(0, 1).flatten(1)
     matrix, scale = problem.linearize(state).information()
     reduced = matrix / scale[:, None] / scale
     torch.testing.assert_close(flat[:-1] @ flat[:-1].T, reduced, rtol=1e-6, atol=1e-6 * float(reduced.max()))
-    data = view_data(problem.motion_without_poses(state), x, state.motion, 100.0)
+    data = view_data(problem.motion_off_poses(state), x, state.motion, 100.0)
     ratio = np.array([-3.0, -2.0, -4.0, -2.5])
     found = data.integrated(ratio)
     torch.testing.assert_close(found.data.K, reduced, rtol=1e-6, atol=1e-6 * float(reduced.max()))
     # Chi² at any x is that of residuals whose covariance contains the motions.
-    each = problem.motion_without_poses(state)
+    each = problem.motion_off_poses(state)
     there = x + 1e-3 * torch.randn(len(x), generator=torch.Generator().manual_seed(3), dtype=F64) / scale
     spread = torch.exp(torch.from_numpy(ratio)).repeat_interleave(3)
     chi2 = logdet = 0.0
@@ -308,14 +310,14 @@ def test_square_pixels_stay_square() -> None:
 
 def test_unknowns_of_two_focal_lengths() -> None:
     problem, state = moving_problem(False)
-    own = unknown_values(state.params, False)
-    assert own[0] == state.params[0]
-    assert own[-1] == state.params[1]
-    torch.testing.assert_close(problem.unknowns.expand(own), state.params[list(problem.unknowns.indices)])
+    own = problem.unknowns(state)[: len(problem.free)]
+    assert own[0] == state.parameters[0]
+    assert own[-1] == state.parameters[1]
+    torch.testing.assert_close(problem.free.expand(own), state.parameters[list(problem.free.indices)])
     # A robust weight of zero leaves a corner out; motions keep their prior.
     weights = torch.ones(4, BOARD.corners, dtype=F64)
     weights[0] = 0.0
-    moved = problem.with_weights(weights).rows(state)
+    moved = problem.with_weights(weights).corner_rows(state)
     assert float(moved[0].abs().max()) == 0.0
     result = minimize(problem.with_weights(0.0 * weights), state, LMOptions(max_iterations=3))
     assert float(result.state[4].abs().max()) < 1e-9

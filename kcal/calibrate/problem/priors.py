@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 import torch
 from torch import Tensor
@@ -22,24 +22,43 @@ _SHARPEST = 30.0
 _KNOTS = 96
 
 
-class Term(Protocol):
-    """Residuals of the camera's parameters and the board's warp, in pixels like all others."""
+class Term(ABC):
+    """Residuals of the camera's parameters and the board's amplitudes, in pixels like all others."""
 
+    @abstractmethod
     def rows(self, values: Tensor) -> Tensor:
         """Derivatives and residuals.
 
         Args:
-            values: (..., 5 + P + 2), the camera's parameters and the two numbers of the warp.
+            values: (..., 5 + P + B), the camera's parameters and the amplitudes of the board's modes.
 
         Returns:
-            (..., 5 + P + 2 + 1, Q): derivatives of Q residuals by each value; last the residuals, NaN where the
+            (..., 5 + P + B + 1, Q): derivatives of Q residuals by each value; last the residuals, NaN where the
             values are not a lens. Q may be 0 where there is no cost.
         """
-        ...
+
+    def cost(self, values: Tensor) -> Tensor:
+        """(...) half the sum of squared residuals."""
+        return 0.5 * self.rows(values)[..., -1, :].square().sum(-1)
+
+    def add_to(self, total: Tensor, values: Tensor, slots: Tensor) -> None:
+        """Add products of the rows to those of a problem.
+
+        Args:
+            total: (..., S + 1, S + 1) of derivatives by S unknowns, and residuals; changed in place.
+            values: see `rows`.
+            slots: (5 + P + B,) the number of each value's unknown; -1 where it is held.
+        """
+        rows, free = self.rows(values), (slots >= 0).nonzero()[:, 0]
+        if rows.shape[-1]:
+            by_unknown = rows.new_zeros(*total.shape[:-1], rows.shape[-1])
+            by_unknown.index_add_(-2, slots[free], rows[..., free, :])
+            by_unknown[..., -1, :] = rows[..., -1, :]
+            total += by_unknown @ by_unknown.transpose(-1, -2)
 
 
 @dataclasses.dataclass(frozen=True)
-class GaussianPrior:
+class GaussianPrior(Term):
     """A Gaussian prior on some values: residuals (value - mean) · weight.
 
     Args:
@@ -56,11 +75,29 @@ class GaussianPrior:
         """See `Term.rows`."""
         derivative = values.new_zeros((*self.weight.shape[:-1], values.shape[-1], len(self.index)))
         derivative[..., self.index, torch.arange(len(self.index), device=values.device)] = self.weight
-        residual = (values[..., self.index] - self.mean) * self.weight
+        residual = self._residual(values)
         return torch.cat([derivative.expand(*values.shape[:-1], -1, -1), residual[..., None, :]], -2)
 
+    def _residual(self, values: Tensor) -> Tensor:
+        return (values[..., self.index] - self.mean) * self.weight
 
-class FoldBarrier:
+    def cost(self, values: Tensor) -> Tensor:
+        """See `Term.cost`."""
+        return 0.5 * self._residual(values).square().sum(-1)
+
+    def add_to(self, total: Tensor, values: Tensor, slots: Tensor) -> None:
+        """See `Term.add_to`; without the rows, of which there may be hundreds."""
+        residual, place = self._residual(values), slots[self.index]
+        free = (place >= 0).nonzero()[:, 0]
+        place, weight = place[free], self.weight[..., free].expand(*total.shape[:-2], -1)
+        gradient = weight * residual[..., free]
+        total.diagonal(dim1=-2, dim2=-1).index_add_(-1, place, weight.square())
+        total[..., -1].index_add_(-1, place, gradient)
+        total[..., -1, :].index_add_(-1, place, gradient)
+        total[..., -1, -1] += residual.square().sum(-1)
+
+
+class FoldBarrier(Term):
     """A smooth barrier before lenses whose radial term folds or meets a pole within a radius.
 
     With q = d ln r_D / d ln r the residuals are weight · ln(q₀ / q) below q₀, weight · ln(q / q₁) above q₁, and zero

@@ -6,9 +6,10 @@ import pytest
 import torch
 from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.views import free_parameters
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import free_parameters
 from kcal.errors import InputError
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.robust import RobustLoss

@@ -1,4 +1,4 @@
-"""The bundle problem: its rows are the derivatives of its residuals, and its residuals are those of the cameras."""
+"""The board problem: its rows are the derivatives of its residuals, and its residuals are those of the cameras."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState, warp_shape
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.state import BoardState, warp_modes
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -43,9 +44,9 @@ def scene(
     model = LensModel.named(name)
     head = torch.tensor([2.0, 1.8, 0.3, -0.2, 0.05], dtype=torch.float64)
     body = torch.tensor([_LENS[name] if strong else 0.0 for name in model.names], dtype=torch.float64)
-    state = BoardState(
+    state = BoardState.still(
         parameters=torch.cat([head, body]).expand(*batch, -1) + (1e-3 * normal(5 + model.size) if batch else 0),
-        warp=strong * torch.tensor([0.02, -0.03], dtype=torch.float64).expand(*batch, -1),
+        board=strong * torch.tensor([0.02, -0.03], dtype=torch.float64).expand(*batch, -1),
         rotation=rotation_from_vector(strong * 0.3 * normal(VIEWS, 3)),
         translation=torch.tensor([-0.15, -0.1, 1.0]).double() + 0.05 * normal(VIEWS, 3),
     )
@@ -112,19 +113,19 @@ class TestRows:
     @pytest.mark.parametrize("name", MODELS)
     def test_all_parameters(self, name: str, kind: str) -> None:
         pixels, model, state = scene(name, kind=kind)
-        check_rows(BoardProblem(BOARD.points, pixels, model, free_all(model), free_warp=True), state)
+        check_rows(BoardProblem(BOARD.points, pixels, model, free_all(model), free_board=True), state)
 
     @pytest.mark.parametrize("name", ["opencv5", "opencv14"])
     def test_every_subset_of_blocks(self, name: str, kind: str) -> None:
         """Blocks: focal lengths, center, skew, lens; the warp."""
         pixels, model, state = scene(name, kind=kind, missing=True)
-        whole = BoardProblem(BOARD.points, pixels, model, free_all(model), free_warp=True)
+        whole = BoardProblem(BOARD.points, pixels, model, free_all(model), free_board=True)
         check_rows(whole, state)
         size = 5 + model.size
         parts = [[0, 1], [2, 3], [4], list(range(5, size))]
         for *chosen, free_warp in itertools.product([False, True], repeat=5):
             free = [i for part, on in zip(parts, chosen, strict=True) if on for i in part]
-            problem = BoardProblem(BOARD.points, pixels, model, free, free_warp=free_warp)
+            problem = BoardProblem(BOARD.points, pixels, model, free, free_board=free_warp)
             wanted = [*range(6), *(6 + i for i in free), *([6 + size, 7 + size] if free_warp else []), 8 + size]
             # The warp is applied alike whether it is free or not.
             torch.testing.assert_close(problem.rows(state), whole.rows(state)[..., wanted, :], rtol=0, atol=0)
@@ -134,7 +135,7 @@ class TestRows:
             held = [i for i in range(size) if i not in free]
             assert torch.equal(after.parameters[held], state.parameters[held])
             assert torch.equal(after.parameters[free], state.parameters[free] + 1.0)
-            assert torch.equal(after.warp, state.warp + (1.0 if free_warp else 0.0))
+            assert torch.equal(after.board, state.board + (1.0 if free_warp else 0.0))
 
     @pytest.mark.parametrize("order", [[7, 0, 3], [1, 0]])
     def test_order_of_free_parameters_is_kept(self, order: list[int], kind: str) -> None:
@@ -147,8 +148,8 @@ class TestRows:
 
     def test_batch(self, kind: str) -> None:
         pixels, model, state = scene("opencv5", kind=kind, missing=True, batch=(2, 2))
-        together = BoardProblem(BOARD.points, pixels, model, free_all(model), free_warp=True, batch=(2, 2))
-        alone = BoardProblem(BOARD.points, pixels, model, free_all(model), free_warp=True)
+        together = BoardProblem(BOARD.points, pixels, model, free_all(model), free_board=True, batch=(2, 2))
+        alone = BoardProblem(BOARD.points, pixels, model, free_all(model), free_board=True)
         for element in itertools.product(range(2), range(2)):
             one = map_state(lambda tensor, element=element: tensor[element], state)
             torch.testing.assert_close(together.rows(state)[element], alone.rows(one), rtol=1e-13, atol=1e-14)
@@ -163,7 +164,7 @@ class TestResiduals:
         pixels, model, state = scene(name, missing=missing)
         problem = BoardProblem(BOARD.points, pixels, model)
         bent = BOARD.points.clone()
-        bent[:, 2] = state.warp @ warp_shape(BOARD.points)
+        bent[:, 2] = state.board @ warp_modes(BOARD.points)[:, 2]
         residuals = problem.residuals(state).unflatten(-1, (2, -1))
         camera = Camera(state.parameters, size=(4, 3), model=model)
         for v in range(VIEWS):
@@ -210,7 +211,7 @@ class TestResiduals:
 
     def test_warp_is_the_deflection_at_the_middle(self) -> None:
         board = Board(columns=5, rows=3, square=0.1)
-        shape = warp_shape(board.points)
+        shape = warp_modes(board.points)[:, 2]
         middle = 1 * 5 + 2
         assert shape[:, middle].tolist() == [1.0, 1.0]
         for corner in (0, 4, 10, 14):

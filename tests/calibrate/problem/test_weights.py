@@ -2,9 +2,10 @@ import pytest
 import torch
 from calibrate_scenes import camera, motions, observe, pixels_of
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.weights import whitening
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.weights import whitening
 from kcal.corners.observations import Observations
 from kcal.lens.pose import rotation_from_vector
 
@@ -81,7 +82,7 @@ def test_rows_are_the_derivatives_of_weighted_residuals():
     weights = torch.where(torch.isnan(pixels)[..., None], torch.nan, root)
     board = observe(pixels).board.points
     free = [0, 1, 2, 3, 5, 6]
-    problem = BoardProblem(board, pixels, truth.model, free, whitening=weights)
+    problem = BoardProblem(board, pixels, truth.model, free, weights=weights)
     state = BoardState.flat(
         truth.params.detach() + 0.01,
         rotation_from_vector(torch.full((3, 3), 1e-3, dtype=torch.float64)) @ rotation,

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.coefficient_prior import CoefficientPrior
-from kcal.calibrate.bundle.priors import GaussianPrior, Term
+from kcal.calibrate.problem.coefficient_prior import CoefficientPrior
+from kcal.calibrate.problem.priors import GaussianPrior, Term
 from kcal.errors import InputError
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
@@ -40,6 +40,11 @@ class FreeParameters:
     def __iter__(self) -> Iterator[int]:
         """The parameters' indices."""
         return iter(self.indices)
+
+    @property
+    def leading(self) -> tuple[int, ...]:
+        """For each unknown the index of the first parameter that follows it."""
+        return tuple(self.indices[self.slots.index(slot)] for slot in range(len(self)))
 
     def collapse(self, columns: Tensor, dim: int) -> Tensor:
         """Derivatives by each unknown, from those by each parameter along `dim`: tied ones are added."""

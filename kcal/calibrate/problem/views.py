@@ -10,9 +10,10 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.board_problem import BoardProblem, BoardState
-from kcal.calibrate.bundle.parameters import FreeParameters, ParameterConstraints
-from kcal.calibrate.bundle.priors import Term
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.parameters import FreeParameters, ParameterConstraints
+from kcal.calibrate.problem.priors import Term
+from kcal.calibrate.problem.state import BoardState
 from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names, project_components
 from kcal.solve.robust import RobustLoss
@@ -71,8 +72,8 @@ class Views:
             self.pixels,
             model,
             free,
-            free_warp=self.free_warp,
-            whitening=self.whitening,
+            free_board=self.free_warp,
+            weights=self.whitening,
             loss=self.loss,
             terms=terms,
             batch=batch,

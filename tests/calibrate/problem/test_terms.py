@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.bundle.priors import FoldBarrier, GaussianPrior
-from kcal.calibrate.bundle.twist import apply_twist
+from kcal.calibrate.problem.priors import FoldBarrier, GaussianPrior
+from kcal.calibrate.problem.twist import apply_twist
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 

@@ -7,7 +7,7 @@ from collections.abc import Collection
 
 import torch
 
-from kcal.calibrate.bundle.priors import GaussianPrior
+from kcal.calibrate.problem.priors import GaussianPrior
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
 

@@ -1,0 +1,339 @@
+"""Least squares of one camera and the boards that it sees, for every lens alike (Eq. 5 and 7 of the paper).
+
+Shared unknowns: those of the camera's parameters that are free, and amplitudes of the board's modes. Local ones: for
+each view the pose of the board, and its motion while the image is read (`kcal.calibrate.problem.readout`).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.problem.parameters import FreeParameters
+from kcal.calibrate.problem.priors import GaussianPrior, Term
+from kcal.calibrate.problem.readout import MOTION, Readout
+from kcal.calibrate.problem.state import BoardState, warp_modes
+from kcal.calibrate.problem.twist import apply_twist
+from kcal.lens.model import LensModel
+from kcal.lens.pose import nearest_rotation, step_rows
+from kcal.lens.projection import INTRINSICS, project_components
+from kcal.solve.result import State
+from kcal.solve.robust import RobustLoss
+from kcal.solve.schur import SchurLinearization, SchurProblem, without_local
+
+_ALL = slice(None)
+POSE = 6
+# Numbers in the rows of derivatives that are formed at a time: as many as fit into the cache of one core.
+_CHUNK = 600_000
+# Unknowns up to which a linearization costs little more than the cost alone.
+_FEW = 40
+
+
+class BoardProblem(SchurProblem[BoardState]):
+    """Reprojection residuals (pixels) of one camera's views of a board, for `kcal.solve.lm.minimize`.
+
+    Args:
+        board_points: (N, 3) meters.
+        pixels: (..., V, N, 2) observed corners; NaN where not seen. Leading dimensions broadcast with `batch`.
+        model: the lens model.
+        free: indices of the camera's free parameters, or which of them are tied.
+        shapes: (B, 3, N) displacements of the corners by the board's modes, meters; None: the two parabolas of a warp.
+        free_board: whether the amplitudes of these modes are estimated.
+        held: (S,) unknowns that keep their values all the same; None: none does.
+        weights: (..., V, N) or (..., V, N, 2, 2) by which each corner's residual is multiplied; 0 leaves it out. None:
+            all corners count alike.
+        loss: of the length of each corner's residual (after weighting), or None for plain least squares.
+        terms: priors and barriers on the camera's parameters and the board's amplitudes, as further residuals.
+        readout: how views move while they are read; None: they stand still.
+        stillness: (12,) the squared noise over the variance of each number of a motion.
+        batch: leading shape of the states, () for one solve.
+
+    Attributes:
+        moving: (M,) numbers of the unknowns that are not held.
+        slots: (5 + P + B,) for each of `values` its place among these; -1 where it has none.
+
+    Example:
+        >>> from kcal.lens.camera import Camera
+        >>> from kcal.lens.pose import rotation_from_vector
+        >>> from kcal.solve.lm import minimize
+        >>> camera = Camera.build(focal=(800, 805), center=(322, 238), size=(640, 480), model="pinhole")
+        >>> board = 0.05 * torch.cartesian_prod(torch.arange(6.0), torch.arange(5.0), torch.zeros(1)).double()
+        >>> tilts = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.1, 0.0], [0.0, 0.5, 0.2]], dtype=torch.float64)
+        >>> rotation, translation = rotation_from_vector(tilts), torch.tensor([[-0.1, -0.1, 0.6]] * 3).double()
+        >>> pixels, _ = camera.project(board @ rotation.mT + translation[:, None])
+        >>> problem = BoardProblem(board, pixels, camera.model, free=[0, 1, 2, 3])  # fx, fy, cx, cy
+        >>> guess = torch.tensor([700.0, 700.0, 320.0, 240.0, 0.0], dtype=torch.float64)
+        >>> result = minimize(problem, BoardState.flat(guess, rotation, translation))
+        >>> [round(float(value), 6) for value in result.state.parameters[:4]], bool(result.converged)
+        ([800.0, 805.0, 322.0, 238.0], True)
+    """
+
+    def __init__(
+        self,
+        board_points: Tensor,
+        pixels: Tensor,
+        model: LensModel,
+        free: Sequence[int] | FreeParameters = (),
+        *,
+        shapes: Tensor | None = None,
+        free_board: bool = False,
+        held: Tensor | None = None,
+        weights: Tensor | None = None,
+        loss: RobustLoss | None = None,
+        terms: Sequence[Term] = (),
+        readout: Readout | None = None,
+        stillness: Tensor | None = None,
+        batch: tuple[int, ...] = (),
+    ) -> None:
+        self.model, self.loss, self.terms, self.batch = model, loss, tuple(terms), batch
+        self.free, self.free_board = FreeParameters.of(free), free_board
+        self.board_points, self._board = board_points, board_points.T.contiguous()
+        self.shapes = warp_modes(board_points) if shapes is None else shapes
+        self.seen = torch.isfinite(pixels).all(-1)
+        if weights is not None and weights.ndim == self.seen.ndim:
+            self.seen = self.seen & (weights > 0)
+        self._target = torch.where(self.seen[..., None], pixels, 0.0).transpose(-1, -2).contiguous()
+        self._weigh(weights)
+        self.residual_count = 2 * int(self.seen.sum((-2, -1)).max())
+        self.readout = readout
+        self.local_size = POSE + (MOTION if readout else 0)
+        if readout is not None:
+            self._time = readout.time(pixels)
+            self._still = torch.zeros(MOTION, dtype=pixels.dtype) if stillness is None else stillness
+        self.unknown_count = len(self.free) + len(self.shapes) * free_board
+        self.moving = torch.arange(self.unknown_count) if held is None else (~held).nonzero()[:, 0]
+        self.shared_size = len(self.moving)
+        self._all_move = self.shared_size == self.unknown_count
+        self.joint = self.shared_size <= _FEW
+        self.slots = self._places(model.size)
+
+    def _weigh(self, weights: Tensor | None) -> None:
+        self.weights: Tensor | None = None  # (..., V, N) or (..., V, 2, 2, N)
+        self._counts = self.seen
+        if weights is not None and weights.ndim > self.seen.ndim:
+            self.weights = torch.where(self.seen[..., None, None], weights, 0.0).movedim(-3, -1).contiguous()
+        elif weights is not None:
+            self.weights = torch.where(self.seen, weights, 0.0)
+            self._counts = self.weights > 0
+        self._all_count = bool(self._counts.all())
+
+    def _places(self, coefficients: int) -> Tensor:
+        """(5 + P + B,) the place of each of `values` among the unknowns of a step; -1 where it has none."""
+        slots = torch.full((len(INTRINSICS) + coefficients + len(self.shapes),), -1)
+        slots[list(self.free.indices)] = torch.tensor(self.free.slots, dtype=torch.long)
+        if self.free_board:
+            slots[len(slots) - len(self.shapes) :] = torch.arange(len(self.free), self.unknown_count)
+        # One more, for values that are no unknowns.
+        place = torch.full((self.unknown_count + 1,), -1)
+        place[self.moving] = torch.arange(self.shared_size)
+        return place[slots]
+
+    def with_weights(self, weights: Tensor) -> BoardProblem:
+        """The same problem with other weights (V, N) of its corners."""
+        changed = copy.copy(self)
+        changed._weigh(weights)
+        return changed
+
+    @property
+    def pixels(self) -> Tensor:
+        """(..., V, N, 2) observed corners; NaN where not seen."""
+        return torch.where(self.seen[..., None], self._target.transpose(-1, -2), torch.nan)
+
+    @property
+    def prior_count(self) -> int:
+        """Number of scalar residuals that are priors."""
+        return sum(len(term.index) for term in self.terms if isinstance(term, GaussianPrior))
+
+    def select(self, elements: Tensor) -> BoardProblem | None:
+        """See `Problem.select`."""
+        if len(self.batch) != 1:
+            return None
+        part = copy.copy(self)
+        part.batch = (len(elements),)
+        if self.seen.ndim > 2:
+            part.seen, part._target, part._counts = self.seen[elements], self._target[elements], self._counts[elements]
+            part._all_count = bool(part._counts.all())
+            if self.weights is not None:
+                part.weights = self.weights[elements]
+        return part
+
+    def values(self, state: BoardState) -> Tensor:
+        """(..., 5 + P + B) the camera's parameters and the board's amplitudes, which terms are about."""
+        return torch.cat([state.parameters, state.board], -1)
+
+    def unknowns(self, state: BoardState) -> Tensor:
+        """(..., S) values of the shared unknowns, those that are held among them."""
+        own = state.parameters[..., list(self.free.leading)]
+        return torch.cat([own, state.board], -1) if self.free_board else own
+
+    def _placed(self, state: BoardState, views: slice = _ALL) -> _Placed:
+        flat = self._board
+        if len(self.shapes) and (self.free_board or bool(state.board.any())):
+            flat = flat + torch.einsum("...b,bkn->...kn", state.board, self.shapes)[..., None, :, :]
+        if self.readout is None:
+            rotated = state.rotation @ flat
+            return _Placed(flat, rotated, rotated + state.translation[..., None], None)
+        flat = flat.squeeze(0)
+        moved = self.readout.moved(state.motion, self._time[views], flat)
+        rotated = state.rotation @ moved.points
+        return _Placed(flat, rotated, rotated + state.translation[..., None] + moved.shift, moved.turn)
+
+    def points(self, state: BoardState) -> Tensor:
+        """(..., V, N, 3) the board's corners in the camera's frame, meters."""
+        return self._placed(state).points.transpose(-1, -2)
+
+    def pixel_errors(self, state: BoardState) -> Tensor:
+        """Projected minus observed, (..., V, 2, N) pixels, not weighted; 0 where not seen.
+
+        NaN where a seen corner lies behind the camera, or beyond a pole or a fold of the lens.
+        """
+        projected = project_components(self._placed(state).points, state.parameters[..., None, :], self.model)
+        bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
+        return torch.where(self.seen[..., None, :], projected.pixels - self._target + bad, 0.0)
+
+    def corner_residuals(self, state: BoardState, *, weighted: bool = False) -> Tensor:
+        """(..., V, N, 2) residuals by corner; NaN where not seen."""
+        errors = self.pixel_errors(state)
+        if weighted:
+            errors = self._weighted(errors[..., None, :, :])[..., 0, :, :]
+        return torch.where(self.seen[..., None], errors.transpose(-1, -2), torch.nan)
+
+    def residuals(self, state: BoardState) -> Tensor:
+        """See `SchurProblem.residuals`: weighted `pixel_errors`, u of all corners, then v; last those of motions."""
+        errors = self._weighted(self.pixel_errors(state)[..., None, :, :])[..., 0, :, :].flatten(-2)
+        return errors if self.readout is None else torch.cat([errors, self._still.sqrt() * state.motion], -1)
+
+    def view_cost(self, state: BoardState) -> Tensor:
+        """See `SchurProblem.view_cost`."""
+        residuals = self.residuals(state)
+        if self.loss is None:
+            return 0.5 * residuals.square().sum(-1)
+        corners = 2 * self._board.shape[-1]
+        squared = residuals[..., :corners].unflatten(-1, (2, -1)).square().sum(-2)
+        return 0.5 * (self.loss.value(squared).sum(-1) + residuals[..., corners:].square().sum(-1))
+
+    def _weighted(self, vectors: Tensor, views: slice = _ALL) -> Tensor:
+        """Vectors (..., V, Q, 2, N) of pixels, multiplied by the corners' weights; 0 where these are zero."""
+        if self.weights is None:
+            return vectors
+        if self.weights.ndim > self.seen.ndim:
+            return torch.einsum("...uwn,...qwn->...qun", self.weights[..., views, :, :, :], vectors)
+        weights = self.weights[..., views, None, None, :]
+        # Without an image a corner of weight zero is NaN.
+        return torch.where(weights > 0, vectors * weights, 0.0)
+
+    def corner_rows(self, state: BoardState, views: slice = _ALL) -> Tensor:
+        """(..., V, L + S + 1, 2 N) as `rows`, of the corners alone."""
+        flat, rotated, points, turn = self._placed(state, views)
+        projected = project_components(points, state.parameters[..., None, :], self.model, self.free.indices)
+        parts = [step_rows(projected.by_point, rotated)]
+        if self.readout is not None:
+            parts.append(self.readout.columns_of(projected.by_point, state.rotation, self._time[views], flat))
+        parts.append(self.free.collapse(projected.by_camera, -3))
+        if self.free_board:
+            by_board = torch.einsum("...vkun,...vkl->...vlun", projected.by_point, state.rotation)
+            if turn is not None:
+                # What displaces a corner of the board turns with it.
+                by_board = by_board + torch.linalg.cross(by_board, turn[:, :, None].expand_as(by_board), dim=1)
+            parts.append(torch.einsum("...vlun,bln->...vbun", by_board, self.shapes))
+        bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
+        error = projected.pixels - self._target[..., views, :, :] + bad
+        rows = torch.cat([*parts, error[..., None, :, :]], -3)
+        if not self._all_count:
+            rows = torch.where(self._counts[..., views, None, None, :], rows, 0.0)
+        rows = self._weighted(rows, views)
+        if self.loss is not None:
+            squared = rows[..., -1, :, :].square().sum(-2)
+            rows = rows * self.loss.weight(squared).sqrt()[..., None, None, :]
+        rows = rows.flatten(-2)
+        if not self._all_move:
+            held = torch.ones(self.unknown_count, dtype=torch.bool).index_fill_(0, self.moving, False)
+            rows[..., self.local_size : -1, :].masked_fill_(held[:, None], 0.0)
+        return rows
+
+    def rows(self, state: BoardState, views: slice = _ALL) -> Tensor:
+        """See `SchurProblem.rows`; with `views` given, of a state of these alone. Zero by unknowns that are held."""
+        rows = self.corner_rows(state, views)
+        if self.readout is None:
+            return rows
+        prior = rows.new_zeros(*rows.shape[:-1], MOTION)
+        prior[..., POSE : self.local_size, :] = torch.diag(self._still.sqrt())
+        prior[..., -1, :] = self._still.sqrt() * state.motion
+        return torch.cat([rows, prior], -1)
+
+    def _chunks(self, state: BoardState) -> Iterator[tuple[BoardState, slice]]:
+        """The state of a few views at a time, so that their rows stay in the cache."""
+        count, row = state.rotation.shape[-3], 2 * self._board.shape[-1] * max(1, math.prod(self.batch))
+        size = max(1, _CHUNK // (row * (self.local_size + self.unknown_count + 1)))
+        for start in range(0, count, size):
+            views = slice(start, start + size)
+            yield (state if size >= count else state.views(views)), views
+
+    def linearize(self, state: BoardState) -> SchurLinearization:
+        """See `Problem.linearize`; by the unknowns that are not held."""
+        L = self.local_size
+        columns = [*(L + self.moving).tolist(), -1]
+        local, right, total = [], [], self.shared_gram(state)
+        for part, views in self._chunks(state):
+            rows = self.rows(part, views)
+            own, others = rows[..., :L, :], rows[..., L:, :] if self._all_move else rows[..., columns, :]
+            local.append(own @ own.transpose(-1, -2))
+            right.append(own @ others.transpose(-1, -2))
+            flat = others.transpose(-3, -2).flatten(-2)
+            total = total + flat @ flat.transpose(-1, -2)
+        linear = SchurLinearization(torch.cat(local, -3), torch.cat(right, -3), total)
+        if self.loss is not None:
+            linear.cost = self.cost(state)
+        return linear
+
+    def off_poses(self, state: BoardState) -> Tensor:
+        """(V, S + 1, R) derivatives by the shared unknowns, and residuals, off what poses and motions can do (QR)."""
+        return torch.cat([without_local(self.rows(part, v), self.local_size) for part, v in self._chunks(state)])
+
+    def motion_off_poses(self, state: BoardState) -> Tensor:
+        """(V, 12 + S + 1, 2 N) derivatives by motion and the shared unknowns, and residuals, off what poses can do."""
+        return torch.cat([without_local(self.corner_rows(part, v), POSE) for part, v in self._chunks(state)])
+
+    def shared_gram(self, state: BoardState) -> Tensor:
+        """See `SchurProblem.shared_gram`: of the terms."""
+        values = self.values(state)
+        total = values.new_zeros(*values.shape[:-1], self.shared_size + 1, self.shared_size + 1)
+        for term in self.terms:
+            term.add_to(total, values, self.slots)
+        return total
+
+    def shared_cost(self, state: BoardState) -> Tensor:
+        """See `SchurProblem.shared_cost`: of the terms."""
+        values = self.values(state)
+        return sum((term.cost(values) for term in self.terms), start=values.new_zeros(values.shape[:-1]))
+
+    def retract(self, state: BoardState, step: State) -> BoardState:
+        """See `SchurProblem.retract`."""
+        shared, local = step
+        if not self._all_move:
+            shared = shared.new_zeros(self.unknown_count).index_copy(0, self.moving, shared)
+        count = len(self.free)
+        parameters = state.parameters.clone()
+        parameters[..., list(self.free)] += self.free.expand(shared[..., :count])
+        board = state.board + shared[..., count:] if self.free_board else state.board
+        rotation, translation = apply_twist(state.rotation, state.translation, local[..., :POSE])
+        motion = state.motion if self.readout is None else state.motion + local[..., POSE:]
+        return BoardState(parameters, board, rotation, translation, motion)
+
+    def tidy(self, state: BoardState) -> BoardState:
+        """The state with its rotations made orthonormal again after many small steps."""
+        return state._replace(rotation=nearest_rotation(state.rotation))
+
+
+class _Placed(NamedTuple):
+    """The board (..., 3, N) in its frame; in each view rotated, and in the camera's frame; turns while it is read."""
+
+    flat: Tensor
+    rotated: Tensor
+    points: Tensor
+    turn: Tensor | None

@@ -1,0 +1,45 @@
+"""What corners and priors say of a camera and of its board, for every lens alike."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.priors import GaussianPrior
+from kcal.calibrate.problem.state import BoardState
+from kcal.lens.information import CameraInformation, triangular
+
+
+def information_of(
+    problem: BoardProblem, state: BoardState, noise: float, off: Tensor | None = None
+) -> CameraInformation:
+    """Square roots of information about all unknowns that are not held, poses and motions eliminated.
+
+    Args:
+        problem: with the Gaussian priors that count; barriers are no information.
+        state: its minimum.
+        noise: px, of a corner of weight one.
+        off: `BoardProblem.off_poses`, if it is known already.
+    """
+    off = problem.off_poses(state) if off is None else off
+    moving = problem.moving
+    rows = off.transpose(0, 1).flatten(1)[[*moving.tolist(), -1]].T / noise
+    triangle = triangular(rows)[:-1]
+    precision = rows.new_zeros(len(moving))
+    mean = torch.zeros_like(precision)
+    for term in problem.terms:
+        if isinstance(term, GaussianPrior):
+            place, weight = problem.slots[term.index], (term.weight / noise).square()
+            free = place >= 0
+            # Parameters that are equal may have a prior each: the product of both.
+            precision.index_add_(0, place[free], weight[free])
+            mean.index_add_(0, place[free], (weight * term.mean)[free])
+    return CameraInformation(
+        slots=tuple(problem.slots[: len(state.parameters)].tolist()),
+        estimate=problem.unknowns(state)[moving],
+        rows=triangle[:, :-1],
+        residuals=triangle[:, -1],
+        mean=torch.where(precision > 0, mean / precision, 0.0),
+        sigma=precision.rsqrt(),
+    )
