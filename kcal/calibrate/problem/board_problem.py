@@ -117,7 +117,7 @@ class BoardProblem(SchurProblem[BoardState]):
         self._counts = self.seen
         if weights is not None and weights.ndim > self.seen.ndim:
             self.weights = torch.where(self.seen[..., None, None], weights, 0.0).movedim(-3, -1).contiguous()
-        elif weights is not None:
+        elif weights is not None and not bool((weights[self.seen] == 1.0).all()):
             self.weights = torch.where(self.seen, weights, 0.0)
             self._counts = self.weights > 0
         self._all_count = bool(self._counts.all())
@@ -280,13 +280,20 @@ class BoardProblem(SchurProblem[BoardState]):
         columns = [*(L + self.moving).tolist(), -1]
         local, right, total = [], [], self.shared_gram(state)
         for part, views in self._chunks(state):
-            rows = self.rows(part, views)
+            rows = self.corner_rows(part, views)
             own, others = rows[..., :L, :], rows[..., L:, :] if self._all_move else rows[..., columns, :]
             local.append(own @ own.transpose(-1, -2))
             right.append(own @ others.transpose(-1, -2))
             flat = others.transpose(-3, -2).flatten(-2)
             total = total + flat @ flat.transpose(-1, -2)
-        linear = SchurLinearization(torch.cat(local, -3), torch.cat(right, -3), total)
+        by_pose, by_both = torch.cat(local, -3), torch.cat(right, -3)
+        if self.readout is not None:
+            # The prior of motions.
+            pull = self._still * state.motion
+            by_pose.diagonal(dim1=-2, dim2=-1)[..., POSE:] += self._still
+            by_both[..., POSE:, -1] += pull
+            total[..., -1, -1] += (pull * state.motion).sum((-2, -1))
+        linear = SchurLinearization(by_pose, by_both, total)
         if self.loss is not None:
             linear.cost = self.cost(state)
         return linear
