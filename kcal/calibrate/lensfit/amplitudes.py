@@ -18,7 +18,7 @@ import torch
 
 from kcal.calibrate.lensfit.evidence import Maximum, evidence_loss, hyper_bounds
 from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
-from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
+from kcal.calibrate.lensfit.quadratic import ViewData
 
 Loss = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
@@ -31,7 +31,7 @@ _WIDEST = 2.0
 
 
 def expected_maximum(
-    data: Quadratic | ViewData, families: PriorFamilies, best: Maximum, hyperprior: Hyperprior, tempering: float = 1.0
+    data: ViewData, families: PriorFamilies, best: Maximum, hyperprior: Hyperprior, tempering: float = 1.0
 ) -> Maximum:
     """The maximum of the evidence with all amplitudes in use, those of motions too, replaced by √<A²>.
 

@@ -11,7 +11,7 @@ from kcal.calibrate.lensfit.base_fit import Estimate
 from kcal.calibrate.lensfit.board_modes import STRETCH, BoardModes
 from kcal.calibrate.lensfit.evidence_rounds import Rounds, expected_estimate
 from kcal.calibrate.lensfit.families import BOARD, Hyperprior, PriorFamilies
-from kcal.calibrate.lensfit.quadratic import ViewData, posterior_root
+from kcal.calibrate.lensfit.quadratic import posterior_root
 
 # Stretch that a print may have whatever this board's amplitude is, in units of its extent to each side: one tenth of a
 # percent, or two of its length. Boards that are upright in all views do not tell it from the aspect of pixels.
@@ -48,9 +48,9 @@ def aspect_of(rounds: Rounds, never: Tensor) -> tuple[float, float]:
     families, h = estimate.families, estimate.hyperparameters.clone()
     h[BOARD + STRETCH] = h[BOARD + STRETCH].clamp_min(math.log(_PRINTED))
     deviation = torch.where(never, 0.0, families.deviation(h))
-    still = data.integrated(estimate.log_ratio).data if isinstance(data, ViewData) else data
+    still = data.integrated(estimate.log_ratio).data
     half = posterior_root(still.K, deviation, estimate.variance) * deviation
-    x = half.T @ (half @ still.g) / estimate.variance + families.mean
+    x = half.T @ (half @ (still.g + still.K @ still.at)) / estimate.variance + families.mean
     columns, rows = 0, len(x) - len(rounds.capture.board.unit) - 1
     aspect = float(x[rows] / x[columns])
     slope = torch.zeros_like(x)

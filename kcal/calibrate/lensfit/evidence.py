@@ -1,7 +1,7 @@
 """How large each family of unknowns may be, told by the data: amplitudes and noise that maximize the evidence.
 
-Near a solution residuals are linear in lens and board: chi²(x) = c - 2 gᵀx + xᵀKx, poses eliminated. With Gaussian
-priors of variances D(h) the unknowns can be integrated out, and
+Near a solution residuals are linear in lens and board (`kcal.calibrate.lensfit.quadratic`), poses eliminated. With
+Gaussian priors of variances D(h) the unknowns can be integrated out, and
 
     -2 ln p(data | h, σ²) = ν ln σ² + rss/σ² + |y|² + ln |I + √D K √D / σ²|,   x = √D y at its best,
 
@@ -34,65 +34,25 @@ _ROUGHLY = {"maxiter": 200, "ftol": 1e-6, "gtol": 0.05, "maxcor": 20}
 _HIGHEST = 300.0
 
 
-class _Root(NamedTuple):
-    """The same without squares: chi²(x) = |rows x - target|² + rest.
-
-    Attributes:
-        rows: (R, S).
-        target: (R,).
-        rest: number.
-    """
-
-    rows: Tensor
-    target: Tensor
-    rest: float
-
-
-def _rooted(data: Quadratic) -> _Root:
-    # In units of the diagonal, below which nothing but rounding is left of directions that the data do not determine.
-    scale = data.K.diagonal().clamp_min(1e-300).rsqrt()
-    values, vectors = torch.linalg.eigh(data.K * scale[:, None] * scale)
-    kept = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
-    root, vectors = values[kept].sqrt(), vectors[:, kept]
-    target = vectors.T @ (scale * data.g) / root
-    return _Root((vectors * root).T / scale, target, max(data.c - float(target @ target), 0.0))
-
-
 def negative_log_evidence(data: Quadratic, families: PriorFamilies, v: np.ndarray) -> tuple[float, np.ndarray]:
-    """The negative logarithm of the evidence of v = (h, ln σ²), (H + 1,), and its gradient."""
-    return _still_evidence(_rooted(data), data.freedom, families, v)
-
-
-def _still_evidence(data: _Root, freedom: float, families: PriorFamilies, v: np.ndarray) -> tuple[float, np.ndarray]:
-    here, s = torch.from_numpy(v[:-1]), math.exp(0.5 * v[-1])
-    d = families.deviation(here) / s
-    size = len(d)
-    # Rows of data and priors, and the last column their target. Never squared: amplitudes may be so wide, or so close
-    # to zero, that a factor of the normal matrix would be rounding.
-    stacked = torch.zeros(len(data.rows) + size, size + 1, dtype=d.dtype)
-    stacked[: len(data.rows), :-1], stacked[: len(data.rows), -1] = data.rows * d, data.target / s
-    stacked[len(data.rows) :].fill_diagonal_(1.0)
-    triangle = torch.linalg.qr(stacked, mode="r")[1]
-    root, corner = triangle[:size, :size], float(triangle[size, size])
-    inverse = torch.linalg.solve_triangular(root, torch.eye(size, dtype=d.dtype), upper=True)
-    y2, kept = (inverse @ triangle[:size, -1]).square(), inverse.square().sum(1)
-    chi2 = corner**2 - float(y2.sum()) + data.rest / s**2
-    value = 0.5 * (freedom * v[-1] + corner**2 + data.rest / s**2) + float(root.diagonal().abs().log().sum())
-    by_h = (families.slopes(here) @ (0.5 * (1.0 - y2 - kept))).numpy()
-    return value, np.append(by_h, 0.5 * (freedom - (size - float(kept.sum())) - chi2))
+    """The negative logarithm of the evidence of v = (h, ln σ²), (H + 1,), and its gradient; infinite beyond numbers."""
+    found = _evidence(data, families, v[:-1], v[-1])
+    if found is None:
+        return math.inf, np.zeros_like(v)
+    return found.value, np.append(found.by_h, found.by_noise)
 
 
 class _Evidence(NamedTuple):
-    """-ln p, its derivatives by h (H,) and ln σ², and the posterior: x (S,) and F (S, S), FᵀF its covariance."""
+    """-ln p, its derivatives by h (H,) and ln σ², and the posterior: δ (S,) and F (S, S), FᵀF its covariance."""
 
     value: float
     by_h: np.ndarray
     by_noise: float
-    x: np.ndarray
+    step: np.ndarray
     factor: Tensor
 
 
-def _moving_evidence(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Evidence | None:
+def _evidence(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Evidence | None:
     """None where priors are too wide for the precision of numbers."""
     K, g, c, freedom = data.K.numpy(), data.g.numpy(), data.c, data.freedom
     here = torch.from_numpy(h)
@@ -105,14 +65,16 @@ def _moving_evidence(data: Quadratic, families: PriorFamilies, h: np.ndarray, lo
         return None
     inverse = torch.linalg.solve_triangular(root, torch.eye(len(g), dtype=A.dtype), upper=False)
     half = inverse.numpy()
-    y = half.T @ (half @ (d * g / s2))
+    # The solution in units of the priors, and from there the posterior's covariance times the gradient.
+    y = np.divide(data.at.numpy(), d, out=np.zeros_like(d), where=d > 0)
+    change = half.T @ (half @ (d * g / s2 - y))
+    y, step = y + change, d * change
     kept = (half**2).sum(0)
-    x = d * y
-    rss = c - 2 * g @ x + x @ (K @ x)
+    rss = c - 2 * g @ step + step @ (K @ step)
     value = 0.5 * (freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
     by_h = families.slopes(here).numpy() @ (0.5 * (1 - y * y - kept))
     by_noise = 0.5 * (freedom - (len(g) - kept.sum()) - rss / s2)
-    return _Evidence(value, by_h, by_noise, x, inverse * torch.from_numpy(d))
+    return _Evidence(value, by_h, by_noise, step, inverse * torch.from_numpy(d))
 
 
 class Maximum(NamedTuple):
@@ -132,7 +94,7 @@ class Maximum(NamedTuple):
 
 
 def maximize_evidence(
-    data: Quadratic | ViewData,
+    data: ViewData,
     families: PriorFamilies,
     h: Tensor,
     variance: float,
@@ -154,7 +116,7 @@ def maximize_evidence(
         rough: end within some hundredths of a nat, for data that will change.
     """
     prior = hyperprior or typical_hyperprior()
-    ratios = np.zeros(0) if not isinstance(data, ViewData) or log_ratio is None else log_ratio
+    ratios = np.zeros(0) if log_ratio is None else log_ratio
     count = len(prior.mean)
     log_variance = math.log(variance)
     bounds = hyper_bounds(prior, len(ratios), log_variance)
@@ -181,32 +143,26 @@ def hyper_bounds(prior: Hyperprior, motions: int, log_variance: float) -> list[t
 
 
 def evidence_loss(
-    data: Quadratic | ViewData, families: PriorFamilies, prior: Hyperprior, tempering: float
+    data: ViewData, families: PriorFamilies, prior: Hyperprior, tempering: float
 ) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
     """The negative logarithm of evidence and hyperprior of v = (h, logarithms of ratios, ln σ²), and its gradient."""
     mean, sd = prior.mean.numpy(), prior.sd.numpy()
     count = len(mean)
-    root = None if isinstance(data, ViewData) else _rooted(data.tempered(tempering))
     values: list[float] = []
 
     def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
         here, ratio, log_variance = v[:count], v[count:-1], v[-1]
-        z = (here - mean) / sd
-        if not isinstance(data, ViewData):
-            assert root is not None
-            value, slope = _still_evidence(root, data.freedom / tempering, families, v)
-            return value + 0.5 * float(z @ z), slope + np.append(z / sd, 0.0)
         integrated = data.integrated(ratio)
         tempered = integrated.data.tempered(tempering)
-        found = _moving_evidence(tempered, families, here, log_variance) if log_variance < _HIGHEST else None
+        found = _evidence(tempered, families, here, log_variance) if log_variance < _HIGHEST else None
         if found is None:
             # Priors are far too wide for this precision, or a first step was far too long: worse than any trial before,
             # so that a shorter step follows.
             return max(values, default=1e30) + 1.0, np.zeros_like(v)
         # The prior of the motions' amplitudes is about these, not about their ratios to the noise.
-        w = (ratio + 0.5 * log_variance - math.log(MEDIAN)) / SPREAD
+        z, w = (here - mean) / sd, (ratio + 0.5 * log_variance - math.log(MEDIAN)) / SPREAD
         values.append(found.value + 0.5 * (float(z @ z) + integrated.log_determinant / tempering + float(w @ w)))
-        by_ratio = integrated.slopes(found.x, found.factor, math.exp(log_variance), tempering) + w / SPREAD
+        by_ratio = integrated.slopes(found.step, found.factor, math.exp(log_variance), tempering) + w / SPREAD
         by_noise = found.by_noise + 0.5 * float(w.sum()) / SPREAD
         return values[-1], np.concatenate([found.by_h + z / sd, by_ratio, [by_noise]])
 
@@ -219,6 +175,6 @@ def evidence_of_motion(data: ViewData, best: Maximum, families: PriorFamilies, t
     moving = data.integrated(best.log_ratio)
     losses = []
     for quadratic, determinant in ((data.still, 0.0), (moving.data, moving.log_determinant)):
-        found = _moving_evidence(quadratic.tempered(tempering), families, best.h.numpy(), log_variance)
+        found = _evidence(quadratic.tempered(tempering), families, best.h.numpy(), log_variance)
         losses.append(math.inf if found is None else found.value + 0.5 * determinant / tempering)
     return losses[0] - losses[1]

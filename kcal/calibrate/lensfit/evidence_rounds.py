@@ -17,7 +17,7 @@ from kcal.calibrate.lensfit.board_modes import BoardModes
 from kcal.calibrate.lensfit.evidence import WORTH, Maximum, evidence_of_motion, maximize_evidence
 from kcal.calibrate.lensfit.families import Hyperprior
 from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem
-from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, overdispersion, quadratic_of, view_data
+from kcal.calibrate.lensfit.quadratic import ViewData, overdispersion, view_data
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.readout import AMPLITUDES, LARGEST, MOTION, Readout, motion_sigma, stillness
 from kcal.solve.lm import LMOptions, minimize
@@ -105,19 +105,11 @@ class FittedViews:
         result = minimize(problem, estimate.state, options)
         return problem, estimate._replace(state=result.state), int(result.iterations)
 
-    def data(self, problem: BoardProblem, estimate: Estimate, never: Tensor) -> tuple[Quadratic | ViewData, Tensor]:
-        """What the views say near an estimate, and the scores (V, S) of views as if they stood still."""
-        state = estimate.state
-        x = problem.unknowns(state) - estimate.families.mean
-        if problem.readout is None:
-            off = problem.off_poses(state)
-            off[:, :-1][:, never] = 0.0
-            score = (off[:, :-1] @ off[:, -1, :, None])[..., 0]
-            return quadratic_of(off, x, self.freedom), score
-        off = problem.motion_off_poses(state)
-        off[:, MOTION:-1][:, never] = 0.0
-        found = view_data(off, x, state.motion, self.freedom)
-        return found, found.score
+    def data(self, problem: BoardProblem, estimate: Estimate, never: Tensor) -> ViewData:
+        """What the views say near an estimate."""
+        off, motion = problem.motion_off_poses(estimate.state), estimate.state.motion
+        off[:, motion.shape[1] : -1][:, never] = 0.0
+        return view_data(off, problem.unknowns(estimate.state) - estimate.families.mean, motion, self.freedom)
 
 
 class Rounds(NamedTuple):
@@ -136,7 +128,7 @@ class Rounds(NamedTuple):
     capture: FittedViews
     readout: Readout | None
     estimate: Estimate
-    data: Quadratic | ViewData
+    data: ViewData
     loss: float
     steps: int
     converged: bool
@@ -186,10 +178,10 @@ def run_rounds(
         first = turn == 0 and cold
         problem, estimate, steps = capture.solved(estimate, never, _FIRST if first else _LATER)
         spent += steps
-        data, score = capture.data(problem, estimate, never)
+        data = capture.data(problem, estimate, never)
         former = tempering = estimate.tempering
         if not first and problem.readout is None:
-            found = _overdispersion(data, score, estimate, never)
+            found = _overdispersion(data, estimate, never)
             # More tempering leaves fewer parameters, over which the scores scatter less, and so on: the mean of both
             # ends this where the new value alone swings forever (OpenCV's left camera, between 1 and 2).
             tempering = math.sqrt(tempering * found) if tempered else found
@@ -211,7 +203,7 @@ def run_rounds(
             tempering=tempering,
         )
         progress(f"evidence, round {turn + 1}")
-        if isinstance(data, ViewData) and turn >= _SETTLED:
+        if data.moving and turn >= _SETTLED:
             gained = evidence_of_motion(data, best, estimate.families, tempering)
             if gained < WORTH:
                 capture = dataclasses.replace(capture, readout=None)
@@ -220,19 +212,19 @@ def run_rounds(
         if resting:
             converged = True
             break
-        if isinstance(data, ViewData) and turn >= _SETTLED:
+        if data.moving and turn >= _SETTLED:
             # Few views that move much leave a direction along which the best camera drifts while the evidence falls:
             # the round of largest evidence counts.
             if top is None or best.loss < top.loss:
                 top = Rounds(capture, readout, estimate, data, best.loss, spent, False)
             elif best.loss > top.loss + _DRIFT:
                 break
-    if top is not None and not converged and isinstance(data, ViewData) and top.loss < best.loss:
+    if top is not None and not converged and data.moving and top.loss < best.loss:
         capture, estimate, data = top.capture, top.estimate, top.data
-    if isinstance(data, ViewData):
+    if data.moving:
         # Once, at the end: amplitudes of motions that were set with it again would grow without bound where views are
         # few, as both explain the same residuals (measured on a webcam's seven views).
-        tempering = _overdispersion(data, data.score, estimate, never)
+        tempering = _overdispersion(data, estimate, never)
         estimate = estimate._replace(variance=estimate.variance * tempering, tempering=tempering)
     return Rounds(capture, readout, estimate, data, best.loss, spent, converged)
 
@@ -243,7 +235,7 @@ def expected_estimate(rounds: Rounds, hyperprior: Hyperprior) -> Estimate:
     variance = estimate.variance / estimate.tempering
     best = Maximum(estimate.hyperparameters, estimate.log_ratio, variance, rounds.loss)
     # Views that move were tempered after their amplitudes were found.
-    tempering = 1.0 if isinstance(data, ViewData) else estimate.tempering
+    tempering = 1.0 if data.moving else estimate.tempering
     found = expected_maximum(data, estimate.families, best, hyperprior, tempering)
     return estimate._replace(hyperparameters=found.h, log_ratio=found.log_ratio)
 
@@ -263,7 +255,7 @@ def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -
     still = estimate._replace(state=estimate.state._replace(motion=torch.zeros_like(estimate.state.motion)))
     for columns in (False, True):
         capture = dataclasses.replace(rounds.capture, readout=dataclasses.replace(readout, columns=columns))
-        data, _ = capture.data(capture.problem(estimate, never), still, never)
+        data = capture.data(capture.problem(estimate, never), still, never)
         best = maximize_evidence(
             data,
             estimate.families,
@@ -285,8 +277,7 @@ def _moved_by(estimate: Estimate, best: Maximum) -> float:
     return change
 
 
-def _overdispersion(data: Quadratic | ViewData, score: Tensor, estimate: Estimate, never: Tensor) -> float:
+def _overdispersion(data: ViewData, estimate: Estimate, never: Tensor) -> float:
     deviation = torch.where(never, 0.0, estimate.families.deviation(estimate.hyperparameters))
-    if isinstance(data, ViewData):
-        score, data = data.scores(estimate.log_ratio), data.integrated(estimate.log_ratio).data
-    return overdispersion(score, data.K, deviation, estimate.variance)
+    K = data.integrated(estimate.log_ratio).data.K
+    return overdispersion(data.scores(estimate.log_ratio), K, deviation, estimate.variance)

@@ -1,6 +1,7 @@
 """Data near a solution as a quadratic form of lens and board, with poses and motions eliminated.
 
-Near a solution residuals are linear in the unknowns: chi²(x) = c - 2 gᵀx + xᵀKx, poses eliminated. Motions of views
+Near a solution x₀ residuals are linear in the unknowns: chi² = c - 2 gᵀδ + δᵀKδ with δ = x - x₀, poses eliminated.
+(About x₀, because about zero all digits of c would cancel where noise is small.) Motions of views
 (`kcal.calibrate.problem.readout`) are integrated out under a normal prior: with U their columns off the poses, R their
 prior standard deviations in units of the noise, and M = (UᵀU + R⁻²)⁻¹, a view's AᵀA becomes AᵀA - AᵀU M UᵀA, and
 ln det(R UᵀU R + I) is added to -2 ln p.
@@ -21,34 +22,36 @@ Array = npt.NDArray[np.float64]
 
 
 class Quadratic(NamedTuple):
-    """Data near a solution: chi²(x) = c - 2 gᵀx + xᵀKx, poses eliminated.
+    """Data near a solution: chi² = c - 2 gᵀδ + δᵀKδ at x = `at` + δ, poses eliminated.
 
     Attributes:
         K: (S, S).
         g: (S,).
         c: number.
         freedom: ν, residuals without those that poses take up.
+        at: (S,) x₀.
     """
 
     K: Tensor
     g: Tensor
     c: float
     freedom: float
+    at: Tensor
 
     def tempered(self, tempering: float) -> Quadratic:
         """The same data, counting less."""
-        return Quadratic(self.K / tempering, self.g / tempering, self.c / tempering, self.freedom / tempering)
+        return Quadratic(self.K / tempering, self.g / tempering, self.c / tempering, self.freedom / tempering, self.at)
 
 
 class ViewData(NamedTuple):
-    """Data near a solution, of views that moved while they were read.
+    """Data near a solution, of views that moved by M = 12 numbers each while they were read, or stood still, M = 0.
 
     Attributes:
         still: as if they had stood still.
-        own: (V, 12, 12) UᵀU of each view.
-        cross: (V, 12, S + 1) Uᵀ [A, b], b being the target of the rows A.
+        own: (V, M, M) UᵀU of each view.
+        cross: (V, M, S + 1) Uᵀ [A, b], b being the target of the rows A.
         score: (V, S) Aᵀ r of each view, r being its residuals as if it had stood still.
-        residual: (V, 12) Uᵀ r likewise.
+        residual: (V, M) Uᵀ r likewise.
     """
 
     still: Quadratic
@@ -57,8 +60,15 @@ class ViewData(NamedTuple):
     score: Tensor
     residual: Tensor
 
+    @property
+    def moving(self) -> bool:
+        """Whether views moved."""
+        return self.own.shape[-1] > 0
+
     def integrated(self, log_ratio: Array) -> Integrated:
         """With motions integrated out, whose standard deviation over the noise has these logarithms by order."""
+        if not self.moving:
+            return Integrated(self.still, 0.0, self.own, self.cross)
         ratio = np.repeat(np.exp(log_ratio), MOTION // AMPLITUDES)
         matrix = self.own * torch.from_numpy(ratio[:, None] * ratio)
         matrix.diagonal(dim1=-2, dim2=-1).add_(1.0)
@@ -69,13 +79,15 @@ class ViewData(NamedTuple):
         gram = flat.T @ flat
         still = self.still
         data = Quadratic(
-            still.K - gram[:-1, :-1], still.g - gram[:-1, -1], still.c - float(gram[-1, -1]), still.freedom
+            still.K - gram[:-1, :-1], still.g - gram[:-1, -1], still.c - float(gram[-1, -1]), still.freedom, still.at
         )
         log_determinant = 2.0 * float(root.diagonal(dim1=-2, dim2=-1).log().sum())
         return Integrated(data, log_determinant, root, half)
 
     def scores(self, log_ratio: Array) -> Tensor:
         """(V, S) derivatives of each view's -½ chi² by the shared unknowns, motions integrated out."""
+        if not self.moving:
+            return self.score
         matrix = self.own + torch.diag(stillness(log_ratio))
         best = torch.linalg.solve(matrix, self.residual[..., None])
         return self.score - (self.cross[..., :-1].transpose(1, 2) @ best)[..., 0]
@@ -96,21 +108,23 @@ class Integrated(NamedTuple):
     root: Tensor
     half: Tensor
 
-    def slopes(self, x: Array, factor: Tensor, variance: float, tempering: float) -> Array:
-        """(4,) derivatives of -ln p by the logarithms of the ratios.
+    def slopes(self, step: Array, factor: Tensor, variance: float, tempering: float) -> Array:
+        """(4,) derivatives of -ln p by the logarithms of the ratios; () where views stand still.
 
         Each is the sum over motions of 1 less the posterior's second moment in units of the prior.
 
         Args:
-            x: (S,) the best lens and board.
+            step: (S,) δ of the best lens and board.
             factor: (S, S), factorᵀ factor being their posterior covariance.
             variance: of the noise.
             tempering: by which the data count less.
         """
+        if not self.root.shape[-1]:
+            return np.zeros(0)
         _, ones, _ = torch.broadcast_tensors(self.root, torch.eye(MOTION, dtype=self.root.dtype), self.root)
         inverse = torch.linalg.solve_triangular(self.root, ones, upper=False)
         kept = inverse.square().sum(1)
-        direction = torch.cat([torch.from_numpy(-x)[:, None], factor.T], 1)
+        direction = torch.cat([torch.from_numpy(-step)[:, None], factor.T], 1)
         reach = self.half[..., :-1] @ direction
         reach[..., 0] += self.half[..., -1]
         moments = (inverse.transpose(1, 2) @ reach).square().sum(-1) / variance
@@ -119,24 +133,22 @@ class Integrated(NamedTuple):
 
 
 def quadratic_of(off: Tensor, x: Tensor, freedom: float) -> Quadratic:
-    """K, g, c of chi²(x) for absolute x, from rows (V, S + 1, R) off the poses at x, the residuals last."""
+    """From rows (V, S + 1, R) off the poses at x, the residuals last."""
     flat = off.transpose(0, 1).flatten(1)
-    target = x @ flat[:-1] - flat[-1]
-    return Quadratic(flat[:-1] @ flat[:-1].T, flat[:-1] @ target, float(target @ target), freedom)
+    return Quadratic(flat[:-1] @ flat[:-1].T, -flat[:-1] @ flat[-1], float(flat[-1] @ flat[-1]), freedom, x)
 
 
 def view_data(off: Tensor, x: Tensor, motion: Tensor, freedom: float) -> ViewData:
-    """From rows (V, 12 + S + 1, R) off the poses, at lens and board x and motions (V, 12); the residuals last."""
-    own, others = off[:, :MOTION], off[:, MOTION:]
+    """From rows (V, M + S + 1, R) off the poses, at lens and board x and motions (V, M); the residuals last."""
+    own, others = off[:, : motion.shape[1]], off[:, motion.shape[1] :]
     # As if all views had stood still: motions are unknowns whose prior is about zero.
     still = others[:, -1] - torch.einsum("vm,vmr->vr", motion, own)
-    target = torch.einsum("s,vsr->vr", x, others[:, :-1]) - still
     residual = still[..., None]
-    aimed = torch.cat([others[:, :-1], target[:, None]], 1)
+    aimed = torch.cat([others[:, :-1], -still[:, None]], 1)
     flat = aimed.transpose(0, 1).flatten(1)
     gram = flat @ flat.T
     return ViewData(
-        still=Quadratic(gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1]), freedom),
+        still=Quadratic(gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1]), freedom, x),
         own=own @ own.transpose(1, 2),
         cross=own @ aimed.transpose(1, 2),
         score=(others[:, :-1] @ residual)[..., 0],

@@ -137,5 +137,5 @@ def _absolute_rows(fit: HybridFit, points: Tensor, pixels: Tensor, weights: Tens
 def _about_hyperparameters(fit: HybridFit, rows: Tensor, freedom: float) -> Likelihood:
     """What the rows (R, S + 1) say, in the variables of the fit's priors."""
     A, target = rows[:, :-1], rows[:, -1]
-    data = Quadratic(A.T @ A, A.T @ target, float(target @ target), freedom)
+    data = Quadratic(A.T @ A, A.T @ target, float(target @ target), freedom, torch.zeros_like(A[0]))
     return hyper_likelihood(data, fit.families, fit.hyperparameters, fit.sigma**2 / fit.tempering)

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import torch
+from standing_views import standing
 
 from kcal.calibrate.lensfit.evidence import Quadratic, maximize_evidence, negative_log_evidence
 from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
@@ -64,10 +65,10 @@ def test_likelihood_of_hyperparameters() -> None:
     x = torch.exp(TYPICAL.mean + 1.0)[index] * torch.randn(count, generator=generator, dtype=F64)
     A = 100.0 * torch.randn(300, count, generator=generator, dtype=F64)
     target = A @ x + 0.1 * torch.randn(300, generator=generator, dtype=F64)
-    data = Quadratic(A.T @ A, A.T @ target, float(target @ target), 300.0)
+    data = Quadratic(A.T @ A, A.T @ target, float(target @ target), 300.0, zero)
     h, variance = TYPICAL.mean, 0.02
     for _ in range(3):
-        h, _, variance, _ = maximize_evidence(data, families, h, variance, TYPICAL)
+        h, _, variance, _ = maximize_evidence(standing(data), families, h, variance, TYPICAL)
     found = hyper_likelihood(data, families, h, variance)
     # Of a spread known from n draws the log has information 2 n.
     torch.testing.assert_close(found.information.diagonal(), torch.full((2,), 40.0, dtype=F64), rtol=0.35, atol=0)

@@ -162,9 +162,9 @@ def test_motions_are_eliminated_like_poses() -> None:
         chi2 += float(still @ torch.linalg.solve(covariance, still))
         logdet += float(torch.logdet(covariance))
     form = found.data
-    value = form.c - 2.0 * float(form.g @ there) + float(there @ form.K @ there)
-    # The form's terms are 1e5 times its value.
-    assert value == pytest.approx(chi2, rel=1e-6)
+    step = there - form.at
+    value = form.c - 2.0 * float(form.g @ step) + float(step @ form.K @ step)
+    assert value == pytest.approx(chi2, rel=1e-9)
     assert found.log_determinant == pytest.approx(logdet, rel=1e-9)
     own = torch.stack(
         [
@@ -213,7 +213,7 @@ def test_deviations_of_motions_by_evidence() -> None:
 
     def value(h: Tensor, ratio: np.ndarray, variance: float) -> float:
         integrated = data.integrated(ratio)
-        K, g, c, freedom = integrated.data
+        K, g, c, freedom, _ = integrated.data
         d = families.deviation(h)
         A = K * d[:, None] * d / variance + torch.eye(len(d), dtype=F64)
         b = d * g / variance
