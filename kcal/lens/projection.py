@@ -122,7 +122,7 @@ def project_components(
     intrinsic = [(lens.x, zero), (zero, lens.y), (one, zero), (zero, one), (lens.y, zero)]
     du, dv = lens.coefficients.unbind(-2)
     across, along, down = (value[..., None] if value.ndim else value for value in (fx, skew, fy))
-    by_lens = torch.stack([across * du + along * dv, down * dv], -2)
+    by_lens = torch.stack([torch.addcmul(across * du, along, dv), down * dv], -2)
     # In the order of `wanted`: intrinsics come first as a rule.
     first = as_columns([intrinsic[i] for i in wanted if i < offset], pixels[..., 0, :])
     whole = pixels.shape[:-2]
