@@ -327,7 +327,12 @@ def calibration_effect(fit: PointFit, scale: Tensor, factor: Tensor) -> Tensor:
         return (factor.mT @ moved.flatten(-2)).unflatten(-1, (2, -1))
 
     moved = torch.cat([pixels(own, left), pixels(other, torch.cat([right, pose], -3))], -2)  # (..., K, 4, N)
-    return -(fit.gain[..., :, None, :, :] * moved[..., None, :, :, :]).sum(-2)
+    # One of the four pixel coordinates after the other: all at once would take four times the memory.
+    gain, moved = -fit.gain[..., :, None, :, :], moved[..., None, :, :, :]
+    effect = gain[..., 0, :] * moved[..., 0, :]
+    for k in range(1, moved.shape[-2]):
+        effect = torch.addcmul(effect, gain[..., k, :], moved[..., k, :])
+    return effect
 
 
 def inverse_covariances(cov: Tensor | None) -> tuple[Tensor | None, Tensor]:
