@@ -7,15 +7,13 @@ from collections.abc import Mapping, Sequence
 
 import torch
 
-from kcal.calibrate.camera.assess import assess
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, unusable_views
 from kcal.calibrate.camera.leave_out import calibrate_what_fits, listed_views, without_views
 from kcal.calibrate.camera.options import CalibrationOptions, Progress
-from kcal.calibrate.camera.outliers import solve_without_outliers
+from kcal.calibrate.camera.parametric import calibrate_parametric
 from kcal.calibrate.camera.repeats import copied_views, copy_warnings, pose_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedView
 from kcal.calibrate.camera.sharing import ALONE, sharing
-from kcal.calibrate.camera.solve import solve
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError
 
@@ -126,10 +124,7 @@ def _complete(
 def _calibrate(observations: Observations, options: CalibrationOptions, progress: Progress) -> CameraCalibrationResult:
     if options.hybrid:
         return calibrate_what_fits(observations, options, progress)
-    if options.reject is None:
-        return assess(observations, solve(observations, options, progress), options)
-    kept = solve_without_outliers(observations, options, options.reject, progress)
-    return kept.complete(assess(kept.observations, kept.solution, options), observations)
+    return calibrate_parametric(observations, options, progress)
 
 
 def calibrate_cameras(

@@ -9,7 +9,6 @@ one.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import torch
@@ -20,16 +19,9 @@ from kcal.calibrate.camera.capture_warnings import motion_warnings, pixel_warnin
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, check_views
 from kcal.calibrate.camera.determined import check_directions
 from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection, Progress
-from kcal.calibrate.camera.outliers import (
-    check_share,
-    corner_limits,
-    corners_beyond,
-    noise_scale,
-    view_rms,
-    views_beyond,
-)
+from kcal.calibrate.camera.outliers import leave_out_outliers, noise_scale
 from kcal.calibrate.camera.pupil_check import pupil_warnings
-from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
+from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.warnings import general_warnings, hybrid_warnings, outlier_warnings
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.corners.observations import Observations
@@ -37,8 +29,6 @@ from kcal.solve.result import SolverStatus
 
 # The unknowns that the views alone must determine: focal length, principal point, shape of the base projection.
 _UNKNOWNS = 4
-# Largest number of fits with outliers left out; two or three are the rule.
-_ROUNDS = 6
 
 
 def calibrate_hybrid(
@@ -48,7 +38,7 @@ def calibrate_hybrid(
     board, pixels, names = observations.board.points, observations.pixels(), observations.names
     check_views(board, pixels, names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
     if options.reject is not None:
-        return _without_outliers(observations, options, options.reject, progress)
+        return _hybrid_without_outliers(observations, options, options.reject, progress)
     weighted = options.weighted and observations.covariances() is not None
     ones = torch.ones_like(pixels[..., 0])
     fit = _fit_views(observations, pixels, ones, None, options, progress, expected=not weighted)
@@ -97,53 +87,27 @@ def _weights(observations: Observations, residuals: Tensor) -> Tensor:
     return torch.where(seen, information / information[seen].mean(), 0.0).sqrt()
 
 
-def _without_outliers(
+def _hybrid_without_outliers(
     observations: Observations, options: CalibrationOptions, reject: OutlierRejection, progress: Progress
 ) -> CameraCalibrationResult:
-    """Leave out corners and views that noise cannot explain, and fit again until nothing changes."""
-    pixels, names = observations.pixels(), observations.names
-    seen = torch.isfinite(pixels).all(-1)
-    own = seen.double()
+    """Leave out corners and views that noise cannot explain."""
+    pixels = observations.pixels()
+    own = torch.isfinite(pixels).all(-1).double()
     # A few wrong corners bend a plain fit towards them; bounded weights let them stand out.
-    fit = _fit_views(observations, pixels, own, None, options, progress, robust=True)
+    robust = _fit_views(observations, pixels, own, None, options, progress, robust=True)
     if options.weighted:
-        own = _weights(observations, fit.residuals)
-    left = list(range(len(pixels)))
-    rejected = torch.zeros_like(seen)
-    views: list[RejectedView] = []
-    for _ in range(_ROUNDS):
-        weighted = fit.residuals_of(pixels)[left] * own[left][..., None]
-        beyond = corners_beyond(weighted)
-        gone = views_beyond(observations.board.points, weighted, pixels[left], beyond)
-        if not gone and bool((beyond == rejected[left]).all()):
-            break
-        rms = view_rms(weighted, beyond)
-        for k, reason in gone.items():
-            count = int(seen[left[k]].sum())
-            views.append(RejectedView(view=names[left[k]], corners=count, residual=float(rms[k]), reason=reason))
-        rejected[left] = beyond
-        left = [i for k, i in enumerate(left) if k not in gone]
-        rejected[[i for i in range(len(pixels)) if i not in left]] = False
-        lost = int(rejected.sum()) + sum(view.corners for view in views)
-        check_share(lost, int(seen.sum()), views, reject.limit)
-        progress(f"{int(rejected.sum())} corners and {len(views)} views left out")
-        weights = torch.where(rejected, 0.0, own)[left]
-        used = observations.subset([names[i] for i in left])
-        fit = _fit_views(used, pixels[left], weights, None, options, progress).among(left, len(pixels))
-    plain = fit.residuals_of(pixels)
-    weighted = plain * own[..., None]
-    limits = corner_limits(torch.where(rejected[..., None], torch.nan, weighted))
-    corners = tuple(
-        RejectedCorner(
-            view=names[i],
-            corner=n,
-            residual=float(plain[i, n].norm()),
-            reason=f"{float(weighted[i, n].norm()):.2f} px off, noise explains {float(limits[i]):.2f} px",
-        )
-        for i, n in rejected.nonzero().tolist()
-    )
-    result = hybrid_result(observations, fit, options)
-    return dataclasses.replace(result, rejected_corners=corners, rejected_views=tuple(views))
+        own = _weights(observations, robust.residuals)
+
+    def fit(left: list[int], rejected: Tensor) -> tuple[HybridFit, Tensor]:
+        some, weights = pixels[left], own[left]
+        used = observations.subset([observations.names[i] for i in left])
+        found = _fit_views(used, some, torch.where(rejected, 0.0, weights), None, options, progress)
+        return found, found.residuals_of(some) * weights[..., None]
+
+    kept = leave_out_outliers(observations, reject, robust.residuals_of(pixels) * own[..., None], fit, progress)
+    plain, weights = kept.fit.residuals_of(pixels[kept.views]), own[kept.views][..., None]
+    used = observations.subset([observations.names[i] for i in kept.views])
+    return kept.complete(hybrid_result(used, kept.fit, options), observations, plain, plain * weights)
 
 
 def hybrid_result(observations: Observations, fit: HybridFit, options: CalibrationOptions) -> CameraCalibrationResult:
@@ -169,7 +133,7 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
         observations.names,
     )
     status = SolverStatus.CONVERGED if fit.converged else SolverStatus.ITERATION_LIMIT
-    used = [i for i in range(len(per_view)) if not math.isnan(float(per_view[i]))]
+    used = [i for i, rms in enumerate(per_view.tolist()) if not math.isnan(rms)]
     return CameraCalibrationResult(
         camera=camera,
         observations=observations,

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection, Progress
+from kcal.calibrate.camera.options import OutlierRejection, Progress
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedCorner, RejectedView
-from kcal.calibrate.camera.solve import Solution, solve
 from kcal.calibrate.problem.closed_form import spread_out
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
-from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.result import SolverStatus
-from kcal.solve.robust import RobustLoss
 
 # Expected number of good corners beyond the limit in a whole calibration, for normal noise.
 _FALSE_CORNERS = 0.01
@@ -28,123 +25,100 @@ _MAD = 1.4826
 _TIMES_TYPICAL, _VIEW_DEVIATIONS = 3.0, 5.0
 # A view is left out whole if fewer of its corners are kept, as a number or as a share.
 _MINIMUM_CORNERS, _MINIMUM_KEPT = 6, 0.5
-# To tell which corners are wrong: a loss that a few of them cannot spoil, its scale in units of the noise.
-_ROUGH = LMOptions(max_iterations=40, tolerance=1e-8)
-_CAUCHY_SCALE, _CAUCHY_ROUNDS = 3.0, 4
-# Largest number of calibrations; two are the rule.
+# Largest number of fits; one or two are the rule.
 _ROUNDS = 5
 
 
+F = TypeVar("F")
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Inliers:
-    """What is left of observations, and its solution.
+class Kept(Generic[F]):
+    """What is left of observations, and its fit.
 
     Args:
-        observations: without outliers.
-        solution: of these.
+        fit: of what is left.
         views: indices of the views that are left.
-        rejected_corners: of these views.
+        rejected: (V, N) corners of these that are left out.
         rejected_views: the others.
     """
 
-    observations: Observations
-    solution: Solution
+    fit: F
     views: list[int]
-    rejected_corners: tuple[RejectedCorner, ...]
+    rejected: Tensor
     rejected_views: tuple[RejectedView, ...]
 
-    def complete(self, result: CameraCalibrationResult, observations: Observations) -> CameraCalibrationResult:
-        """A result for these views as one for all observations: NaN for views left out, all rejections listed."""
+    def complete(
+        self, result: CameraCalibrationResult, observations: Observations, plain: Tensor, weighted: Tensor
+    ) -> CameraCalibrationResult:
+        """A result for these views as one for all observations: NaN for views left out, all rejections listed.
+
+        Args:
+            result: of the views that are left.
+            observations: all.
+            plain: (V, N, 2) residuals of all corners of these views, pixels.
+            weighted: the same by the corners' weights.
+        """
+        limits = corner_limits(torch.where(self.rejected[..., None], torch.nan, weighted))
+        corners = tuple(
+            RejectedCorner(
+                view=observations.names[self.views[i]],
+                corner=n,
+                residual=float(plain[i, n].norm()),
+                reason=f"{float(weighted[i, n].norm()):.2f} px off, noise explains {float(limits[i]):.2f} px"
+                if bool(torch.isfinite(plain[i, n]).all())
+                else "the lens does not reach it",
+            )
+            for i, n in self.rejected.nonzero().tolist()
+        )
         return dataclasses.replace(
-            result.among(self.views, observations),
-            rejected_corners=self.rejected_corners,
-            rejected_views=self.rejected_views,
+            result.among(self.views, observations), rejected_corners=corners, rejected_views=self.rejected_views
         )
 
 
-def solve_without_outliers(
-    observations: Observations, options: CalibrationOptions, rejection: OutlierRejection, progress: Progress
-) -> Inliers:
-    """Solve, leave out outliers, and solve again until nothing changes.
+def leave_out_outliers(
+    observations: Observations,
+    rejection: OutlierRejection,
+    robust: Tensor,
+    fit: Callable[[list[int], Tensor], tuple[F, Tensor]],
+    progress: Progress,
+) -> Kept[F]:
+    """Fit without outliers, and look for them again, until nothing changes.
 
     Corners of the remaining views are tested anew in every round, so that one that was rejected beside a worse one can
-    come back. The solution is that of `solve` for what is left.
+    come back.
+
+    Args:
+        observations: all.
+        rejection: how much may be left out.
+        robust: (V, N, 2) weighted residuals at a solution that a few wrong corners do not spoil; NaN where not seen,
+            infinite where the lens does not reach a corner.
+        fit: fits some views (indices) without some of their corners (V, N), and returns such residuals of all of them.
+        progress: see `calibrate_camera`.
     """
-    total = int(torch.isfinite(observations.pixels()).all(-1).sum())
-    left = list(range(len(observations.views)))
-    rejected = torch.zeros(len(left), observations.board.corners, dtype=torch.bool)
+    pixels, names = observations.pixels(), observations.names
+    seen = torch.isfinite(pixels).all(-1)
+    left, rejected = list(range(len(pixels))), torch.zeros_like(seen)
     gone: list[RejectedView] = []
-    spent = 0
-    for last in (*[False] * (_ROUNDS - 1), True):
-        used = without(observations, left, rejected)
-        solution = solve(used, options, progress)
-        spent += solution.spent
-        every = without(observations, left, torch.zeros_like(rejected))
-        if last:
-            break
-        residuals, steps = _robust_residuals(every, solution)
-        spent += steps
+    found: F | None = None
+    residuals = robust
+    for _ in range(_ROUNDS):
         beyond = corners_beyond(residuals)
-        views = views_beyond(observations.board.points, residuals, every.pixels(), beyond)
-        if not views and bool((beyond == rejected).all()):
+        views = views_beyond(observations.board.points, residuals, pixels[left], beyond)
+        if found is not None and not views and bool((beyond == rejected).all()):
             break
-        seen, rms = torch.isfinite(every.pixels()).all(-1), view_rms(residuals, beyond)
+        rms = view_rms(residuals, beyond)
         for i, reason in views.items():
-            corners = int(seen[i].sum())
-            gone.append(RejectedView(view=every.names[i], corners=corners, residual=float(rms[i]), reason=reason))
+            count = int(seen[left[i]].sum())
+            gone.append(RejectedView(view=names[left[i]], corners=count, residual=float(rms[i]), reason=reason))
         kept = [i for i in range(len(left)) if i not in views]
         left, rejected = [left[i] for i in kept], beyond[kept]
-        check_share(int(rejected.sum()) + sum(view.corners for view in gone), total, gone, rejection.limit)
+        lost = int(rejected.sum()) + sum(view.corners for view in gone)
+        check_share(lost, int(seen.sum()), gone, rejection.limit)
         progress(f"{int(rejected.sum())} corners and {len(gone)} views left out")
-    return Inliers(
-        observations=used,
-        solution=dataclasses.replace(solution, spent=spent),
-        views=left,
-        rejected_corners=_rejected_corners(every, solution, rejected),
-        rejected_views=tuple(gone),
-    )
-
-
-def _rejected_corners(every: Observations, solution: Solution, rejected: Tensor) -> tuple[RejectedCorner, ...]:
-    """Rejected corners (V, N), with their residuals at a solution without them."""
-    problem, state = solution.problem_for(every.pixels(), every.covariances()), solution.result.state
-    plain = problem.pixel_errors(state).norm(dim=-2)
-    weighted = problem.corner_residuals(state, weighted=True)
-    limits = corner_limits(torch.where(rejected[..., None], torch.nan, weighted))
-    return tuple(
-        RejectedCorner(
-            view=every.names[i],
-            corner=n,
-            residual=float(plain[i, n]),
-            reason=f"{float(weighted[i, n].norm()):.2f} px off, noise explains {float(limits[i]):.2f} px"
-            if bool(torch.isfinite(plain[i, n]))
-            else "the lens model does not reach it",
-        )
-        for i, n in rejected.nonzero().tolist()
-    )
-
-
-def _robust_residuals(observations: Observations, solution: Solution) -> tuple[Tensor, int]:
-    """Weighted residuals (V, N, 2) of all corners at a solution robust to a few wrong ones, and its trial steps.
-
-    Infinite where the lens does not reach a corner at all.
-    """
-    state, spent = solution.result.state, 0
-    whole = solution.problem_for(observations.pixels(), observations.covariances())
-    for _ in range(_CAUCHY_ROUNDS):
-        residuals = whole.corner_residuals(state, weighted=True)
-        reached = torch.isfinite(residuals).all(-1)
-        some = without(observations, range(len(observations.views)), whole.seen & ~reached)
-        scale = max(_CAUCHY_SCALE * float(noise_scale(residuals.flatten(0, 1))), LEAST_NOISE)
-        loss = RobustLoss(kind="cauchy", scale=scale)
-        result = minimize(solution.problem_for(some.pixels(), some.covariances(), loss), state, _ROUGH)
-        spent += int(result.iterations)
-        if result.status == SolverStatus.BAD_START:
-            break
-        state = result.state
-    residuals = whole.corner_residuals(state, weighted=True)
-    unreached = whole.seen & ~torch.isfinite(residuals).all(-1)
-    return torch.where(unreached[..., None], torch.inf, residuals), spent
+        found, residuals = fit(left, rejected)
+    assert found is not None
+    return Kept(fit=found, views=left, rejected=rejected, rejected_views=tuple(gone))
 
 
 def noise_scale(residuals: Tensor) -> Tensor:

@@ -36,13 +36,13 @@ _HIGHEST = 300.0
 
 def negative_log_evidence(data: Quadratic, families: PriorFamilies, v: np.ndarray) -> tuple[float, np.ndarray]:
     """The negative logarithm of the evidence of v = (h, ln σ²), (H + 1,), and its gradient; infinite beyond numbers."""
-    found = _evidence(data, families, v[:-1], v[-1])
+    found = _posterior(data, families, v[:-1], v[-1])
     if found is None:
         return math.inf, np.zeros_like(v)
     return found.value, np.append(found.by_h, found.by_noise)
 
 
-class _Evidence(NamedTuple):
+class _Posterior(NamedTuple):
     """-ln p, its derivatives by h (H,) and ln σ², and the posterior: δ (S,) and F (S, S), FᵀF its covariance."""
 
     value: float
@@ -52,7 +52,7 @@ class _Evidence(NamedTuple):
     factor: Tensor
 
 
-def _evidence(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Evidence | None:
+def _posterior(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Posterior | None:
     """None where priors are too wide for the precision of numbers."""
     K, g, c, freedom = data.K.numpy(), data.g.numpy(), data.c, data.freedom
     here = torch.from_numpy(h)
@@ -74,7 +74,7 @@ def _evidence(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_varia
     value = 0.5 * (freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
     by_h = families.slopes(here).numpy() @ (0.5 * (1 - y * y - kept))
     by_noise = 0.5 * (freedom - (len(g) - kept.sum()) - rss / s2)
-    return _Evidence(value, by_h, by_noise, step, inverse * torch.from_numpy(d))
+    return _Posterior(value, by_h, by_noise, step, inverse * torch.from_numpy(d))
 
 
 class Maximum(NamedTuple):
@@ -154,7 +154,7 @@ def evidence_loss(
         here, ratio, log_variance = v[:count], v[count:-1], v[-1]
         integrated = data.integrated(ratio)
         tempered = integrated.data.tempered(tempering)
-        found = _evidence(tempered, families, here, log_variance) if log_variance < _HIGHEST else None
+        found = _posterior(tempered, families, here, log_variance) if log_variance < _HIGHEST else None
         if found is None:
             # Priors are far too wide for this precision, or a first step was far too long: worse than any trial before,
             # so that a shorter step follows.
@@ -175,6 +175,6 @@ def evidence_of_motion(data: ViewData, best: Maximum, families: PriorFamilies, t
     moving = data.integrated(best.log_ratio)
     losses = []
     for quadratic, determinant in ((data.still, 0.0), (moving.data, moving.log_determinant)):
-        found = _evidence(quadratic.tempered(tempering), families, best.h.numpy(), log_variance)
+        found = _posterior(quadratic.tempered(tempering), families, best.h.numpy(), log_variance)
         losses.append(math.inf if found is None else found.value + 0.5 * determinant / tempering)
     return losses[0] - losses[1]

@@ -113,6 +113,16 @@ def test_outliers_are_left_out_and_listed() -> None:
     assert error_at_infinity(result.camera, truth()).rms < 2.0 * summarize(calibrated()).worst
 
 
+def test_with_nothing_to_leave_out_the_camera_is_the_plain_one() -> None:
+    """Not that of the robust fit, by which outliers are looked for and whose error bars mean nothing."""
+    found = calibrate_camera(capture()[0], CalibrationOptions(reject=OutlierRejection()))
+    assert not found.rejected_corners
+    assert not found.rejected_views
+    torch.testing.assert_close(found.camera.params, calibrated().camera.params, rtol=0, atol=0)
+    assert found.covariance is not None
+    torch.testing.assert_close(found.covariance, calibrated().covariance, rtol=0, atol=0)
+
+
 def test_corners_weigh_by_their_covariances() -> None:
     seen, clean = capture()
     blurred = clean.clone()
