@@ -30,8 +30,6 @@ _ALL = slice(None)
 POSE = 6
 # Numbers in the rows of derivatives that are formed at a time: with fewer, default cameras took longer (measured).
 _CHUNK = 1_200_000
-# Unknowns up to which a linearization costs little more than the cost alone.
-_FEW = 40
 
 
 class BoardProblem(SchurProblem[BoardState]):
@@ -109,7 +107,8 @@ class BoardProblem(SchurProblem[BoardState]):
         self.moving = torch.arange(self.unknown_count) if held is None else (~held).nonzero()[:, 0]
         self.shared_size = len(self.moving)
         self._all_move = self.shared_size == self.unknown_count
-        self.joint = self.shared_size <= _FEW
+        # With hundreds of columns a linearization costs far more than the cost alone.
+        self.joint = not model.hybrid
         self.slots = self._places(model.size)
 
     def _weigh(self, weights: Tensor | None) -> None:
@@ -241,8 +240,10 @@ class BoardProblem(SchurProblem[BoardState]):
                 # What displaces a corner of the board turns with it.
                 by_board = by_board + torch.linalg.cross(by_board, turn[:, :, None].expand_as(by_board), dim=1)
             parts.append(torch.einsum("...vlun,bln->...vbun", by_board, self.shapes))
-        bad = torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
-        error = projected.pixels - self._target[..., views, :, :] + bad
+        error = projected.pixels - self._target[..., views, :, :]
+        if self.joint:
+            # A hybrid lens has values beyond its disc, too: a start may have corners there, but no state that follows.
+            error = error + torch.where(projected.regular, 0.0, torch.nan)[..., None, :]
         rows = torch.cat([*parts, error[..., None, :, :]], -3)
         if not self._all_count:
             rows = torch.where(self._counts[..., views, None, None, :], rows, 0.0)

@@ -349,3 +349,20 @@ def test_the_start_of_a_narrow_lens(seed: int) -> None:
     found = fit_hybrid(capture.points, capture.pixels, lens.size, modes=modes)
     assert float(found.camera.focal[0]) == pytest.approx(1600.0, rel=0.03)
     assert found.sigma == pytest.approx(0.1, rel=0.15)
+
+
+def test_a_start_may_have_corners_beyond_the_disc() -> None:
+    """Steps lead from there to states where all have an image; a state without one is never accepted."""
+    found = printed()
+    pixels = views(truth(), 4, 7)
+    model = LensModel(hybrid=HybridForm(shape=0.4, radius=0.2))
+    count = 3 + model.size + 28
+    held = torch.full((count,), torch.inf, dtype=torch.float64)
+    problem = hybrid_problem(
+        BOARD.points, found.board_shapes.shapes, pixels, torch.ones_like(pixels[..., 0]), model, 0 * held, held
+    )
+    params = torch.zeros(5 + model.size, dtype=torch.float64)
+    params[:4] = found.camera.params.detach()[:4]
+    state = BoardState.still(params, 0 * found.state.board, found.state.rotation[:4], found.state.translation[:4])
+    assert math.isnan(float(problem.cost(state)))
+    assert math.isfinite(float(problem.linearize(state).cost))
