@@ -21,6 +21,7 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
+from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
