@@ -1,4 +1,4 @@
-"""How often the intervals of `kcal demo` contain the truth: the whole command, many seeds; a table of docs/measured/chain.md.
+"""How often the intervals of `kcal demo` contain the truth: the whole command, many seeds.
 
     python -m scripts.check.demo --out seeds.jsonl --seeds 40        # seeds that the file holds are kept
     python -m scripts.check.demo --out seeds.jsonl --write           # the page, from what is there
