@@ -169,7 +169,8 @@ def _rig(seen: dict[str, Observations], repeats: int) -> list[str]:
         ]
     )
     left, right = seen["left"], seen["right"]
-    cameras = (calibrate_camera(left).camera, calibrate_camera(right).camera)
+    five = CalibrationOptions(model="opencv5")
+    cameras = (calibrate_camera(left, five).camera, calibrate_camera(right, five).camera)
     pairs = pair_by_name(left.names, right.names)
     for word, refine in (("fixed", False), ("refined jointly", True)):
         options = RigOptions(intrinsics="free" if refine else "fixed", reject=False)

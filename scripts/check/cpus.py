@@ -144,7 +144,9 @@ def main() -> None:
     parser.add_argument("--tests", nargs="+", default=["kcal", "tests"], metavar="PATH")
     parser.add_argument("--settings", nargs="+", default=list(SETTINGS), choices=list(SETTINGS), metavar="NAME")
     parser.add_argument("--processes", type=int, default=2, help="0: pytest without workers")
-    parser.add_argument("--figures", action="store_true", help="cameras, σ and positions; docs/measured/other-programs.md")
+    parser.add_argument(
+        "--figures", action="store_true", help="cameras, σ and positions; docs/measured/other-programs.md"
+    )
     parser.add_argument("--folder", type=Path, help="keep outcomes and figures here; what is there is not run again")
     parser.add_argument("--write", action="store_true", help="figures into docs/measured/other-programs.md")
     arguments = parser.parse_args()
