@@ -30,9 +30,14 @@ SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         ("board", "calibrate", "wide-lenses", "survey", "mark*", "detector", "drift", "exchange*", "other-programs",
          "batches", "gpu"),
     ),
-    ("Explanation", "explanation", ("which-lens", "rms", "relative-yaw", "intervals", "camera", "paper")),
+    ("Explanation", "explanation", ("which-lens", "rms", "relative-yaw", "intervals", "camera", "corners", "paper")),
     ("Reference", "reference", ("commands", "warnings", "conventions")),
-    ("Measured", "measured", ("chain", "one-camera", "opencv", "rig", "locate", "paper", "corners", "lens", "solver")),
+    (
+        "Measured",
+        "measured",
+        ("chain", "one-camera", "ordinary", "other-programs", "rig", "locate", "tracks", "marking", "paper", "corners",
+         "lens", "solver"),
+    ),
 )  # fmt: skip
 NETWORK_SHIM = "https://unpkg.com/iframe-worker/shim"
 OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md")  # pages of the repository's root, shown under Reference

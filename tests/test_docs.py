@@ -14,7 +14,6 @@ import pytest
 
 import kcal
 from scripts.docs_site import commands_page, navigation, ordered, public_names
-from scripts.shared.page import CONCLUSIONS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -141,9 +140,26 @@ def test_the_way_to_a_first_position_is_short() -> None:
     assert sum(len(page.read_text(encoding="utf-8").split()) for page in pages) < 1500
 
 
-@pytest.mark.parametrize("page", sorted(path.name for path in (ROOT / "docs" / "measured").glob("*.md")))
-def test_a_measured_page_begins_with_its_conclusion(page: str) -> None:
-    opening = (ROOT / "docs" / "measured" / page).read_text(encoding="utf-8").split("\n\n")[1]
-    assert opening.startswith("**Conclusion.**")
-    # What a script writes anew must be what the page says.
-    assert page not in CONCLUSIONS or opening == CONCLUSIONS[page]
+MEASURED = sorted((ROOT / "docs" / "measured").glob("*.md"))
+
+
+@pytest.mark.parametrize("page", MEASURED, ids=[page.stem for page in MEASURED])
+def test_a_measured_page_concludes_and_then_shows(page: Path) -> None:
+    """The conclusion, a table or a picture, and the command that makes it come first."""
+    text = re.sub(r"<!--.*?-->\n", "", page.read_text(encoding="utf-8"))
+    _, conclusion, shown, made = text.split("\n\n")[:4]
+    assert conclusion.startswith("**Conclusion.** ")
+    assert shown.startswith(("| ", "!["))
+    assert "`python -m scripts." in made
+
+
+@pytest.mark.parametrize("page", MEASURED, ids=[page.stem for page in MEASURED])
+def test_a_script_writes_each_table(page: Path) -> None:
+    """Every section is closed, and some script names both the page and the section."""
+    text = page.read_text(encoding="utf-8")
+    sections = re.findall(r"<!-- begin: (.+) -->", text)
+    assert sections == re.findall(r"<!-- end: (.+) -->", text)
+    assert len(sections) == len(set(sections)) > 0
+    scripts = [path.read_text(encoding="utf-8") for path in (ROOT / "scripts").rglob("*.py")]
+    own = [script for script in scripts if f'"{page.name}"' in script]
+    assert [name for name in sections if not any(f'"{name}"' in script for script in own)] == []

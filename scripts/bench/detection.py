@@ -37,7 +37,7 @@ from kcal.lens.camera import Camera
 from kcal.sim.board import BoardSize
 from kcal.sim.poses import sample_board_poses
 from kcal.sim.render import render_board
-from scripts.shared.page import write_section
+from scripts.shared.page import table, write_section
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 SLOW = 1  # image of 12 megapixels on which the sector detector is timed: minutes
@@ -202,18 +202,22 @@ def main() -> None:
     arguments = parser.parse_args()
     limit_threads(1)
     images = render(arguments.rendered)
-    head = ["| | images/s | found |", "|---|---|---|"]
-    text = ["## Speed", "", "One thread; each row is that work alone. `python -m scripts.bench.detection --write`", ""]
-    text += ["Rendered, 4000 x 3000 pixels:", "", *head, *(f"| {row} |" for row in single(images)), ""]
+    heads, rows = ["", "4000 x 3000, images/s", "found"], [row.split(" | ") for row in single(images)]
     data = os.environ.get("KCAL_DATA")
     if data:
         real = [read_gray(path) for path in expand_images([str(Path(data) / "opencv_stereo" / "*.jpg")])]
         eight_bits = [image.astype(np.uint8) for image in real]
-        text += ["OpenCV's sample images, 640 x 480:", "", *head, *(f"| {row} |" for row in single(eight_bits)), ""]
-    text += [f"`kcal batch` on {arguments.images} JPEG files of 12 megapixels in folders of 100 a camera:", ""]
+        heads += ["640 x 480, images/s", "found"]
+        rows = [[*row, *more.split(" | ")[1:]] for row, more in zip(rows, single(eight_bits), strict=True)]
+    text = [
+        *table(heads, rows),
+        "",
+        f"`kcal batch` on {arguments.images} JPEG files of 12 megapixels in folders of 100 a camera:",
+        "",
+    ]
     text += batches(images, arguments.images)
     if arguments.write:
-        write_section("corners.md", "bench_detection.py", "\n".join(text))
+        write_section("corners.md", "speed", "\n".join(text))
 
 
 if __name__ == "__main__":

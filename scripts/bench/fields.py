@@ -1,4 +1,4 @@
-"""Kinds of fields of the hybrid lens on views that were held out (docs/measured/fields.md).
+"""Kinds of fields of the hybrid lens on views that were held out (docs/measured/one-camera.md).
 
     KCAL_DATA=... python -m scripts.bench.fields [--wide-folds 5] [--stereo-folds 13] [--write]
 
@@ -31,7 +31,7 @@ from kcal.lens.network_modes import NetworkModes
 from kcal.lens.projection import from_pixels
 from kcal.lens.zernike import ZernikeModes
 from kcal.nets.field_features import train_features
-from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 from scripts.shared.wide_lens import folds, held_out, load
 
@@ -81,7 +81,7 @@ KINDS: dict[str, Fitter] = {
 
 def wide_lens(count: int) -> list[Case]:
     seen, weights = load()
-    return [Case("wide lens, blocks20", seen, torch.from_numpy(weights), folds("blocks20", len(weights))[:count])]
+    return [Case("wide lens, whole blocks", seen, torch.from_numpy(weights), folds("blocks20", len(weights))[:count])]
 
 
 def stereo(count: int) -> list[Case]:
@@ -91,28 +91,25 @@ def stereo(count: int) -> list[Case]:
         seen = detect_images(paths, Board(columns=9, rows=6, square=0.025))
         weight = torch.isfinite(seen.pixels()).all(-1).double()
         parts = [np.array([i]) for i in range(len(seen.views))][:count]
-        cases.append(Case(f"OpenCV's images, {side}", seen, weight, parts))
+        cases.append(Case(f"{side}, each view", seen, weight, parts))
     return cases
 
 
-def measure(case: Case, fit: Fitter) -> list[str]:
-    """Held-out RMS over all parts, effective parameters (median), evidence (median), CPU seconds per fit."""
-    total, count, effective, tempering, clock = 0.0, 0, [], [], 0.0
+def measure(case: Case, fit: Fitter) -> tuple[float, float]:
+    """Held-out RMS over all parts, and CPU seconds per fit."""
+    total, count, clock = 0.0, 0, 0.0
     for out in case.parts:
         train = np.setdiff1d(np.arange(len(case.seen.views)), out)
         start = time.process_time()
         found = fit(case.seen.subset([case.seen.names[i] for i in train]), case.weight[train])
         clock += time.process_time() - start
-        effective.append(found.effective)
-        tempering.append(found.tempering)
+        print(
+            f"    {case.name}: {found.effective:.1f} effective parameters, tempering {found.tempering:.2f}", flush=True
+        )
         test = case.seen.subset([case.seen.names[i] for i in out])
         error, corners = held_out(found.camera, found.board_points, test, case.weight[out])
         total, count = total + error, count + corners
-    weights = len(found.camera.names) - 8
-    return [
-        f"{math.sqrt(total / count):.4f}", str(weights), f"{np.median(effective):.1f}",
-        f"{np.median(tempering):.2f}", f"{clock / len(case.parts):.1f}",
-    ]  # fmt: skip
+    return math.sqrt(total / count), clock / len(case.parts)
 
 
 def main() -> None:
@@ -120,34 +117,18 @@ def main() -> None:
     parser.add_argument("--wide-folds", type=int, default=5)
     parser.add_argument("--stereo-folds", type=int, default=13)
     parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS))
-    parser.add_argument("--write", action="store_true", help="also write docs/measured/fields.md")
+    parser.add_argument("--write", action="store_true", help="also write the table of docs/measured/one-camera.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    lines = [
-        "# Kinds of fields",
-        "",
-        CONCLUSIONS["fields.md"],
-        "",
-        "Made by `scripts/bench/fields.py`. A field is features times weights (`kcal.lens.field_modes`), and "
-        "`fit_hybrid(..., modes=...)` sets the priors of all weights by the same evidence. *zernike*: the default, "
-        "sorted by how modes turn around the axis. *gaussian*: units on square grids, from one radius of the disc down "
-        "by halves. *network*: the last layer over a fixed hidden layer of tanh features, which are random or trained "
-        "on the field and the residuals of a first fit with Zernike modes (that fit is part of the CPU seconds). "
-        f"Held out: RMS in pixels of {arguments.wide_folds} folds of whole blocks of views of the wide lens (by the "
-        f"file's weights), and of {arguments.stereo_folds} single views of OpenCV's images, poses solved again. "
-        "Effective: parameters of lens and board that the views determine, of the weights of the field and some more "
-        "(medians). Tempering: by how much residuals repeat within views. CPU seconds: per fit, one thread.",
-    ]
-    heads = ["field", "held out, px", "weights", "effective", "tempering", "CPU s"]
-    for case in [*wide_lens(arguments.wide_folds), *stereo(arguments.stereo_folds)]:
-        print(case.name, flush=True)
-        rows = []
-        for kind in arguments.kinds:
-            rows.append([kind, *measure(case, KINDS[kind])])
-            show([" | ".join(rows[-1])])
-        lines += ["", f"## {case.name[0].upper()}{case.name[1:]}", "", *table(heads, rows)]
+    cases = [*wide_lens(arguments.wide_folds), *stereo(arguments.stereo_folds)]
+    rows = []
+    for kind in arguments.kinds:
+        found = [measure(case, KINDS[kind]) for case in cases]
+        rows.append([kind, *(f"{error:.4f}" for error, _ in found), f"{found[0][1]:.1f}"])
+        show([" | ".join(rows[-1])])
     if arguments.write:
-        (DOCS / "fields.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        heads = ["field", *(case.name for case in cases), "CPU s, wide lens"]
+        write_section("one-camera.md", "fields", "\n".join(table(heads, rows)))
 
 
 if __name__ == "__main__":

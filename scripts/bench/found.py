@@ -68,7 +68,6 @@ def _ordered(gray: NDArray[np.uint8], corners: NDArray[Any], board: Board) -> Te
 DETECTORS: dict[str, Detector] = {
     "kcal": lambda image, board: detect_board(image, board).pixels,
     "classic, cornerSubPix 5": classic,
-    "SB": sector(0),
     "SB, exhaustive, accurate, normalized": sector(_SECTOR),
 }
 
@@ -133,26 +132,16 @@ def main() -> None:
         cells = [score(find, some, BOARD) for find in DETECTORS.values()]
         rows.append(" | ".join([f"{kind.__name__} (none is right)", *cells]))
         print(rows[-1], flush=True)
-    text = [
-        "## Found",
-        "",
-        f"Rendered, {arguments.images} images of each kind, one thread: found rightly, RMS per axis,",
-    ]
-    text += [
-        "CPU seconds an image. `python -m scripts.bench.found --write`",
-        "",
-        *head,
-        *(f"| {row} |" for row in rows),
-    ]
+    text = [*head, *(f"| {row} |" for row in rows)]
     if os.environ.get("KCAL_DATA"):
-        text += ["", "Folders of real images: found, CPU seconds an image.", "", *head]
+        text += ["", *head]
         for folder, board in FOLDERS:
             images = real(folder, board)()
             cells = [found_only(find, images, board) for find in DETECTORS.values()]
             text.append(f"| {folder}, {board.columns}x{board.rows} | " + " | ".join(cells) + " |")
             print(text[-1], flush=True)
     if arguments.write:
-        write_section("corners.md", "bench_found.py", "\n".join(text))
+        write_section("corners.md", "found", "\n".join(text))
 
 
 if __name__ == "__main__":

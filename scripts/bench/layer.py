@@ -19,7 +19,7 @@ from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.problem.board_problem import BoardProblem
 from scripts.shared.page import write_section
 from scripts.shared.timing import row, show
-from scripts.shared.views import MODELS, NOISE, SIZE, simulate
+from scripts.shared.views import MODELS, SIZE, simulate
 
 VIEWS, REPEATS, STEP = (30, 200, 800), 3, 1e-3
 LENSES = {
@@ -90,14 +90,6 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     lines = [
-        "## Gradients through a calibration",
-        "",
-        f"Made by `scripts/bench/layer.py`: simulated views of a 6x7 board, noise {NOISE} px an axis; 5 and 14 "
-        "coefficients (with the weak prior), and the default lens. CPU seconds on one thread, medians of three: "
-        "calibrating from nothing, again from an earlier solution as in a training loop, and the gradient of fx by all "
-        "corners. *Error*: of that gradient along a random direction against the central difference of two "
-        "calibrations. *Gauss-Newton*: how far off it would be without the curvature of the residuals.",
-        "",
         row("views", "lens", "from nothing, s", "again, s", "gradient, s", "error", "Gauss-Newton"),
         "|---|---|---|---|---|---|---|",
     ]

@@ -1,41 +1,36 @@
-"""From pixels to positions, measured: speed beside OpenCV and kornia, coverage of the intervals, Table 2, geodesy.
+"""From pixels to positions, measured: speed beside OpenCV and kornia, coverage of the intervals, geodesy.
 
-    python -m scripts.bench.locate [--quick] [--markdown docs/measured/locate.md]
+    python -m scripts.bench.locate [--quick] [--write]
 
-Within a round every side runs once, in turn; ratios are taken within a round: median (smallest to largest), above 1
-kcal is faster. The statistics are simulations with fixed seeds and do not depend on the machine.
+Within a round every side runs once, in turn; ratios are taken within a round: medians, above 1 kcal is
+faster. The statistics are simulations with fixed seeds and do not depend on the machine.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-import platform
-from pathlib import Path
+from collections.abc import Callable
 
 import cv2
-import kornia
 import numpy as np
 import pyproj
 import torch
 from kornia.geometry.epipolar import triangulate_points
 from torch import Tensor
 
-import kcal
 from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.angular import triangulate_pairs
-from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
 from kcal.locate.cep import circular_error
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.linear import triangulate_linear
 from kcal.locate.localizer import StereoLocalizer
-from kcal.locate.stereo import PositionStatus
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import CONCLUSIONS
-from scripts.shared.timing import ratios, row, show, spread, times
+from scripts.shared.page import write_section
+from scripts.shared.timing import median, ratio, row, show, times
 
 COUNTS = (100, 10_000, 1_000_000)
 
@@ -68,38 +63,32 @@ def sides(points: Tensor, sigma: float) -> Tensor:
 def throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
     lines = show(
         [
-            "| points | threads | kcal closed form | kcal compiled | kcal singular values | OpenCV | kornia eigh "
-            "| kornia cofactor | OpenCV / closed | eigh / closed | cofactor / closed | OpenCV / compiled "
-            "| cofactor / compiled |",
-            "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+            "| points | kcal closed form | kcal compiled | OpenCV | kornia eigh | kornia cofactor "
+            "| OpenCV / closed | cofactor / closed |",
+            "|---|---|---|---|---|---|---|---|",
         ]
     )
     cameras = poses()
     pose = cameras[1, :, :3].contiguous(), cameras[1, :, 3].contiguous()
     P = cameras.numpy()
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        cv2.setNumThreads(threads)
-        torch.compiler.reset()
-        compiled = torch.compile(triangulate_pairs, fullgraph=True, dynamic=True)
-        for count in counts:
-            flat = sides(some_points(count), 0.1)
-            rays = torch.cat([flat, torch.ones(count, 2, 1, dtype=torch.float64)], -1)
-            left, right = rays[:, 0].contiguous(), rays[:, 1].contiguous()
-            arrays = [np.ascontiguousarray(flat[:, c].T.numpy()) for c in (0, 1)]
-            pairs = flat[None, :, 0].contiguous(), flat[None, :, 1].contiguous()
-            calls = [
-                lambda: triangulate_pairs(left, right, pose),  # noqa: B023
-                lambda: compiled(left, right, pose),  # noqa: B023
-                lambda: triangulate_linear(cameras, rays),  # noqa: B023
-                lambda: cv2.triangulatePoints(P[0], P[1], *arrays),  # noqa: B023
-                lambda: triangulate_points(cameras[:1], cameras[1:], *pairs),  # noqa: B023
-                lambda: triangulate_points(cameras[:1], cameras[1:], *pairs, solver="cofactor"),  # noqa: B023
-            ]
-            found = times(calls, rounds)
-            rate = [spread([1e-6 * count / s for s in side], 2) for side in found]
-            faster = [ratios(found[own], found[other]) for own, other in ((0, 3), (0, 4), (0, 5), (1, 3), (1, 5))]
-            lines += show([row(f"{count:.0e}", threads, *rate, *faster)])
+    torch.compiler.reset()
+    compiled = torch.compile(triangulate_pairs, fullgraph=True, dynamic=True)
+    for count in counts:
+        flat = sides(some_points(count), 0.1)
+        rays = torch.cat([flat, torch.ones(count, 2, 1, dtype=torch.float64)], -1)
+        left, right = rays[:, 0].contiguous(), rays[:, 1].contiguous()
+        arrays = [np.ascontiguousarray(flat[:, c].T.numpy()) for c in (0, 1)]
+        pairs = flat[None, :, 0].contiguous(), flat[None, :, 1].contiguous()
+        calls = [
+            lambda: triangulate_pairs(left, right, pose),  # noqa: B023
+            lambda: compiled(left, right, pose),  # noqa: B023
+            lambda: cv2.triangulatePoints(P[0], P[1], *arrays),  # noqa: B023
+            lambda: triangulate_points(cameras[:1], cameras[1:], *pairs),  # noqa: B023
+            lambda: triangulate_points(cameras[:1], cameras[1:], *pairs, solver="cofactor"),  # noqa: B023
+        ]
+        found = times(calls, rounds)
+        rate = [median([1e-6 * count / s for s in side], 2) for side in found]
+        lines += show([row(f"{count:.0e}", *rate, ratio(found[0], found[2]), ratio(found[0], found[4]))])
     return lines
 
 
@@ -143,24 +132,21 @@ def known_to() -> RigCovariance:
 def localizer(rounds: int, counts: tuple[int, ...]) -> list[str]:
     lines = show(
         [
-            "| points | threads | marks' noise given once | a 4x4 covariance a point "
-            "| with the calibration's covariance |",
-            "|---|---|---|---|---|",
+            "| points | marks' noise given once | a 4x4 covariance a point | with the calibration's covariance |",
+            "|---|---|---|---|",
         ]
     )
     plain = StereoLocalizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1)
     known = StereoLocalizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1, calibration=known_to())
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        for count in counts:
-            left, right, _ = rig()(some_points(count))
-            cov = (0.01 * torch.eye(4, dtype=torch.float64)).expand(count, 4, 4)
-            found = times(
-                [lambda: plain(left, right), lambda: plain(left, right, cov), lambda: known(left, right)],  # noqa: B023
-                rounds,
-            )
-            rate = [spread([1e-6 * count / s for s in side], 3) for side in found]
-            lines += show([row(f"{count:.0e}", threads, *rate)])
+    for count in counts:
+        left, right, _ = rig()(some_points(count))
+        cov = (0.01 * torch.eye(4, dtype=torch.float64)).expand(count, 4, 4)
+        found = times(
+            [lambda: plain(left, right), lambda: plain(left, right, cov), lambda: known(left, right)],  # noqa: B023
+            rounds,
+        )
+        rate = [median([1e-6 * count / s for s in side], 3) for side in found]
+        lines += show([row(f"{count:.0e}", *rate)])
     return lines
 
 
@@ -170,8 +156,8 @@ def coverage(draws: int) -> list[str]:
     lines = show(
         [
             "| range, m | marks only: interval | CEP50 | CEP95 | RMS of range / bound | with calibration: interval "
-            "| interval of marks alone, same rigs | bearing only |",
-            "|---|---|---|---|---|---|---|---|",
+            "| interval of marks alone, same rigs |",
+            "|---|---|---|---|---|---|---|",
         ]
     )
     there, known = rig(), known_to()
@@ -201,13 +187,12 @@ def coverage(draws: int) -> list[str]:
         for module in (wide, plain):
             answer = module(noisy[:, :2], noisy[:, 2:])
             shares.append(((answer.range_low <= distance) & (distance <= answer.range_high)).double().mean().item())
-        weak = (found.status == int(PositionStatus.BEARING_ONLY)).double().mean().item()
         lines += show(
             [
                 row(
                     f"{distance:.0f}", f"{100 * inside.double().mean().item():.2f} %",
                     *(f"{100 * share:.1f} %" for share in circles), f"{range_rms / bound:.3f}",
-                    *(f"{100 * share:.2f} %" for share in shares), f"{100 * weak:.2f} %",
+                    *(f"{100 * share:.2f} %" for share in shares),
                 )
             ]
         )  # fmt: skip
@@ -229,24 +214,6 @@ def _marks_of_drawn_rigs(
         for camera, step, points in ((there.left, left, in_left), (there.right, right, in_right))
     ]
     return torch.cat(pixels, -1)
-
-
-def table_2() -> list[str]:
-    lines = show(
-        [
-            "| Δd, px | 1 km: paper | nearer | farther | 5 km: paper | nearer | farther |",
-            "|---|---|---|---|---|---|---|",
-        ]
-    )
-    for disparity in (2.0, 1.0, 0.5, 0.1):
-        found = range_errors(planned_rig(), [1000.0, 5000.0], BudgetErrors(disparity_px=disparity))["disparity"]
-        cells = [
-            f"{float(value[i]):+.1f} m" for i in (0, 1) for value in (found.first_order, found.nearer, found.farther)
-        ]
-        lines += show(
-            [row(f"{disparity:g}", *(cell.lstrip("+") if j % 3 == 0 else cell for j, cell in enumerate(cells)))]
-        )
-    return lines
 
 
 def geodesy() -> list[str]:
@@ -275,53 +242,22 @@ def geodesy() -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="few rounds, no more than 10 000 points")
-    parser.add_argument("--markdown", type=Path, help="also write the page to this file")
+    parser.add_argument("--write", action="store_true", help="write the tables into docs/measured/locate.md")
     arguments = parser.parse_args()
     rounds, counts = (3, COUNTS[:2]) if arguments.quick else (15, COUNTS)
     draws = 4000 if arguments.quick else 40_000
-    lines = show(
-        [
-            "# From pixels to positions, measured",
-            "",
-            CONCLUSIONS["locate.md"],
-            "",
-            f"Made by `scripts/bench/locate.py` with kcal {kcal.__version__}, torch {torch.__version__}, kornia "
-            f"{kornia.__version__}, OpenCV {cv2.__version__}, PROJ {pyproj.proj_version_str} on "
-            f"{platform.processor() or platform.machine()}; {rounds} rounds, {draws} draws. Two cameras 10 m apart, "
-            "f 1600 px, distorting lenses. Median (smallest to largest); a ratio is the other's time over kcal's: "
-            "above 1, kcal is faster.",
-            "",
-            "## Triangulation",
-            "",
-            "Million points a second from coordinates on the plane z = 1, float64, each library's arrays laid out "
-            "beforehand as it likes them. kcal's answers carry a mask.",
-            "",
-        ]
-    )
-    lines += throughput(rounds, counts)
-    lines += show([""])
-    lines += accuracy()
-    lines += show(["", "## Pixels to WGS84 with covariance", "", "`StereoLocalizer`, million points a second.", ""])
-    lines += localizer(rounds, counts)
-    lines += show(
-        [
-            "",
-            "## Do the intervals cover?",
-            "",
-            "Share of simulated marks (0.1 px along each axis) whose 95 % interval holds the true range, and whose CEP "
-            "circles hold the true place. The bound is the σ of the range that the marks' noise alone allows, to first "
-            "order. With calibration: rigs drawn from their covariance (0.05 px, 0.001°, 1 mm), seen by a user who "
-            "believes the mean one; an interval of the marks alone fails there.",
-            "",
-        ]
-    )
-    lines += coverage(draws)
-    lines += show(["", "## Table 2 of the paper, and the exact values", ""])
-    lines += table_2()
-    lines += show(["", "## Geodesy", ""])
-    lines += geodesy()
-    if arguments.markdown:
-        arguments.markdown.write_text("\n".join(lines) + "\n")
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    parts: dict[str, Callable[[], list[str]]] = {
+        "coverage": lambda: coverage(draws),
+        "triangulation": lambda: throughput(rounds, counts),
+        "accuracy": lambda: [*accuracy(), "", *geodesy()],
+        "localizer": lambda: localizer(rounds, counts),
+    }
+    for name, made in parts.items():
+        lines = made()
+        if arguments.write:
+            write_section("locate.md", name, "\n".join(lines))
 
 
 if __name__ == "__main__":

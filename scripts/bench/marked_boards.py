@@ -60,12 +60,10 @@ def own(image: NDArray[np.uint8], board: Board) -> Tensor:
 
 CHARUCO: dict[str, Detector] = {
     "kcal": own,
-    "CharucoDetector": charuco(),
     "CharucoDetector, tryRefineMarkers, SUBPIX": charuco(cv2.aruco.CORNER_REFINE_SUBPIX, again=True),
 }
 GRID: dict[str, Detector] = {
     "kcal": own,
-    "ArucoDetector, SUBPIX": aruco_grid(cv2.aruco.CORNER_REFINE_SUBPIX),
     "ArucoDetector, APRILTAG": aruco_grid(cv2.aruco.CORNER_REFINE_APRILTAG),
 }
 TAGGED: dict[str, Detector] = dict(CHARUCO)
@@ -104,13 +102,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write the section of docs/measured/corners.md")
     arguments = parser.parse_args()
     limit_threads(1)
-    text = [
-        "## Boards with markers",
-        "",
-        f"Rendered, {arguments.images} images of each kind, one thread: images found, share of the visible corners",
-        f"found rightly, wrong corners (more than {WRONG:g} px off, or not visible), RMS per axis of the others, CPU",
-        "seconds an image. `python -m scripts.bench.marked_boards --write`",
-    ]
+    text = []
     if not HAS_APRILTAG:
         missing = "AprilTag's own library is left out: `pip install --target DIR pupil-apriltags`, DIR in PYTHONPATH."
         print(missing)
@@ -124,7 +116,7 @@ def main() -> None:
             print(name, *rows[-1], sep=" | ", flush=True)
         text += ["", f"`{name}`:", "", *table(["", *detectors], rows)]
     if arguments.write:
-        write_section("corners.md", "bench_marked_boards.py", "\n".join(text))
+        write_section("corners.md", "marked boards", "\n".join(text))
 
 
 if __name__ == "__main__":

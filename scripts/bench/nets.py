@@ -1,8 +1,9 @@
-"""Inverse nets and lookup tables, measured; two sections of docs/measured/nets.md.
+"""Inverse nets and lookup tables, measured; two tables of docs/measured/lens.md.
 
     python -m scripts.bench.nets [--rounds 15] [--write]
 
-Inverse nets: how good they are alone, how many Newton steps they save as a start, and what that is worth in time.
+Inverse nets: how good they are alone, how many evaluations of the lens they save as a start, and what that is worth in
+time.
 Lookup tables: size, stated bound, the largest error found at random points, and time beside the camera itself.
 """
 
@@ -26,18 +27,15 @@ from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.inverse import InverseStart
-from kcal.lens.inverse_start import start_from, undo_tilt
 from kcal.lens.model import LensModel
-from kcal.lens.newton import TOLERANCE
-from kcal.lens.projection import from_pixels
 from kcal.lens.zernike import ZernikeModes
 from kcal.nets.inverse import InverseNetOptions, train_inverse
 from scripts.bench.lens import LENS, SIZE
 from scripts.bench.lens import build as build_hd
 from scripts.shared.page import write_section
-from scripts.shared.timing import ratios, row, show, spread, times
+from scripts.shared.timing import ratio, row, show, spread, times
 
-PAGE = "nets.md"
+PAGE = "lens.md"
 POINTS = 10_000
 # A lens of some 150 degrees, as fitted to a real one.
 WIDE = [0.4749, 0.02579, 3e-5, -9e-6, 8.2e-5, 0.7623, 0.09433, 1.329e-3, 3.1e-5, -2e-7, -2.6e-5, 3e-8, 1.1e-3, 1e-3]
@@ -80,27 +78,6 @@ def random_pixels(camera: Camera, count: int) -> Tensor:
     generator = torch.Generator().manual_seed(5)
     pixels = torch.rand(2 * count, 2, generator=generator, dtype=torch.float64) * torch.tensor(camera.size) - 0.5
     return pixels[camera.unproject(pixels)[1]][:count]
-
-
-def steps_from(camera: Camera, pixels: Tensor, start: InverseStart | None) -> Tensor:
-    """How many full Newton steps each pixel takes to the tolerance of `kcal.lens.newton`, at the most 12."""
-    goal_x, goal_y = from_pixels(pixels[:, 0], pixels[:, 1], camera.params)
-    if start is None:
-        x, y, _, rest = undo_tilt(goal_x, goal_y, camera.coefficients, camera.model)
-        x, y = start_from(x, y, rest, camera.inverse_start)
-    else:
-        x, y = start(goal_x, goal_y)
-    enough = (1 + goal_x**2 + goal_y**2) * TOLERANCE**2
-    steps = torch.zeros(len(pixels))
-    for _ in range(12):
-        lens = distort_components(x, y, camera.coefficients, camera.model)
-        a, b, d, e = lens.point
-        error_x, error_y = lens.x - goal_x, lens.y - goal_y
-        far = ~(error_x**2 + error_y**2 <= enough)
-        steps += far
-        inverse = torch.where(far, lens.determinant.reciprocal(), 0.0)
-        x, y = x - (e * error_x - b * error_y) * inverse, y - (a * error_y - d * error_x) * inverse
-    return steps
 
 
 def evaluations(camera: Camera, pixels: Tensor, start: InverseStart | None) -> int:
@@ -149,9 +126,8 @@ def as_start(rounds: int) -> list[str]:
     """Steps, evaluations and time of `unproject` with and without a net."""
     lines = show(
         [
-            "| camera | Newton steps, mean (most): closed form | with the net | evaluations of the lens a call "
-            "| with the net | µs per 1000 pixels | with the net | time without / with |",
-            "|---|---|---|---|---|---|---|---|",
+            "| camera | evaluations of the lens a call | with the net | time without / with |",
+            "|---|---|---|---|",
         ]
     )
     for name, build in CAMERAS.items():
@@ -161,16 +137,13 @@ def as_start(rounds: int) -> list[str]:
         plain, helped = camera.unproject(pixels), camera.unproject(pixels, start=guess)
         assert torch.equal(plain[1], helped[1])
         assert float((plain[0] - helped[0]).abs().max()) < 1e-6
-        steps = [steps_from(camera, pixels, start) for start in (None, guess)]
         found = times([lambda: camera.unproject(pixels), lambda: camera.unproject(pixels, start=guess)], rounds)  # noqa: B023
         lines += show(
             [
                 row(
                     name,
-                    *(f"{float(s.mean()):.2f} ({int(s.max())})" for s in steps),
                     *(evaluations(camera, pixels, start) for start in (None, guess)),
-                    *(spread([1e9 * s / POINTS for s in side], 0) for side in found),
-                    ratios(found[1], found[0]),
+                    ratio(found[1], found[0]),
                 )
             ]
         )
@@ -182,9 +155,9 @@ def tables(rounds: int) -> list[str]:
     """Lookup tables of each camera."""
     lines = show(
         [
-            "| camera | tolerance, px | baking, s | cells: project | unproject | file, kB | bound, px | largest error "
+            "| camera | tolerance, px | baking, s | file, kB | bound, px | largest error "
             "found, px | answers for | project: camera / table | unproject: camera / table |",
-            "|---|---|---|---|---|---|---|---|---|---|---|",
+            "|---|---|---|---|---|---|---|---|---|",
         ]
     )
     for name, build in CAMERAS.items():
@@ -207,7 +180,6 @@ def tables(rounds: int) -> list[str]:
                 lambda: lookup.unproject(few),  # noqa: B023
             ]
             found = times(calls, rounds)
-            cells = [t.cells.shape for t in (lookup.pixels_from_chart, lookup.chart_from_pixels)]
             buffer = io.BytesIO()
             np.savez(buffer, **{key: value.numpy() for key, value in lookup.state_dict().items()})
             lines += show(
@@ -216,13 +188,12 @@ def tables(rounds: int) -> list[str]:
                         name,
                         f"{tolerance:.0e}",
                         f"{seconds:.1f}",
-                        *(f"{c[1]} x {c[0]}" for c in cells),
                         round(len(buffer.getvalue()) / 1000),
                         f"{max(lookup.bound):.1e}",
                         f"{largest:.1e}",
                         f"{100 * min(lookup.coverage):.1f} %",
-                        ratios(found[1], found[0]),
-                        ratios(found[3], found[2]),
+                        ratio(found[1], found[0]),
+                        ratio(found[3], found[2]),
                     )
                 ]
             )
@@ -236,32 +207,8 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help=f"also write the sections of docs/{PAGE}")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    nets = [
-        "## Inverse nets",
-        "",
-        "Made by `scripts/bench/nets.py`. The net of `train_inverse` (three layers, Inv_NN of the paper's Fig. 8), "
-        "fitted by Levenberg-Marquardt to exact rays of pixels all over the image, and judged on others. *Guess*: "
-        f"what it corrects, in closed form. Medians over {arguments.seeds} seeds. Infinite: somewhere the answer lies "
-        "beyond the fold.",
-        "",
-        *alone(arguments.seeds),
-        "",
-        f"As a start of `unproject`, {POINTS} pixels, one thread, eager. Newton steps are counted for each pixel until "
-        "its residual is rounding; a call works on all pixels together and stops with the slowest. Rays and masks are "
-        "the same either way. Compiled and exported graphs take the same number of steps with any start.",
-        "",
-        *as_start(arguments.rounds),
-    ]
-    lookup = [
-        "## Lookup tables",
-        "",
-        "Made by `scripts/bench/nets.py`: `bake(camera, tolerance)`, the coarsest bicubic tables that keep it. "
-        f"*Bound*: stated by the tables, both directions; *found*: at {10 * POINTS} random pixels. *Answers for*: the "
-        "share of the image's pixels with a ray, the worse direction. Ratios of time for "
-        f"{POINTS} points, one thread, eager: above 1, the table is faster.",
-        "",
-        *tables(arguments.rounds),
-    ]
+    show(alone(arguments.seeds))
+    nets, lookup = as_start(arguments.rounds), tables(arguments.rounds)
     if arguments.write:
         write_section(PAGE, "inverse nets", "\n".join(nets))
         write_section(PAGE, "lookup tables", "\n".join(lookup))

@@ -7,7 +7,7 @@
     KCAL_DATA=DATA python -m scripts.bench.one_camera --epipolar              # the same, 9 pairs fitted and 4 held out
     KCAL_MRCAL=/usr/bin/python3 ... --models mrcal                            # mrcal's spline too, of the wide lens
 
-With --write the table goes into docs/measured/one-camera.md.
+With --write the row goes into the table of docs/measured/one-camera.md.
 
 On each held-out view only its pose is solved again; camera and board stay as fitted. Measure: sqrt(sum w² |r|² / count)
 over all folds, with the weights of the file (OpenCV's images: all one). Epipolar error:
@@ -17,10 +17,11 @@ Sampson's distance of held-out corners in pixels, which needs no board.
 from __future__ import annotations
 
 import argparse
+import functools
 import math
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -38,12 +39,13 @@ from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from scripts.shared.mrcal_spline import splined
-from scripts.shared.page import write_section
+from scripts.shared.page import write_row
 from scripts.shared.timing import row, show
 from scripts.shared.wide_lens import folds, held_out, load, warped
 
 # The spline of mrcal that predicts held-out views of the wide lens best, and about its focal length, pixels.
 SPLINE, FOCAL = "SPLINED11x8", 1900.0
+SPLITS = {"blocks20": "whole blocks of views", "evenodd": "every other view"}
 # A camera and the corners of its board (N, 3), from views and their weights (V, N).
 Fitter = Callable[[Observations, Tensor], tuple[Camera, Tensor]]
 
@@ -81,7 +83,7 @@ def with_mrcal(seen: Observations, weight: Tensor, parts: list[np.ndarray]) -> s
         splined(SPLINE, corners, weights, out, size=seen.image_size, board=seen.board, focal=FOCAL) for out in parts
     ]
     total, seconds, count = (sum(one[key] for one in found) for key in ("sum", "cpu_s", "count"))
-    return row(f"mrcal, {SPLINE}", f"{math.sqrt(total / count):.4f}", f"{seconds / len(parts):.1f}")
+    return f"{math.sqrt(total / count):.4f} ({seconds / len(parts):.1f} s)"
 
 
 def measure(name: str, seen: Observations, weight: Tensor, parts: list[np.ndarray]) -> str:
@@ -96,7 +98,7 @@ def measure(name: str, seen: Observations, weight: Tensor, parts: list[np.ndarra
         test = seen.subset([seen.names[i] for i in out])
         error, corners = held_out(camera, points, test, weight[out])
         total, count = total + error, count + corners
-    return row(name, f"{math.sqrt(total / count):.4f}", f"{seconds / len(parts):.1f}")
+    return f"{math.sqrt(total / count):.4f} ({seconds / len(parts):.1f} s)"
 
 
 def epipolar(rig: StereoRig, left: Tensor, right: Tensor) -> Tensor:
@@ -141,7 +143,7 @@ def stereo_images() -> list[Observations]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--split", choices=["blocks20", "evenodd"], help="of the wide lens")
+    parser.add_argument("--split", choices=list(SPLITS), help="of the wide lens")
     parser.add_argument("--views", type=int, help="fitted of the wide lens, all others held out")
     parser.add_argument("--stereo", action="store_true", help="OpenCV's stereo images, both cameras")
     parser.add_argument("--epipolar", action="store_true", help="OpenCV's stereo images, pairs")
@@ -149,39 +151,36 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write the tables into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    head = [row("model", "held out, RMS px", "CPU s per fit"), row("---", "---", "---")]
+    columns = [*MODELS, "mrcal"]
 
-    def tell(name: str, title: str, head: list[str], rows: Iterable[str]) -> None:
-        lines = [title, "", *head]
-        show(lines)
-        for line in rows:
-            show([line])
-            lines.append(line)
+    def tell(name: str, measured: Callable[[str], str]) -> None:
+        cells = [measured(model) if model in arguments.models else None for model in columns]
+        show([row(name, *(cell or "" for cell in cells))])
         if arguments.write:
-            write_section("one-camera.md", name, "\n".join(lines))
+            write_row("one-camera.md", "held-out", ["held out", *MODELS, f"mrcal, {SPLINE}"], [name, *cells])
 
     if arguments.split:
         seen, weights = load()
         parts = folds(arguments.split, len(seen.views))
-        rows = (measure(name, seen, torch.from_numpy(weights), parts) for name in arguments.models)
-        tell(arguments.split, f"Wide lens of 150 degrees, `{arguments.split}`:", head, rows)
+        tell(
+            f"wide lens, {SPLITS[arguments.split]}", lambda name: measure(name, seen, torch.from_numpy(weights), parts)
+        )
     if arguments.views:
         seen, weights = load()
         draws = [
             np.random.default_rng(seed).permutation(len(seen.views))[arguments.views :] for seed in (100, 101, 102)
         ]
-        rows = (measure(name, seen, torch.from_numpy(weights), draws) for name in arguments.models)
-        tell(f"random{arguments.views}", f"Wide lens, {arguments.views} views fitted, three draws:", head, rows)
+        name = f"wide lens, all but {arguments.views} views"
+        tell(name, lambda name: measure(name, seen, torch.from_numpy(weights), draws))
     if arguments.stereo:
         for side, seen in zip(("left", "right"), stereo_images(), strict=True):
             weight = torch.isfinite(seen.pixels()).all(-1).double()
             each = [np.array([i]) for i in range(len(seen.views))]
-            rows = (measure(name, seen, weight, each) for name in arguments.models)
-            tell(side, f"OpenCV's stereo images, {side}, one view left out:", head, rows)
+            fitted = functools.partial(measure, seen=seen, weight=weight, parts=each)
+            tell(f"OpenCV's images, {side}, each view", fitted)
     if arguments.epipolar:
         sides = stereo_images()
-        rows = (row(name, f"{measure_epipolar(name, sides):.4f}") for name in arguments.models)
-        tell("epipolar", "OpenCV's pairs, 9 fitted and 4 held out:", [row("model", "RMS px"), row("---", "---")], rows)
+        tell("OpenCV's pairs, 4 of 13", lambda name: f"{measure_epipolar(name, sides):.4f}")
 
 
 if __name__ == "__main__":

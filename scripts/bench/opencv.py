@@ -1,6 +1,6 @@
 """kcal beside OpenCV on OpenCV's own 13 stereo pairs: projection, calibration, rig, time.
 
-    KCAL_DATA=folder python -m scripts.bench.opencv [--repeats 5] [--markdown docs/measured/opencv.md]
+    KCAL_DATA=folder python -m scripts.bench.opencv [--repeats 5] [--write]
 
 The folder holds `opencv_stereo/left01.jpg` ... `right14.jpg` (OpenCV's samples; Debian ships them in opencv-doc). Both
 sides get the same corners, found by kcal and rounded to float32, as OpenCV wants them. RMS is sqrt(mean ‖r‖²) over
@@ -23,7 +23,6 @@ import cv2
 import numpy as np
 import torch
 
-import kcal
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.pairs import pair_by_name
@@ -33,7 +32,7 @@ from kcal.corners.detect import detect_images
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from kcal.locate.check import triangulated_sides
-from scripts.shared.page import CONCLUSIONS
+from scripts.shared.page import write_section
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 CRITERIA = (3, 300, 1e-12)
@@ -48,7 +47,7 @@ FLAGS = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=5, help="timed runs of each side")
-    parser.add_argument("--markdown", type=Path, help="also write the tables to this file")
+    parser.add_argument("--write", action="store_true", help="write the tables into docs/measured/other-programs.md")
     arguments = parser.parse_args()
     folder = os.environ.get("KCAL_DATA")
     if not folder or not Path(folder, "opencv_stereo").is_dir():
@@ -57,22 +56,15 @@ def main() -> None:
     cv2.setNumThreads(1)
 
     seen = {side: _observe(Path(folder, "opencv_stereo"), side) for side in ("left", "right")}
-    text = [
-        "# kcal beside OpenCV",
-        "",
-        CONCLUSIONS["opencv.md"],
-        "",
-        f"Made by `scripts/bench/opencv.py` with kcal {kcal.__version__}, torch {torch.__version__}, OpenCV "
-        f"{cv2.__version__}, one thread. 13 pairs of OpenCV's sample images, 640x480, 9x6 corners, squares of 25 mm; "
-        "the same corners for both.",
-        "",
-        *_detection(seen),
-        *_projection(),
-        *_calibration(seen, arguments.repeats),
-        *_rig(seen, arguments.repeats),
-    ]
-    if arguments.markdown:
-        arguments.markdown.write_text("\n".join(text) + "\n")
+    parts: dict[str, Callable[[], list[str]]] = {
+        "opencv, cameras": lambda: _calibration(seen, arguments.repeats),
+        "opencv, projection": _projection,
+        "opencv, rig": lambda: _rig(seen, arguments.repeats),
+    }
+    for name, made in parts.items():
+        lines = made()
+        if arguments.write:
+            write_section("other-programs.md", name, "\n".join(lines))
 
 
 def _show(lines: list[str]) -> list[str]:
@@ -89,15 +81,8 @@ def _observe(folder: Path, side: str) -> Observations:
     return found.model_copy(update={"views": tuple(views)})
 
 
-def _detection(seen: dict[str, Observations]) -> list[str]:
-    found = sum(len(o.views) for o in seen.values())
-    total = found + sum(len(o.failures) for o in seen.values())
-    unseen = sum(view.pixels.count(None) for o in seen.values() for view in o.views)
-    return _show(["## Detection", "", f"Boards found: {found} of {total} images; corners left out: {unseen}.", ""])
-
-
 def _projection() -> list[str]:
-    lines = ["## Projection against `cv2.projectPoints`", "", "| coefficients | largest difference, px |", "|---|---|"]
+    lines = ["| coefficients | largest difference, px |", "|---|---|"]
     generator = np.random.default_rng(0)
     lens = generator.normal(size=14) * [0.2, 0.05, 1e-3, 1e-3, 0.02, 0.05, 0.02, 0.01, *[1e-3] * 4, 0.02, 0.02]
     points = generator.uniform(-1, 1, (2000, 3)) * [1.2, 0.7, 0.5] + [0, 0, 2]
@@ -114,17 +99,12 @@ def _projection() -> list[str]:
         ours, valid = camera.project(torch.from_numpy(points))
         difference = np.abs(ours.numpy() - theirs)[valid.numpy()].max()
         lines.append(f"| {count} | {difference:.1e} ({int(valid.sum())} points) |")
-    return _show([*lines, ""])
+    return _show(lines)
 
 
 def _calibration(seen: dict[str, Observations], repeats: int) -> list[str]:
     lines = _show(
         [
-            "## Calibration of one camera",
-            "",
-            f"OpenCV's criteria: {CRITERIA[1]} iterations, {CRITERIA[2]:g}. Time: median (smallest to largest) of "
-            f"{repeats} whole calls; kcal's passes through every smaller model and several starts.",
-            "",
             "| camera | model | RMS kcal, px | RMS OpenCV | difference | kcal, ms | OpenCV, ms | ratio |",
             "|---|---|---|---|---|---|---|---|",
         ]
@@ -132,7 +112,9 @@ def _calibration(seen: dict[str, Observations], repeats: int) -> list[str]:
     for side, observations in seen.items():
         for model in FLAGS:
             ours, theirs, times = _in_turn(
-                partial(calibrate_camera, observations, CalibrationOptions(model=model, weighted=False)),
+                partial(
+                    calibrate_camera, observations, CalibrationOptions(model=model, weak_prior=None, weighted=False)
+                ),
                 partial(_opencv, observations, model),
                 repeats,
             )
@@ -140,16 +122,15 @@ def _calibration(seen: dict[str, Observations], repeats: int) -> list[str]:
             lines += _show(
                 [
                     f"| {side} | {model} | {ours.rms:.7f} | {theirs[0]:.7f} | {ours.rms - theirs[0]:+.1e} "
-                    f"| {_spread(times[0], 1e3)} | {_spread(times[1], 1e3)} | {_spread(ratios)} |"
+                    f"| {_median(times[0], 1e3)} | {_median(times[1], 1e3)} | {_median(ratios)} |"
                 ]
             )
-    return [*lines, *_show([""])]
+    return lines
 
 
-def _spread(values: list[float], factor: float = 1.0) -> str:
-    median, low, high = (factor * f(values) for f in (statistics.median, min, max))
-    digits = 1 if median < 10 else 0
-    return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+def _median(values: list[float], factor: float = 1.0) -> str:
+    median = factor * statistics.median(values)
+    return f"{median:.{1 if median < 10 else 0}f}"
 
 
 def _in_turn(first: Callable[[], Any], second: Callable[[], Any], repeats: int) -> tuple[Any, Any, list[list[float]]]:
@@ -183,17 +164,13 @@ def _opencv(observations: Observations, model: str) -> Any:
 def _rig(seen: dict[str, Observations], repeats: int) -> list[str]:
     lines = _show(
         [
-            "## Rig from the 13 pairs",
-            "",
-            "Both sides start from the same cameras (kcal's, 5 coefficients). Squares: mean and standard deviation of "
-            "all triangulated sides, `cv2.undistortPoints` and `cv2.triangulatePoints` for OpenCV; true 25 mm.",
-            "",
             "| intrinsics | side | baseline, mm | RMS, px | squares, mm | ms |",
             "|---|---|---|---|---|---|",
         ]
     )
     left, right = seen["left"], seen["right"]
-    cameras = (calibrate_camera(left).camera, calibrate_camera(right).camera)
+    five = CalibrationOptions(model="opencv5")
+    cameras = (calibrate_camera(left, five).camera, calibrate_camera(right, five).camera)
     pairs = pair_by_name(left.names, right.names)
     for word, refine in (("fixed", False), ("refined jointly", True)):
         options = RigOptions(intrinsics="free" if refine else "fixed", reject=False)
@@ -208,12 +185,12 @@ def _rig(seen: dict[str, Observations], repeats: int) -> list[str]:
         lines += _show(
             [
                 f"| {word} | kcal | {1e3 * float(rig.baseline):.5f} | {ours.rms:.7f} "
-                f"| {1e3 * side.mean:.4f} ± {1e3 * side.spread:.4f} | {_spread(times[0], 1e3)} |",
+                f"| {1e3 * side.mean:.4f} ± {1e3 * side.spread:.4f} | {_median(times[0], 1e3)} |",
                 f"| {word} | OpenCV | {1e3 * baseline:.5f} | {rms:.7f} | {1e3 * mean:.4f} ± {1e3 * spread:.4f} "
-                f"| {_spread(times[1], 1e3)} |",
+                f"| {_median(times[1], 1e3)} |",
             ]
         )
-    return [*lines, *_show([""])]
+    return lines
 
 
 def _opencv_stereo(

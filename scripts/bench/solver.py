@@ -27,12 +27,11 @@ from typing import Any
 import numpy as np
 
 from scripts.shared.memory import peak_megabytes
-from scripts.shared.page import write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table, write_section
+from scripts.shared.timing import row, show
 from scripts.shared.views import (
     COLUMNS,
     MODELS,
-    NOISE,
     ROWS,
     SIZE,
     SQUARE,
@@ -46,6 +45,9 @@ from scripts.shared.views import (
 
 # Solutions whose relative excess of RMS is below this count as equally good.
 SAME = 1e-4
+# Sections of the page, one for each number of coefficients; 20 have no peer and are printed only.
+SECTIONS = {5: "5 coefficients", 8: "8 coefficients", 14: "14 coefficients"}
+COLUMN_NAMES = ("RMS px", "excess", "truth px", "flipped", "memory MB")
 
 
 # Solvers: data, number of coefficients -> (fx fy cx cy, coefficients, rotations, translations, seconds).
@@ -238,8 +240,8 @@ def run(name: str, path: Path, coefficients: int, timeout: float) -> dict[str, A
     return found
 
 
-def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> tuple[list[str], dict[str, float]]:
-    """Lines of the table for one problem, and the median seconds of each solver."""
+def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> tuple[list[list[Any]], dict[str, float]]:
+    """Rows of the table for one problem, and the median seconds of each solver."""
     names = [name for name in arguments.solvers if coefficients in KNOWN[name]]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "views.npz"
@@ -257,27 +259,27 @@ def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> tup
         }
     best = min((one["rms"] for one in judged.values() if one["regular"]), default=float("nan"))
     own = {name: [one.get("seconds", float("nan")) for one in runs[name]] for name in names if name.startswith("kcal")}
-    lines = []
+    lines: list[list[Any]] = []
     for name in names:
-        head = f"| {views} | {coefficients} | {name} |"
+        mine = ("kcal",) if coefficients == 5 else ("kcal", "kcal, weak prior")
         if name not in judged:
-            lines.append(f"{head} {runs[name][-1]['failed']} | | | | | | | |")
+            lines.append([views, name, runs[name][-1]["failed"], *[""] * (len(mine) + len(COLUMN_NAMES))])
             continue
         seconds = [one["seconds"] for one in runs[name]]
         cells = []
-        for mine in ("kcal", "kcal, weak prior"):
-            ratios = [a / b for a, b in zip(own.get(mine, []), seconds, strict=False)]
+        for way in mine:
+            ratios = [a / b for a, b in zip(own.get(way, []), seconds, strict=False)]
             shown = ratios and not name.startswith("kcal")
-            cells.append(f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})" if shown else "")
+            cells.append(f"{statistics.median(ratios):.2f}" if shown else "")
         one = judged[name]
         excess = f"{one['rms'] / best - 1:+.1e}" if one["regular"] else "folds"
         if one["regular"] and one["rms"] / best - 1 <= SAME:
             excess = "best"
         memory = max(entry["megabytes"] for entry in runs[name])
-        lines.append(
-            f"{head} {1e3 * statistics.median(seconds):.0f} | {cells[0]} | {cells[1]} | {one['rms']:.6f} | {excess} | "
-            f"{one['truth']:.2f} | {one['flipped']} | {memory:.0f} |"
-        )
+        lines.append([
+            views, name, f"{1e3 * statistics.median(seconds):.0f}", *cells, f"{one['rms']:.6f}", excess,
+            f"{one['truth']:.2f}", one["flipped"], f"{memory:.0f}",
+        ])  # fmt: skip
     return lines, {name: statistics.median(one["seconds"] for one in runs[name]) for name in judged}
 
 
@@ -316,32 +318,17 @@ def main() -> None:
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
     arguments.solvers = [name for name in SOLVERS if name not in PYTHON or os.environ.get(PYTHON[name])]
-    threads = os.environ.setdefault("OMP_NUM_THREADS", "1")
-    lines = [
-        f"## Beside other solvers, {threads} thread{'s' if threads != '1' else ''}",
-        "",
-        f"Made by `scripts/bench/solver.py`: simulated views of a {COLUMNS}x{ROWS} board, {SIZE[0]}x{SIZE[1]} px, "
-        f"noise {NOISE} px an axis, {threads} thread(s), median of {arguments.repeats} "
-        "alternating runs after a small one. kcal and OpenCV start from nothing, Ceres and mrcal from a good start "
-        "that is not timed. "
-        f"*Weak prior*: `CalibrationOptions(weak_prior={WEAK})`. *Ratio* is kcal's time over the other's, without and "
-        "with the weak prior: below 1 kcal is faster. *Excess*: RMS over the best of a lens that does not fold between "
-        "the corners; within 1e-4 counts as best. *Truth*: RMS over the image, in pixels, between the rays of the "
-        "found and of the true camera after the best rotation. *Flipped*: boards more than 8 degrees from the truth. "
-        "*Memory*: peak of the whole process, libraries included.",
-        "",
-        "| views | coefficients | solver | ms | ratio (range) | ratio, weak prior | RMS px | excess | truth px "
-        "| flipped | memory MB |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     seconds = {}
-    for views in arguments.views:
-        for coefficients in arguments.coefficients:
+    for coefficients in arguments.coefficients:
+        ratios = ["kcal / this"] if coefficients == 5 else ["kcal / this", "kcal, weak prior / this"]
+        lines = show(table(["views", "solver", "ms", *ratios, *COLUMN_NAMES], []))
+        for views in arguments.views:
             found, seconds[views, coefficients] = compare(views, coefficients, arguments)
-            lines += show(found)
-    lines += show(["", *growth(seconds)])
-    if not arguments.dry:
-        write_section("solver.md", f"beside other solvers, {threads} thread(s)", "\n".join(lines))
+            lines += show([row(*cells) for cells in found])
+        if coefficients in SECTIONS and not arguments.dry:
+            write_section("solver.md", SECTIONS[coefficients], "\n".join(lines))
+    show(growth(seconds))
 
 
 if __name__ == "__main__":

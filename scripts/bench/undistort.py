@@ -6,7 +6,7 @@
 
 One image, one lens of 8 coefficients. The maps of kcal and OpenCV are made beforehand, as one would for a video;
 kornia's function has no way to keep them. All three keep the source's intrinsics. In each round every side runs once,
-in turn, and ratios are taken within a round; median (smallest to largest). One thread, then two.
+in turn, and ratios are taken within a round; medians, one thread.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from kornia.geometry.calibration import undistort_image
 
 from kcal.lens.camera import Camera
 from kcal.lens.images import Undistort, undistort_maps
-from scripts.shared.timing import ratios, row, show, spread, times
+from scripts.shared.timing import median, ratio, row, show, times
 
 SIZE = (1920, 1080)
 LENS = [-0.28, 0.1, 1e-3, -1e-3, 0.02, 0.05, 0.02, 0.01]
@@ -44,23 +44,20 @@ def tables(rounds: int) -> list[str]:
     """Print the table and return its lines."""
     camera = Camera.build(focal=(1400, 1400), center=(957, 541), size=SIZE, coefficients=LENS, model="opencv8")
     new = Camera.build(focal=(1400, 1400), center=(957, 541), size=SIZE, model="pinhole")
+    milliseconds = _milliseconds(times([lambda: undistort_maps(camera, new)], 3)[0])
+    print(f"Making kcal's maps, once for each camera: {milliseconds} ms.")
     lines = show(
         [
-            "One image, 8 coefficients, eager, milliseconds. The maps of kcal and OpenCV are made beforehand, as one "
-            "would for a video; kornia's function has no way to keep them. Making kcal's maps, once a camera: "
-            f"{_milliseconds(times([lambda: undistort_maps(camera, new)], 3)[0])} ms.",
-            "",
-            "| image | threads | kcal, maps kept | `cv2.remap` | kornia `undistort_image` | cv2 / kcal | kornia / kcal "
+            "| image | kcal, maps kept | `cv2.remap` | kornia `undistort_image` | cv2 / kcal | kornia / kcal "
             "| largest difference to cv2, levels of 255 |",
-            "|---|---|---|---|---|---|---|---|",
+            "|---|---|---|---|---|---|---|",
         ]
     )
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
     undistort = Undistort(camera, new)
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        cv2.setNumThreads(threads)
-        for name, channels, dtype in CASES:
-            lines += show([_row(name, threads, camera, undistort, _image(channels, dtype), rounds)])
+    for name, channels, dtype in CASES:
+        lines += show([_row(name, camera, undistort, _image(channels, dtype), rounds)])
     return lines
 
 
@@ -74,7 +71,7 @@ def _image(channels: int, dtype: torch.dtype) -> torch.Tensor:
 
 
 @torch.no_grad()
-def _row(name: str, threads: int, camera: Camera, undistort: Undistort, image: torch.Tensor, rounds: int) -> str:
+def _row(name: str, camera: Camera, undistort: Undistort, image: torch.Tensor, rounds: int) -> str:
     maps = undistort_maps(undistort.camera, undistort.new_camera)
     # OpenCV's images have their channels last.
     array = np.ascontiguousarray(image[0].permute(1, 2, 0).squeeze(-1).numpy())
@@ -86,16 +83,16 @@ def _row(name: str, threads: int, camera: Camera, undistort: Undistort, image: t
     if image.is_floating_point():
         calls.append(lambda: undistort_image(image, matrix, lens))
     found = times(calls, rounds)
-    faster = [ratios(found[0], other) for other in found[1:]]
+    faster = [ratio(found[0], other) for other in found[1:]]
     theirs = torch.from_numpy(np.atleast_3d(cv2.remap(array, maps.map_x, maps.map_y, cv2.INTER_LINEAR)))
     difference = float((undistort(image)[0][0].double() - theirs.permute(2, 0, 1).double()).abs().max())
-    cells = [name, str(threads), *(_milliseconds(t) for t in found), *["–"] * (3 - len(found))]
+    cells = [name, *(_milliseconds(t) for t in found), *["–"] * (3 - len(found))]
     cells += [*faster, *["–"] * (2 - len(faster)), f"{difference:.3f}"]
     return row(*cells)
 
 
 def _milliseconds(seconds: list[float]) -> str:
-    return spread([1e3 * value for value in seconds])
+    return median([1e3 * value for value in seconds])
 
 
 if __name__ == "__main__":

@@ -64,9 +64,6 @@ def lines(records: list[Record]) -> list[str]:
     for stretch in sorted({record["key"][0] for record in records}):
         own = [record for record in records if record["key"][0] == stretch]
         kinds = {
-            "all": own,
-            "upright": [r for r in own if r["upright"]],
-            "turned": [r for r in own if not r["upright"]],
             "by hand": [r for r in own if r["hand"]],
             "on a stand": [r for r in own if not r["hand"]],
         }
@@ -76,11 +73,11 @@ def lines(records: list[Record]) -> list[str]:
             off = [abs(record["aspect"] / record["factor"] - 1.0) for record in said]
             rows.append(
                 [
-                    f"{stretch:g}", name, len(part), len(part) - len(known), len(said),
+                    f"{stretch:g}", name, len(part), len(said),
                     f"{100 * len(said) / len(known):.1f} %" if known else "–", f"{max(off):.4f}" if off else "–",
                 ]
             )  # fmt: skip
-    head = ["stretch", "captures", "number", "refused", "said not to be square", "share", "largest error of f_y/f_x"]
+    head = ["stretch", "captures", "number", "said not to be square", "share", "largest error of f_y/f_x"]
     return table(head, rows)
 
 

@@ -1,4 +1,4 @@
-"""Whether calibration ends where it should, on real views; writes two sections of docs/measured/solver.md.
+"""Whether calibration ends where it should, on real views; writes a table of docs/measured/solver.md.
 
     KCAL_DATA=folder python -m scripts.check.calibration            both checks, 20 starts
     KCAL_DATA=folder python -m scripts.check.calibration --starts 5 --sets left --dry
@@ -206,27 +206,12 @@ def main() -> None:
         sys.exit("KCAL_DATA is not set: it names the folder with the real images and corners")
     torch.set_num_threads(1)
     sets = real_sets(Path(folder), arguments.sets)
-    made = f"Made by `scripts/check/calibration.py`, {len(arguments.sets)} sets of real views. *left*, *right*: "
-    made += "13 views each of OpenCV's sample, 640x480, 54 corners; *wide*: 93 views of a lens of some 150 degrees, "
-    made += "6016x4016, 100 corners less outliers. All corners count alike."
     if arguments.only != "starts":
-        text = [
-            "## Richer models", "", made + " RMS in pixels over the number of coefficients. ᵇ: the solver stopped at a "
-            "bound, because lower costs lie at lenses that fold; ᶠ: it stopped in a flat valley. A rise is an RMS more "
-            f"than {SAME_RMS:g} above that of a model with fewer coefficients.", "", *ladder(sets),
-        ]  # fmt: skip
+        text = ladder(sets)
         if not arguments.dry:
             write_section("solver.md", "richer models", "\n".join(text))
     if arguments.only != "ladder":
-        text = [
-            "## Starts and units", "", made + f" The optimum is the best end of `calibrate_camera`; an end counts as "
-            f"it where the RMS is within {SAME_RMS:g} and all corners' projections within {SAME_PIXELS:g} px; the "
-            "worst of all ends are given. *Solver alone*: one Levenberg-Marquardt from no lens, a focal length wrong "
-            "by a factor of 1/2 to 2, boards turned by 5 degrees an axis and moved by 5 % (1 σ), without the searches "
-            "over minima that `calibrate_camera` makes.", "", *starts(sets, arguments.starts),
-        ]  # fmt: skip
-        if not arguments.dry:
-            write_section("solver.md", "starts and units", "\n".join(text))
+        starts(sets, arguments.starts)
 
 
 if __name__ == "__main__":

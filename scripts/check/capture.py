@@ -1,7 +1,7 @@
 """Guided photography of a board against views at random: how many views give the same camera.
 
     python -m scripts.check.capture --out cells.jsonl --seeds 8      # cells in the file are kept
-    python -m scripts.check.capture --out cells.jsonl --write        # docs/measured/capture.md
+    python -m scripts.check.capture --out cells.jsonl --write        # docs/measured/ordinary.md
 
 Each seed has a lens with five coefficients of its own, 1280 x 720, and a board of 9 x 6 corners 25 mm apart. Frames are
 rendered, with noise and a little blur, and corners are detected in them. *Random*: 20 views drawn by
@@ -38,14 +38,13 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.sim.board import BoardPose, BoardSize
 from kcal.sim.poses import sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
-from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 PRINT = BoardSize(BOARD.columns, BOARD.rows, BOARD.square)
 SIZE, RANDOM = (1280, 720), 20
 ACROSS, ALONG, TILT, ROLL = 0.05, 0.10, math.radians(8.0), math.radians(10.0)
-PAGE = "capture.md"
 
 
 def lens(seed: int) -> Camera:
@@ -167,9 +166,7 @@ def main() -> None:
     lines = tables(records)
     show(lines)
     if arguments.write:
-        text = (__doc__ or "").split("\n\n", 2)[2].strip()
-        page = ["# Guided photography, measured", "", CONCLUSIONS[PAGE], "", "Made by `scripts/check/capture.py`."]
-        (DOCS / PAGE).write_text("\n".join([*page, text, "", *lines, ""]), encoding="utf-8")
+        write_section("ordinary.md", "capture", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.sim.true_rig import TrueRig
-from scripts.check.chain_page import conclude, tables
+from scripts.check.chain_page import conclude, failures, tables
 from scripts.check.chain_rig import How, judge, targets, true_rig
 from scripts.shared.timing import show
 from scripts.shared.traced import BOARD, as_camera, capture, printed, pupil_of
@@ -181,7 +181,7 @@ def main() -> None:
         if left:
             with torch.no_grad():
                 cell(dict(zip(keys, values, strict=False)), left, arguments.marks, arguments.exact, write)
-    show(tables(records))
+    show([*tables(records), "", *failures(records)])
 
 
 if __name__ == "__main__":

@@ -1,31 +1,17 @@
-"""The tables of `scripts.check.chain`, and its page."""
+"""The tables of `scripts.check.chain`, and its table of docs/measured/chain.md."""
 
 from __future__ import annotations
 
+import itertools
 import re
 import statistics
 from collections.abc import Sequence
 from typing import Any
 
 from scripts.shared.long_range import RANGES
-from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.page import table, write_section
 
-PAGE = "chain.md"
 Records = Sequence[dict[str, Any]]
-HEAD = """# The whole chain, measured
-
-{conclusion}
-
-Made by `scripts/check/chain.py`, which says what is simulated: two ray-traced lenses 10 m apart, calibrated one by one
-from 60 views of a board at 0.55 to 1.3 m, a rig solved from 12 landmarks at 40 to 400 m (2 cm, 0.07 px), and targets
-all over the common image at 100 m to 5 km, marked to 0.1 px. *Held*: the rig takes the cameras as exact. *Prior*: it
-takes what their calibrations know, and refines them. *cv8*, *cv14*: `cv2.calibrateCamera` with 8 and 14 coefficients;
-*cvRO*: `cv2.calibrateCameraRO` with 8. Their rig is kcal's with cameras held, because OpenCV has none from landmarks
-with errors of a survey. *true*: the lenses themselves.
-
-The *bound* is the standard deviation of the range that noise in the marks leaves when everything else is exact. All
-errors are those of the inverse range, which is Gaussian at any range; meters are such errors times the squared range.
-"""
 
 
 def pooled(records: Records, name: str, index: Sequence[int] = range(len(RANGES))) -> float:
@@ -47,72 +33,49 @@ def inside(records: Records, i: int | None) -> str:
 
 
 def tables(records: Records) -> list[str]:
-    """All tables: errors, coverage, failures."""
-    lines = ["Draws of lenses, boards and corners, by seed: " + ", ".join(map(str, _values(records, "draw"))) + ".", ""]
+    """Errors and coverage of all chains, and what failed."""
+    rows: list[list[str]] = []
     chains = _values(records, "chain", sort=False)
-    for board in _values(records, "board"):
-        for noise in _values(records, "noise"):
-            part = [r for r in records if r["board"] == board and r["noise"] == noise]
-            if part:
-                lines += [f"## {board.capitalize()} boards, corners of {noise:g} px", "", *_errors(part, chains)]
-    return [*lines, *_failures(records, chains)]
-
-
-def _errors(records: Records, chains: Sequence[str]) -> list[str]:
-    lines = []
-    for pupil in _values(records, "pupil"):
-        rows, coverage = [], []
+    keys = [_values(records, key) for key in ("board", "pupil", "noise")]
+    for board, pupil, noise in itertools.product(*keys):
         for chain in chains:
-            own = [r for r in records if r["pupil"] == pupil and r["chain"] == chain]
-            good = [r for r in own if r["runs"]]
-            if not own:
-                continue
-            runs = sum(r["runs"] for r in own)
-            failed = sum(sum(r["failed"].values()) for r in own)
-            if not good:
-                rows.append([chain, *["–"] * 7, f"{failed} of {failed}"])
-                continue
-            alone = [value**2 for r in good for value in r["lenses_m"]]
-            far = (len(RANGES) - 1,)
-            lost, counted = (sum(sum(r["sums"][name]) for r in good) for name in ("lost", "count"))
-            share, total, expected = (pooled(good, name) for name in ("share", "total", "expected"))
-            rows.append(
-                [
-                    chain,
-                    f"{statistics.fmean(alone) ** 0.5:.0f}" if alone else "–",
-                    f"{pooled(good, 'meters', far):.0f}",
-                    f"{share:.2f}",
-                    f"{total:.2f}",
-                    f"{expected:.2f}",
-                    f"{pooled(good, 'total', far):.2f}",
-                    f"{100 * lost / (lost + counted):.1f} %",
-                    f"{failed} of {runs + failed}",
-                ]
-            )
-            coverage.append([chain, *(inside(good, i) for i in range(len(RANGES))), inside(good, None), runs])
-        heads = [
-            "chain", "lenses alone, m", "calibration, m", "share / bound", "total / bound", "expected / bound",
-            "total / bound at 5 km", "without ray", "failed",
-        ]  # fmt: skip
-        lines += [
-            f"Pupil {pupil:g} mm/rad². Range error at 5 km, RMS over the common image, of lenses alone (landmarks "
-            "without noise) and of calibration (with it); RMS over all seven ranges of calibration's share, of the "
-            "total error, and of the error that the localizer expects, over the bound. *Without ray*: targets at which "
-            "a lens model folds, left out of all else. *Failed*: rigs that ended with an error.",
-            "",
-            *table(heads, rows),
-            "",
-            "True range inside the 95 % interval, percent ± one standard error over draws of the cameras:",
-            "",
-            *table(["chain", *(f"{r:g} m" for r in RANGES), "all", "runs"], coverage),
-            "",
-        ]
-    return lines
+            wanted = (board, pupil, noise, chain)
+            own = [r for r in records if (r["board"], r["pupil"], r["noise"], r["chain"]) == wanted]
+            if own:
+                corners = [f"{noise:g}"] if len(keys[2]) > 1 else []
+                rows.append([board, f"{pupil:g}", *corners, chain, *_cells(own)])
+    heads = [
+        "board", "pupil, mm/rad²", *(["corners, px"] if len(keys[2]) > 1 else []), "chain", "lenses alone, m",
+        "calibration, m", "total / bound", "in 95 %, %", "at each range, %", "without ray", "failed",
+    ]  # fmt: skip
+    draws = "Draws of lenses, boards and corners, by seed: " + ", ".join(map(str, _values(records, "draw"))) + "."
+    return [*table(heads, rows), "", draws]
 
 
-def _failures(records: Records, chains: Sequence[str]) -> list[str]:
+def _cells(records: Records) -> list[str]:
+    """Of one chain: errors, coverage, targets without a ray, runs that failed."""
+    good = [r for r in records if r["runs"]]
+    runs, failed = sum(r["runs"] for r in records), sum(sum(r["failed"].values()) for r in records)
+    if not good:
+        return [*["–"] * 6, f"{failed} of {failed}"]
+    alone = [value**2 for r in good for value in r["lenses_m"]]
+    lost, counted = (sum(sum(r["sums"][name]) for r in good) for name in ("lost", "count"))
+    by_range = [float(inside(good, i).split(" ")[0]) for i in range(len(RANGES))]
+    return [
+        f"{statistics.fmean(alone) ** 0.5:.0f}" if alone else "–",
+        f"{pooled(good, 'meters', (len(RANGES) - 1,)):.0f}",
+        f"{pooled(good, 'total'):.2f}",
+        inside(good, None),
+        f"{min(by_range):.1f} to {max(by_range):.1f}",
+        f"{100 * lost / (lost + counted):.1f} %",
+        f"{failed} of {runs + failed}",
+    ]
+
+
+def failures(records: Records) -> list[str]:
+    """A table of the messages of runs that failed."""
     rows = []
-    for chain in chains:
+    for chain in _values(records, "chain", sort=False):
         found: dict[str, int] = {}
         own = [r for r in records if r["chain"] == chain]
         for record in own:
@@ -123,13 +86,12 @@ def _failures(records: Records, chains: Sequence[str]) -> list[str]:
         rows += [[chain, f"{count} of {total}", message[:200]] for message, count in found.items()]
     if not rows:
         return ["No run failed."]
-    return ["## Failed runs", "", *table(["chain", "runs", "message"], rows)]
+    return table(["chain", "runs", "message"], rows)
 
 
 def conclude(records: Records) -> None:
-    """Write the page."""
-    text = HEAD.format(conclusion=CONCLUSIONS[PAGE])
-    (DOCS / PAGE).write_text("\n".join([text, *tables(records)]).rstrip() + "\n", encoding="utf-8")
+    """Write the table of the page."""
+    write_section("chain.md", "chain", "\n".join(tables(records)))
 
 
 def _values(records: Records, key: str, *, sort: bool = True) -> list[Any]:

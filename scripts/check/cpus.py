@@ -1,8 +1,8 @@
 """Repeat tests and calibrations as other makes of CPU would round them, and say what differs.
 
     python -m scripts.check.cpus                           # make test-cpus: the whole test suite, once under each
-    python -m scripts.check.cpus --tests tests/calibrate   # some tests; --write: docs/measured/cpus.md
-    python -m scripts.check.cpus --figures --write         # cameras, σ and positions in place of tests
+    python -m scripts.check.cpus --tests tests/calibrate   # some tests
+    python -m scripts.check.cpus --figures --write         # cameras, σ and positions; docs/measured/other-programs.md
 
 Libraries choose their code by the CPU: sums run in another order, products are fused with sums or are not, and results
 differ in the last bits. Environment variables choose in place of the CPU, so one machine stands for others: `MKL_CBWR`
@@ -23,16 +23,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kcal.files import make_folder
-from scripts.check.cpus_figures import compare
-from scripts.shared.page import CONCLUSIONS, DOCS, table, write_section
+from scripts.check.cpus_figures import Row, compare
+from scripts.shared.page import DOCS, table, write_section
 from scripts.shared.timing import show
 
 ROOT = DOCS.parents[1]
-_MADE = (
-    "Made by `scripts/check/cpus.py`: environment variables let one machine compute as others do. Each stage begins "
-    "with the same input under all settings. A difference from this CPU is the largest over the image, or over the "
-    "points, in units of its σ. The last column says how the solver ended where settings differ."
-)
 _NO_AVX512 = "X86_V4 AVX512_ICL AVX512_SPR"
 # What each setting stands for. MKL runs its AVX-512 code on Intel's CPUs only.
 SETTINGS: dict[str, dict[str, str]] = {
@@ -100,17 +95,6 @@ def differing(found: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
     return {name: one for name, one in by_test.items() if set(one.values()) not in ({"passed"}, {"skipped"})}
 
 
-def settings_table() -> list[str]:
-    """What each setting sets."""
-    names = ("MKL_CBWR", "ATEN_CPU_CAPABILITY", "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES")
-    rows = [[name, *(f"`{one[key]}`" if key in one else "" for key in names)] for name, one in SETTINGS.items()]
-    return [
-        "An empty cell leaves the choice to the library.",
-        "",
-        *table(["setting", *map("`{}`".format, names)], rows),
-    ]
-
-
 def tests_table(found: dict[str, dict[str, str]]) -> list[str]:
     """How many tests passed under each setting, and which did not under all."""
     rows = []
@@ -140,11 +124,19 @@ def figures(folder: Path) -> list[str]:
         words = ["-m", "scripts.check.cpus_figures", str(place), "--common", str(places[first])]
         if not (place / "told.json").exists():
             subprocess.run([sys.executable, *words], env=environment(setting), cwd=ROOT, check=True)
-    rows = [
-        [stage, *(f"{max(values):.0e}" if values else "" for values in (away, sigma)), worst, note]
-        for stage, (away, sigma, worst, note) in compare(places[first], {name: places[name] for name in others}).items()
-    ]
-    return table(["stage", "largest difference / σ", "of σ itself", "under", "status"], rows)
+    kinds: dict[str, dict[str, Row]] = {}
+    for stage, found in compare(places[first], {name: places[name] for name in others}).items():
+        name, _, model = stage.rpartition(", ")
+        kind = f"cameras, {model}" if name else "rigs" if stage.startswith("rig ") else stage
+        kinds.setdefault(kind, {})[name or stage] = found
+    rows = []
+    for kind, stages in kinds.items():
+        where, (away, _, setting, _) = max(stages.items(), key=lambda item: max(item[1][0], default=0.0))
+        sigma = [value for _, values, _, _ in stages.values() for value in values]
+        notes = "; ".join(f"{stage}: {note}" for stage, (*_, note) in stages.items() if note)
+        largest = (f"{max(values):.0e}" if values else "" for values in (away, sigma))
+        rows.append([kind, len(stages), *largest, f"{where}, {setting}", notes])
+    return table(["stage", "number", "largest difference / σ", "of σ itself", "where", "status"], rows)
 
 
 def main() -> None:
@@ -152,9 +144,11 @@ def main() -> None:
     parser.add_argument("--tests", nargs="+", default=["kcal", "tests"], metavar="PATH")
     parser.add_argument("--settings", nargs="+", default=list(SETTINGS), choices=list(SETTINGS), metavar="NAME")
     parser.add_argument("--processes", type=int, default=2, help="0: pytest without workers")
-    parser.add_argument("--figures", action="store_true", help="cameras, σ and positions in place of tests")
+    parser.add_argument(
+        "--figures", action="store_true", help="cameras, σ and positions; docs/measured/other-programs.md"
+    )
     parser.add_argument("--folder", type=Path, help="keep outcomes and figures here; what is there is not run again")
-    parser.add_argument("--write", action="store_true", help="into docs/measured/cpus.md")
+    parser.add_argument("--write", action="store_true", help="figures into docs/measured/other-programs.md")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="kcal-cpus-") as name:
         folder = make_folder(arguments.folder or Path(name))
@@ -171,13 +165,8 @@ def main() -> None:
                 kept.write_text(json.dumps(found), encoding="utf-8")
             lines, different = tests_table(found), differing(found)
     show(lines)
-    if arguments.write:
-        page = DOCS / "cpus.md"
-        if not page.exists():
-            page.write_text("\n\n".join(["# Other CPUs", CONCLUSIONS["cpus.md"], _MADE, ""]), encoding="utf-8")
-        write_section("cpus.md", "settings", "\n".join(["## Settings", "", *settings_table()]))
-        title = ("figures", "## Cameras and positions") if arguments.figures else ("tests", "## Tests")
-        write_section("cpus.md", title[0], "\n".join([title[1], "", *lines]))
+    if arguments.write and arguments.figures:
+        write_section("other-programs.md", "cpus", "\n".join(lines))
     if different:
         sys.exit(1)
 

@@ -1,4 +1,4 @@
-"""How often the intervals of `kcal demo` contain the truth: the whole command, many seeds; makes docs/measured/demo.md.
+"""How often the intervals of `kcal demo` contain the truth: the whole command, many seeds.
 
     python -m scripts.check.demo --out seeds.jsonl --seeds 40        # seeds that the file holds are kept
     python -m scripts.check.demo --out seeds.jsonl --write           # the page, from what is there
@@ -26,7 +26,7 @@ from kcal.io.rig_file import load_rig
 from kcal.locate.positions import locate_points
 from kcal.locate.truth import position_errors
 from kcal.sim.scene import DemoScene
-from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 
 
@@ -71,10 +71,10 @@ def tables(records: list[dict[str, Any]]) -> list[str]:
     ]
     half = 1.96 * statistics.stdev(own) / len(own) ** 0.5
     return [
+        *table(["target", "range of the first seed", "located", "median error of range", "in the interval"], rows),
+        "",
         f"{len(records)} seeds: the 95 % intervals contain the true range in {100 * share:.1f} ± {100 * half:.1f} % of "
         f"{len(every)} cases (± from the scatter of seeds).",
-        "",
-        *table(["target", "range of the first seed", "located", "median error of range", "in the interval"], rows),
     ]
 
 
@@ -96,15 +96,7 @@ def main() -> None:
     lines = tables(records)
     show(lines)
     if arguments.write:
-        head = [
-            "# The demonstration, many times",
-            "",
-            CONCLUSIONS["demo.md"],
-            "",
-            "`python -m scripts.check.demo`.",
-            "",
-        ]
-        (DOCS / "demo.md").write_text("\n".join([*head, *lines, ""]), encoding="utf-8")
+        write_section("chain.md", "demo", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The whole localizer compiled, exported and in onnxruntime, with lenses of every kind, against eager results.
 
-    python -m scripts.check.deploy --write             all kinds, some minutes each; docs/measured/deploy.md
+    python -m scripts.check.deploy --write             all kinds, some minutes each; docs/measured/other-programs.md
     python -m scripts.check.deploy --lenses opencv5    one kind
 
 Among the pixels are one that is not finite and one outside the image; the number of pairs differs from the traced one.
@@ -121,7 +121,7 @@ def main() -> None:
         rows.append([lens, *(f"{apart:.0e} ({seconds:.0f} s)" for apart, seconds in found)])
         show([row(*rows[-1])])
     if options.write:
-        write_section("deploy.md", "deploy", "\n".join(table(["lens", *options.ways], rows)))
+        write_section("other-programs.md", "deploy", "\n".join(table(["lens", *options.ways], rows)))
     if not worst < ALLOWED:
         raise SystemExit(f"largest difference {worst:.1e}: more than {ALLOWED:.0e}")
 

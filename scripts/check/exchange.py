@@ -29,7 +29,8 @@ from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
-from scripts.shared.page import DOCS, table
+from scripts.shared.page import table, write_section
+from scripts.shared.timing import show
 
 POINTS = 10_000
 LENSES = {
@@ -149,11 +150,12 @@ def by_opensfm(path: Path, points: np.ndarray) -> np.ndarray:
 
 
 def exact_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> list[list[str]]:
-    """For each format and each model that it holds: largest error of the peer, and of the way back to kcal."""
+    """For each format, over the models that it holds: largest error of the peer, and of the way back to kcal."""
     from kcal.io.formats import FORMATS
 
     rows = []
     for format_name, (file, reader, project) in readers.items():
+        errors = []
         for model in FORMATS[format_name].models:
             camera = sample_camera(model)
             points, pixels = random_points(camera)
@@ -162,7 +164,9 @@ def exact_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> li
             error = np.abs(project(done.paths[0], points) - pixels).max()
             back = import_cameras(*done.paths, fisheye=model == "fisheye4").cameras[0]
             again = np.abs(back.project(torch.from_numpy(points))[0].numpy() - pixels).max()
-            rows.append([format_name, model, reader, f"{error:.1e}", f"{again:.1e}"])
+            errors.append((error, again))
+        worst = (f"{max(column):.1e}" for column in zip(*errors, strict=True))
+        rows.append([format_name, ", ".join(FORMATS[format_name].models), reader, *worst])
     return rows
 
 
@@ -269,7 +273,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name in ("mrcal", "ros", "colmap"):
         parser.add_argument(f"--{name}", metavar="PYTHON")
-    parser.add_argument("--write", action="store_true", help="write docs/measured/exchange.md")
+    parser.add_argument("--write", action="store_true", help="write the tables into docs/measured/other-programs.md")
     args = parser.parse_args()
     readers: dict[str, tuple[str, str, Project]] = {
         "opencv": ("camera.yaml", "cv2.FileStorage, cv2.projectPoints", by_opencv),
@@ -287,27 +291,20 @@ def main() -> None:
         readers["colmap"] = ("cameras.txt", "pycolmap", peer(args.colmap, "colmap"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        lines = ["## Models that a format holds", ""]
-        lines += table(["format", "model", "reader and projection", "peer, px", "back in kcal, px"],
-                       exact_rows(readers, folder))  # fmt: skip
-        lines += ["", "## Lenses that a format does not hold", ""]
-        lines += table(["lens", "format", "fitted", "RMS, px", "stated maximum, px", "of 10,000 points; within"],
-                       fitted_rows(readers, folder))  # fmt: skip
-        lines += ["", "## Relative poses", ""]
-        lines += table(["format", "rotation", "translation, m", "peer's own library"],
-                       rig_rows(folder, args.ros, args.mrcal))  # fmt: skip
-        lines += ["", "## Files written by the peers", ""]
-        lines += table(["file", "largest error, px", ""], back_rows(folder, args.mrcal, args.colmap))
+        holds = table(["format", "models", "reader and projection", "peer, px", "back in kcal, px"],
+                      exact_rows(readers, folder))  # fmt: skip
+        heads = ["lens", "format", "fitted", "RMS, px", "stated maximum, px", "of 10,000 points; within"]
+        parts = {"formats": holds, "refitted": table(heads, fitted_rows(readers, folder))}
         if args.mrcal:
-            lines += ["", "## Difference of two cameras", ""]
             heads = ["kcal, RMS px", "mrcal, RMS px", "equal frames, px", "mrcal's turn, px", "own turns, px"]
-            lines += table(heads, difference_rows(folder, args.mrcal))
-    text = "\n".join(lines)
-    print(text)
-    if args.write:
-        page = DOCS / "exchange.md"
-        head = page.read_text(encoding="utf-8").split("## Models that")[0]
-        page.write_text(head + text + "\n", encoding="utf-8")
+            parts["difference"] = table(heads, difference_rows(folder, args.mrcal))
+        show(table(["relative poses", "rotation", "translation, m", "peer's own library"],
+                   rig_rows(folder, args.ros, args.mrcal)))  # fmt: skip
+        show(table(["written by", "largest error, px", ""], back_rows(folder, args.mrcal, args.colmap)))
+    for section, lines in parts.items():
+        show(lines)
+        if args.write:
+            write_section("other-programs.md", section, "\n".join(lines))
 
 
 if __name__ == "__main__":

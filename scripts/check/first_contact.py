@@ -1,7 +1,6 @@
-"""Measure what a newcomer meets first; writes docs/measured/first-contact.md.
+"""Measure what a newcomer meets first.
 
     python -m scripts.check.first_contact            # builds the site and a wheel: two minutes
-    python -m scripts.check.first_contact --no-page
 
 Times are wall clock, each a process of its own; of several the median.
 """
@@ -17,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.page import DOCS, table
 from scripts.shared.timing import show, spread
 
 ROOT = DOCS.parents[1]
@@ -118,14 +117,8 @@ def measured(runs: int) -> list[list[str]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=9, help="of `kcal --help`")
-    parser.add_argument("--no-page", action="store_true")
     arguments = parser.parse_args()
-    lines = table(["figure", "measured", "aim"], measured(arguments.runs))
-    show(lines)
-    if not arguments.no_page:
-        head = ["# First contact", "", CONCLUSIONS["first-contact.md"], ""]
-        made = "Made by `scripts/check/first_contact.py`; times: median (smallest to largest)."
-        (DOCS / "first-contact.md").write_text("\n".join([*head, made, "", *lines, ""]), encoding="utf-8")
+    show(table(["figure", "measured", "aim"], measured(arguments.runs)))
 
 
 if __name__ == "__main__":

@@ -30,9 +30,9 @@ from kcal.calibrate.problem.views import free_parameters
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import LMOptions, minimize
-from scripts.shared.page import DOCS, write_section
+from scripts.shared.page import write_section
 from scripts.shared.timing import show
-from scripts.shared.views import COLUMNS, MODELS, NOISE, ROWS, SIZE, simulate
+from scripts.shared.views import MODELS, SIZE, simulate
 
 VIEWS = 15
 RATES = [10.0**e for e in range(-8, 5)]
@@ -134,9 +134,8 @@ def rows_of(coefficients: int, runs: dict[str, Run]) -> list[str]:
     for name, run in runs.items():
         reached = np.flatnonzero(run.rms <= 1.01 * bottom)
         near = f"{reached[0]} ({1e3 * run.seconds[reached[0]]:.0f} ms)" if len(reached) else "never"
-        rate = "" if run.rate is None else f"{run.rate:.0e}"
         rows.append(
-            f"| {coefficients} | {name} | {rate} | {len(run.rms) - 1} | {run.seconds[-1]:.2f} | {run.rms[-1]:.4f} | "
+            f"| {coefficients} | {name} | {len(run.rms) - 1} | {run.seconds[-1]:.2f} | {run.rms[-1]:.4f} | "
             f"{run.rms[-1] / bottom:.2f} | {near} |"
         )
     return show(rows)
@@ -146,22 +145,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--coefficients", type=int, nargs="*", default=[5, 14], choices=list(MODELS))
-    parser.add_argument("--dry", action="store_true", help="print only; the picture goes to the working directory")
+    parser.add_argument("--picture", type=Path, help="draw RMS over steps and time into this file")
+    parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     lines = [
-        "## First-order methods",
-        "",
-        f"Made by `scripts/check/first_order.py`: {VIEWS} simulated views of a {COLUMNS}x{ROWS} board, noise {NOISE} "
-        "px an axis; the same residuals, start (base projection, no distortion) and analytic model for all. *Scaled*: "
-        "each parameter in units of its column of the Jacobian at the start. Learning rates: the best of "
-        f"{len(RATES)} decades, by runs of a tenth of the length; the time of that search is not counted. *Within "
-        "1 %*: step and time after which the RMS was within 1 % of the lowest of Levenberg-Marquardt.",
-        "",
-        "![RMS over steps and time](first-order.png)",
-        "",
-        "| coefficients | method | learning rate | steps | s | RMS px | over the lowest | within 1 % |",
-        "|---|---|---|---|---|---|---|---|",
+        "| coefficients | method | steps | s | RMS px | over the lowest | within 1 % |",
+        "|---|---|---|---|---|---|---|",
     ]
     show(lines[-2:])
     runs: dict[int, dict[str, Run]] = {}
@@ -175,7 +165,8 @@ def main() -> None:
                 of[name] = best_descent(problem, start, method, scaled, arguments.steps)
         runs[coefficients] = of
         lines += rows_of(coefficients, of)
-    draw(runs, Path("first-order.png") if arguments.dry else DOCS / "first-order.png")
+    if arguments.picture:
+        draw(runs, arguments.picture)
     if not arguments.dry:
         write_section("solver.md", "first-order methods", "\n".join(lines))
 

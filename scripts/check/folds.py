@@ -1,6 +1,6 @@
 """Whether a pixel has two valid rays, on lenses that are built to fold where it is hard to see.
 
-    python -m scripts.check.folds                  all of docs/measured/folds.md
+    python -m scripts.check.folds                  the table of docs/measured/lens.md
     python -m scripts.check.folds --lenses 500 --dry
 
 The numerator and the denominator of a radial factor that nearly cancel, denominators and derivatives with nearly double
@@ -38,7 +38,7 @@ from kcal.lens.newton import inverse_jacobian, newton_step
 from kcal.lens.projection import from_pixels
 from kcal.lens.region import DIRECTIONS, Region, direction_limits, in_region, sampled_region, valid_region
 from scripts.check.uncertainty import LENS
-from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 from scripts.shared.wide_lens import load
 
@@ -48,17 +48,6 @@ SPOKES, RADII = 3, 40
 NEAR = np.concatenate([-np.logspace(-7, -0.7, 20)[::-1], [0.0], np.logspace(-7, -0.7, 20)])
 # Rays closer together than this, on the plane z = 1, count as one.
 SEPARATE = 1e-6
-CONSTRUCTED = """Lenses that are built so that a fold is hard to see: numerator and denominator of the radial factor
-nearly cancel at a nearly double root (*cancelling*), the denominator alone has one (*pole*), or the derivative of the
-distorted radius has one (*derivative*); the depth is drawn from 1e-12 to 0.01. To seven in ten of them, tangential,
-prism and tilt terms of all sizes are added, and one in ten has a model without such terms. *Random* lenses have all
-coefficients drawn at random, up to 0.5. Two rays of a pixel are looked for among valid points that are sampled ever
-more densely around the complex roots of numerator, denominator and derivative, by Newton's method from those with
-nearly equal images, and around points that the lens turns over."""
-ORDINARY = """Pixels that have a ray by the samples alone, and those of them that have none with the proof. The
-calibrated cameras have 5 to 24 coefficients, with and without the weak prior."""
-TIMES = """Median time of the processor to make the valid region and the start of the inverse, which is most of
-`Camera.build` and of loading a camera."""
 RATIONAL = ("opencv8", "opencv12", "opencv14", "ext20", "ext24")
 
 
@@ -316,18 +305,13 @@ def main() -> None:
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    parts = [
-        ["# Folds", "", CONCLUSIONS["folds.md"], "", "`python -m scripts.check.folds` writes this page.", ""],
-        ["## Constructed lenses", "", CONSTRUCTED, ""],
-        constructed(arguments.lenses, arguments.seed, arguments.compared, arguments.minutes),
-        ["", "## Ordinary lenses", "", ORDINARY, "", *ordinary(arguments.ordinary, arguments.seed)]
-        if arguments.ordinary
-        else [],
-        ["", "## Time of a camera", "", TIMES, "", *build_times(15)],
-    ]
-    text = show([line for part in parts for line in part])
+    text = constructed(arguments.lenses, arguments.seed, arguments.compared, arguments.minutes)
+    if arguments.ordinary:
+        text += ["", *ordinary(arguments.ordinary, arguments.seed)]
+    show(text)
+    show(build_times(15))
     if not arguments.dry:
-        (DOCS / "folds.md").write_text("\n".join(text) + "\n", encoding="utf-8")
+        write_section("lens.md", "folds", "\n".join(text))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ each, tests run that call the function that was changed: those of the same folde
 docstrings, the quickest first, then those of other folders. Each mistake costs a forked process that has the libraries
 loaded already.
 
-    python -m scripts.check.mutants [FOLDER ...] [--sample 40] [--seed 0] [--seconds 3600] [--budget 60] [--write]
+    python -m scripts.check.mutants [FOLDER ...] [--sample 40] [--seed 0] [--seconds 3600] [--budget 60]
 
 First, every test file runs once, to see which functions each test calls and what time it takes. All results are kept in
 .mutants/, and another run goes on where the last one stopped; what was changed since is drawn anew. `--again` repeats
@@ -40,7 +40,7 @@ import pytest
 
 from scripts.check.harmless import HARMLESS
 from scripts.check.mutations import Site, sites
-from scripts.shared.page import DOCS, table
+from scripts.shared.page import table
 
 ROOT = Path(__file__).parents[2]
 STATE = ROOT / ".mutants"
@@ -270,7 +270,7 @@ def interval(hits: int, count: int) -> tuple[float, float]:
 
 
 def report(seed: int) -> str:
-    """The page: a table of the folders, and what was not noticed, line by line."""
+    """A table of the folders, and what was not noticed, line by line."""
     kept, rows, missed, counts = results(), [], [], {}
     idle: list[tuple[object, ...]] = []
     for folder in FOLDERS:
@@ -298,12 +298,8 @@ def report(seed: int) -> str:
         f"{100 * hits / total:.0f} % over all folders, {100 * counts[worst][0] / counts[worst][1]:.0f} % in `{worst}`"
     )
     return "\n".join([
-        "# What the tests notice", "",
-        f"**Conclusion.** The tests notice {hits} of {total} small mistakes planted at random that change a result: "
+        f"The tests notice {hits} of {total} small mistakes planted at random that change a result: "
         f"{shares}, the lowest.", "",
-        "Made by `scripts/check/mutants.py`, which says what a mistake is and which tests run. The intervals tell how "
-        "well so few mistakes know the share. Tests were written for some that went unnoticed: of mistakes drawn anew, "
-        "fewer are noticed.", "",
         *table(("folder", "possible mistakes", "planted", "harmless", "noticed", "share", "95 % interval"), rows), "",
         f"## Not noticed ({len(missed)})", "", "With the number of tests that call the function.", "",
         *table(("line", "kind", "before", "after", "tests"), missed), "",
@@ -321,7 +317,6 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=math.inf, help="after which nothing is begun")
     parser.add_argument("--budget", type=float, default=60.0, help="seconds of tests for one mistake")
     parser.add_argument("--again", action="store_true", help="only what went unnoticed, with the tests as they are now")
-    parser.add_argument("--write", action="store_true", help="write docs/measured/mutants.md")
     arguments = parser.parse_args()
     STATE.mkdir(exist_ok=True)
     for library in LIBRARIES:
@@ -342,8 +337,6 @@ def main() -> None:
                 judge(groups, path, number, site, arguments.budget)
     text = report(arguments.seed)
     print(text)
-    if arguments.write:
-        (DOCS / "mutants.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

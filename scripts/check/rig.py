@@ -12,12 +12,12 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-import kcal
 from kcal.calibrate.rig.drift import measure_drift
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
@@ -29,7 +29,7 @@ from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.monitor import drift_effect
 from kcal.report.rig import save_rig_picture
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import CONCLUSIONS, DOCS
+from scripts.shared.page import DOCS, write_section
 from scripts.shared.timing import row, show
 
 HEADING = 35.0
@@ -296,56 +296,19 @@ def example(path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="few repetitions")
-    parser.add_argument("--write", action="store_true", help="also write docs/measured/rig.md and docs/rig.png")
+    parser.add_argument("--write", action="store_true", help="write the tables of docs/measured/rig.md and its picture")
     arguments = parser.parse_args()
     draws, marks = (20, 50) if arguments.quick else (100, 50)
-    lines = show(
-        [
-            "# Rigs from a survey, measured",
-            "",
-            CONCLUSIONS["rig.md"],
-            "",
-            f"Made by `scripts/check/rig.py` with kcal {kcal.__version__} and torch {torch.__version__}. Two cameras "
-            f"{BASELINE:.1f} m apart, f 1600 px, distorting lenses that are known; 12 landmarks 100 m to 2.6 km away, "
-            f"surveyed to {100 * SURVEY:g} cm along each axis; marks of {MARK:g} px along each axis in each image. "
-            "Simulations with fixed seeds; places, survey errors and marks are drawn anew in each.",
-            "",
-            "![Residuals of a rig with a wrong landmark and a wrong match](rig.png)",
-            "",
-            "## Do the intervals cover, and what does the calibration cost?",
-            "",
-            f"{draws} rigs are solved, and {marks} marks of each of 7 targets located with each, with the rig's own "
-            "covariance. For each range: the share of 95 % intervals that hold the true range, ± one standard error; "
-            "and the RMS error of the inverse range over the bound that the targets' own marks set with a perfect rig.",
-            "",
-        ]
-    )
-    lines += coverage(draws, marks)
-    lines += show(
-        [
-            "",
-            "## A wrong landmark",
-            "",
-            f"One of the twelve is wrong, {draws // 2} rigs each: its mark in the right image, or its surveyed height.",
-            "",
-        ]
-    )
-    lines += wrong(draws // 2)
-    lines += show(
-        [
-            "",
-            "## Has the rig turned?",
-            "",
-            f"`kcal rig check`, {draws // 2} repetitions: the right camera has turned by 0.01° of yaw. Static features "
-            f"300 m to 8 km away whose places nobody knows, marked then and now with {MARK:g} px along each axis in "
-            "each image; and summits of roughly known range, marked now only. The old rig finds a target at 5 km that "
-            "far off; after `--relock` what remains is the error of the check.",
-            "",
-        ]
-    )
-    lines += drift(draws // 2)
+    parts: dict[str, Callable[[], list[str]]] = {
+        "coverage": lambda: coverage(draws, marks),
+        "wrong landmark": lambda: wrong(draws // 2),
+        "turned": lambda: drift(draws // 2),
+    }
+    for name, made in parts.items():
+        lines = made()
+        if arguments.write:
+            write_section("rig.md", name, "\n".join(lines))
     if arguments.write:
-        (DOCS / "rig.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
         example(DOCS / "rig.png")
 
 

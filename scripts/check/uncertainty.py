@@ -20,9 +20,9 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
-from scripts.shared.page import write_section
-from scripts.shared.timing import show
-from scripts.shared.views import COLUMNS, MODELS, NOISE, ROWS, SIZE, observed, simulate
+from scripts.shared.page import table, write_section
+from scripts.shared.timing import row, show
+from scripts.shared.views import MODELS, NOISE, SIZE, observed, simulate
 
 VIEWS = 30
 WEAK = 0.3
@@ -106,43 +106,31 @@ def study(coefficients: int, weak: float | None, refits: int) -> list[str]:
     variances = torch.stack([fit.variances for fit in fits])
     errors, covariances = torch.stack([fit.errors for fit in fits]), torch.stack([fit.covariances for fit in fits])
     named = f"{coefficients}{', weak prior' if weak else ''}"
-    rows = [
-        line(named, name, found[:, k, None], variances[:, k, None], found[:, k].square() < NORMAL * variances[:, k])
-        for k, name in enumerate(("fx", "cx"))
-    ]
+    focal, center = (ratios(found[:, k, None], variances[:, k, None]) for k in (0, 1))
     inside = torch.zeros(2, len(fits), len(PLACES), dtype=torch.bool)
     for turned in (0, 1):
-        for k, (u, v) in enumerate(PLACES):
+        for k in range(len(PLACES)):
             error, spread = errors[:, turned, k], covariances[:, turned, k]
             seen = torch.isfinite(error).all(-1)
             distance = (error[seen] * torch.linalg.solve(spread[seen], error[seen])).sum(-1)
             inside[turned, seen, k] = distance < ELLIPSE
-            name = f"({u:.0f}, {v:.0f}){' turned' if turned else ''}"
-            rows.append(line(named, name, error[seen], spread[seen].diagonal(dim1=-2, dim2=-1), inside[turned, :, k]))
+    last = errors[:, 1, -1]
+    seen = torch.isfinite(last).all(-1)
+    corner = ratios(last[seen], covariances[seen, 1, -1].diagonal(dim1=-2, dim2=-1))
     warned = torch.tensor([fit.warned for fit in fits])
     shares = [
         f"{100.0 * float(part.double().mean()):.1f}" if len(part) else "-"
         for part in (inside[0], inside[1], inside[0][~warned], inside[1][~warned])
     ]
-    lost = int((~torch.isfinite(errors[:, 0]).all(-1).all(-1)).sum())
-    rows.append(
-        f"| {named} | **all places**: {shares[0]} % inside, {shares[1]} % turned; warned of: {int(warned.sum())} of "
-        f"{len(fits)} captures, the others {shares[2]} % and {shares[3]} % turned; no image of a place: {lost} "
-        "| | | | | | |"
-    )
-    return show(rows)
+    cells = [f"{center[0]:.3f}", f"{center[1]:.2f}", f"{focal[1]:.2f}", f"{corner[2]:.2f}"]
+    return show([row(named, *cells, *shares[:2], int(warned.sum()), *shares[2:])])
 
 
-def line(named: str, what: str, error: Tensor, variance: Tensor, inside: Tensor) -> str:
-    """A row from errors and variances (captures, axes) and what lies in the 95 % ellipse; RMS over the axes."""
+def ratios(error: Tensor, variance: Tensor) -> tuple[float, float, float]:
+    """RMS error over captures and axes, the predicted σ over it, and the same of medians; of (captures, axes)."""
     predicted, repeated = float(variance.mean().sqrt()), float(error.square().mean().sqrt())
-    bias = float((error.mean(0) / error.std(0)).abs().max())
     usual = MEDIAN * float((variance.median(0).values.mean() / error.square().median(0).values.mean()).sqrt())
-    ratio = predicted / repeated
-    return (
-        f"| {named} | {what} | {predicted:.3f} | {repeated:.3f} | {ratio:.2f} | {usual:.2f} | {bias:.2f} "
-        f"| {100.0 * float(inside.double().mean()):.1f} |"
-    )
+    return repeated, predicted / repeated, usual
 
 
 def main() -> None:
@@ -152,26 +140,12 @@ def main() -> None:
     parser.add_argument("--dry", action="store_true", help="print only")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    cover = 100 * math.sqrt(0.95 * 0.05 / arguments.refits)
-    lines = [
-        "## Predicted and repeated",
-        "",
-        f"Made by `scripts/check/uncertainty.py`: {VIEWS} views of a {COLUMNS}x{ROWS} board, {SIZE[0]}x{SIZE[1]} px, "
-        f"noise {NOISE} px an axis, captured and calibrated {arguments.refits} times with fresh noise. *Weak prior*: "
-        f"`CalibrationOptions(weak_prior={WEAK})`. Pixels of fx, cx and of the images of fixed directions in the "
-        "camera's frame, as they are and after the turn of the camera that brings the whole image closest (*turned*): "
-        "the standard deviation that kcal predicts (root of the mean variance), the root mean square error against "
-        "the truth, their ratio, the ratio of their medians (of normal errors both are 1), the mean error in standard "
-        f"deviations, and how many of the 95 % intervals or ellipses hold the truth (standard error {cover:.1f} % for "
-        "one place). Without the prior, σ of models of more than five coefficients is that of the mild lens that fits "
-        "almost as well, widened by the distance to it (`kcal.calibrate.camera.prior_comparison`): it covers, but "
-        "where the solution bends sharply it is far too large, and rules the root of the mean variance. A capture is "
-        "warned of where anything but its corners is doubted.",
-        "",
-        "| coefficients | of | predicted σ | error | ratio | of medians | bias / σ | in 95 %, % |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    show(lines[-2:])
+    lines = table(
+        ["coefficients", "cx: error, px", "cx: σ / error", "fx: σ / error",
+         "corner of the image, turned: σ / error, medians", "in 95 %, %", "turned, %", "warned of",
+         "the others: in 95 %, %", "turned, %"], [],
+    )  # fmt: skip
+    show(lines)
     for coefficients in arguments.coefficients:
         for weak in (None,) if coefficients == 5 else (None, WEAK):
             lines += study(coefficients, weak, arguments.refits)

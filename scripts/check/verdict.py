@@ -1,4 +1,4 @@
-"""Does the verdict say yes only to captures that deserve it? Makes docs/measured/verdict.md.
+"""Does the verdict say yes only to captures that deserve it? A table of docs/measured/ordinary.md.
 
     python -m scripts.check.verdict --out captures.jsonl --planted 200 --clean 100     continues where it stopped
     python -m scripts.check.verdict --out captures.jsonl --write                       the page, from what is there
@@ -13,14 +13,12 @@ import itertools
 import json
 import math
 import time
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-import kcal
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.rig.pairs import pair_by_name, paired_boards
 from kcal.calibrate.rig.solve import solve_rig
@@ -33,7 +31,7 @@ from kcal.report.rig_verdict import rig_verdict
 from kcal.report.verdict import Requirement, Verdict
 from kcal.sim.truth import TruthLens
 from scripts.check.verdict_captures import FAULTS, Planted, PlantedPair, drawn
-from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 
 FIRST = 200
@@ -131,7 +129,8 @@ def broken(line: dict[str, Any], times: float) -> bool:
     return line["over"] is None or line["over"] > times
 
 
-def page(lines: list[dict[str, Any]]) -> str:
+def table_of(lines: list[dict[str, Any]]) -> list[str]:
+    """The page's table, and what happens to good captures."""
     planted = [line for line in lines if line["kind"] in FAULTS]
     clean = [line for line in lines if line["kind"] not in FAULTS]
     rows = []
@@ -140,36 +139,20 @@ def page(lines: list[dict[str, Any]]) -> str:
         if not here:
             continue
         yes = [line for line in here if line["yes"]]
-        said = Counter(name for line in here for name in line["stops"][:1] or ([] if line["yes"] else ["range"]))
         rows.append([
             kind, len(here), len(yes), sum(broken(line, 1.0) for line in yes), sum(broken(line, 2.0) for line in yes),
             sum(broken(line, 1.0) for line in here), "" if kind == "clean" else sum(map(named, here)),
-            ", ".join(f"{name} {count}" for name, count in said.most_common()),
         ])  # fmt: skip
     head = [
         "captures", "number", "yes", "yes, but off by more than required", "by twice that", "all that are off by more",
-        "fault named", "reasons of the no",
+        "fault named",
     ]  # fmt: skip
     good = [line for line in clean if not broken(line, 1.0)]
-    text = [
-        f"Made by `scripts/check/verdict.py` with kcal {kcal.__version__} and torch {torch.__version__}, from "
-        f"{len(planted)} captures with one planted fault each and {len(clean)} clean ones; thresholds were set on "
-        f"other seeds. Ray-traced lenses, 18 to 28 views, noise 0.05 to 0.2 px. Required of a camera: {CAMERA}, in a "
-        f"rig with 10 m of baseline; of a pair: {RIG}, from boards alone; marks to {MARK} px. *Off*: the RMS error of "
-        "the range, over the image, from the true error of the camera. What is required is a standard deviation: of "
-        "cameras whose error bars just meet it, a third are off by more. *Named*: a finding "
-        "names the planted fault, whatever the answer.", "",
+    return [
         *table(head, rows), "",
         f"Of the {len(good)} clean captures that are not off by more than required, "
-        f"{sum(not line['yes'] for line in good)} are answered with no.", "",
-        "*Model*: an opencv4 or opencv5 lens forced on a webcam lens. *Fronto-parallel*: boards within 0.5 "
-        "to 4° of the image. *Warp*: a board bent by 1 to 4 mm, taken as exact. *Blur*: four fifths of the views have "
-        "corners with a noise of 0.8 to 2 px, as stated with them. *Unsynchronized*: the board moves by 1 to 5 cm an "
-        "axis (σ) between both exposures, at 14 to 25 m. *Pupil*: a wide lens of 4 to 12 mm, near boards, no pupil in "
-        "the model. *Mirrored or mixed*: all views mirrored, some mirrored, or two boards whose squares differ by 1 to "
-        "3 % in one direction. Mirroring does not change a camera's calibration, only everything that is seen with it.",
+        f"{sum(not line['yes'] for line in good)} are answered with no.",
     ]  # fmt: skip
-    return "\n".join(["# May it be used?", "", CONCLUSIONS["verdict.md"], "", *text, ""])
 
 
 def main() -> None:
@@ -181,14 +164,14 @@ def main() -> None:
     parser.add_argument("--share", type=int, default=0, help="which share of the captures, from 0")
     parser.add_argument("--count", type=int, default=1, help="into how many shares they are divided")
     parser.add_argument("--only", nargs="*", help="kinds of captures")
-    parser.add_argument("--write", action="store_true", help="write the page")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     lines = []
     if arguments.out.exists():
         lines = [json.loads(text) for text in arguments.out.read_text().splitlines()]
     if arguments.write:
-        (DOCS / "verdict.md").write_text(page(lines), encoding="utf-8")
+        write_section("ordinary.md", "verdict", "\n".join(table_of(lines)))
         return
     done = {(line["kind"], line["seed"]) for line in lines}
     wanted = [(FAULTS[i % len(FAULTS)], arguments.first + i // len(FAULTS)) for i in range(arguments.planted)]

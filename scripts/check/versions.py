@@ -1,6 +1,6 @@
 """Install kcal into empty environments, from wheel and sdist, with the oldest and newest dependencies, and use it.
 
-    python -m scripts.check.versions                          # all that can be had; writes docs/measured/versions.md
+    python -m scripts.check.versions                          # all that can be had; writes the page other-programs.md
     python -m scripts.check.versions --only oldest --no-page  # quicker, for CI
 
 Each cell is an environment of its own in a temporary folder: an interpreter, what it is installed from, and its
@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from kcal.files import make_folder
-from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.page import DOCS, table, write_section
 from scripts.shared.timing import show
 
 ROOT = DOCS.parents[1]
@@ -129,26 +129,12 @@ def cell(folder: Path, python: str, package: Path, pins: list[str]) -> dict[str,
         shutil.rmtree(place, ignore_errors=True)
 
 
-def page(rows: list[list[str]], packages: dict[str, Path], missing: list[str]) -> str:
-    """The Markdown page; cells that were left out are shown as not run."""
+def filled(rows: list[list[str]], missing: list[str]) -> list[str]:
+    """The page's table; cells that were left out are shown as not run."""
     cells = [(version, *cell) for version in PYTHONS for cell in CELLS if version not in missing]
     there = {(row[0], row[1], row[2]): row for row in rows}
     rows = [there.get(head, [*head, "", "", "", "not run"]) for head in cells]
-    sizes = ", ".join(f"{kind} {path.stat().st_size / 1024:.0f} KB" for kind, path in packages.items())
-    none = f"Not to be had on this machine: Python {', '.join(missing)}." if missing else ""
-    return "\n".join(
-        [
-            "# Versions",
-            "",
-            CONCLUSIONS["versions.md"],
-            "",
-            "Made by `scripts/check/versions.py`, which says what each cell installs and runs. "
-            f"*Oldest*: the lowest versions that `pyproject.toml` allows. {sizes}. {none}".strip(),
-            "",
-            *table(["Python", "from", "dependencies", "torch", "numpy", "scipy", "result"], rows),
-            "",
-        ]
-    )
+    return table(["Python", "from", "dependencies", "torch", "numpy", "scipy", "result"], rows)
 
 
 def main() -> None:
@@ -185,7 +171,7 @@ def main() -> None:
                         with arguments.out.open("a") as file:
                             file.write(json.dumps(rows[-1]) + "\n")
         if not arguments.no_page:
-            (DOCS / "versions.md").write_text(page(rows, packages, missing), encoding="utf-8")
+            write_section("other-programs.md", "versions", "\n".join(filled(rows, missing)))
     if not rows or any(row[-1] != "passed" for row in rows):
         sys.exit(1)
 

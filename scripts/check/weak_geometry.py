@@ -1,4 +1,4 @@
-"""Are wrong intervals from weak sets of landmarks refused or warned of? Makes docs/measured/weak_geometry.md.
+"""Are wrong intervals from weak sets of landmarks refused or warned of? A table of docs/measured/rig.md.
 
     python -m scripts.check.weak_geometry --out sets.jsonl           # 200 random, 200 nearly degenerate, 56 as reported
     python -m scripts.check.weak_geometry --out sets.jsonl --write   # the page; sets in the file are not drawn again
@@ -22,7 +22,6 @@ from unittest import mock
 import torch
 from torch import Tensor
 
-import kcal
 from kcal.calibrate.rig import solve, weak_geometry
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import Landmarks, RigData
@@ -31,7 +30,7 @@ from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import CONCLUSIONS, DOCS, table
+from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 
 # How many sets of each kind.
@@ -223,11 +222,10 @@ def checked(truth: StereoRig, found: RigResult, draw: Draw) -> dict[str, Any]:
     return record | {"outcome": outcome, "said": "; ".join(said), "contained": judged(truth, found, draw, widen)[0]}
 
 
-def page(records: list[dict[str, Any]]) -> list[str]:
-    """The tables."""
+def by_kind(records: list[dict[str, Any]]) -> list[str]:
+    """How many sets are refused and warned of, and how many of their intervals contain the truth."""
     heads = ("sets", "number", "refused", "warned", "accepted")
-    ranges = [f"{distance:g} m" for distance in RANGES]
-    rows, lines = [], list[str]()
+    rows = []
     groups = {"random": ("random",), "nearly degenerate, all": DEGENERATE, **{kind: (kind,) for kind in KINDS}}
     for name, kinds in groups.items():
         own = [record for record in records if record["kind"] in kinds and record["outcome"] != "too few seen"]
@@ -240,25 +238,20 @@ def page(records: list[dict[str, Any]]) -> list[str]:
         rows.append(
             [name, len(own), *counts]
             + [percent([r["contained"] for r in by[what]]) for what in ("accepted", "warned")]
-            + [percent([r["unchecked"] for r in by[what] if "unchecked" in r]) for what in ("warned", "refused")]
-            + [f"{lost} of {len(usable)}"]
+            + [percent([r["unchecked"] for r in by["warned"] if "unchecked" in r]), f"{lost} of {len(usable)}"]
         )
-    contain = ("accepted contain", "warned contain", "warned, not widened", "refused would contain", "usable refused")
-    lines += table((*heads, *contain), rows)
-    lines += ["", "By range, accepted and warned sets:", ""]
-    rows = []
-    for name, kinds in (("random", ("random",)), ("nearly degenerate", DEGENERATE), ("graded", ("graded",))):
-        for what in ("accepted", "warned"):
-            shares = [r["contained"] for r in records if r["kind"] in kinds and r["outcome"] == what]
-            rows.append([name, what, *(percent([[share[i]] for share in shares]) for i in range(len(RANGES)))])
-    lines += table(("sets", "", *ranges), rows)
-    lines += ["", "By the check's ratio, sets whose baseline is open by less than half; intervals not widened:", ""]
+    contain = ("accepted contain", "warned contain", "warned, not widened", "usable refused")
+    return table((*heads, *contain), rows)
+
+
+def by_ratio(records: list[dict[str, Any]]) -> list[str]:
+    """By the check's ratio, sets whose baseline is open by less than half; intervals not widened."""
     rows = []
     for low, high in itertools.pairwise((0, 0.9, 1.05, 1.15, 1.4, 2, 3, math.inf)):
         own = [r for r in records if low <= r.get("ratio", -1) < high and r["share"] <= 0.5]
         useful = sum(r["usable"] for r in own)
         rows.append([f"{low:g} to {high:g}", len(own), percent([r["unchecked"] for r in own]), useful])
-    return lines + table(("ratio", "sets", "contain", "usable"), rows)
+    return table(("ratio", "sets", "contain", "usable"), rows)
 
 
 def percent(shares: Sequence[Sequence[float]]) -> str:
@@ -269,33 +262,11 @@ def percent(shares: Sequence[Sequence[float]]) -> str:
     return f"{100 * float(means.mean()):.1f} ± {100 * float(means.std()) / math.sqrt(len(means)):.1f} %"
 
 
-def write(lines: Sequence[str]) -> None:
-    text = [
-        "# Weak geometry of landmarks",
-        "",
-        CONCLUSIONS["weak_geometry.md"],
-        "",
-        f"Made by `scripts/check/weak_geometry.py` with kcal {kcal.__version__} and torch {torch.__version__}. Exact "
-        "cameras, f 1600 px; baselines of 3 to 20 m, 6 to 20 landmarks at 200 m to 2 km, marked to 0.1 to 0.5 px and "
-        "surveyed to 1 to 10 cm. Rows lie across, up or away, with a spread of 0 to 4 % of their distance; planes face "
-        "the camera up to 17° tilted, as thick; clusters have 1 to 10 % of their distance; two groups have 0.2 to 5 % "
-        "each. *Row at 1 km*: 12 landmarks in a row of 0 to 40 m of height at 1 km, 0.3 px, 5 cm, baseline 10 m. "
-        "*Graded*: rows, planes, clusters and groups with noise scaled so that the baseline is open by 2 to 50 %. "
-        "Seeds are others than those by which thresholds were set. Each set has 15 targets at each of seven ranges, "
-        "marked to 0.1 px; intervals of one set share its error, so that the standard errors (±) are over sets. "
-        f"*Usable*: without the check, the RMS error at 250 m and at 1 km is below {100 * USABLE:g} % (where a set is "
-        f"not accepted: in most of {DRAWS} draws of its noise, the first included).",
-        "",
-        *lines,
-    ]
-    (DOCS / "weak_geometry.md").write_text("\n".join(text) + "\n", encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="JSON lines, continued if it is there")
     parser.add_argument("--share", type=float, default=1.0, help="of the sets")
-    parser.add_argument("--write", action="store_true", help="write the page")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     out = arguments.out
@@ -307,9 +278,10 @@ def main() -> None:
             records.append(one(kind, seed))
             with out.open("a") as file:
                 file.write(json.dumps(records[-1]) + "\n")
-    lines = show(page(records))
+    lines = show(by_kind(records))
+    show(by_ratio(records))
     if arguments.write:
-        write(lines)
+        write_section("rig.md", "weak geometry", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -4,33 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from kcal.corners.observations import Observations
 from kcal.locate.ranges import range_text
 from kcal.report.figures import new_figure, save_picture
-from scripts.paper.aims import LIMIT
 from scripts.paper.numbers import (
     DISTANCES,
-    HALF_CENTER,
-    MIDDLE,
     SHOWN,
     TABLE_3,
     Results,
     calibration,
-    edge_means,
     lens_share,
     median,
     position,
     reprojection,
     rig_share,
 )
+from scripts.paper.split import LIMIT
 from scripts.shared.page import DOCS
 
 COLORS = {
@@ -40,12 +34,10 @@ COLORS = {
 TRUE, FOUND, FAINT, INK, GRID = "#c02a6b", "#2b6cb0", "#9aa3af", "#111827", "#e5e7eb"
 
 
-def write_figures(results: Results, work: Path, views: int) -> None:
+def write_figures(results: Results) -> None:
     _split(results)
-    _coverage(work, next(iter(results)), views)
     _models(results)
     _distance(results)
-    _edges(results)
     _map(results)
 
 
@@ -102,32 +94,6 @@ def _legend_below(figure: Figure, axes: Axes) -> None:
     figure.legend(handles, titles, loc="lower center", ncols=len(titles), fontsize=9, frameon=False)
 
 
-def _coverage(work: Path, name: str, views: int) -> None:
-    seen = Observations.load(work / f"{name}-0-{views}" / "left.kcal.json")
-    figure = new_figure(8.0, 4.9)
-    axes = figure.subplots()
-    width, height = seen.image_size
-    for number, view in enumerate(seen.pixels().numpy()):
-        axes.scatter(view[:, 0], view[:, 1], s=5, linewidths=0, color=_turbo(number / len(seen.views)))
-    axes.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor=INK))
-    axes.set_xlim(-30, width + 30)
-    axes.set_ylim(height + 30, -30)
-    axes.set_aspect("equal")
-    axes.set_title(
-        f"Corners of {len(seen.views)} views, one color a view (the paper's Fig. 1)", fontsize=11, loc="left"
-    )
-    axes.set_xlabel("u, pixels")
-    axes.set_ylabel("v, pixels")
-    figure.tight_layout()
-    save_picture(DOCS / "paper-coverage.png", figure)
-
-
-def _turbo(share: float) -> tuple[float, float, float, float]:
-    from matplotlib import colormaps
-
-    return colormaps["turbo"](share)
-
-
 def _models(results: Results) -> None:
     figure = new_figure(11.0, 3.6 * len(results))
     models = [*TABLE_3, "hybrid"]
@@ -181,36 +147,6 @@ def _distance(results: Results) -> None:
             axes.grid(axis="y", color=GRID, linewidth=0.6)
     _legend_below(figure, right)
     save_picture(DOCS / "paper-distance.png", figure)
-
-
-def _edges(results: Results) -> None:
-    figure = new_figure(4.6 * (len(results) + 1), 4.0)
-    place = np.arange(len(SHOWN))
-    _where(figure.add_subplot(1, len(results) + 1, 1), next(iter(results.values()))[0]["target_pixels"])
-    for column, (name, runs) in enumerate(results.items(), 2):
-        axes = figure.add_subplot(1, len(results) + 1, column)
-        for shift, which, title, color in ((-0.2, 0, "center", FAINT), (0.2, 1, "edge", FOUND)):
-            values = _shown(median(edge_means(run, m)[which] for run in runs) for m in SHOWN)
-            axes.bar(place + shift, values, 0.38, color=color, label=title)
-        axes.set_xticks(place, SHOWN)
-        axes.tick_params(labelsize=8)
-        axes.set_title(f"{name}: mean reprojection error, pixels", fontsize=10, loc="left")
-    _legend_below(figure, axes)
-    save_picture(DOCS / "paper-edges.png", figure)
-
-
-def _where(axes: Axes, pixels: list[list[float]]) -> None:
-    """The paper's Fig. 7: what counts as the center, and where the seven points are seen."""
-    axes.add_patch(Rectangle((-0.5, -0.5), 1920, 1080, fill=False, edgecolor=INK))
-    axes.add_patch(Rectangle((MIDDLE - HALF_CENTER, -0.5), 2 * HALF_CENTER, 1080, color=GRID))
-    for number, (u, v) in enumerate(pixels, 1):
-        axes.scatter(u, v, color=TRUE, s=22)
-        axes.annotate(str(number), (u, v), textcoords="offset points", xytext=(4, 3), fontsize=8, color=TRUE)
-    axes.set_xlim(-40, 1960)
-    axes.set_ylim(1120, -40)
-    axes.set_aspect("equal")
-    axes.tick_params(labelsize=8)
-    axes.set_title("the seven points in the left image, shaded: center", fontsize=10, loc="left")
 
 
 def _map(results: Results) -> None:

@@ -6,16 +6,13 @@ Three kinds of cameras stand for the paper's: wide glass lenses that are poorly 
 vision lenses; all are ray-traced (`kcal.sim.truth`), so that no lens model of kcal or OpenCV is the truth. Every seed
 is another pair of lenses, another set of board views, survey and marks. Images are rendered, spoiled and searched;
 corners and results of each seed stay in FOLDER, and a run that was interrupted goes on from there: a changed kcal needs
-another folder. Processes for other `--kinds` may work in the same one. With `--write` the demo is timed, and the page
-docs/measured/paper.md and its pictures are made. One process, one thread; the page says how long every stage takes.
+another folder. Processes for other `--kinds` may work in the same one. With `--write` the tables of
+docs/measured/paper.md and its pictures are made. One process, one thread.
 """
 
 from __future__ import annotations
 
 import argparse
-import re
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -23,21 +20,11 @@ import cv2
 import torch
 
 from scripts.paper.figures import write_figures
-from scripts.paper.page import page
+from scripts.paper.page import sections
 from scripts.paper.site import KINDS
 from scripts.paper.solve import run_seed
-from scripts.shared.page import DOCS
-
-
-def timed_demo(folder: Path) -> list[tuple[str, float]]:
-    """Seconds of each stage of `kcal demo`, as it says itself, and of the whole command."""
-    start = time.perf_counter()
-    command = [sys.executable, "-c", "from kcal.cli.main import main; main()", "demo", "--output", str(folder)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    whole = time.perf_counter() - start
-    said = next(line for line in done.stdout.replace("\n", " ").split("Time: ")[1:])
-    stages = re.findall(r"([a-z ]+?) ([0-9.]+) s", said)
-    return [*((name.strip(), float(seconds)) for name, seconds in stages), ("the command", whole)]
+from scripts.shared.page import write_section
+from scripts.shared.timing import show
 
 
 def main() -> None:
@@ -46,7 +33,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--views", type=int, default=30, help="board views of each camera")
     parser.add_argument("--kinds", default=",".join(KINDS), help="kinds of cameras")
-    parser.add_argument("--write", action="store_true", help="write docs/measured/paper.md and its pictures")
+    parser.add_argument(
+        "--write", action="store_true", help="write the tables of docs/measured/paper.md and its pictures"
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -59,12 +48,12 @@ def main() -> None:
             result = run_seed(arguments.work / f"{name}-{seed}-{arguments.views}", name, seed, arguments.views)
             results.setdefault(name, []).append(result)
             print(f"{name}, seed {seed}: {time.perf_counter() - start:.0f} s", flush=True)
-    demo = timed_demo(arguments.work / "demo") if arguments.write else []
-    text = page(results, arguments.views, demo)
-    print(text)
+    for name, lines in sections(results).items():
+        show(["", *lines])
+        if arguments.write:
+            write_section("paper.md", name, "\n".join(lines))
     if arguments.write:
-        (DOCS / "paper.md").write_text(text, encoding="utf-8")
-        write_figures(results, arguments.work, arguments.views)
+        write_figures(results)
 
 
 if __name__ == "__main__":

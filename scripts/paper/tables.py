@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
-from scripts.paper.numbers import TABLE_3, Results, median, middle
+from scripts.paper.numbers import TABLE_3, Results, median, middle, number
 from scripts.paper.site import KINDS
 from scripts.shared.page import table
 
@@ -24,8 +24,6 @@ def table_1(results: Results) -> list[str]:
         ratios.append(ours / median(b for _, b in pairs))
         rows.append([f"{title}: {KINDS[name].title}, {side}", theirs, ours, other, own])
     return [
-        "## Table 1: reprojection error with 14 coefficients, pixels",
-        "",
         *table(["camera", "paper, OpenCV", "paper, own", "OpenCV here", "kcal here"], rows),
         "",
         f"In {smaller} of {total} calibrations kcal's residual is the smaller one. The paper's own residuals are "
@@ -49,8 +47,6 @@ def table_2() -> list[str]:
         float(part[0]) for part in range_errors(planned_rig(), [5000.0], BudgetErrors(disparity_px=2.0))["disparity"]
     )
     return [
-        "## Table 2: range error by an error of disparity, meters",
-        "",
         *table(["Δd, px", "paper, 1 km", "slope", "exact", "paper, 5 km", "slope", "exact"], rows),
         "",
         "The paper's formula, ΔZ = Z² Δd / (f B) with f B = 16 000 px m, is the slope at the true point, and kcal's "
@@ -64,7 +60,7 @@ def table_3(results: Results) -> list[str]:
     rows, gains = [], []
     for label, paper in TABLE_3.items():
         cells = [
-            middle([run["cameras"][label][side]["rms"] for run in runs], 4)
+            number(median(run["cameras"][label][side]["rms"] for run in runs), 4)
             for runs in results.values()
             for side in ("right", "left")
         ]
@@ -77,8 +73,6 @@ def table_3(results: Results) -> list[str]:
         ]
         gains.append(f"{middle(gain, 1)} % ({name})")
     return [
-        "## Table 3: reprojection error by model, pixels",
-        "",
         *table(["coefficients", "paper, right", "left", *heads], rows),
         "",
         f"From 14 to 20 coefficients the paper's residual falls by 0.1 %; here by {', '.join(gains)}. A flat table "

@@ -1,4 +1,4 @@
-"""Calibration with a pure network lens by gradient descent, Adam and Levenberg-Marquardt (docs/measured/nets.md).
+"""Calibration with a pure network lens by gradient descent, Adam and Levenberg-Marquardt (docs/measured/paper.md).
 
     python -m scripts.paper.train_net_lens [--steps 2000] [--seeds 3] [--write]
 
@@ -33,11 +33,11 @@ from kcal.corners.observations import Observations, View
 from kcal.nets.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import State
-from scripts.shared.page import DOCS, write_section
-from scripts.shared.timing import row, show, spread
+from scripts.shared.page import write_section
+from scripts.shared.timing import median, row, show, spread
 from scripts.shared.views import COLUMNS, NOISE, ROWS, SIZE, simulate
 
-PAGE, PICTURE = "nets.md", "net-lens.png"
+PAGE = "paper.md"
 VIEWS, HELD_OUT = 20, 20
 # Half the image's width in focal lengths, a little more.
 REACH = 0.65
@@ -126,7 +126,7 @@ def reference(board: Tensor, pixels: Tensor, others: Tensor) -> list[str]:
     poses, _ = poses_under(result.camera, views, LMOptions(max_iterations=100))
     points = board @ poses.rotation.transpose(-1, -2) + poses.translation[:, None]
     error = (result.camera.project(points)[0] - others).norm(dim=-1).square().mean().sqrt()
-    cells = ("14 coefficients", "", LM, "", result.iterations, f"{seconds:.1f}", f"{result.rms:.4f}", f"{error:.4f}")
+    cells = ("14 coefficients", LM, "", f"{seconds:.1f}", f"{result.rms:.4f}", f"{error:.4f}")
     return show([row(*cells)])
 
 
@@ -153,7 +153,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--write", action="store_true", help=f"write the section of docs/{PAGE} and its picture")
+    parser.add_argument("--write", action="store_true", help=f"write the table of docs/measured/{PAGE}")
+    parser.add_argument("--picture", type=Path, help="draw RMS over steps into this file")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     data, more = simulate(VIEWS), simulate(HELD_OUT, seed=1000)
@@ -162,23 +163,10 @@ def main() -> None:
     base = fit_projection(board, pixels, SIZE, torch.ones_like(pixels[..., 0])).state
     intrinsics, poses = base.parameters[:4], (base.rotation, base.translation)
     lines = [
-        "## A lens that is only a network",
-        "",
-        f"Made by `scripts/paper/train_net_lens.py`: the pure network lens of the paper's Section 4.3.1 and Fig. 5 "
-        f"(`PureLensNet`, four layers), with intrinsics and poses, on {VIEWS} simulated views of a {COLUMNS}x{ROWS} "
-        f"board through a lens of 14 coefficients, noise {NOISE} px an axis (RMS {NOISE * math.sqrt(2):.3f}); start at "
-        "the base projection. *As in the figure*: it replaces x, y, beginning with random weights; *with a skip*: it "
-        "adds to them, beginning with nothing. First-order methods: every parameter in units of its column of the "
-        f"Jacobian at the start, the best of {len(RATES)} decades of learning rates by runs of a tenth of the length "
-        f"(not timed). RMS: the lowest on the way. Held out: {HELD_OUT} other views, poses alone solved, from the "
-        f"true. Medians over {arguments.seeds} seeds (smallest to largest).",
-        "",
-        f"![RMS over steps]({PICTURE})",
-        "",
-        "| lens | network | method | learning rate | steps | CPU s | RMS px | held-out RMS px |",
-        "|---|---|---|---|---|---|---|---|",
+        "| network | method | learning rate | CPU s | RMS px | held-out RMS px |",
+        "|---|---|---|---|---|---|",
     ]
-    show(lines[-2:])
+    show(lines)
     lines += reference(board, pixels, others)
     runs: dict[str, dict[str, list[Run]]] = {}
     for form, skip in (("as in the figure", False), ("with a skip", True)):
@@ -200,18 +188,17 @@ def main() -> None:
             lines += show(
                 [
                     row(
-                        f"network of {lens.weights.numel()} weights",
                         form,
                         method,
                         "" if rate is None else f"{rate:.0e}",
-                        spread([len(run.rms) - 1 for run in repeats], 0),
-                        spread([run.seconds for run in repeats]),
+                        median([run.seconds for run in repeats]),
                         spread([float(np.nanmin(run.rms)) for run in repeats], 4),
                         spread(outside, 4),
                     )
                 ]
             )
-    draw(runs, DOCS / PICTURE if arguments.write else Path(PICTURE))
+    if arguments.picture:
+        draw(runs, arguments.picture)
     if arguments.write:
         write_section(PAGE, "net lens", "\n".join(lines))
 

@@ -34,6 +34,15 @@ def spread(values: Sequence[float], digits: int = 1) -> str:
     return f"{statistics.median(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
 
 
+def median(values: Sequence[float], digits: int = 1) -> str:
+    return f"{statistics.median(values):.{digits}f}"
+
+
+def ratio(own: Sequence[float], other: Sequence[float], digits: int = 2) -> str:
+    """Median of the other's time over one's own, round by round: above 1, one's own is faster."""
+    return median([b / a for a, b in zip(own, other, strict=True)], digits)
+
+
 def ratios(own: Sequence[float], other: Sequence[float], digits: int = 2) -> str:
     """`spread` of the other's time over one's own, round by round: above 1, one's own is faster."""
     return spread([b / a for a, b in zip(own, other, strict=True)], digits)

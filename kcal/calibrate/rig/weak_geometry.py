@@ -21,7 +21,7 @@ from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.uncertainty import SharedCovariance, relative_rows
 from kcal.errors import DegenerateError
 
-# Measured on simulated landmarks (docs/measured/weak_geometry.md): up to the first ratio first-order intervals contain
+# Measured on simulated landmarks (scripts/check/weak_geometry.py): up to the first ratio first-order intervals contain
 # the truth as often as they should; above it, once they are widened by the ratio's square, at most three times. Hardly
 # any set above the second ratio gave useful ranges, nor one whose baseline across the line of sight is open by half.
 _LINEAR, _HOPELESS, _OPEN = 1.15, 3.0, 0.5
