@@ -1,1 +1,5 @@
-"""From observations to cameras and rigs (floor 3)."""
+"""From observations to cameras and rigs."""
+
+from kcal.doors import door
+
+__getattr__, __dir__ = door(__name__, __file__)

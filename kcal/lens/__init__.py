@@ -1,1 +1,5 @@
-"""Lens models, cameras and rigs in pure torch (floor 1)."""
+"""Lens models, cameras and rigs in pure torch."""
+
+from kcal.doors import door
+
+__getattr__, __dir__ = door(__name__, __file__)

@@ -1,0 +1,9 @@
+# ruff: noqa: I001
+# The names of `kcal.solve`, and where each is defined: for type checkers, `kcal.solve.__getattr__` and the reference.
+# A comment begins a group of the page.
+
+# Least squares
+from kcal.solve.lm import LevenbergMarquardt as LevenbergMarquardt
+from kcal.solve.lm import LMOptions as LMOptions
+from kcal.solve.result import SolverStatus as SolverStatus
+from kcal.solve.robust import RobustLoss as RobustLoss
