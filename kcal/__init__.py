@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from kcal.doors import door
+from kcal.old_names import PLACES, find_old
 
 __version__ = "0.1.0"
 
@@ -16,6 +17,4 @@ _find, __dir__ = door(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
-    from kcal import old_names
-
-    return old_names.find(name) if name in old_names.PLACES else _find(name)
+    return find_old(name) if name in PLACES else _find(name)

@@ -1,6 +1,5 @@
 # ruff: noqa: I001
-# The names of `kcal`, and where each is defined: for type checkers, `kcal.__getattr__` and the reference.
-# A comment begins a group of the page.
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
 # Cameras and rigs
 from kcal.lens.camera import Camera as Camera

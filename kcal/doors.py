@@ -1,8 +1,9 @@
 """Public names of a folder, loaded when they are first used.
 
-A door is the `__init__.py` of a folder from which users import. Its stub `__init__.pyi` says where each name is defined:
-one table for type checkers and for the door. A door imports nothing when it is opened, so that `import kcal` and
-`kcal --help` do not wait for torch, and it may name what rooms above it define without an import circle.
+A door is the `__init__.py` of a folder from which users import. Its stub `__init__.pyi` says where each name is
+defined: one table for type checkers, the reference and the door. A door imports nothing when it is opened, so that
+`import kcal` and `kcal --help` do not wait for torch, and it may name what rooms above it define without an import
+circle.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ def door(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], li
         return value
 
     def names() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *modules()})
+        # Without what the `__init__.py` itself imports, and without modules that happen to be loaded.
+        return sorted({*(name for name in vars(sys.modules[package]) if name.startswith("__")), *modules()})
 
     return find, names

@@ -71,7 +71,7 @@ _PUBLIC = {name: f"{module}.{name}" for module, names in _MOVED.items() for name
 PLACES = _PUBLIC | {name: f"{module}.{name}" for module, name in _INTERNAL.items()}
 
 
-def find(name: str) -> Any:
+def find_old(name: str) -> Any:
     """What an old name meant, with a warning that says where it is now. Call it from `kcal.__getattr__` only."""
     module, _, new_name = PLACES[name].rpartition(".")
     now = f"is now {PLACES[name]}" if name in _PUBLIC else "is internal, and not public any more"

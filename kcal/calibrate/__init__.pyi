@@ -1,6 +1,5 @@
 # ruff: noqa: I001
-# The names of `kcal.calibrate`, and where each is defined: for type checkers, `kcal.calibrate.__getattr__` and the reference.
-# A comment begins a group of the page.
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
 # More than one calibration
 from kcal.calibrate.camera.calibrate import calibrate_cameras as calibrate_cameras

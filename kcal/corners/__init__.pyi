@@ -1,6 +1,5 @@
 # ruff: noqa: I001
-# The names of `kcal.corners`, and where each is defined: for type checkers, `kcal.corners.__getattr__` and the reference.
-# A comment begins a group of the page.
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
 # Boards in images
 from kcal.corners.detect import detect_board as detect_board

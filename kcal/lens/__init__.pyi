@@ -1,6 +1,5 @@
 # ruff: noqa: I001
-# The names of `kcal.lens`, and where each is defined: for type checkers, `kcal.lens.__getattr__` and the reference.
-# A comment begins a group of the page.
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
 # Lens models
 from kcal.lens.model import LensModel as LensModel

@@ -1,6 +1,5 @@
 # ruff: noqa: I001
-# The names of `kcal.locate`, and where each is defined: for type checkers, `kcal.locate.__getattr__` and the reference.
-# A comment begins a group of the page.
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
 # Positions
 from kcal.locate.localizer import Localization as Localization

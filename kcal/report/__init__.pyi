@@ -1,6 +1,5 @@
 # ruff: noqa: I001
-# The names of `kcal.report`, and where each is defined: for type checkers, `kcal.report.__getattr__` and the reference.
-# A comment begins a group of the page.
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
 # May it be used
 from kcal.report.judge_camera import camera_verdict as camera_verdict

@@ -52,7 +52,7 @@ def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = (
 
     Args:
         observations: with the paths of their images; a view whose image is not there is drawn on gray.
-        failed: images that gave no view, from `kcal.corners.detect.detect_images`.
+        failed: images that gave no view, from `kcal.corners.detect.detect`.
     """
     order = sorted(range(len(observations.views)), key=lambda i: _badness(observations.views[i]), reverse=True)
     shown, drawn = order[:_MOST_VIEWS], failed[:_MOST_FAILED]

@@ -1,6 +1,5 @@
 # ruff: noqa: I001
-# The names of `kcal.rig`, and where each is defined: for type checkers, `kcal.rig.__getattr__` and the reference.
-# A comment begins a group of the page.
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
 # From files
 from kcal.calibrate.rig.pairs import pair_by_name as pair_by_name

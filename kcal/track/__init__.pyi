@@ -1,6 +1,5 @@
 # ruff: noqa: I001
-# The names of `kcal.track`, and where each is defined: for type checkers, `kcal.track.__getattr__` and the reference.
-# A comment begins a group of the page.
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
 # From a detector's boxes to pairs
 from kcal.pipeline.detections import Detections as Detections

@@ -80,8 +80,8 @@ class BoardProblem(SchurProblem[BoardState]):
         batch: leading shape of the states, () for one solve.
 
     Example:
-        >>> from kcal.lens.camera import Camera
-        >>> from kcal.lens.pose import rotation_from_vector
+        >>> from kcal import Camera
+        >>> from kcal.lens import rotation_from_vector
         >>> from kcal.solve.lm import minimize
         >>> camera = Camera.build(focal=(800, 805), center=(322, 238), size=(640, 480), model="pinhole")
         >>> board = 0.05 * torch.cartesian_prod(torch.arange(6.0), torch.arange(5.0), torch.zeros(1)).double()
