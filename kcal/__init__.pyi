@@ -9,7 +9,7 @@ from kcal.io.camera_file import save_camera as save_camera
 from kcal.io.rig_file import load_rig as load_rig
 from kcal.io.rig_file import save_rig as save_rig
 
-# Boards and what is seen of them
+# Boards and observations
 from kcal.corners.board import Board as Board
 from kcal.corners.observations import View as View
 from kcal.corners.observations import Observations as Observations

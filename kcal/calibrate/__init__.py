@@ -1,4 +1,4 @@
-"""From observations to cameras and rigs."""
+"""Calibrate several cameras, compare models, judge results, measure boards; `calibrate_camera` is in `kcal`."""
 
 from kcal.doors import door
 

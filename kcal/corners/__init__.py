@@ -1,4 +1,4 @@
-"""Boards, detection, sub-pixel refinement and observation files."""
+"""Find boards and points in images; `Board`, `Observations` and `detect` are in `kcal`."""
 
 from kcal.doors import door
 

@@ -1,4 +1,4 @@
-"""Lens models, cameras and rigs in pure torch."""
+"""Lens models, images, error bars of cameras, and exchange with other programs; `Camera` is in `kcal`."""
 
 from kcal.doors import door
 

@@ -27,7 +27,7 @@ from kcal.calibrate.bundle.covariance import projection_covariance as projection
 from kcal.lens.uncertainty import pixel_covariance as pixel_covariance
 from kcal.lens.information import CameraInformation as CameraInformation
 
-# What a camera file says
+# Calibration records
 from kcal.lens.calibration import CameraCalibration as CameraCalibration
 from kcal.lens.calibration import CalibrationRecord as CalibrationRecord
 from kcal.lens.calibration import BoardRecord as BoardRecord
@@ -42,7 +42,7 @@ from kcal.calibrate.camera.export import ExportedCameras as ExportedCameras
 from kcal.calibrate.camera.export import Misfit as Misfit
 from kcal.io.onnx_file import save_onnx as save_onnx
 
-# Tables and networks in place of a lens
+# Tables and networks
 from kcal.lens.baking import bake as bake
 from kcal.lens.lookup import LookupCamera as LookupCamera
 from kcal.io.lookup_file import load_lookup as load_lookup

@@ -1,4 +1,4 @@
-"""From pixel pairs to positions on the Earth."""
+"""Positions, triangulation, the ground and geodesy; `StereoLocalizer` and `locate_points` are in `kcal`."""
 
 from kcal.doors import door
 

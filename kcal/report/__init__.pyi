@@ -1,7 +1,7 @@
 # ruff: noqa: I001
 # Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
-# May it be used
+# Verdicts
 from kcal.report.judge_camera import camera_verdict as camera_verdict
 from kcal.report.judge_camera import stored_verdict as stored_verdict
 from kcal.report.judge_rig import rig_verdict as rig_verdict

@@ -1,4 +1,4 @@
-"""Stereo rigs: what they are solved from, what was found, and whether they have turned since."""
+"""Read and match surveys, place rigs, and notice when they have turned; `solve_rig` is in `kcal`."""
 
 from kcal.doors import door
 

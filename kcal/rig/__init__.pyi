@@ -1,7 +1,7 @@
 # ruff: noqa: I001
 # Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
 
-# From files
+# Read and match data
 from kcal.calibrate.rig.pairs import pair_by_name as pair_by_name
 from kcal.calibrate.rig.pairs import read_pairs as read_pairs
 from kcal.calibrate.rig.pairs import paired_boards as paired_boards
@@ -13,7 +13,7 @@ from kcal.locate.survey import MarkedLandmarks as MarkedLandmarks
 from kcal.locate.survey import read_features as read_features
 from kcal.locate.survey import camera_positions as camera_positions
 
-# What was found
+# Results
 from kcal.calibrate.rig.result import ItemResidual as ItemResidual
 from kcal.calibrate.rig.result import SourceResidual as SourceResidual
 from kcal.calibrate.rig.initial_poses import TurnedBoard as TurnedBoard
@@ -23,7 +23,7 @@ from kcal.lens.rig import RigCovariance as RigCovariance
 from kcal.locate.check import triangulated_sides as triangulated_sides
 from kcal.locate.check import Sides as Sides
 
-# On the Earth
+# Place and plan rigs
 from kcal.lens.mounting import Mounting as Mounting
 from kcal.locate.mounting import placed_rig as placed_rig
 from kcal.locate.mounting import mounting_covariance as mounting_covariance

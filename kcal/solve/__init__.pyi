@@ -1,5 +1,5 @@
-# The names of `kcal.solve`, and where each is defined: for type checkers, `kcal.solve.__getattr__` and the reference.
 # Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
+
 # Least squares
 from kcal.solve.lm import LevenbergMarquardt as LevenbergMarquardt
 from kcal.solve.lm import LMOptions as LMOptions
