@@ -62,10 +62,12 @@ def page(door: str) -> str:
     if door == "kcal":
         others = (f"[`{other}`]({page_of(other).name})" for other in DOORS[1:])
         lines += ["The names that most programs need. The others are in namespaces: " + ", ".join(others) + ".", ""]
+    named = groups(door)
+    example = next(iter(named.values()))[0][0]
     lines += [
-        f"`help({door}.NAME)` explains arguments, units and errors, and so does the site that `make docs` builds."
+        f"`help({door}.{example})` explains arguments, units and errors, and so does the site that `make docs` builds."
     ]
-    for title, names in groups(door).items():
+    for title, names in named.items():
         lines += ["", f"## {title}", "", "| Name | What it is |", "|---|---|"]
         lines += [f"| `{name}` | {first_line(module, name).replace('|', chr(92) + '|')} |" for name, module in names]
     return "\n".join(lines) + "\n"

@@ -164,7 +164,7 @@ def main() -> None:
         "the truth, their ratio, the ratio of their medians (of normal errors both are 1), the mean error in standard "
         f"deviations, and how many of the 95 % intervals or ellipses hold the truth (standard error {cover:.1f} % for "
         "one place). Without the prior, σ of models of more than five coefficients is that of the mild lens that fits "
-        "almost as well, widened by the distance to it (`kcal.calibrate.camera.prior_comparison`): it covers, but "
+        "almost as well, widened by the distance to it: it covers, but "
         "where the solution bends sharply it is far too large, and rules the root of the mean variance. A capture is "
         "warned of where anything but its corners is doubted.",
         "",
