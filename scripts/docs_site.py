@@ -1,4 +1,4 @@
-"""Pages of the documentation site that follow from the repository: navigation, commands, API, measured conclusions.
+"""Pages of the documentation site that follow from the repository: navigation, commands, docstrings, conclusions.
 
 MkDocs calls the functions whose names begin with `on_` (`hooks` in mkdocs.yml). New pages appear without an edit: those
 named in `SECTIONS` come first, others of the folder follow by name.
@@ -6,13 +6,14 @@ named in `SECTIONS` come first, others of the folder follow by name.
 
 from __future__ import annotations
 
-import ast
 import inspect
 import re
 from collections.abc import Iterator
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from scripts.make_reference import DOORS, groups, page_of
 
 if TYPE_CHECKING:  # the tests of the navigation run without MkDocs
     from mkdocs.config.defaults import MkDocsConfig
@@ -41,17 +42,7 @@ SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 )  # fmt: skip
 NETWORK_SHIM = "https://unpkg.com/iframe-worker/shim"
 OUTSIDE = ("CHANGELOG.md", "CONTRIBUTING.md")  # pages of the repository's root, shown under Reference
-ROOMS = {
-    "lens": "Cameras and lenses",
-    "corners": "Boards and corners",
-    "calibrate": "Calibration of cameras and rigs",
-    "locate": "Positions",
-    "report": "Pictures and maps",
-    "io": "Files",
-    "nets": "Networks",
-    "solve": "Least squares",
-    "errors": "Errors",
-}
+PYTHON = {page_of(door).relative_to(DOCS).as_posix(): door for door in DOORS}  # pages of Python names
 
 
 def ordered(names: list[str], order: tuple[str, ...]) -> list[str]:
@@ -68,7 +59,8 @@ def navigation() -> list[Any]:
         if folder == "measured":
             pages.insert(0, "measured/index.md")
         if folder == "reference":
-            pages += [{"Python": [f"reference/api/{room}.md" for room in public_names()]}]
+            pages = [page for page in pages if page not in PYTHON]
+            pages += [{"Python": list(PYTHON)}]
             pages += ["architecture.md", *(f"reference/{name.lower()}" for name in OUTSIDE)]
         nav.append({title: pages})
     return nav
@@ -78,20 +70,14 @@ def _generated(folder: str) -> list[str]:
     return ["commands"] if folder == "reference" else []
 
 
-def public_names() -> dict[str, list[str]]:
-    """Full names of the public classes and functions of each room, as the stub of the package lists them."""
-    rooms: dict[str, list[str]] = {room: [] for room in ROOMS}
-    for line in ast.parse((ROOT / "kcal" / "__init__.pyi").read_text(encoding="utf-8")).body:
-        if isinstance(line, ast.ImportFrom):
-            room = str(line.module).split(".")[1]
-            rooms.setdefault(room, []).extend(f"{line.module}.{alias.name}" for alias in line.names)
-    return {room: names for room, names in rooms.items() if names}
-
-
-def api_page(room: str, names: list[str]) -> str:
-    """A page of mkdocstrings' directives."""
-    lines = [f"# {ROOMS.get(room, room.capitalize())}", "", "All names are imported from `kcal`.", ""]
-    return "\n".join([*lines, *(f"::: {name}\n" for name in names)])
+def with_descriptions(door: str, markdown: str) -> str:
+    """A page of names with each linked to its docstring, which follows as mkdocstrings' directive."""
+    lines = []
+    for title, names in groups(door).items():
+        for name, module in names:
+            markdown = markdown.replace(f"| `{name}` |", f"| [`{name}`][{module}.{name}] |")
+        lines += [f"## {title}: descriptions", "", *(f"::: {module}.{name}\n" for name, module in names)]
+    return "\n".join([markdown, *lines])
 
 
 def commands_page() -> str:
@@ -153,7 +139,6 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     from mkdocs.structure.files import File
 
     pages = {"reference/commands.md": commands_page(), "measured/index.md": conclusions_page()}
-    pages |= {f"reference/api/{room}.md": api_page(room, names) for room, names in public_names().items()}
     pages |= {f"reference/{name.lower()}": (ROOT / name).read_text(encoding="utf-8") for name in OUTSIDE}
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))
@@ -167,8 +152,10 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     """Links that leave docs/ in the repository stay inside the site."""
     if page.is_homepage:
         page.meta["hide"] = ["navigation", "toc"]  # the picture gets their place
-    if page.file.src_uri.startswith(("reference/api/", "reference/changelog")):
+    if page.file.src_uri in PYTHON or page.file.src_uri.startswith("reference/changelog"):
         page.meta["search"] = {"boost": 0.3}  # what explains is found before what lists
+    if page.file.src_uri in PYTHON:
+        return with_descriptions(PYTHON[page.file.src_uri], markdown)
     if page.file.src_uri in {f"reference/{name.lower()}" for name in OUTSIDE}:
         return re.sub(r"\]\(docs/", "](../", markdown)
     up = "../" * page.file.src_uri.count("/")

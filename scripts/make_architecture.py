@@ -61,8 +61,8 @@ def read_imports() -> dict[str, set[str]]:
     for path in PACKAGE.rglob("*.py"):
         module = ".".join(["kcal", *path.relative_to(PACKAGE).with_suffix("").parts])
         room = room_of(module)
-        # The folders' own files and the two doors of the package name everything and belong to no room.
-        if path.name in ("__init__.py", "__main__.py") and room in (BOTTOM, "calibrate/__init__"):
+        # Doors name what other rooms define, and belong to no room.
+        if path.name == "__main__.py" or path.with_suffix(".pyi").exists():
             continue
         imported = rooms.setdefault(room, set())
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -1,4 +1,4 @@
-"""What kcal promises to its users at the top level."""
+"""What kcal promises to its users: the names in `kcal` and its namespaces."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import importlib.metadata
 import inspect
 import subprocess
 import sys
+import tomllib
 import typing
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,222 +20,68 @@ import pytest
 
 import kcal
 from kcal.locate.max_likelihood import PointFit
+from kcal.old_names import PLACES
 
 # Taking a name away breaks users; adding one is a promise. Either is a line here and one in CHANGELOG.md.
 PUBLIC = {
-    "Association",
-    "AssociationOptions",
-    "Baseline",
-    "Board",
-    "BoardModes",
-    "BoardRecord",
-    "Boards",
-    "BudgetErrors",
-    "CalibratedViews",
-    "CalibrationLayer",
-    "CalibrationOptions",
-    "CalibrationRecord",
-    "CalibrationSummary",
-    "Camera",
-    "CameraCalibration",
-    "CameraCalibrationResult",
-    "CameraInformation",
-    "Examination",
-    "HalvesDifference",
-    "ParaxialFocal",
-    "ResidualStructure",
-    "examine",
-    "camera_verdict",
-    "paraxial_focal",
-    "stored_verdict",
-    "rig_verdict",
-    "Finding",
-    "RangeAnswer",
-    "Requirement",
-    "Verdict",
-    "save_verdict_page",
-    "CameraDifference",
-    "CameraPose",
-    "ComparisonResult",
-    "DegenerateError",
-    "Detection",
-    "Detections",
-    "DisparityOptions",
-    "Drift",
-    "DriftEffect",
-    "Exclusion",
-    "ExportedCameras",
-    "FailedImage",
-    "Failure",
-    "Features",
-    "FieldModes",
-    "FileError",
-    "GaussianModes",
-    "Geoid",
-    "HybridFit",
-    "HybridForm",
-    "BoardState",
-    "Readout",
-    "ImageTransform",
-    "ImportedCameras",
-    "InputError",
-    "InverseFit",
-    "InverseNet",
-    "InverseNetOptions",
-    "ItemResidual",
-    "KcalError",
-    "LMOptions",
-    "Landmarks",
-    "LearnedStart",
-    "LensModel",
-    "LevenbergMarquardt",
-    "Localization",
-    "Located",
-    "LookupCamera",
-    "MarkedLandmarks",
-    "Marks",
-    "MatchOptions",
-    "MatchStatus",
-    "Matches",
-    "MeasuredBoard",
-    "MeasuredPosition",
-    "Misfit",
-    "Mounting",
-    "Observations",
-    "GroundPlaces",
-    "Origin",
-    "level_ground",
-    "locate_on_ground",
-    "terrain",
-    "Tracks",
-    "TrackOptions",
-    "Tracker",
-    "SmoothedTrack",
-    "ObjectPairs",
-    "Motion",
-    "TrackStates",
-    "ClockPrior",
-    "ClockEstimate",
-    "NetworkModes",
-    "ObjectDisparities",
-    "ObjectDisparity",
-    "OutlierRejection",
-    "Position",
-    "PositionStatus",
-    "PriorFamilies",
-    "RangeError",
-    "RefinedPoint",
-    "RefittedCamera",
-    "RejectedCorner",
-    "RejectedView",
-    "RigCalibration",
-    "RigCovariance",
-    "RigData",
-    "RigOptions",
-    "RigResult",
-    "RigSource",
-    "RobustLoss",
-    "Sensitivity",
-    "SharedBoard",
-    "Sides",
-    "SolverStatus",
-    "SourceResidual",
-    "Spline",
-    "StereoLocalizer",
-    "StereoRig",
-    "Survey",
-    "Triangulate",
-    "TriangulateViews",
-    "Triangulation",
-    "TurnedBoard",
-    "Undistort",
-    "UndistortImage",
-    "UndistortMaps",
-    "Unproject",
-    "View",
-    "Viewpoint",
-    "ViewsResult",
-    "ZernikeModes",
-    "associate",
-    "bake",
-    "calibrate_camera",
-    "calibrate_cameras",
-    "calibrate_rig",
-    "calibration_figure",
-    "camera_difference",
-    "camera_positions",
-    "check_rig",
-    "circular_error",
-    "compare_models",
-    "detect_board",
-    "detect_images",
-    "detect_video",
-    "drift_effect",
-    "enu_from_cam",
-    "enu_to_geodetic",
-    "expand_images",
-    "export_cameras",
-    "find_geoid",
-    "geodetic_to_enu",
-    "image_sigma",
-    "import_cameras",
-    "import_corners",
-    "import_survey",
-    "load_camera",
-    "load_lookup",
-    "load_measured_board",
-    "load_rig",
-    "locate_points",
-    "match_landmarks",
-    "match_points",
-    "measure_board",
-    "measure_drift",
-    "mounting_covariance",
-    "new_pinhole",
-    "pair_by_name",
-    "pair_objects",
-    "paired_boards",
-    "pixel_covariance",
-    "projection_sigma",
-    "placed_rig",
-    "planned_rig",
-    "position_errors",
-    "positions_figure",
-    "range_errors",
-    "read_features",
-    "read_gray",
-    "read_marks",
-    "read_pairs",
-    "read_survey",
-    "read_truth",
-    "refine_point",
-    "refit_camera",
-    "relocked",
-    "rig_figure",
-    "save_board",
-    "save_board_picture",
-    "save_budget_picture",
-    "save_calibration_picture",
-    "save_camera",
-    "save_coverage",
-    "save_difference_picture",
-    "save_gallery",
-    "save_lookup",
-    "save_map",
-    "save_measured_board",
-    "save_onnx",
-    "save_positions_picture",
-    "save_rig",
-    "save_rig_picture",
-    "solve_rig",
-    "summarize",
-    "train_features",
-    "train_inverse",
-    "triangulated_sides",
-    "true_from_grid",
-    "undistort_maps",
-    "write_positions",
+    "kcal": """
+        Baseline Board Boards CalibrationOptions Camera CameraCalibrationResult DegenerateError Features
+        FileError InputError KcalError Landmarks Located MeasuredPosition Observations Origin PositionStatus
+        RigData RigOptions RigResult StereoLocalizer StereoRig View calibrate_camera calibrate_rig detect
+        load_camera load_rig locate_points save_camera save_rig solve_rig
+    """,
+    "kcal.lens": """
+        BoardRecord CalibrationRecord CameraCalibration CameraDifference CameraInformation CameraPose Exclusion
+        ExportedCameras HybridForm ImageTransform ImportedCameras InverseFit InverseNet InverseNetOptions
+        LearnedStart LensModel LookupCamera Misfit ParaxialFocal RefittedCamera Undistort UndistortImage
+        UndistortMaps Unproject ZernikeModes bake camera_difference export_cameras image_sigma import_cameras
+        load_lookup new_pinhole paraxial_focal pixel_covariance projection_covariance projection_sigma
+        refit_camera rotation_from_vector save_lookup save_onnx train_inverse undistort_maps
+        vector_from_rotation
+    """,
+    "kcal.corners": """
+        Detection Failure MatchOptions MatchStatus Matches RefinedPoint detect_board detect_video expand_images
+        import_corners match_points read_gray refine_point save_board
+    """,
+    "kcal.calibrate": """
+        CalibratedViews CalibrationLayer CalibrationSummary ComparisonResult Examination HalvesDifference
+        MeasuredBoard OutlierRejection RejectedCorner RejectedView ResidualStructure SharedBoard
+        calibrate_cameras calibrate_views compare_models examine load_measured_board measure_board
+        save_measured_board summarize
+    """,
+    "kcal.rig": """
+        Drift DriftEffect ItemResidual MarkedLandmarks Mounting RigCalibration RigCovariance RigSource Sides
+        SourceResidual Survey TurnedBoard camera_positions check_rig drift_effect import_survey match_landmarks
+        measure_drift mounting_covariance pair_by_name paired_boards placed_rig planned_rig read_features
+        read_pairs read_survey relocked triangulated_sides
+    """,
+    "kcal.locate": """
+        BudgetErrors Geoid GroundPlaces Localization Marks Position RangeError Sensitivity Triangulate
+        TriangulateViews Triangulation Viewpoint ViewsResult circular_error enu_from_cam enu_to_geodetic
+        find_geoid geodetic_to_enu level_ground locate_on_ground position_errors range_errors read_marks
+        read_truth terrain true_from_grid write_positions
+    """,
+    "kcal.track": """
+        Association AssociationOptions ClockEstimate ClockPrior Detections DisparityOptions Motion
+        ObjectDisparities ObjectDisparity ObjectPairs SmoothedTrack TrackOptions TrackStates Tracker Tracks
+        associate pair_objects
+    """,
+    "kcal.report": """
+        FailedImage Finding RangeAnswer Requirement Verdict calibration_figure camera_verdict positions_figure
+        rig_figure rig_verdict save_board_picture save_budget_picture save_calibration_picture save_coverage
+        save_difference_picture save_gallery save_map save_positions_picture save_rig_picture save_verdict_page
+        stored_verdict
+    """,
+    "kcal.solve": """
+        LMOptions LevenbergMarquardt RobustLoss SolverStatus
+    """,
 }
+NAMES = [(door, name) for door, names in PUBLIC.items() for name in names.split()]
+NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
+# Names that were not in `kcal` itself before there were namespaces.
+NEW_NAMES = {"calibrate_views", "detect", "rotation_from_vector", "vector_from_rotation"}
+# Types of attributes in which only those look who work on kcal.
+INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
     "Examination",
@@ -281,7 +128,6 @@ RECORDS = {
     "MeasuredBoard",
     "MeasuredPosition",
     "Misfit",
-    "NetworkModes",
     "ObjectDisparities",
     "ObjectDisparity",
     "ObjectPairs",
@@ -298,7 +144,6 @@ RECORDS = {
     "SharedBoard",
     "Sides",
     "SourceResidual",
-    "Spline",
     "SolverStatus",
     "Survey",
     "Triangulation",
@@ -311,7 +156,6 @@ RECORDS = {
 # They write a picture or page of a whole result, or need a video, raster or observations: see the tests of their rooms.
 WITHOUT_EXAMPLE = {
     "terrain",
-    "FieldModes",
     "detect_video",
     "paired_boards",
     "read_pairs",
@@ -327,15 +171,23 @@ WITHOUT_EXAMPLE = {
 }
 
 
-def test_the_list() -> None:
-    assert set(kcal.__all__) == PUBLIC
-    assert len(kcal.__all__) == len(PUBLIC)
-    assert set(dir(kcal)) >= PUBLIC
+@pytest.mark.parametrize("door", PUBLIC)
+def test_the_list(door: str) -> None:
+    names = PUBLIC[door].split()
+    module = importlib.import_module(door)
+    more = NAMESPACES if door == "kcal" else set()
+    assert module.__all__ == sorted({*names, *more})
+    assert {name for name in dir(module) if not name.startswith("__")} == set(module.__all__)
 
 
-@pytest.mark.parametrize("name", sorted(PUBLIC))
-def test_each_name(name: str) -> None:
-    value = getattr(kcal, name)
+def test_a_name_has_one_place() -> None:
+    names = [name for _, name in NAMES]
+    assert sorted(names) == sorted(set(names))
+
+
+@pytest.mark.parametrize(("door", "name"), NAMES)
+def test_each_name(door: str, name: str) -> None:
+    value = getattr(importlib.import_module(door), name)
     assert value is getattr(importlib.import_module(value.__module__), name)
     docstring = inspect.getdoc(value) or ""
     # Options are shown where they are used, and errors by the messages they carry.
@@ -363,10 +215,11 @@ def signature_types(value: object) -> set[type]:
     return set().union(*(named_types(hint) for name, hint in hints.items() if not name.startswith("_")))
 
 
-@pytest.mark.parametrize("name", sorted(name for name in PUBLIC if not name.endswith("Error")))
-def test_every_type_in_a_public_signature_is_public(name: str) -> None:
-    public = {getattr(kcal, name) for name in PUBLIC}
-    assert {kind.__qualname__ for kind in signature_types(getattr(kcal, name)) - public} == set()
+def test_every_type_in_a_public_signature_is_public() -> None:
+    public = {getattr(importlib.import_module(door), name) for door, name in NAMES}
+    values = [value for value in public if not (inspect.isclass(value) and issubclass(value, Exception))]
+    others = {value.__qualname__: signature_types(value) - public for value in values}
+    assert {kind.__qualname__ for kinds in others.values() for kind in kinds} == INSIDE, others
 
 
 def test_a_type_that_is_not_public_is_seen() -> None:
@@ -375,32 +228,58 @@ def test_a_type_that_is_not_public_is_seen() -> None:
     assert {kind.__name__ for kind in signature_types(function)} == {"PointFit", "Camera"}
 
 
-def test_type_checkers_see_the_same_names() -> None:
-    """The stub is the one table: it must travel with the package."""
-    stub = Path(kcal.__file__).with_suffix(".pyi")
-    assert stub.is_file()
-    assert '"__init__.pyi"' in (Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8")
+def test_stubs_travel_with_the_package() -> None:
+    """They are the table of names, for type checkers and for the package itself."""
+    settings = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+    package = Path(kcal.__file__).parent
+    shipped = {
+        path for pattern in settings["tool"]["setuptools"]["package-data"]["kcal"] for path in package.glob(pattern)
+    }
+    stubs = {Path(str(importlib.import_module(door).__file__)).with_suffix(".pyi") for door in PUBLIC}
+    assert stubs == set(package.rglob("*.pyi"))
+    assert stubs <= shipped
 
 
-def test_no_name_hides_a_folder() -> None:
-    """`kcal.locate` is a folder; a function of that name would be replaced by it at the first import."""
-    folders = {path.parent.name for path in Path(kcal.__file__).parent.glob("*/__init__.py")}
-    assert folders.isdisjoint(PUBLIC)
+@pytest.mark.parametrize("door", PUBLIC)
+def test_no_name_hides_a_module(door: str) -> None:
+    """`kcal.corners.detect` is a module; a function of that name would be replaced by it at the first import."""
+    folder = Path(str(importlib.import_module(door).__file__)).parent
+    inside = {path.stem for path in folder.glob("*.py")} | {path.parent.name for path in folder.glob("*/__init__.py")}
+    assert inside.isdisjoint(PUBLIC[door].split())
+
+
+@pytest.mark.parametrize("name", sorted(PLACES))
+def test_an_old_name_warns_and_works(name: str) -> None:
+    now, _, new_name = PLACES[name].rpartition(".")
+    public = (now, new_name) in NAMES
+    with pytest.warns(DeprecationWarning, match=rf"^kcal\.{name} is (now {PLACES[name]};|internal,)") as caught:
+        value = getattr(kcal, name)
+    assert value is getattr(importlib.import_module(now), new_name)
+    assert ("is now" in str(caught[0].message)) == public
+    assert caught[0].filename == __file__  # where the old name is used
+    assert name not in vars(kcal)  # so that each place of use is warned of
+
+
+def test_every_name_that_moved_has_an_old_one() -> None:
+    moved = {name: f"{door}.{name}" for door, name in NAMES if door != "kcal" and name not in NEW_NAMES}
+    assert {name: place for name, place in PLACES.items() if name in moved} == moved
+    assert PLACES["detect_images"] == "kcal.detect"
 
 
 def test_unknown_names() -> None:
     with pytest.raises(AttributeError, match="module 'kcal' has no attribute 'nothing'"):
         _ = kcal.nothing
+    with pytest.raises(AttributeError, match=r"module 'kcal\.lens' has no attribute 'Camera'"):
+        _ = kcal.lens.Camera
 
 
 def test_version() -> None:
     assert importlib.metadata.version("kcal") == kcal.__version__
 
 
-@pytest.mark.parametrize("module", ["kcal", "kcal.cli.main"])
+@pytest.mark.parametrize("module", [*PUBLIC, "kcal.cli.main"])
 def test_import_is_light(module: str) -> None:
-    code = (
-        f"import sys, {module}; print(sorted({{'torch', 'cv2', 'numpy', 'skimage', 'matplotlib'}} & set(sys.modules)))"
-    )
+    heavy = {"torch", "cv2", "numpy", "skimage", "matplotlib"}
+    code = f"import sys, {module}; dir({module}); print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

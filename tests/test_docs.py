@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import importlib.util
 import os
 import re
@@ -12,8 +13,10 @@ from pathlib import Path
 
 import pytest
 
-import kcal
-from scripts.docs_site import commands_page, navigation, ordered, public_names
+from kcal.old_names import PLACES
+from scripts.docs_site import commands_page, navigation, ordered, with_descriptions
+from scripts.make_reference import DOORS, groups, page, page_of
+from scripts.shared.page import CONCLUSIONS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -50,6 +53,28 @@ def missing_code(text: str) -> list[str]:
     return absent
 
 
+def missing_names(text: str) -> list[str]:
+    """`kcal.lens.baking` and its like that do not exist, or are old names."""
+    return [name for name in sorted(set(re.findall(r"(?<![\w./-])kcal(?:\.\w+)+", text))) if not exists(name)]
+
+
+def exists(name: str) -> bool:
+    """Whether a dotted name is a module or something in one, and not an old name of `kcal`."""
+    first, *parts = name.split(".")
+    found: object = importlib.import_module(first)
+    for number, part in enumerate(parts):
+        if number == 0 and part in PLACES:
+            return False
+        try:
+            found = getattr(found, part)
+        except AttributeError:
+            try:
+                found = importlib.import_module(".".join([first, *parts[: number + 1]]))
+            except ImportError:
+                return False
+    return True
+
+
 def names_of(node: ast.stmt) -> set[str]:
     """What a statement defines."""
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
@@ -62,6 +87,7 @@ def test_a_page_names_what_exists(page: Path) -> None:
     assert missing_links(page, text) == []
     assert missing_scripts(text) == []
     assert missing_code(text) == []
+    assert missing_names(text) == []
 
 
 def test_planted_mistakes_are_seen() -> None:
@@ -73,6 +99,12 @@ def test_planted_mistakes_are_seen() -> None:
     ]
     text = "`kcal/none.py` `kcal/lens/camera.py::Camera.none` `kcal/lens/camera.py::Camera.project`"
     assert missing_code(text) == ["kcal/none.py", "kcal/lens/camera.py::Camera.none"]
+    there = "`kcal.lens.bake(camera)`, kcal.Camera.project, kcal.lens.zernike, kcal/none.py, a.kcal.none"
+    assert missing_names(f"{there}: kcal.bake kcal.lens.none kcal.none.Camera") == [
+        "kcal.bake",
+        "kcal.lens.none",
+        "kcal.none.Camera",
+    ]
 
 
 def names_in(nav: object) -> list[str]:
@@ -101,9 +133,25 @@ def test_pages_without_a_place_follow_those_that_have_one() -> None:
     ]
 
 
-def test_every_public_name_is_in_the_reference() -> None:
-    names = [name.rsplit(".", 1)[1] for room in public_names().values() for name in room]
-    assert sorted(names) == sorted(kcal.__all__)
+@pytest.mark.parametrize("door", DOORS)
+def test_every_public_name_is_in_the_reference(door: str) -> None:
+    module, text = importlib.import_module(door), page_of(door).read_text(encoding="utf-8")
+    assert text == page(door), "python -m scripts.make_reference writes it anew"
+    listed = re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)
+    linked = re.findall(r"\[`kcal\.(\w+)`\]\(\1\.md\)", text)
+    assert sorted([*listed, *linked]) == module.__all__
+    # On the site each name leads to its docstring.
+    site = with_descriptions(door, text)
+    homes = dict(name for names in groups(door).values() for name in names)
+    assert sorted(homes) == sorted(listed)
+    for name, home in homes.items():
+        assert f"| [`{name}`][{home}.{name}] |" in site
+        assert f"::: {home}.{name}\n" in site
+
+
+def test_the_pages_of_the_reference_are_on_the_index() -> None:
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    assert [door for door in DOORS if f"(reference/{page_of(door).name})" not in index] == []
 
 
 def test_the_commands_page_has_every_option() -> None:

@@ -38,8 +38,12 @@ SIM_IMPORTERS = {"sim", "cli"}
 IMAGE_LIBRARIES = {"cv2", "skimage"}
 IMAGE_ROOMS = {"corners", "io"}
 MOST_LINES = 400
-# These two name everything for users and have no floor.
-DOORS = {PACKAGE / "__init__.py", PACKAGE / "__main__.py"}
+# Doors name what users import, whichever room defines it, and have no floor: they import nothing but `kcal.doors`.
+DOORS = {stub.with_suffix(".py") for stub in PACKAGE.rglob("__init__.pyi")}
+# These two have no floor, too: one has the version and old names besides, the other runs the command line.
+WITHOUT_FLOOR = DOORS | {PACKAGE / "__main__.py"}
+# Folders that are a door alone.
+EMPTY_ROOMS = {"rig", "track"}
 
 
 def room_of(module: str) -> str:
@@ -77,6 +81,14 @@ def may_import(importer: str, imported: str) -> bool:
     return imported in FLOORS and FLOORS[imported] < FLOORS[importer]
 
 
+def public_module(path: Path) -> str:
+    return ".".join(["kcal", *path.parent.relative_to(PACKAGE).parts])
+
+
+# `import kcal` itself loads nothing; it is how a module reads the version.
+DOOR_NAMES = {public_module(path) for path in DOORS} - {"kcal"} | {f"kcal.{name}" for name in kcal.__all__}
+
+
 def violations(module: str, source: str) -> list[str]:
     """What is wrong with a module's source, one line each."""
     tree = ast.parse(source)
@@ -86,8 +98,14 @@ def violations(module: str, source: str) -> list[str]:
         root = name.split(".")[0]
         if root == "kcal" and not may_import(here, room_of(name)):
             wrong.append(f"{module} imports {name}")
+        elif name in DOOR_NAMES:
+            wrong.append(f"{module} goes through the door {name}")
         if root in IMAGE_LIBRARIES and here not in IMAGE_ROOMS:
             wrong.append(f"{module} imports {root}")
+    of_kcal = [
+        n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and getattr(n.value, "id", None) == "kcal"
+    ]
+    wrong += [f"{module} goes through the door kcal.{name}" for name in of_kcal if name in kcal.__all__]
     if here != "cli":
         prints = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and getattr(n.func, "id", None) == "print"]
         wrong += [f"{module}:{node.lineno} prints" for node in prints]
@@ -96,7 +114,7 @@ def violations(module: str, source: str) -> list[str]:
     return wrong
 
 
-MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path not in DOORS)
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path not in WITHOUT_FLOOR)
 
 
 def name_of(path: Path) -> str:
@@ -110,9 +128,18 @@ def test_module_keeps_the_rules(path: Path) -> None:
     assert violations(name, path.read_text(encoding="utf-8")) == []
 
 
+@pytest.mark.parametrize("path", sorted(DOORS), ids=public_module)
+def test_a_door_imports_nothing(path: Path) -> None:
+    allowed = {"kcal.doors"} | ({"kcal.old_names", "__future__", "typing"} if path.parent == PACKAGE else set())
+    assert imported_modules(ast.parse(path.read_text(encoding="utf-8")), public_module(path)) == allowed
+    stub = ast.parse(path.with_suffix(".pyi").read_text(encoding="utf-8"))
+    homes = {line.module for line in stub.body if isinstance(line, ast.ImportFrom)}
+    assert homes.isdisjoint(DOOR_NAMES)
+
+
 def test_every_folder_is_a_room() -> None:
     folders = {path.parent.relative_to(PACKAGE).as_posix() for path in PACKAGE.glob("**/__init__.py")}
-    assert folders == (set(FLOORS) - {""}) | {"sim", "calibrate", "."}
+    assert folders == (set(FLOORS) - {""}) | {"sim", "calibrate", "."} | EMPTY_ROOMS
 
 
 def circle(graph: dict[str, set[str]]) -> list[str]:
@@ -180,6 +207,10 @@ def test_a_planted_circle_is_seen() -> None:
         ("kcal.calibrate.camera.solve", "from kcal.sim.scene import demo_rig", "imports kcal.sim.scene"),
         ("kcal.sim.render", "from kcal.corners.board import Board", "imports kcal.corners.board"),
         ("kcal.errors", "from kcal.lens.camera import Camera", "imports kcal.lens.camera"),
+        ("kcal.locate.stereo", "from kcal.lens import Undistort", "through the door kcal.lens"),
+        ("kcal.locate.stereo", "from kcal import Camera", "through the door kcal.Camera"),
+        ("kcal.locate.stereo", "from kcal.rig import Mounting", "through the door kcal.rig"),
+        ("kcal.locate.stereo", "import kcal\nkcal.Camera(1)", "through the door kcal.Camera"),
         ("kcal.locate.stereo", "import cv2", "imports cv2"),
         ("kcal.sim.render", "from skimage.io import imread", "imports skimage"),
         ("kcal.solve.lm", "def f():\n    print(1)", ":2 prints"),
@@ -197,7 +228,7 @@ def test_planted_violations_are_seen(module: str, source: str, complaint: str) -
         ("kcal.corners.detect", "import cv2\nfrom kcal.corners.board import Board\nfrom kcal.errors import InputError"),
         ("kcal.calibrate.camera.solve", "from kcal.calibrate.problem.poses import refine_poses\nfrom . import options"),
         ("kcal.sim.render", "from kcal.lens.camera import Camera\nfrom kcal.checks import as_points"),
-        ("kcal.io.camera_file", "import kcal\nimport skimage.io"),
+        ("kcal.io.camera_file", "import kcal\nimport skimage.io\nprovenance = kcal.__version__"),
         ("kcal.solve.lm", "x = 1\n" * 400),
     ],
 )

@@ -10,6 +10,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+import kcal
 from kcal import PositionStatus
 from kcal.cli.main import app
 
@@ -63,6 +64,15 @@ def test_make_targets_exist() -> None:
     assert sorted(targets) == ["demo", "docs", "test"]
     for target in targets:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+
+
+def test_the_names_on_its_first_screen_are_at_the_top() -> None:
+    bullet = README.split("**Names on one screen.**")[1].split("* ")[0].split("## ")[0]
+    at_top, others = bullet.split("are in `kcal`, the rest in")
+    names = re.findall(r"`(\w+)`", at_top)
+    assert len(names) > 5
+    assert set(names) <= set(kcal.__all__)
+    assert set(re.findall(r"`kcal\.(\w+)`", others)) < set(kcal.__all__)
 
 
 def test_linked_files_exist() -> None:

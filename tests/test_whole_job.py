@@ -50,7 +50,7 @@ def test_from_images_to_positions(images: Path, tmp_path: Path) -> None:
     # Images to corners.
     seen = {}
     for side in ("left", "right"):
-        found = kcal.detect_images(kcal.expand_images([images / f"{side}-*.png"]), BOARD)
+        found = kcal.detect(kcal.corners.expand_images([images / f"{side}-*.png"]), BOARD)
         assert len(found.views) == 6
         seen[side] = kcal.Observations.load(found.save(tmp_path / f"{side}.obs.json"))
 
@@ -69,17 +69,17 @@ def test_from_images_to_positions(images: Path, tmp_path: Path) -> None:
         assert known.covariance is not None
         torch.testing.assert_close(known.covariance, result.covariance, rtol=1e-6, atol=1e-12)
         points = torch.tensor([[0.0, 0.0, 5.0]], dtype=torch.float64)
-        spread = kcal.projection_covariance(
+        spread = kcal.lens.projection_covariance(
             known.covariance, points, cameras[side].params, result.camera.model, range(5)
         )
         assert 0 < float(spread[0].diagonal().sqrt().max()) < 1.0
 
     # Cameras to a rig; where it stands is measured.
-    pairs = kcal.pair_by_name(seen["left"].names, seen["right"].names)
+    pairs = kcal.rig.pair_by_name(seen["left"].names, seen["right"].names)
     solved = kcal.calibrate_rig(cameras["left"], cameras["right"], seen["left"], seen["right"], pairs)
     rig = solved.stereo()
-    rig.mounting = kcal.Mounting(
-        origin=ORIGIN, heading_deg=35.0, covariance=kcal.mounting_covariance(origin_m=[0.02] * 3)
+    rig.mounting = kcal.rig.Mounting(
+        origin=ORIGIN, heading_deg=35.0, covariance=kcal.rig.mounting_covariance(origin_m=[0.02] * 3)
     )
     assert float(rig.baseline) == pytest.approx(0.25, rel=2e-3)
     file = kcal.save_rig(rig, tmp_path / "rig.json")
@@ -98,13 +98,13 @@ def test_from_images_to_positions(images: Path, tmp_path: Path) -> None:
         assert position.range_low_m == pytest.approx(low, rel=1e-12)
 
     # Positions to files.
-    truth = TARGETS @ kcal.enu_from_cam(35.0).T
+    truth = TARGETS @ kcal.locate.enu_from_cam(35.0).T
     for name in ("positions.csv", "positions.geojson", "positions.kml", "positions.cot"):
-        kcal.write_positions(tmp_path / name, located)
-    kcal.save_map(tmp_path / "map.html", located, truth)
+        kcal.locate.write_positions(tmp_path / name, located)
+    kcal.report.save_map(tmp_path / "map.html", located, truth)
     rows = list(csv.DictReader((tmp_path / "positions.csv").open()))
     assert [row["name"] for row in rows] == ["gate", "mast"]
     features = json.loads((tmp_path / "positions.geojson").read_text())["features"]
-    place = kcal.enu_to_geodetic(truth[:1], ORIGIN)[0].tolist()
+    place = kcal.locate.enu_to_geodetic(truth[:1], ORIGIN)[0].tolist()
     gate = next(item for item in features if item["properties"].get("name") == "gate")
     assert gate["geometry"]["coordinates"][:2] == pytest.approx([place[1], place[0]], abs=2e-6)

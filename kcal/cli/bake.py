@@ -37,7 +37,7 @@ def bake_command(
 
     from kcal.io.camera_file import load_camera
     from kcal.io.lookup_file import save_lookup
-    from kcal.lens.bake import bake
+    from kcal.lens.baking import bake
 
     lookup = bake(load_camera(camera), tolerance)
     save_lookup(lookup, path)

@@ -267,7 +267,7 @@ def more_views(board: Board, observations: Path) -> str:
     """The command that adds views to an observations file.
 
     Example:
-        >>> from kcal.corners.board import Board
+        >>> from kcal import Board
         >>> more_views(Board(columns=9, rows=6, square=0.025), Path("left.obs.json"))
         'To add views: kcal capture camera:0 --board 9x6 --square 25mm -o left.obs.json'
     """

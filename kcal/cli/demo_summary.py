@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from kcal.cli.demo_steps import SIDES
 from kcal.corners.observations import Observations
 from kcal.io.rig_file import RigFile
-from kcal.report.rig_verdict import rig_verdict
+from kcal.report.judge_rig import rig_verdict
 from kcal.report.summary import Part, save_summary
 from kcal.report.verdict import Requirement
 

@@ -74,7 +74,7 @@ def detect_command(
     check_writable(output)
     board = Board.parse(size, square)
 
-    from kcal.corners.detect import Detection, detect_images
+    from kcal.corners.detect import Detection, detect
     from kcal.corners.images import expand_images
     from kcal.corners.orientation import turned_images
     from kcal.corners.video import VIDEO_SUFFIXES, detect_video
@@ -108,7 +108,7 @@ def detect_command(
         paths = expand_images(images)
         check_writable(output, *paths)
         with steps("detecting", len(paths)) as advance:
-            observations = detect_images(
+            observations = detect(
                 paths,
                 board,
                 refine.value,

@@ -97,8 +97,8 @@ def live_command(
     """Follow what two cameras see: tracks with latitude, longitude, velocity and honest errors, written as they come.
 
     Of two videos, frames belong together by their own times, and the images inside the boxes are matched to a fraction
-    of a pixel. The detector returns what `kcal.Detections.read` takes: an array of x1, y1, x2, y2, score, class, or
-    results of supervision, torchvision, ultralytics or kornia.
+    of a pixel. The detector returns what `kcal.track.Detections.read` takes: an array of x1, y1, x2, y2, score, class,
+    or results of supervision, torchvision, ultralytics or kornia.
 
     A line of `--detections` is one moment: `{"left": {"time": T, "boxes": [[x1,y1,x2,y2], ...]}, "right": {...}}`, or
     pairs that are matched already: `{"time": T, "left": [[u,v], ...], "right": [[u,v], ...], "sigma": PX}`.

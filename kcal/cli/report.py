@@ -124,7 +124,7 @@ def print_verdict(verdict: Verdict) -> None:
 def _of_camera(
     path: Path, observations: list[Path], needs: tuple[Requirement, ...], baseline: float, mark_sigma: float
 ) -> Judged:
-    from kcal.report.camera_verdict import stored_verdict
+    from kcal.report.judge_camera import stored_verdict
     from kcal.report.verdict_page import camera_tables
 
     camera = single_camera(str(path))
@@ -149,7 +149,7 @@ def judged(
 ) -> Judged:
     """The verdict on a calibration, with the pictures and tables of its page."""
     from kcal.calibrate.camera.trust import examine
-    from kcal.report.camera_verdict import camera_verdict
+    from kcal.report.judge_camera import camera_verdict
     from kcal.report.verdict_page import camera_tables
     from kcal.report.verdict_pictures import camera_pictures
 
@@ -182,7 +182,7 @@ def _again(camera: Camera, observations: Path) -> tuple[CameraCalibrationResult,
 
 def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], mark_sigma: float) -> Judged:
     from kcal.io.rig_file import load_rig
-    from kcal.report.rig_verdict import rig_verdict
+    from kcal.report.judge_rig import rig_verdict
     from kcal.report.verdict_page import camera_tables
 
     rig = load_rig(path)

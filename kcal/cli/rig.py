@@ -169,8 +169,8 @@ def solve_command(
         warn(f"range errors are not split: {error}")
     print_wrote(output, picture)
     if needs or report is not None:
+        from kcal.report.judge_rig import rig_verdict
         from kcal.report.rig import rig_figure
-        from kcal.report.rig_verdict import rig_verdict
         from kcal.report.verdict_page import camera_tables
         from kcal.report.verdict_pictures import png_bytes
 

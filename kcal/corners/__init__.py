@@ -1,1 +1,5 @@
-"""Boards, detection, sub-pixel refinement and observation files (floor 2)."""
+"""Find boards and points in images; `Board`, `Observations` and `detect` are in `kcal`."""
+
+from kcal.doors import door
+
+__getattr__, __dir__ = door(__name__, __file__)

@@ -91,7 +91,7 @@ def detect_board(image: Gray, board: Board, refine: Refinement = "erf") -> Detec
     return Detection(refined.pixels, covariance=refined.covariance)
 
 
-def detect_images(
+def detect(
     paths: Sequence[str | Path],
     board: Board,
     refine: Refinement = "erf",
@@ -127,7 +127,7 @@ def detect_images(
         >>> image = np.where(on & ((x // 20 + y // 20) % 2 == 0), 40, 220).astype(np.uint8)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = cv2.imwrite(f"{folder}/a.png", image), Path(folder, "b.png").write_bytes(b"")
-        ...     seen = detect_images([f"{folder}/a.png", f"{folder}/b.png"], Board(columns=5, rows=3, square=0.02))
+        ...     seen = detect([f"{folder}/a.png", f"{folder}/b.png"], Board(columns=5, rows=3, square=0.02))
         >>> seen.names, seen.image_size, seen.failures[0].reason
         (('a.png',), (160, 120), 'the file is empty; copy it again')
     """

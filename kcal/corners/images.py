@@ -66,7 +66,7 @@ def decode_gray(data: bytes, source: str | Path) -> Gray:
 
 
 def read_gray(path: str | Path) -> Gray:
-    """Read an image file to gray levels, (H, W) uint8 or uint16 as stored; see `decode_gray`.
+    """Read an image file to gray levels, (H, W) uint8 or uint16 as stored.
 
     Raises:
         FileError: missing, empty, or refused by `decode_gray`.

@@ -139,7 +139,7 @@ def match_points(
         InputError: images that do not fit the cameras or are not finite, or pixels of another shape.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(400, 400), center=(79.5, 59.5), size=(160, 120))
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> image = torch.rand(15, 20, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

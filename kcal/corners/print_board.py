@@ -176,7 +176,9 @@ def _foot(board: Board, page_wide: float, page_high: float) -> tuple[tuple[Recta
 
 
 def save_board(path: str | Path, board: Board, page: str = "auto") -> Path:
-    """Write a board to print, as a .svg or .pdf file; see `board_sheet` for the page.
+    """Write a board to print, as a .svg or .pdf file.
+
+    For the page see `board_sheet`.
 
     Raises:
         InputError: another suffix, or a page as for `board_sheet`.

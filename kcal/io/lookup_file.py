@@ -57,8 +57,8 @@ def save_lookup(camera: LookupCamera, path: str | Path) -> Path:
 
     Example:
         >>> import tempfile
-        >>> from kcal.lens.bake import bake
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
+        >>> from kcal.lens import bake
         >>> lookup = bake(Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole"))
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = save_lookup(lookup, Path(folder, "camera.npz"))

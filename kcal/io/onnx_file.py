@@ -38,7 +38,7 @@ def save_onnx(module: nn.Module, example: Tensor | Sequence[Tensor], path: str |
 
     Example:
         >>> import tempfile
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     save_onnx(camera, torch.ones(2, 3), Path(folder, "camera.onnx")).name

@@ -144,7 +144,7 @@ class RigFile(NativeFile):
         calibration: how the rig was solved, if it was.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080))
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> float(rig_to_file(rig).rig().baseline)
@@ -234,7 +234,7 @@ def rig_to_file(
         InputError: a camera file that contains another camera than the rig, or values that do not fit together.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> rig_to_file(rig).right_from_left.translation
@@ -279,7 +279,7 @@ def save_rig(rig: StereoRig, path: str | Path) -> Path:
 
     Example:
         >>> import tempfile
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> with tempfile.TemporaryDirectory() as folder:

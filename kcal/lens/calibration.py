@@ -174,7 +174,7 @@ class CameraCalibration:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RigSource:
-    """One kind of data that a rig was solved from; see `kcal.calibrate.rig.result.SourceResidual`."""
+    """One kind of data that a rig was solved from; see `kcal.rig.SourceResidual`."""
 
     name: str
     used: int

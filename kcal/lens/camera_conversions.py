@@ -26,7 +26,7 @@ class ConvertibleCamera(CameraParameters):
             InputError: a transform of an image of another size.
 
         Example:
-            >>> from kcal.lens.camera import Camera
+            >>> from kcal import Camera
             >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080))
             >>> small = camera.transformed(ImageTransform.letterbox(camera.size, (640, 640)))
             >>> small.size, [round(value, 9) for value in small.center.tolist()]
@@ -58,7 +58,7 @@ class ConvertibleCamera(CameraParameters):
             InputError: a lens that no camera of kornia holds, or a batch of cameras with lenses.
 
         Example:
-            >>> from kcal.lens.camera import Camera
+            >>> from kcal import Camera
             >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.1])
             >>> type(camera.to_kornia()).__name__
             'CameraModel'
@@ -73,7 +73,7 @@ class ConvertibleCamera(CameraParameters):
             InputError: another class, an orthographic camera, a camera with a pose, or several image sizes.
 
         Example:
-            >>> from kcal.lens.camera import Camera
+            >>> from kcal import Camera
             >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.1])
             >>> str(Camera.from_kornia(camera.to_kornia()).model)
             'opencv8'

@@ -71,7 +71,7 @@ class CameraParameters(Float64Module):
             InputError: an unknown parameter name.
 
         Example:
-            >>> from kcal.lens.camera import Camera
+            >>> from kcal import Camera
             >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480)).free("fx", "k1")
             >>> camera.project(torch.tensor([[1.0, 1.0, 4.0]]))[0].sum().backward()
             >>> [name for name, g in zip(camera.names, camera.params.grad) if g != 0]

@@ -52,7 +52,7 @@ def kornia_camera(camera: CameraParameters) -> Any:
         raise InputError(
             f"to_kornia: no camera of kornia holds this {camera.model} lens"
             f"{' with skew' if bool(values[4] != 0) else ''}. Fit one that it holds, with its misfit stated: "
-            "kcal.refit_camera(camera, 'opencv8').camera, or undistort the images first"
+            "kcal.lens.refit_camera(camera, 'opencv8').camera, or undistort the images first"
         )
     zero = values.new_zeros(())
     names = camera.model.names if fisheye else _BROWN_CONRADY

@@ -38,8 +38,8 @@ class LookupCamera(Float64Module):
         InputError: tables whose shapes do not fit.
 
     Example:
-        >>> from kcal.lens.bake import bake
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
+        >>> from kcal.lens import bake
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.2, 0.05])
         >>> lookup = bake(camera, tolerance=1e-3)
         >>> point = torch.tensor([[0.3, 0.2, 1.0]], dtype=torch.float64)

@@ -82,7 +82,7 @@ def check_refraction(refraction: float, sigma: float) -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Mounting:
-    """How the left camera of a rig stands, how light bended when that was found, and how well both are known.
+    """How the left camera of a rig stands, how light was refracted when that was found, and how well both are known.
 
     Args:
         origin: place of the camera's projection center.

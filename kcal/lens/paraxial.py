@@ -77,7 +77,7 @@ def paraxial_focal(camera: Camera) -> ParaxialFocal:
         InputError: a batch of cameras.
 
     Example:
-        >>> from kcal.lens.calibration import CameraCalibration
+        >>> from kcal.lens import CameraCalibration
         >>> camera = Camera.build(focal=(800, 801), center=(320, 240), size=(640, 480), coefficients=[-0.3, 0.1])
         >>> camera.calibration = CameraCalibration(covariance=torch.diag(torch.tensor([4.0, 1] + 8 * [0]).double()))
         >>> [value.tolist() for value in paraxial_focal(camera)[:2]]

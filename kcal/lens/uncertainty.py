@@ -93,7 +93,7 @@ def projection_sigma(camera: Camera, places: Tensor, *, at: float = math.inf) ->
         InputError: see `pixel_covariance`.
 
     Example:
-        >>> from kcal.lens.calibration import CameraCalibration
+        >>> from kcal.lens import CameraCalibration
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
         >>> longer = torch.diag(torch.tensor([1.0, 0, 0, 0, 0], dtype=torch.float64))  # fx ± 1 px
         >>> camera.calibration = CameraCalibration(covariance=longer)
@@ -110,7 +110,7 @@ def image_sigma(camera: Camera, columns: int = 33, rows: int = 25) -> Tensor:
     """(rows, columns) `projection_sigma` at infinity on a grid whose outermost points are the outermost pixels.
 
     Example:
-        >>> from kcal.lens.calibration import CameraCalibration
+        >>> from kcal.lens import CameraCalibration
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
         >>> longer = torch.diag(torch.tensor([1.0, 0, 0, 0, 0], dtype=torch.float64))  # fx ± 1 px
         >>> camera.calibration = CameraCalibration(covariance=longer)

@@ -1,1 +1,5 @@
-"""From pixel pairs to positions on the Earth (floor 4)."""
+"""Positions, triangulation, the ground and geodesy; `StereoLocalizer` and `locate_points` are in `kcal`."""
+
+from kcal.doors import door
+
+__getattr__, __dir__ = door(__name__, __file__)

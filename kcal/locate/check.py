@@ -40,7 +40,7 @@ def triangulated_sides(rig: StereoRig, columns: int, rows: int, pixels: Tensor, 
         DegenerateError: no side could be triangulated.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> corners = torch.tensor([[0, 0, 5], [0.1, 0, 5], [0, 0.1, 5], [0.1, 0.1, 5]], dtype=torch.float64)

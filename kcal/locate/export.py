@@ -228,8 +228,8 @@ def to_geojson(located: Located) -> dict[str, Any]:
     infinite, because JSON has no infinity; `range_high_infinite` is then true.
 
     Example:
-        >>> from kcal.lens.mounting import Origin
-        >>> from kcal.locate.positions import Viewpoint
+        >>> from kcal import Origin
+        >>> from kcal.locate import Viewpoint
         >>> left = Viewpoint(name="left", enu=(0, 0, 0), geodetic=(19.07, 72.87, 14.0), azimuths_deg=None)
         >>> located = Located(positions=(), cameras=(left, left), origin=Origin(lat=19.07, lon=72.87, height=14.0),
         ...                   heading_deg=0.0, pitch_deg=0.0, roll_deg=0.0, pixel_sigma=0.3)
@@ -256,9 +256,8 @@ def write_positions(path: str | Path, located: Located) -> Path:
 
     Example:
         >>> import torch
-        >>> from kcal.lens.mounting import Origin
-        >>> from kcal.locate.budget import planned_rig
-        >>> from kcal.locate.positions import locate_points
+        >>> from kcal import Origin, locate_points
+        >>> from kcal.rig import planned_rig
         >>> left, right, _ = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))
         >>> located = locate_points(planned_rig(), left, right, origin=Origin(lat=19.07, lon=72.87, height=14.0),
         ...                         heading_deg=0.0)

@@ -146,7 +146,7 @@ def locate_on_ground(
         InputError: wrong shapes, or a value that is not positive.
 
     Example:
-        >>> from kcal.lens.mounting import Origin
+        >>> from kcal import Origin
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> stands = Mounting(origin=Origin(lat=19.07, lon=72.87, height=30.0), heading_deg=0.0, refraction=0.0)
         >>> found = locate_on_ground(camera, stands, torch.tensor([[960.0, 600.0], [960.0, 500.0]]), level_ground(10.0))

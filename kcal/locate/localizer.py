@@ -117,7 +117,7 @@ class StereoLocalizer(nn.Module):
         DegenerateError: a rig without a baseline.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> localize = StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0,
@@ -218,9 +218,8 @@ class StereoLocalizer(nn.Module):
 
         Example:
             >>> import tempfile
-            >>> from kcal.io.rig_file import save_rig
-            >>> from kcal.lens.mounting import Mounting
-            >>> from kcal.locate.budget import planned_rig
+            >>> from kcal import save_rig
+            >>> from kcal.rig import Mounting, planned_rig
             >>> rig = planned_rig()
             >>> rig.mounting = Mounting(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
             >>> with tempfile.TemporaryDirectory() as folder:

@@ -42,8 +42,8 @@ def drift_effect(
         distances: meters; `usual_ranges` if left out.
 
     Example:
-        >>> from kcal.locate.budget import planned_rig
-        >>> from kcal.lens.pose import rotation_from_vector
+        >>> from kcal.lens import rotation_from_vector
+        >>> from kcal.rig import planned_rig
         >>> old = planned_rig()
         >>> turn = rotation_from_vector(torch.tensor([0.0, 1.745329e-4, 0.0]).double())  # 0.01°
         >>> new = StereoRig(old.left, old.right, turn, turn @ old.right_from_left_translation)

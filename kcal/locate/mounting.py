@@ -20,7 +20,7 @@ def attitude(enu_from_cam: Tensor) -> tuple[float, float, float]:
     """Heading, pitch and roll in degrees of a rotation (3, 3): the inverse of `kcal.locate.geodesy.enu_from_cam`.
 
     Example:
-        >>> from kcal.locate.geodesy import enu_from_cam
+        >>> from kcal.locate import enu_from_cam
         >>> [round(angle, 9) for angle in attitude(enu_from_cam(200.0, -3.0, 1.5))]
         [200.0, -3.0, 1.5]
     """
@@ -57,7 +57,7 @@ def mounting_of(
         refraction: the coefficient, if anything was found of it.
 
     Example:
-        >>> from kcal.locate.geodesy import enu_from_cam
+        >>> from kcal.locate import enu_from_cam
         >>> there = mounting_of(enu_from_cam(35.0).T, torch.zeros(3).double(), torch.eye(6).double(),
         ...                     Origin(lat=19.07, lon=72.87, height=14.0))
         >>> round(there.heading_deg, 9), round(there.origin.height, 6)
@@ -86,10 +86,9 @@ def placed_rig(result: RigResult, origin: Origin) -> StereoRig:
         origin: of the frame in which landmarks and positions were given.
 
     Example:
-        >>> from kcal.calibrate.rig.sources import Landmarks, RigData
-        >>> from kcal.calibrate.rig.solve import solve_rig
-        >>> from kcal.locate.budget import planned_rig
-        >>> from kcal.locate.geodesy import enu_from_cam
+        >>> from kcal import Landmarks, RigData, solve_rig
+        >>> from kcal.locate import enu_from_cam
+        >>> from kcal.rig import planned_rig
         >>> rig, generator = planned_rig(), torch.Generator().manual_seed(0)
         >>> points = torch.rand(12, 3, dtype=torch.float64, generator=generator) * 40 + torch.tensor([-20, -10, 60])
         >>> landmarks = Landmarks(names=tuple("abcdefghijkl"), points=points @ enu_from_cam(0.0).T,

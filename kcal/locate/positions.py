@@ -151,7 +151,7 @@ def locate_points(
         InputError: wrong shapes, dtypes or names, or an angle or sigma out of range.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> located = locate_points(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),

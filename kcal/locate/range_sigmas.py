@@ -47,7 +47,7 @@ def usual_ranges(rig: StereoRig, baselines: Sequence[float] = (25.0, 100.0, 500.
     """Ranges at which a rig is near, usual and far: about so many baselines, as round numbers of meters.
 
     Example:
-        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.rig import planned_rig
         >>> usual_ranges(planned_rig())
         [250.0, 1000.0, 5000.0]
     """
@@ -83,8 +83,7 @@ def range_sigmas(
         InputError: a distance that is not positive or that the right camera does not see.
 
     Example:
-        >>> from kcal.lens.rig import RigCovariance
-        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.rig import RigCovariance, planned_rig
         >>> rig = planned_rig()
         >>> yaw = torch.zeros(6, 6, dtype=torch.float64)
         >>> yaw[1, 1] = torch.deg2rad(torch.tensor(0.001)) ** 2

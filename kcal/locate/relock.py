@@ -30,7 +30,7 @@ def check_rig(rig: StereoRig, *, features: Features | None = None, landmarks: La
         DegenerateError: too little to tell the turn.
 
     Example:
-        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.rig import planned_rig
         >>> rig, rows = planned_rig(), torch.tensor([[-90.0, 2, 300], [80, -9, 250], [4, 6, 400], [30, 20, 200]])
         >>> pixels = torch.cat([torch.stack(rig(rows.double())[:2], 1)] * 2, 1)  # the same then and now
         >>> unknown = torch.zeros(4).double(), torch.full((4,), torch.inf).double()
@@ -70,7 +70,7 @@ def relocked(rig: StereoRig, drift: Drift, note: str) -> StereoRig:
         note: when and from what, for the record.
 
     Example:
-        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.rig import planned_rig
         >>> rig, rows = planned_rig(), torch.tensor([[-90.0, 2, 300], [80, -9, 250], [4, 6, 400], [30, 20, 200]])
         >>> pixels = torch.cat([torch.stack(rig(rows.double())[:2], 1)] * 2, 1)
         >>> unknown = torch.zeros(4).double(), torch.full((4,), torch.inf).double()

@@ -69,7 +69,7 @@ class Triangulate(nn.Module):
         DegenerateError: a rig without a baseline.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> left = torch.tensor([[960.0, 540.0]], dtype=torch.float64)

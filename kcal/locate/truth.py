@@ -27,8 +27,8 @@ def read_truth(path: str | Path, located: Located) -> Tensor:
 
     Example:
         >>> import tempfile
-        >>> from kcal.locate.budget import planned_rig
-        >>> from kcal.locate.positions import locate_points
+        >>> from kcal import locate_points
+        >>> from kcal.rig import planned_rig
         >>> left, right, _ = planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))
         >>> located = locate_points(planned_rig(), left, right, names=["mast"], heading_deg=0.0,
         ...                         origin=Origin(lat=19.07, lon=72.87, height=14.0))
@@ -55,9 +55,7 @@ def position_errors(located: Located, truth: Tensor) -> list[tuple[float, float,
         the range interval contains the true range.
 
     Example:
-        >>> from kcal.lens.camera import Camera
-        >>> from kcal.lens.rig import StereoRig
-        >>> from kcal.locate.positions import locate_points
+        >>> from kcal import Camera, StereoRig, locate_points
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> found = locate_points(rig, torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]]),

@@ -106,7 +106,7 @@ def associate(
         InputError: detections or images that are not of the cameras' size, or a missing keypoint.
 
     Example:
-        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.rig import planned_rig
         >>> rig = planned_rig()
         >>> boxes = torch.tensor([[900.0, 500, 920, 520], [1000, 700, 1030, 720]])
         >>> left = Detections.read(boxes, size=(1920, 1080))

@@ -100,7 +100,7 @@ class ObjectDisparity(nn.Module):
         options: see `DisparityOptions`.
 
     Example:
-        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.rig import planned_rig
         >>> texture = torch.rand(135, 240, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
         >>> left = torch.nn.functional.interpolate(255 * texture[None, None], scale_factor=8, mode="bicubic")[0, 0]
         >>> match = ObjectDisparity(planned_rig())

@@ -29,7 +29,7 @@ def near_epipolar_lines(rig: StereoRig, left: Tensor, right: Tensor, sigma: floa
         gate: standard deviations.
 
     Example:
-        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.rig import planned_rig
         >>> left = torch.tensor([[960.0, 540.0]], dtype=torch.float64)
         >>> right = torch.tensor([[944.0, 541.0], [944.0, 640.0]], dtype=torch.float64)
         >>> near_epipolar_lines(planned_rig(), left, right, 1.0, 4.0).tolist()

@@ -48,7 +48,7 @@ def read_moment(line: str | bytes, rig: StereoRig, options: AssociationOptions, 
         InputError: no JSON, or values that are no detections or pairs.
 
     Example:
-        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.rig import planned_rig
         >>> line = '{"time": 3.5, "left": [[960, 540]], "right": [[944, 540]]}'
         >>> read_moment(line, planned_rig(), AssociationOptions(), 0.3).pairs.time.tolist()
         [[3.5, 3.5]]

@@ -41,7 +41,7 @@ def pair_objects(
         InputError: see `associate` and `ObjectDisparity`; or only one of the images has a time.
 
     Example:
-        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.rig import planned_rig
         >>> boxes = torch.tensor([[900.0, 500, 920, 520], [1000, 700, 1030, 720]])
         >>> left = Detections.read(boxes, size=(1920, 1080))
         >>> right = Detections.read(boxes - torch.tensor([16.0, 0, 16, 0]), size=(1920, 1080))

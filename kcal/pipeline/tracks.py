@@ -139,8 +139,8 @@ class Tracker:
             each moment of many tracks then takes about half the time.
 
     Example:
-        >>> from kcal.lens.mounting import Origin
-        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal import Origin
+        >>> from kcal.rig import planned_rig
         >>> rig = planned_rig()
         >>> tracker = Tracker(StereoLocalizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0))
         >>> for time in torch.arange(10).double() / 10:

@@ -63,5 +63,5 @@ def board_figure(board: MeasuredBoard) -> Figure:
 
 
 def save_board_picture(path: str | Path, board: MeasuredBoard) -> Path:
-    """Write the picture of `board_figure` as PNG or SVG, atomically."""
+    """Write a picture of how a measured board differs from the ordered one as PNG or SVG; see `board_figure`."""
     return save_picture(path, board_figure(board))

@@ -55,5 +55,5 @@ def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[
 def save_budget_picture(
     path: str | Path, distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]
 ) -> Path:
-    """Write the picture of `budget_figure` as PNG or SVG, atomically."""
+    """Write a picture of range errors over the distance as PNG or SVG; see `budget_figure`."""
     return save_picture(path, budget_figure(distances, found, labels))

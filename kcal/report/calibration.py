@@ -35,7 +35,7 @@ def calibration_figure(result: CameraCalibrationResult) -> Figure:
     Example:
         >>> import torch
         >>> from kcal import Board, CalibrationOptions, Camera, Observations, View, calibrate_camera
-        >>> from kcal.lens.pose import rotation_from_vector
+        >>> from kcal.lens import rotation_from_vector
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.2, 0.05])
         >>> board, views = Board(columns=7, rows=6, square=0.05), []
         >>> for turn in ((0.5, 0, 0), (-0.5, 0, 0.2), (0, 0.5, 0), (0, -0.5, 0.1), (0.3, 0.3, 1.5)):

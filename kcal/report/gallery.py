@@ -52,7 +52,7 @@ def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = (
 
     Args:
         observations: with the paths of their images; a view whose image is not there is drawn on gray.
-        failed: images that gave no view, from `kcal.corners.detect.detect_images`.
+        failed: images that gave no view, from `kcal.corners.detect.detect`.
     """
     order = sorted(range(len(observations.views)), key=lambda i: _badness(observations.views[i]), reverse=True)
     shown, drawn = order[:_MOST_VIEWS], failed[:_MOST_FAILED]
@@ -135,12 +135,12 @@ def coverage_figure(observations: Observations) -> Figure:
 
 
 def save_gallery(path: str | Path, observations: Observations, failed: Sequence[FailedImage] = ()) -> Path:
-    """Write the picture of `gallery_figure` as PNG or SVG, atomically."""
+    """Write a picture of failed images and of views with their corners as PNG or SVG; see `gallery_figure`."""
     return save_picture(path, gallery_figure(observations, failed))
 
 
 def save_coverage(path: str | Path, observations: Observations) -> Path:
-    """Write the picture of `coverage_figure` as PNG or SVG, atomically."""
+    """Write a picture of where in the image corners were seen as PNG or SVG; see `coverage_figure`."""
     return save_picture(path, coverage_figure(observations))
 
 

@@ -120,7 +120,7 @@ def map_page(
 
 
 def save_map(path: str | Path, located: Located, truth: Tensor | None = None, **options: Any) -> Path:
-    """Write `map_page` to an .html file, atomically; for the options see there.
+    """Write positions on a map to an .html file that needs no network; for the options see `map_page`.
 
     Raises:
         InputError: another suffix, or as `map_page`.

@@ -80,9 +80,8 @@ def chance_text(located: Located, truth: Tensor) -> str:
     """How many 95 % intervals contain the true range, and how many misses chance explains.
 
     Example:
-        >>> from kcal.locate.budget import planned_rig
-        >>> from kcal.locate.positions import locate_points
-        >>> from kcal.lens.mounting import Origin
+        >>> from kcal import Origin, locate_points
+        >>> from kcal.rig import planned_rig
         >>> import torch
         >>> points = torch.tensor([[0.0, 0.0, 1000.0]] * 7, dtype=torch.float64)
         >>> left, right, _ = planned_rig()(points)

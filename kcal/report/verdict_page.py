@@ -77,7 +77,7 @@ def save_verdict_page(
     pictures: Mapping[str, bytes] | None = None,
     tables: Sequence[Sequence[Sequence[str]]] = (),
 ) -> Path:
-    """Write the page of `verdict_page`, atomically.
+    """Write a verdict with its pictures and tables as a page (.html), atomically.
 
     Raises:
         FileError: the file cannot be written.

@@ -203,7 +203,7 @@ def project_board(camera: LensLike, cam_from_board: tuple[Tensor, Tensor], board
         InputError: a board or pose that cannot be.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
         >>> pose = BoardPose(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
         >>> pixels, visible = project_board(camera, pose, BoardSize(9, 6, 0.05))

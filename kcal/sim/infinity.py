@@ -54,7 +54,7 @@ def error_at_infinity(camera: LensLike, truth: LensLike, *, columns: int = 49, r
         InputError: images of different sizes, or a camera that sees none of the directions.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> truth = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
         >>> camera = Camera.build(focal=(800, 800), center=(329.5, 239.5), size=(640, 480))
         >>> found = error_at_infinity(camera, truth)  # a shifted center is a rotation, nearly

@@ -154,7 +154,7 @@ def moving_capture(
         InputError: no poses, or a sigma that is negative.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> lens = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
         >>> pose = BoardPose(torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
         >>> still, moving = (moving_capture(lens, [pose], sigma=0.1, seed=3, hands=hands) for hands in (None, Hands()))

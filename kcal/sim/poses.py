@@ -74,7 +74,7 @@ def sample_board_poses(
         InputError: fewer than `count` of 4096 drawn boards are completely seen, or an argument out of range.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
         >>> from kcal.sim.board import BoardSize, project_board
         >>> board = BoardSize(9, 6, 0.025)
@@ -119,9 +119,9 @@ def sample_pair_poses(
         InputError: fewer than `count` of 4096 drawn boards are completely seen by both, or an argument out of range.
 
     Example:
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
-        >>> from kcal.lens.rig import StereoRig
+        >>> from kcal import StereoRig
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> from kcal.sim.board import BoardSize, project_board
         >>> board = BoardSize(9, 6, 0.1)

@@ -32,7 +32,7 @@ _LONG_PATIENCE = 100
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LMOptions:
-    """Options of `minimize`.
+    """Options of the Levenberg-Marquardt method.
 
     Args:
         max_iterations: maximum number of trial steps, rejected ones included.

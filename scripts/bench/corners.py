@@ -28,7 +28,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.grid import local_side
 from kcal.corners.images import expand_images
 from kcal.corners.refine import Refinement, refine_corners
@@ -196,7 +196,7 @@ def print_real(folder: Path) -> None:
     for side in ("left", "right"):
         paths = expand_images([str(folder / "opencv_stereo" / f"{side}*.jpg")])
         for refine in get_args(Refinement):
-            seen = detect_images(paths, BOARD, refine)
+            seen = detect(paths, BOARD, refine)
             result = calibrate_camera(seen, CalibrationOptions(weighted=False))
             unseen = sum(view.pixels.count(None) for view in seen.views)
             print(

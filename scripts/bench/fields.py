@@ -22,7 +22,7 @@ from torch import Tensor
 
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
 from kcal.lens.field_modes import FieldModes
@@ -88,7 +88,7 @@ def stereo(count: int) -> list[Case]:
     cases, folder = [], Path(os.environ["KCAL_DATA"], "opencv_stereo")
     for side in ("left", "right"):
         paths = [path for path in expand_images([str(folder)]) if path.name.startswith(side)]
-        seen = detect_images(paths, Board(columns=9, rows=6, square=0.025))
+        seen = detect(paths, Board(columns=9, rows=6, square=0.025))
         weight = torch.isfinite(seen.pixels()).all(-1).double()
         parts = [np.array([i]) for i in range(len(seen.views))][:count]
         cases.append(Case(f"{side}, each view", seen, weight, parts))

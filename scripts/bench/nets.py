@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 import kcal.lens.inverse
-from kcal.lens.bake import bake
+from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_terms import HybridForm

@@ -33,7 +33,7 @@ from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
 from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.solve import RigOptions
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
@@ -138,7 +138,7 @@ def stereo_images() -> list[Observations]:
     paths = expand_images([str(Path(os.environ["KCAL_DATA"], "opencv_stereo"))])
     board = Board(columns=9, rows=6, square=0.025)
     sides = ("left", "right")
-    return [detect_images([path for path in paths if path.name.startswith(side)], board) for side in sides]
+    return [detect([path for path in paths if path.name.startswith(side)], board) for side in sides]
 
 
 def main() -> None:

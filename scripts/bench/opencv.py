@@ -28,7 +28,7 @@ from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.calibrate.rig.solve import RigOptions
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from kcal.locate.check import triangulated_sides
@@ -73,7 +73,7 @@ def _show(lines: list[str]) -> list[str]:
 
 
 def _observe(folder: Path, side: str) -> Observations:
-    found = detect_images(sorted(folder.glob(f"{side}*.jpg")), BOARD)
+    found = detect(sorted(folder.glob(f"{side}*.jpg")), BOARD)
     views = []
     for view in found.views:
         rounded = tuple(p if p is None else (float(np.float32(p[0])), float(np.float32(p[1]))) for p in view.pixels)

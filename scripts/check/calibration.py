@@ -25,7 +25,7 @@ from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import free_parameters
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
 from kcal.lens.model import LensModel
@@ -52,7 +52,7 @@ def real_sets(folder: Path, names: list[str]) -> dict[str, Observations]:
     for side in ("left", "right"):
         if side in names:
             images = sorted((folder / "opencv_stereo").glob(f"{side}*.jpg"))
-            found[side] = detect_images(images, Board(columns=9, rows=6, square=0.025))
+            found[side] = detect(images, Board(columns=9, rows=6, square=0.025))
     if "wide" in names:
         data = np.load(folder / "wide_lens_corners.npz")
         views = []

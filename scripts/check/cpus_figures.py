@@ -26,7 +26,7 @@ from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.files import make_folder
@@ -61,7 +61,7 @@ def captures(folder: Path) -> dict[str, Observations]:
 def find_corners(folder: Path) -> None:
     for side in PAIRS:
         files = sorted((Path(os.environ["KCAL_DATA"]) / "opencv_stereo").glob(f"{side}*.jpg"))
-        detect_images(files, Board(columns=9, rows=6, square=0.025)).save(folder / f"{side}.obs.json")
+        detect(files, Board(columns=9, rows=6, square=0.025)).save(folder / f"{side}.obs.json")
 
 
 def fit_cameras(folder: Path, common: Path, only: list[str]) -> dict[str, Any]:

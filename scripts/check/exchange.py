@@ -23,7 +23,8 @@ import torch
 import yaml
 from scipy.io import loadmat
 
-from kcal import Camera, StereoRig, camera_difference, export_cameras, import_cameras
+from kcal import Camera, StereoRig
+from kcal.lens import camera_difference, export_cameras, import_cameras
 from kcal.lens.base_map import radius_over_angle
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.model import LensModel

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.images import expand_images
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort_components
@@ -240,7 +240,7 @@ def calibrated() -> list[Camera]:
     sources = [load()[0]]
     for side in ("left", "right"):
         paths = expand_images([str(Path(folder, "opencv_stereo", f"{side}*.jpg"))])
-        sources.append(detect_images(paths, Board(columns=9, rows=6, square=0.025)))
+        sources.append(detect(paths, Board(columns=9, rows=6, square=0.025)))
     models = ("opencv5", "opencv8", "opencv14", "ext20", "ext24")
     return [
         calibrate_camera(seen, CalibrationOptions(model=model, weak_prior=weak)).camera

@@ -38,7 +38,7 @@ from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.rig_file import RigMounting, rig_to_file
-from kcal.lens.bake import bake
+from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 

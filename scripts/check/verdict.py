@@ -26,8 +26,8 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation
-from kcal.report.camera_verdict import camera_verdict
-from kcal.report.rig_verdict import rig_verdict
+from kcal.report.judge_camera import camera_verdict
+from kcal.report.judge_rig import rig_verdict
 from kcal.report.verdict import Requirement, Verdict
 from kcal.sim.truth import TruthLens
 from scripts.check.verdict_captures import FAULTS, Planted, PlantedPair, drawn

@@ -149,8 +149,7 @@ def held_out(camera: Projection, points: Tensor, pixels: Tensor, weight: Tensor 
     Views with fewer than eight corners are not judged.
 
     Example:
-        >>> from kcal.lens.camera import Camera
-        >>> from kcal.corners.board import Board
+        >>> from kcal import Board, Camera
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
         >>> points = Board(columns=5, rows=4, square=0.1).points
         >>> tilted = torch.tensor([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]]).double()

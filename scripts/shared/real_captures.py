@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
 from scripts.shared import wide_lens
@@ -51,11 +51,11 @@ def load(name: str, folder: Path, cache: Path) -> RealCapture:
         seen, weights = wide_lens.load()
         return RealCapture(seen, torch.from_numpy(weights))
     if name in FOLDERS:
-        seen = _detected(name, lambda: detect_images(_images(folder / "captures" / name), FOLDERS[name]), cache)
+        seen = _detected(name, lambda: detect(_images(folder / "captures" / name), FOLDERS[name]), cache)
     elif name.startswith("stereo_"):
         side = name.removeprefix("stereo_")
         images = [path for path in _images(folder / "opencv_stereo") if path.name.startswith(side)]
-        seen = _detected(name, lambda: detect_images(images, STEREO_BOARD), cache)
+        seen = _detected(name, lambda: detect(images, STEREO_BOARD), cache)
     else:
         path = folder / "captures" / f"{name}.obs.json"
         seen = Observations.load(path if path.exists() else Path(name))

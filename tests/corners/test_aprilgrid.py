@@ -6,7 +6,7 @@ import torch
 from kcal.corners.aprilgrid import find_aprilgrid
 from kcal.corners.board import Board
 from kcal.corners.charuco import opencv_dictionary
-from kcal.corners.detect import detect_board, detect_images
+from kcal.corners.detect import detect, detect_board
 from kcal.corners.pattern_shapes import pattern_shapes
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -146,4 +146,4 @@ def test_wrong_target_says_what_was_seen(paper, tmp_path):
     cv2.imwrite(path, image)
     for text in ("9x6", "charuco:9x6", "circles:9x6", "charuco:9x6:apriltag_36h11"):
         with pytest.raises(InputError, match=r"markers 0 to 11 of dictionary apriltag_36h11 .*give --board aprilgrid:"):
-            detect_images([path], Board.parse(text, "25mm"))
+            detect([path], Board.parse(text, "25mm"))

@@ -7,7 +7,7 @@ import torch
 
 from kcal.corners.board import Board
 from kcal.corners.charuco import _opencv_board, find_charuco
-from kcal.corners.detect import detect_board, detect_images
+from kcal.corners.detect import detect, detect_board
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from scripts.shared.printed_board import Paper, errors, expose, light_of, points_of, pose
@@ -65,10 +65,10 @@ def test_images_that_do_not_tell_follow_the_others(tmp_path):
     assert find_charuco(part, board).legacy is None
     cv2.imwrite(str(tmp_path / "a.png"), part)
     cv2.imwrite(str(tmp_path / "b.png"), image)
-    seen = detect_images([tmp_path / "a.png", tmp_path / "b.png"], board)
+    seen = detect([tmp_path / "a.png", tmp_path / "b.png"], board)
     for pixels in seen.pixels():
         assert errors(pixels, truth)[1] < 0.05
-    alone = detect_images([tmp_path / "a.png"], board)
+    alone = detect([tmp_path / "a.png"], board)
     assert errors(alone.pixels()[0], truth)[1] == pytest.approx(SIDE, abs=0.1)
 
 
@@ -79,7 +79,7 @@ def test_images_of_two_numberings_are_refused(tmp_path):
     with pytest.raises(
         InputError, match=r"two ChArUco boards: old\.png shows the numbering of OpenCV before 4\.6, new\.png"
     ):
-        detect_images([tmp_path / "old.png", tmp_path / "new.png"], board)
+        detect([tmp_path / "old.png", tmp_path / "new.png"], board)
 
 
 def test_markers_of_both_numberings_in_one_image():

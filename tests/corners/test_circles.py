@@ -6,7 +6,7 @@ import torch
 from kcal.corners.board import Board
 from kcal.corners.circle_bias import center_shift, homography, local_maps
 from kcal.corners.circles import circle_order, find_circles, refine_circles
-from kcal.corners.detect import detect_board, detect_images
+from kcal.corners.detect import detect, detect_board
 from kcal.corners.ellipse import fit_ellipses
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -156,9 +156,9 @@ def test_wrong_target_says_what_was_seen(papers, tmp_path):
     path = str(tmp_path / "a.png")
     cv2.imwrite(path, image)
     with pytest.raises(InputError, match=r"some 44 circles were found, the board has 48: .*asymmetric"):
-        detect_images([path], CIRCLES)
+        detect([path], CIRCLES)
     with pytest.raises(InputError, match=r"44 circles were found: give --board circles:COLUMNSxROWS or asymmetric"):
-        detect_images([path], Board.parse("9x6", "25mm"))
+        detect([path], Board.parse("9x6", "25mm"))
 
 
 def test_refinements_for_corners_are_refused(papers):

@@ -98,7 +98,7 @@ def test_what_cannot_be_done_leaves_no_file(shots, tmp_path):
 
 
 def test_output_is_checked_before_the_work(shots, tmp_path, monkeypatch):
-    monkeypatch.setattr("kcal.corners.detect.detect_images", lambda *_, **__: pytest.fail("work was begun"))
+    monkeypatch.setattr("kcal.corners.detect.detect", lambda *_, **__: pytest.fail("work was begun"))
     refused(FileError, "does not exist", "detect", shots, *OPTIONS, tmp_path / "none" / "x.obs.json")
     refused(FileError, "is a folder", "detect", shots, *OPTIONS, tmp_path)
 

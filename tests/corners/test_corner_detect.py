@@ -9,7 +9,7 @@ import torch
 from board_render import homography, render
 
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_board, detect_images
+from kcal.corners.detect import detect, detect_board
 from kcal.corners.images import read_gray
 from kcal.corners.observations import Observations
 from kcal.corners.search import find_sector
@@ -117,7 +117,7 @@ def test_another_size_is_told(tmp_path):
     image, _ = render(BOARD, (640, 480), H, supersample=2)
     cv2.imwrite(str(tmp_path / "a.png"), image)
     with pytest.raises(InputError, match="a board of 9x6 was found: give --board 9x6"):
-        detect_images([tmp_path / "a.png"], Board(columns=8, rows=6, square=0.025))
+        detect([tmp_path / "a.png"], Board(columns=8, rows=6, square=0.025))
 
 
 @pytest.mark.parametrize(("dx", "dy", "radius"), [(3, 2, 5), (4, 0, 6), (5, 5, 8), (0, 0, 9)])
@@ -158,7 +158,7 @@ def test_bad_arguments():
     with pytest.raises(InputError, match="choose one of"):
         detect_board(image, BOARD, "best")
     with pytest.raises(InputError, match="no images"):
-        detect_images([], BOARD)
+        detect([], BOARD)
 
 
 def test_detect_images_lists_views_and_failures(pictures, tmp_path):
@@ -169,7 +169,7 @@ def test_detect_images_lists_views_and_failures(pictures, tmp_path):
     cv2.imwrite(f"{tmp_path}/blank.png", np.random.default_rng(0).integers(200, 210, image.shape, dtype=np.uint8))
     done = []
     files = [folder / "a.png", *sorted(tmp_path.iterdir()), folder / "b.png"]
-    seen = detect_images(files, SMALL, progress=done.append)
+    seen = detect(files, SMALL, progress=done.append)
     assert seen.names == ("a.png", "b.png")
     assert done == [file.name for file in files]
     assert {failure.name: failure.reason for failure in seen.failures} == {
@@ -191,7 +191,7 @@ def test_detect_images_lists_views_and_failures(pictures, tmp_path):
 def test_same_file_name_in_two_folders(pictures, tmp_path):
     folder, image, _ = pictures
     cv2.imwrite(f"{tmp_path}/a.png", image)
-    seen = detect_images([folder / "a.png", tmp_path / "a.png"], SMALL)
+    seen = detect([folder / "a.png", tmp_path / "a.png"], SMALL)
     assert seen.names == (f"{folder.name}/a.png", f"{tmp_path.name}/a.png")
 
 
@@ -200,7 +200,7 @@ def test_two_sizes_name_the_images(pictures, tmp_path):
     cv2.imwrite(f"{tmp_path}/odd.png", image[:-2])
     (tmp_path / "words.png").write_bytes(b"words")
     with pytest.raises(InputError) as caught:
-        detect_images([folder / "a.png", tmp_path / "words.png", tmp_path / "odd.png", folder / "b.png"], SMALL)
+        detect([folder / "a.png", tmp_path / "words.png", tmp_path / "odd.png", folder / "b.png"], SMALL)
     assert str(caught.value) == (
         "images of different sizes: 240x200 (a.png, b.png); 240x198 (odd.png); some were cropped: "
         "take the originals, or run kcal detect on those of each size apart, as on a camera of its own"
@@ -210,12 +210,12 @@ def test_two_sizes_name_the_images(pictures, tmp_path):
 def test_squares_counted_instead_of_corners(pictures):
     folder, _, _ = pictures
     with pytest.raises(InputError, match=r"no board in any of 1 images .*a board of 6x5 was found: count inner"):
-        detect_images([folder / "a.png"], Board(columns=7, rows=6, square=0.02))
+        detect([folder / "a.png"], Board(columns=7, rows=6, square=0.02))
 
 
 def test_real_images_all_found_and_three_methods_agree(stereo):
     assert len(stereo) == 26
-    ours, opencv, skimage = (detect_images(stereo, BOARD, refine) for refine in ("saddle", "opencv", "skimage"))
+    ours, opencv, skimage = (detect(stereo, BOARD, refine) for refine in ("saddle", "opencv", "skimage"))
     assert len(ours.views) == len(opencv.views) == len(skimage.views) == 26
     pixels = ours.pixels()
     assert float(torch.isfinite(pixels).double().mean()) > 0.999
@@ -231,7 +231,7 @@ def test_real_images_all_found_and_three_methods_agree(stereo):
 @pytest.mark.slow
 def test_real_calibration_reaches_the_known_residual(stereo):
     for side in ("left", "right"):
-        seen = detect_images([path for path in stereo if path.name.startswith(side)], BOARD)
+        seen = detect([path for path in stereo if path.name.startswith(side)], BOARD)
         views = [p.numpy().astype(np.float32) for p in seen.pixels()]
         good = [np.isfinite(view).all(-1) for view in views]
         points = BOARD.points.numpy().astype(np.float32)

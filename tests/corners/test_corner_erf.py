@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.board import Board
 from kcal.corners.crossing import NAMES, LineDistances, crossing
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.erf import erf_saddle
 from kcal.corners.grid import line_bend, local_side, neighbors
 from kcal.corners.refine import _saturation_levels, refine_corners
@@ -426,7 +426,7 @@ def test_real_images_calibrate_to_sixteen_hundredths(side):
     if not data:
         pytest.skip("KCAL_DATA is not set: no real images")
     paths = sorted(Path(data, "opencv_stereo").glob(f"{side}*.jpg"))
-    seen = detect_images(paths, Board(columns=9, rows=6, square=0.025))
+    seen = detect(paths, Board(columns=9, rows=6, square=0.025))
     assert len(seen.views) == len(paths) == 13
     assert sum(view.pixels.count(None) for view in seen.views) <= 2
     plain = calibrate_camera(seen, CalibrationOptions(model="opencv5", weighted=False))

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.observations import View
 from kcal.corners.sizes import common_size, rescaled, resized_alike
 from kcal.errors import InputError
@@ -36,7 +36,7 @@ def folder(tmp_path):
 
 def test_corners_of_a_smaller_image_are_those_of_the_whole_one(folder) -> None:
     notes: list[str] = []
-    seen = detect_images([folder / f"{name}.png" for name in "abc"], BOARD, note=notes.append)
+    seen = detect([folder / f"{name}.png" for name in "abc"], BOARD, note=notes.append)
     assert seen.image_size == (720, 540)
     # Edges of squares, between pixels: corner (1, 1) of the squares from (150, 120).
     first = torch.tensor([150.0 + 60.0 - 0.5, 120.0 + 60.0 - 0.5], dtype=torch.float64)
@@ -46,7 +46,7 @@ def test_corners_of_a_smaller_image_are_those_of_the_whole_one(folder) -> None:
     assert notes == [
         "images of several sizes: corners were scaled to 720x540 px of most images: c.png from 240x180 px by 3"
     ]
-    alone = detect_images([folder / "c.png"], BOARD)
+    alone = detect([folder / "c.png"], BOARD)
     small, large = alone.covariances(), seen.covariances()
     assert small is not None
     assert large is not None
@@ -55,7 +55,7 @@ def test_corners_of_a_smaller_image_are_those_of_the_whole_one(folder) -> None:
 
 def test_it_is_never_silent(folder) -> None:
     with pytest.warns(UserWarning, match="scaled to 720x540"):
-        detect_images([folder / f"{name}.png" for name in "abc"], BOARD)
+        detect([folder / f"{name}.png" for name in "abc"], BOARD)
 
 
 def test_most_images_decide_and_then_the_largest() -> None:

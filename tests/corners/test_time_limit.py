@@ -5,14 +5,14 @@ import cv2
 import pytest
 from board_render import homography, render
 
-from kcal.corners import detect
+from kcal.corners import detect as module
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import InputError
 
 BOARD = Board(columns=6, rows=5, square=0.02)
-found_by_the_library = detect.detect_board
+found_by_the_library = module.detect_board
 
 
 def slow_if_upright(image, board, refine):
@@ -49,12 +49,12 @@ def test_no_limit_and_bad_limit():
 
 @pytest.mark.slow
 def test_a_slow_image_is_a_failure_and_the_rest_goes_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(detect, "detect_board", slow_if_upright)
+    monkeypatch.setattr(module, "detect_board", slow_if_upright)
     for k in range(3):
         image = render(BOARD, (200, 240), homography(BOARD, (200, 240), 20, (0.05 * k, 0.05), 0.1), seed=k)[0]
         image[0, 0] = 7 if k == 1 else 8
         cv2.imwrite(f"{tmp_path}/{k}.png", image)
-    seen = detect_images([tmp_path / f"{k}.png" for k in range(3)], BOARD, time_limit=3.0)
+    seen = detect([tmp_path / f"{k}.png" for k in range(3)], BOARD, time_limit=3.0)
     assert seen.names == ("0.png", "2.png")
     assert [failure.name for failure in seen.failures] == ["1.png"]
     assert "time limit of 3 s" in seen.failures[0].reason

@@ -11,7 +11,7 @@ from lenses import HYBRID, parameters, strong
 from torch import nn
 
 from kcal.errors import InputError
-from kcal.lens.bake import bake
+from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.rig import StereoRig

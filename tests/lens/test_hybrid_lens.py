@@ -13,7 +13,7 @@ from torch.autograd import gradgradcheck
 from torch.func import functional_call
 
 from kcal.errors import InputError
-from kcal.lens.bake import bake
+from kcal.lens.baking import bake
 from kcal.lens.base_map import growth_by_shape, largest_base_radius
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort_components

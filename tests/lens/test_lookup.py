@@ -18,7 +18,7 @@ from torch import Tensor
 from kcal.errors import DegenerateError, FileError, InputError
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.onnx_file import save_onnx
-from kcal.lens.bake import bake
+from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
 from kcal.lens.lookup import LookupCamera, chart_from_points, rays_from_chart
 from kcal.lens.spline import RINGS, Spline, evaluate_spline, extend_nodes, filter_nodes

@@ -20,9 +20,9 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
-from kcal.report.camera_verdict import camera_verdict, stored_verdict
+from kcal.report.judge_camera import camera_verdict, stored_verdict
+from kcal.report.judge_rig import rig_verdict
 from kcal.report.model_findings import model_findings
-from kcal.report.rig_verdict import rig_verdict
 from kcal.report.verdict import Finding, RangeAnswer, Requirement, Verdict
 from kcal.report.verdict_page import range_rows, verdict_page
 from kcal.report.view_findings import view_findings

@@ -29,8 +29,7 @@ def reached(observations: Observations, columns: int, rows: int) -> Tensor:
     """(rows, columns) which parts of the image lie within the corners of some view's board.
 
     Example:
-        >>> from kcal.corners.board import Board
-        >>> from kcal.corners.observations import View
+        >>> from kcal import Board, View
         >>> view = View(name="a", pixels=((0.0, 0.0), (50.0, 0.0), (0.0, 99.0), (50.0, 99.0)))
         >>> seen = Observations(board=Board(columns=2, rows=2, square=0.1), image_size=(100, 100), views=(view,))
         >>> 0.45 < float(reached(seen, 100, 100).double().mean()) < 0.55

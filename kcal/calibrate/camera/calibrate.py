@@ -54,10 +54,8 @@ def calibrate_camera(
         InputError: the data and the model do not fit at all.
 
     Example:
-        >>> from kcal.corners.board import Board
-        >>> from kcal.corners.observations import View
-        >>> from kcal.lens.camera import Camera
-        >>> from kcal.lens.pose import rotation_from_vector
+        >>> from kcal import Board, Camera, View
+        >>> from kcal.lens import rotation_from_vector
         >>> board = Board(columns=7, rows=6, square=0.05)
         >>> truth = Camera.build(focal=(800, 800), center=(322, 238), size=(640, 480), coefficients=[-0.1, 0.02])
         >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)
@@ -154,8 +152,7 @@ def calibrate_cameras(
         InputError: `one_type` with a parametric model, or with images of several sizes.
 
     Example:
-        >>> from kcal.corners.board import Board
-        >>> from kcal.corners.observations import View
+        >>> from kcal import Board, View
         >>> board = Board(columns=3, rows=3, square=0.1)
         >>> view = View(name="a", pixels=[(100.0 * x, 100.0 * y) for y in range(1, 4) for x in range(1, 4)])
         >>> calibrate_cameras([Observations(board=board, image_size=(640, 480), views=[view])])

@@ -110,10 +110,8 @@ def compare_models(
         KcalError: no model could be fitted.
 
     Example:
-        >>> from kcal.corners.board import Board
-        >>> from kcal.corners.observations import View
-        >>> from kcal.lens.camera import Camera
-        >>> from kcal.lens.pose import rotation_from_vector
+        >>> from kcal import Board, Camera, View
+        >>> from kcal.lens import rotation_from_vector
         >>> board = Board(columns=7, rows=6, square=0.05)
         >>> truth = Camera.build(focal=(800, 805), center=(322, 238), size=(640, 480), coefficients=[-0.3, 0.1])
         >>> noise, views = torch.Generator().manual_seed(0), []

@@ -127,8 +127,8 @@ def calibrate_views(
             solution is a saddle or at a barrier. Fix parameters, choose a smaller model, or add priors.
 
     Example:
-        >>> from kcal.corners.board import Board
-        >>> from kcal.lens.pose import rotation_from_vector
+        >>> from kcal import Board
+        >>> from kcal.lens import rotation_from_vector
         >>> board = Board(columns=7, rows=6, square=0.05).points
         >>> truth = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)

@@ -47,11 +47,8 @@ def summarize(result: CameraCalibrationResult) -> CalibrationSummary:
     """Sum up one calibration.
 
     Example:
-        >>> from kcal.calibrate.camera.calibrate import calibrate_camera
-        >>> from kcal.corners.board import Board
-        >>> from kcal.corners.observations import Observations, View
-        >>> from kcal.lens.camera import Camera
-        >>> from kcal.lens.pose import rotation_from_vector
+        >>> from kcal import Board, Camera, Observations, View, calibrate_camera
+        >>> from kcal.lens import rotation_from_vector
         >>> board, views = Board(columns=7, rows=6, square=0.05), []
         >>> truth = Camera.build(focal=(800, 800), center=(322, 238), size=(640, 480), model="pinhole")
         >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)

@@ -163,9 +163,7 @@ def measure_board(
         InputError: no observations.
 
     Example:
-        >>> from kcal.corners.board import Board
-        >>> from kcal.corners.observations import View
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Board, Camera, View
         >>> from kcal.sim.captures import capture_corners
         >>> camera = Camera.build(focal=(500, 500), center=(320, 240), size=(640, 480), coefficients=[-0.1])
         >>> shots = capture_corners(camera, 6, sigma=0.1, seed=3).pixels.tolist()

@@ -75,7 +75,7 @@ class HybridFit:
         converged: whether the hyperparameters came to rest.
 
     Example:
-        >>> from kcal.lens.pose import rotation_from_vector
+        >>> from kcal.lens import rotation_from_vector
         >>> points = torch.cartesian_prod(torch.arange(6.0), torch.arange(7.0), torch.zeros(1)).double() * 0.05
         >>> truth = Camera.build(focal=(800, 800), center=(322, 238), size=(640, 480), model="pinhole")
         >>> tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)

@@ -119,8 +119,8 @@ def measure_drift(
         DegenerateError: too little to tell the turn.
 
     Example:
-        >>> from kcal.lens.camera import Camera
-        >>> from kcal.lens.pose import rotation_from_vector
+        >>> from kcal import Camera
+        >>> from kcal.lens import rotation_from_vector
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> turn = rotation_from_vector(torch.tensor([0.0, 2e-4, 0.0], dtype=torch.float64))

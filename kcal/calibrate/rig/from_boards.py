@@ -46,10 +46,8 @@ def calibrate_rig(
         DegenerateError: no pair is left.
 
     Example:
-        >>> from kcal.corners.board import Board
-        >>> from kcal.corners.observations import View
-        >>> from kcal.lens.pose import rotation_from_vector
-        >>> from kcal.lens.rig import StereoRig
+        >>> from kcal import Board, StereoRig, View
+        >>> from kcal.lens import rotation_from_vector
         >>> board = Board(columns=7, rows=6, square=0.05)
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
         >>> truth = StereoRig(camera, camera, torch.eye(3), torch.tensor([-0.2, 0.0, 0.0]))

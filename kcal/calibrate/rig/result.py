@@ -196,8 +196,8 @@ class RigResult:
     def stereo(self, first: int = 0, second: int = 1) -> StereoRig:
         """Two of the cameras as a rig, with its covariance and with how it was solved.
 
-        `kcal.placed_rig` adds where it stands on the Earth. The covariance is left out where the data do not determine
-        all parameters of the cameras.
+        `kcal.rig.placed_rig` adds where it stands on the Earth. The covariance is left out where the data do not
+        determine all parameters of the cameras.
         """
         rotation = self.rotation[second] @ self.rotation[first].T
         translation = self.rotation[second] @ (self.center[first] - self.center[second])

@@ -95,8 +95,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
             determine; what could be anything is named.
 
     Example:
-        >>> from kcal.calibrate.rig.sources import Landmarks
-        >>> from kcal.lens.camera import Camera
+        >>> from kcal import Camera, Landmarks
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
         >>> truth = torch.tensor([[0.0, 0, 0], [10.0, 0, 0]], dtype=torch.float64)  # both look north
         >>> look = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)

@@ -14,7 +14,7 @@ from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from kcal.locate.check import triangulated_sides
@@ -39,7 +39,7 @@ def seen(kcal_data: Path) -> dict[str, Observations]:
     """
     found = {}
     for side in SIDES:
-        views = detect_images(sorted((kcal_data / "opencv_stereo").glob(f"{side}*.jpg")), BOARD, "saddle")
+        views = detect(sorted((kcal_data / "opencv_stereo").glob(f"{side}*.jpg")), BOARD, "saddle")
         assert len(views.views) == 13
         pixels = views.pixels()
         assert bool(torch.isfinite(pixels).all())

@@ -14,7 +14,7 @@ from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.repeats import copied_views, repeated_poses
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.errors import DegenerateError
 from kcal.lens.pose import rotation_from_vector
 
@@ -131,7 +131,7 @@ def test_real_captures_repeat_nothing_and_their_copies_are_found(kcal_data: Path
         image = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
         cv2.imwrite(str(tmp_path / f"again_{file.name}"), image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     again = sorted(tmp_path.iterdir())
-    observations = detect_images([*files, *again], Board(columns=9, rows=6, square=0.025))
+    observations = detect([*files, *again], Board(columns=9, rows=6, square=0.025))
     assert repeated_poses(observations.pixels()[:13]) == {}
     result = calibrate_camera(observations, FIVE)
     assert [view.view for view in result.rejected_views] == [file.name for file in again]

@@ -16,7 +16,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.pupil_check import corner_pupil, pupil_warnings
 from kcal.calibrate.camera.warnings import general_warnings
 from kcal.corners.board import Board
-from kcal.corners.detect import detect_images
+from kcal.corners.detect import detect
 from kcal.corners.observations import Observations
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
@@ -67,7 +67,7 @@ class TestRolls:
             return
 
         images = sorted((kcal_data / "captures" / "pi640").glob("*.jpg"))
-        seen = detect_images(images[5:16], Board(columns=7, rows=7, square=0.0254), "none")
+        seen = detect(images[5:16], Board(columns=7, rows=7, square=0.0254), "none")
         rotation = calibrate_camera(seen, CalibrationOptions(model="opencv4")).cam_from_board_rotation
         assert re.search(r"upright \(rolled by at most [1-5]°\)", roll_warnings(rotation)[0])
 

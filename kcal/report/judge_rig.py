@@ -50,8 +50,7 @@ def rig_verdict(
 
     Example:
         >>> import torch
-        >>> from kcal.lens.rig import RigCovariance
-        >>> from kcal.locate.budget import planned_rig
+        >>> from kcal.rig import RigCovariance, planned_rig
         >>> rig = planned_rig()
         >>> rig.covariance = RigCovariance.of(rig, pose=torch.diag(torch.tensor([0, 1e-8, 0, 0, 0, 0]).double()))
         >>> verdict = rig_verdict(rig, Requirement.parse("1km:5%, 5km:5%"), mark_sigma=0.1)

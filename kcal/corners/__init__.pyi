@@ -1,0 +1,20 @@
+# ruff: noqa: I001
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
+
+# Find boards
+from kcal.corners.detect import detect_board as detect_board
+from kcal.corners.detection import Detection as Detection
+from kcal.corners.video import detect_video as detect_video
+from kcal.corners.observations import Failure as Failure
+from kcal.corners.images import expand_images as expand_images
+from kcal.corners.images import read_gray as read_gray
+from kcal.corners.foreign_corners import import_corners as import_corners
+from kcal.corners.print_board import save_board as save_board
+
+# Refine and match points
+from kcal.corners.point import refine_point as refine_point
+from kcal.corners.point import RefinedPoint as RefinedPoint
+from kcal.corners.match import match_points as match_points
+from kcal.corners.match import MatchOptions as MatchOptions
+from kcal.corners.match import Matches as Matches
+from kcal.corners.match import MatchStatus as MatchStatus

@@ -1,0 +1,58 @@
+# ruff: noqa: I001
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
+
+# Lens models
+from kcal.lens.model import LensModel as LensModel
+from kcal.lens.hybrid_terms import HybridForm as HybridForm
+from kcal.lens.zernike import ZernikeModes as ZernikeModes
+from kcal.lens.paraxial import paraxial_focal as paraxial_focal
+from kcal.lens.paraxial import ParaxialFocal as ParaxialFocal
+from kcal.lens.pinhole import new_pinhole as new_pinhole
+from kcal.calibrate.camera.refit import refit_camera as refit_camera
+from kcal.calibrate.camera.refit import RefittedCamera as RefittedCamera
+from kcal.lens.difference import camera_difference as camera_difference
+from kcal.lens.difference import CameraDifference as CameraDifference
+
+# Images
+from kcal.lens.images import Undistort as Undistort
+from kcal.lens.images import UndistortImage as UndistortImage
+from kcal.lens.images import undistort_maps as undistort_maps
+from kcal.lens.images import UndistortMaps as UndistortMaps
+from kcal.lens.image_transform import ImageTransform as ImageTransform
+
+# Error bars
+from kcal.lens.uncertainty import projection_sigma as projection_sigma
+from kcal.lens.uncertainty import image_sigma as image_sigma
+from kcal.lens.uncertainty import pixel_covariance as pixel_covariance
+from kcal.lens.information import CameraInformation as CameraInformation
+
+# Calibration records
+from kcal.lens.calibration import CameraCalibration as CameraCalibration
+from kcal.lens.calibration import CalibrationRecord as CalibrationRecord
+from kcal.lens.calibration import BoardRecord as BoardRecord
+from kcal.lens.calibration import Exclusion as Exclusion
+
+# Other programs
+from kcal.io.formats import import_cameras as import_cameras
+from kcal.io.foreign import ImportedCameras as ImportedCameras
+from kcal.io.foreign import CameraPose as CameraPose
+from kcal.calibrate.camera.export import export_cameras as export_cameras
+from kcal.calibrate.camera.export import ExportedCameras as ExportedCameras
+from kcal.calibrate.camera.export import Misfit as Misfit
+from kcal.io.onnx_file import save_onnx as save_onnx
+
+# Tables and networks
+from kcal.lens.baking import bake as bake
+from kcal.lens.lookup import LookupCamera as LookupCamera
+from kcal.io.lookup_file import load_lookup as load_lookup
+from kcal.io.lookup_file import save_lookup as save_lookup
+from kcal.lens.modules import Unproject as Unproject
+from kcal.lens.modules import LearnedStart as LearnedStart
+from kcal.nets.inverse import train_inverse as train_inverse
+from kcal.nets.inverse import InverseNet as InverseNet
+from kcal.nets.inverse import InverseNetOptions as InverseNetOptions
+from kcal.nets.inverse import InverseFit as InverseFit
+
+# Rotations
+from kcal.lens.pose import rotation_from_vector as rotation_from_vector
+from kcal.lens.pose import vector_from_rotation as vector_from_rotation

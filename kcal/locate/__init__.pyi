@@ -1,0 +1,39 @@
+# ruff: noqa: I001
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
+
+# Positions
+from kcal.locate.localizer import Localization as Localization
+from kcal.locate.localizer import Sensitivity as Sensitivity
+from kcal.locate.positions import Position as Position
+from kcal.locate.tabulate import Viewpoint as Viewpoint
+from kcal.locate.marks import read_marks as read_marks
+from kcal.locate.marks import Marks as Marks
+from kcal.locate.export import write_positions as write_positions
+from kcal.locate.cep import circular_error as circular_error
+from kcal.locate.truth import read_truth as read_truth
+from kcal.locate.truth import position_errors as position_errors
+
+# Triangulate
+from kcal.locate.triangulate import Triangulate as Triangulate
+from kcal.locate.triangulate import Triangulation as Triangulation
+from kcal.locate.multiview import TriangulateViews as TriangulateViews
+from kcal.locate.multiview import ViewsResult as ViewsResult
+
+# Points on the ground
+from kcal.locate.ground import locate_on_ground as locate_on_ground
+from kcal.locate.ground import GroundPlaces as GroundPlaces
+from kcal.locate.ground import level_ground as level_ground
+from kcal.locate.ground import terrain as terrain
+
+# Geodesy
+from kcal.locate.geodesy import enu_from_cam as enu_from_cam
+from kcal.locate.geodesy import enu_to_geodetic as enu_to_geodetic
+from kcal.locate.geodesy import geodetic_to_enu as geodetic_to_enu
+from kcal.locate.datum import find_geoid as find_geoid
+from kcal.locate.datum import Geoid as Geoid
+from kcal.locate.datum import true_from_grid as true_from_grid
+
+# Range errors of a rig
+from kcal.locate.budget import range_errors as range_errors
+from kcal.locate.budget import RangeError as RangeError
+from kcal.locate.budget import BudgetErrors as BudgetErrors

@@ -1,0 +1,38 @@
+# ruff: noqa: I001
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
+
+# Read and match data
+from kcal.calibrate.rig.pairs import pair_by_name as pair_by_name
+from kcal.calibrate.rig.pairs import read_pairs as read_pairs
+from kcal.calibrate.rig.pairs import paired_boards as paired_boards
+from kcal.locate.survey import read_survey as read_survey
+from kcal.locate.survey_files import import_survey as import_survey
+from kcal.locate.survey import Survey as Survey
+from kcal.locate.survey import match_landmarks as match_landmarks
+from kcal.locate.survey import MarkedLandmarks as MarkedLandmarks
+from kcal.locate.survey import read_features as read_features
+from kcal.locate.survey import camera_positions as camera_positions
+
+# Results
+from kcal.calibrate.rig.result import ItemResidual as ItemResidual
+from kcal.calibrate.rig.result import SourceResidual as SourceResidual
+from kcal.calibrate.rig.initial_poses import TurnedBoard as TurnedBoard
+from kcal.lens.calibration import RigCalibration as RigCalibration
+from kcal.lens.calibration import RigSource as RigSource
+from kcal.lens.rig import RigCovariance as RigCovariance
+from kcal.locate.check import triangulated_sides as triangulated_sides
+from kcal.locate.check import Sides as Sides
+
+# Place and plan rigs
+from kcal.lens.mounting import Mounting as Mounting
+from kcal.locate.mounting import placed_rig as placed_rig
+from kcal.locate.mounting import mounting_covariance as mounting_covariance
+from kcal.locate.budget import planned_rig as planned_rig
+
+# Drift
+from kcal.locate.relock import check_rig as check_rig
+from kcal.calibrate.rig.drift import measure_drift as measure_drift
+from kcal.calibrate.rig.drift import Drift as Drift
+from kcal.locate.relock import relocked as relocked
+from kcal.locate.monitor import drift_effect as drift_effect
+from kcal.locate.monitor import DriftEffect as DriftEffect

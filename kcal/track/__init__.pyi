@@ -1,0 +1,23 @@
+# ruff: noqa: I001
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
+
+# From a detector's boxes to pairs
+from kcal.pipeline.detections import Detections as Detections
+from kcal.pipeline.pairing import pair_objects as pair_objects
+from kcal.pipeline.pairs import ObjectPairs as ObjectPairs
+from kcal.pipeline.association import associate as associate
+from kcal.pipeline.association import Association as Association
+from kcal.pipeline.association import AssociationOptions as AssociationOptions
+from kcal.pipeline.disparity import ObjectDisparity as ObjectDisparity
+from kcal.pipeline.disparity import ObjectDisparities as ObjectDisparities
+from kcal.pipeline.disparity import DisparityOptions as DisparityOptions
+
+# Tracks
+from kcal.pipeline.tracks import Tracker as Tracker
+from kcal.pipeline.tracks import TrackOptions as TrackOptions
+from kcal.pipeline.motion import Motion as Motion
+from kcal.pipeline.tracks import Tracks as Tracks
+from kcal.pipeline.estimates import TrackStates as TrackStates
+from kcal.pipeline.smoothing import SmoothedTrack as SmoothedTrack
+from kcal.pipeline.shared_errors import ClockPrior as ClockPrior
+from kcal.pipeline.shared_errors import ClockEstimate as ClockEstimate
