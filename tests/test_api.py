@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import importlib.metadata
 import inspect
+import re
 import subprocess
 import sys
 import tomllib
@@ -20,7 +21,7 @@ import pytest
 
 import kcal
 from kcal.locate.max_likelihood import PointFit
-from kcal.old_names import PLACES
+from kcal.old_names import GONE, PLACES
 
 # Taking a name away breaks users; adding one is a promise. Either is a line here and one in CHANGELOG.md.
 PUBLIC = {
@@ -35,7 +36,7 @@ PUBLIC = {
         ExportedCameras HybridForm ImageTransform ImportedCameras InverseFit InverseNet InverseNetOptions
         LearnedStart LensModel LookupCamera Misfit ParaxialFocal RefittedCamera Undistort UndistortImage
         UndistortMaps Unproject ZernikeModes bake camera_difference export_cameras image_sigma import_cameras
-        load_lookup new_pinhole paraxial_focal pixel_covariance projection_covariance projection_sigma
+        load_lookup new_pinhole paraxial_focal pixel_covariance projection_sigma
         refit_camera rotation_from_vector save_lookup save_onnx train_inverse undistort_maps
         vector_from_rotation
     """,
@@ -264,6 +265,12 @@ def test_every_name_that_moved_has_an_old_one() -> None:
     moved = {name: f"{door}.{name}" for door, name in NAMES if door != "kcal" and name not in NEW_NAMES}
     assert {name: place for name, place in PLACES.items() if name in moved} == moved
     assert PLACES["detect_images"] == "kcal.detect"
+
+
+def test_names_that_are_gone_say_what_takes_their_place() -> None:
+    for name, instead in GONE.items():
+        with pytest.raises(AttributeError, match=re.escape(instead)):
+            getattr(kcal, name)
 
 
 def test_unknown_names() -> None:

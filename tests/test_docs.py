@@ -16,7 +16,6 @@ import pytest
 from kcal.old_names import PLACES
 from scripts.docs_site import commands_page, navigation, ordered, with_descriptions
 from scripts.make_reference import DOORS, groups, page, page_of
-from scripts.shared.page import CONCLUSIONS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

@@ -69,9 +69,7 @@ def test_from_images_to_positions(images: Path, tmp_path: Path) -> None:
         assert known.covariance is not None
         torch.testing.assert_close(known.covariance, result.covariance, rtol=1e-6, atol=1e-12)
         points = torch.tensor([[0.0, 0.0, 5.0]], dtype=torch.float64)
-        spread = kcal.lens.projection_covariance(
-            known.covariance, points, cameras[side].params, result.camera.model, range(5)
-        )
+        spread = kcal.lens.pixel_covariance(cameras[side], points)
         assert 0 < float(spread[0].diagonal().sqrt().max()) < 1.0
 
     # Cameras to a rig; where it stands is measured.

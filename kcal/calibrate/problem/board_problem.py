@@ -56,8 +56,8 @@ class BoardProblem(SchurProblem[BoardState]):
         slots: (5 + P + B,) for each of `values` its place among these; -1 where it has none.
 
     Example:
-        >>> from kcal.lens.camera import Camera
-        >>> from kcal.lens.pose import rotation_from_vector
+        >>> from kcal import Camera
+        >>> from kcal.lens import rotation_from_vector
         >>> from kcal.solve.lm import minimize
         >>> camera = Camera.build(focal=(800, 805), center=(322, 238), size=(640, 480), model="pinhole")
         >>> board = 0.05 * torch.cartesian_prod(torch.arange(6.0), torch.arange(5.0), torch.zeros(1)).double()
