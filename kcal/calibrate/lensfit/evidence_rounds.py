@@ -240,6 +240,19 @@ def expected_estimate(rounds: Rounds, hyperprior: Hyperprior) -> Estimate:
     return estimate._replace(hyperparameters=found.h, log_ratio=found.log_ratio)
 
 
+def motion_is_worth(rounds: Rounds, readout: Readout, hyperprior: Hyperprior, never: Tensor) -> bool:
+    """Whether motion would explain views better that were fitted as standing still; to first order, near the fit."""
+    capture = dataclasses.replace(rounds.capture, readout=readout)
+    estimate = rounds.estimate
+    moving = begin_motion(capture, estimate)
+    data = capture.data(capture.problem(moving, never), moving, never)
+    variance, families = estimate.variance / estimate.tempering, estimate.families
+    best = maximize_evidence(
+        data, families, estimate.hyperparameters, variance, hyperprior, moving.log_ratio, rough=True
+    )
+    return evidence_of_motion(data, best, families, 1.0) >= WORTH
+
+
 def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> bool:
     """Whether columns, read one after the other, may explain the motion of views better than rows.
 

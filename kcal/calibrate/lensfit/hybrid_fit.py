@@ -22,6 +22,7 @@ from kcal.calibrate.lensfit.evidence_rounds import (
     Rounds,
     columns_may_be_read,
     expected_estimate,
+    motion_is_worth,
     run_rounds,
 )
 from kcal.calibrate.lensfit.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, typical_hyperprior
@@ -271,9 +272,14 @@ def fit_hybrid(
         rounds, never = begin(capture)
         if square is None and lens is None and square_pixels(rounds, hyperprior, never):
             # Motion along columns and the aspect of pixels look alike: with square pixels it is looked for anew.
-            one = dataclasses.replace(rounds.capture, square=True, readout=rounds.readout)
+            one, readout = dataclasses.replace(rounds.capture, square=True), rounds.readout
             near = with_square_pixels(rounds.estimate, shown)
-            rounds, never = begin(one) if near is None else run(one, near, rounds.steps, False)
+            if near is None:
+                rounds, never = begin(dataclasses.replace(one, readout=readout))
+            else:
+                rounds, never = run(one, near, rounds.steps, False)
+                if one.readout is None and readout is not None and motion_is_worth(rounds, readout, hyperprior, never):
+                    rounds, never = run(dataclasses.replace(one, readout=readout), near, rounds.steps, False)
         if capture.readout is not None and columns_may_be_read(rounds, hyperprior, never):
             by_columns = dataclasses.replace(capture.readout, columns=True)
             other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))

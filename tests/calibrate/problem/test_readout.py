@@ -10,8 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal.calibrate.lensfit.base_fit import fit_base
 from kcal.calibrate.lensfit.board_modes import board_modes
 from kcal.calibrate.lensfit.evidence import maximize_evidence
+from kcal.calibrate.lensfit.evidence_rounds import FittedViews, motion_is_worth, run_rounds
 from kcal.calibrate.lensfit.families import prior_families, typical_hyperprior
 from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem
@@ -332,3 +334,18 @@ def test_limits_of_motions() -> None:
     assert float((np.exp(best.log_ratio) * 0.3).max()) <= LARGEST * (1 + 1e-9)
     assert float((np.exp(best.log_ratio) * 0.3).min()) >= SMALLEST * (1 - 1e-9)
     assert isinstance(wild.still, Quadratic)
+
+
+@pytest.mark.parametrize(("rate", "worth"), [(2e-3, True), (0.0, False)])
+def test_motion_is_looked_for_beside_a_fit_of_views_that_stand_still(rate: float, worth: bool) -> None:
+    pixels, points = capture(rate, 8), BOARD.points
+    weights, board, hyperprior = torch.ones_like(pixels[..., 0]), board_modes(BOARD.points), typical_hyperprior(MODES)
+    estimate, _ = fit_base(points, pixels, SIZE, weights, MODES, board, True, None, False, hyperprior.mean, None)
+    views = FittedViews(
+        points=points, board=board, pixels=pixels, weights=weights, readout=None, square=True, robust=False, exact=False
+    )
+    never = torch.zeros_like(estimate.families.mean, dtype=torch.bool)
+    rounds = run_rounds(views, estimate, hyperprior, never, cold=True, spent=0, rough=True, progress=lambda _: None)
+    distance = float(estimate.state.translation.norm(dim=-1).median())
+    readout = Readout(center=points.mean(0), distance=distance, size=SIZE)
+    assert motion_is_worth(rounds, readout, hyperprior, never) is worth
