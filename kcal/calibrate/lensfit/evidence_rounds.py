@@ -250,7 +250,7 @@ def motion_is_worth(rounds: Rounds, readout: Readout, hyperprior: Hyperprior, ne
     best = maximize_evidence(
         data, families, estimate.hyperparameters, variance, hyperprior, moving.log_ratio, rough=True
     )
-    return evidence_of_motion(data, best, families, 1.0) >= WORTH
+    return bool(evidence_of_motion(data, best, families, 1.0) >= WORTH)
 
 
 def columns_may_be_read(rounds: Rounds, hyperprior: Hyperprior, never: Tensor) -> bool:
