@@ -164,7 +164,6 @@ from kcal.locate.triangulate import Triangulate as Triangulate
 from kcal.locate.triangulate import Triangulation as Triangulation
 from kcal.locate.truth import position_errors as position_errors
 from kcal.locate.truth import read_truth as read_truth
-from kcal.nets.field_features import train_features as train_features
 from kcal.nets.inverse import InverseFit as InverseFit
 from kcal.nets.inverse import InverseNet as InverseNet
 from kcal.nets.inverse import InverseNetOptions as InverseNetOptions

@@ -229,7 +229,6 @@ PUBLIC = {
     "save_rig_picture",
     "solve_rig",
     "summarize",
-    "train_features",
     "train_inverse",
     "triangulated_sides",
     "true_from_grid",
