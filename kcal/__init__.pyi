@@ -124,6 +124,7 @@ from kcal.locate.budget import range_errors as range_errors
 from kcal.locate.cep import circular_error as circular_error
 from kcal.locate.check import Sides as Sides
 from kcal.locate.check import triangulated_sides as triangulated_sides
+from kcal.locate.columns import PositionColumns as PositionColumns
 from kcal.locate.datum import Geoid as Geoid
 from kcal.locate.datum import find_geoid as find_geoid
 from kcal.locate.datum import true_from_grid as true_from_grid
