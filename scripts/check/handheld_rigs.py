@@ -3,8 +3,8 @@
     python -m scripts.check.handheld_rigs --out FILE --seeds 0-99
     python -m scripts.check.handheld_rigs --out FILE --write     # the table in docs/measured
 
-Truth: two exact cameras of 1280 x 960 pixels, 25 cm apart, which see twelve boards (9 x 6 corners, 5 cm); noise of
-0.1 px; hands as in `scripts.shared.moving_captures`, for each camera its own. Measure: the error of the relative pose (six
+Truth: two exact cameras of 1280 x 960 pixels, 25 cm apart, which see twelve boards (9 x 6 corners, 5 cm); noise of 0.1
+px; hands as in `scripts.shared.moving_captures`, for each camera its own. Measure: the error of the relative pose (six
 numbers) in units of its covariance, squared and divided by six, which is one on the average; and the errors themselves.
 """
 
