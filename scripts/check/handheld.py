@@ -12,7 +12,9 @@ of 0.08 px. By hand (`scripts.shared.moving_captures`): the camera or the board 
 a readout of 10 to 30 ms; rates of 0.1 to 1 rad/s and 0.05 to 0.3 m/s (standard deviation along each axis, drawn for
 each capture), half of their variance tremor of 2 to 10 Hz; exposures of 5 to 20 ms, pictures with more than 12 px of
 blur taken again; noise grows along the blur, as the views' covariances say. Measure: as in
-`scripts.bench.traced_lenses`, where the camera sees infinitely distant points, all over the image, after the best turn."""
+`scripts.bench.traced_lenses`, where the camera sees infinitely distant points, all over the image, after the best
+turn.
+"""
 
 from __future__ import annotations
 
