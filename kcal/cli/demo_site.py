@@ -111,13 +111,13 @@ class _Clock:
 
 
 def _render(scene: DemoScene, folder: Path) -> None:
-    """Write the site's images, a folder for each camera and kind of board."""
+    """Write the site's images, a folder for each camera."""
     from kcal.io.images import write_png
     from kcal.sim.scene import render_demo
 
     with steps("rendering", scene.images) as advance:
         for view in render_demo(scene, advance):
-            place = make_folder(folder / f"{view.camera}-{view.kind}")
+            place = make_folder(folder / f"{view.camera}-near")
             write_png(place / f"{view.name}.png", view.image.numpy())
 
 
