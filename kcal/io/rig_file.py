@@ -188,11 +188,6 @@ class RigFile(NativeFile):
     def _size(self) -> int:
         return len(self.left.coefficients) + len(self.right.coefficients) + 2 * len(INTRINSICS) + 6
 
-    def joint_covariance(self) -> Tensor | None:
-        """The stored covariance as a matrix, float64."""
-        known = self.known()
-        return None if known is None else known.matrix
-
     def known(self) -> RigCovariance | None:
         """The stored covariance."""
         if self.half is not None:
