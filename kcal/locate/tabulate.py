@@ -135,11 +135,7 @@ def number_table(found: Localization, more: Sequence[Group] = ()) -> NDArray[np.
         ("lat", ok, found.geodetic.T.numpy()),
         ("east_m", ok, found.enu.T.numpy()),
         ("range_m", ok, 1.0 / np.where(ok, found.inverse_range.numpy(), 1.0)[None]),
-        (
-            "range_low_m",
-            aimed & torch.isfinite(found.range_low).numpy(),
-            torch.stack([found.range_low, found.range_high]).numpy(),
-        ),
+        ("range_low_m", aimed & torch.isfinite(found.range_low).numpy(), interval.numpy()),
         ("cov_ee_m2", ok, found.covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].T.numpy()),
         ("cep50_m", ok, circles.T.numpy()),
         ("azimuth_deg", aimed, azimuth_elevation(found.bearing).T.numpy()),
