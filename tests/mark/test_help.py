@@ -15,7 +15,7 @@ from kcal.io.images import write_png
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.marks import Marks, write_marks
-from kcal.locate.relock import check_rig
+from kcal.locate.relock import check_rig, seen_again
 from kcal.locate.survey import Survey
 from kcal.mark.guide import RigBand, at_shape, propose
 from kcal.mark.items import Add, Mark, Place, Put, Side, SurveyPlace
@@ -225,9 +225,7 @@ class TestDrift:
         now = session.marks("feature", single=False)
         desk.close()
         assert len(now.names) >= 10
-        from kcal.cli.rig_check import _features
-
-        drift = check_rig(site.rig, features=_features(then, now, 0.05))
+        drift = check_rig(site.rig, features=seen_again(then, now, 0.05))
         assert drift.significant
         found_turn = drift.rig.right_from_left_rotation @ site.rig.right_from_left_rotation.T
         expected = moved @ site.rig.right_from_left_rotation.T
