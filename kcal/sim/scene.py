@@ -18,7 +18,7 @@ from torch import Tensor
 
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
-from kcal.sim.board import BoardLike, BoardPose, PrintedBoard, RigLike, project_board
+from kcal.sim.board import BoardLike, BoardPose, PrintedBoard, project_board
 from kcal.sim.poses import sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
 from kcal.sim.true_rig import TrueRig, drawn_rig
@@ -135,7 +135,7 @@ class DemoScene:
     """
 
     seed: int = 0
-    rig: RigLike = field(default_factory=demo_rig)
+    rig: TrueRig = field(default_factory=demo_rig)
     lat: float = 40.762
     lon: float = -113.896
     height: float = 1282.0
@@ -216,7 +216,7 @@ class DemoScene:
         return NamedPoints(tuple(name for name, *_ in table), torch.tensor(rows, dtype=torch.float64))
 
 
-def mark_points(rig: RigLike, points_rig: Tensor, sigma: float, generator: torch.Generator) -> SceneMarks:
+def mark_points(rig: TrueRig, points_rig: Tensor, sigma: float, generator: torch.Generator) -> SceneMarks:
     """Mark points in both images with Gaussian noise.
 
     Args:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcal.sim.board import BoardLike, BoardPose, RigLike
+from kcal.lens.rig import StereoRig
+from kcal.sim.board import BoardLike, BoardPose
 from kcal.sim.poses import PoseOptions, check_draws, choose_poses, draw_poses
+from kcal.sim.true_rig import TrueRig
 
 
 def sample_pair_poses(
-    rig: RigLike,
+    rig: StereoRig | TrueRig,
     board: BoardLike,
     count: int,
     generator: torch.Generator,
@@ -37,7 +39,6 @@ def sample_pair_poses(
     Example:
         >>> from kcal.lens.camera import Camera
         >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
-        >>> from kcal.lens.rig import StereoRig
         >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> from kcal.sim.board import BoardSize, project_board
         >>> board = BoardSize(9, 6, 0.1)
@@ -54,7 +55,7 @@ def sample_pair_poses(
     return choose_poses(drawn, [(rig.left, *still), (rig.right, rotation, translation)], board, count, options)
 
 
-def rig_pose(rig: RigLike, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
+def rig_pose(rig: StereoRig | TrueRig, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
     """Convert left_from_board to right_from_board."""
     rotation, translation = left_from_board
     return BoardPose(rig.right_from_left_rotation @ rotation, rig.right_from_left(translation))
