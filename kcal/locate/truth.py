@@ -90,10 +90,10 @@ def interval_coverage(localize: StereoLocalizer, left: Tensor, right: Tensor, ra
 
     Example:
         >>> from kcal.locate.budget import planned_rig
-        >>> points = torch.tensor([[0.0, 0.0, 500.0], [9.0, 0.0, 800.0]], dtype=torch.float64)
+        >>> points = torch.tensor([[0.0, 0.0, 500.0], [9.0, 0.0, 800.0], [0.0, 9.0, 900.0]]).double()
         >>> localize = StereoLocalizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
-        >>> interval_coverage(localize, *planned_rig()(points)[:2], torch.tensor([500.0, 2000.0]))
-        0.5
+        >>> round(interval_coverage(localize, *planned_rig()(points)[:2], torch.tensor([500.0, 2000.0, 900.0])), 3)
+        0.667
     """
     found = localize(left, right)
     return float(((found.range_low <= ranges) & (ranges <= found.range_high)).double().mean())

@@ -228,7 +228,9 @@ def test_windows_cover_what_was_asked_for_and_say_where_they_end():
         [pytest.approx(float(here[40, 21]))],
         [pytest.approx(float(here[98, 57]))],
     ]
-    # Beside the first window, beyond the image, and where a sample's slope would be.
+    # In the image, but beside the first window.
+    assert has_samples(windows, torch.tensor([5.0, 10.0]).double().expand(2, 1, 2)).tolist() == [[False], [True]]
+    # Beyond the image, and where a sample's slope would be.
     for odd in ((400.0, 35.0), (21.0, 99.0), (21.0, -3.0), (0.5, 30.0)):
         assert not bool(has_samples(windows, torch.tensor(odd).double().expand(2, 1, 2)).any())
 
