@@ -63,14 +63,16 @@ _INTERNAL = {
     "kcal.lens.gaussian_modes": "GaussianModes",
     "kcal.lens.network_modes": "NetworkModes",
     "kcal.lens.spline": "Spline",
-    "kcal.nets.field_features": "train_features",
 }
 _PUBLIC = {name: f"{module}.{name}" for module, names in _MOVED.items() for name in names.split()} | _RENAMED
 # Old name -> full name.
 PLACES = _PUBLIC | {name: f"{module}.{name}" for module, name in _INTERNAL.items()}
 PLACES["HybridState"] = "kcal.calibrate.problem.state.BoardState"
 # Old names that mean nothing any more, and what takes their place.
-GONE = {"projection_covariance": "kcal.lens.pixel_covariance and kcal.lens.projection_sigma"}
+GONE = {
+    "projection_covariance": "kcal.lens.pixel_covariance and kcal.lens.projection_sigma",
+    "train_features": "scripts/shared/field_features.py of the repository",
+}
 
 
 def find_old(name: str) -> Any:

@@ -37,7 +37,7 @@ LOOKS = {
     "locate": (1.0, "pixels to positions"),
     "calibrate/camera": (2.8, "one camera"),
     "calibrate/rig": (1.0, "several cameras"),
-    "nets": (4.0, "the paper's networks"),
+    "nets": (4.55, "learned inverse"),
     "sim": (0.0, "simulated truth"),
     "io": (1.0, "files"),
     "corners": (2.15, "boards, detection"),

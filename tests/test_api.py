@@ -57,7 +57,7 @@ PUBLIC = {
         read_pairs read_survey relocked triangulated_sides
     """,
     "kcal.locate": """
-        BudgetErrors Geoid GroundPlaces Localization Marks Position RangeError Sensitivity Triangulate
+        BudgetErrors Geoid GroundPlaces Localization Marks Position PositionColumns RangeError Sensitivity Triangulate
         TriangulateViews Triangulation Viewpoint ViewsResult circular_error enu_from_cam enu_to_geodetic
         find_geoid geodetic_to_enu level_ground locate_on_ground position_errors range_errors read_marks
         read_truth terrain true_from_grid write_positions
@@ -80,7 +80,7 @@ PUBLIC = {
 NAMES = [(door, name) for door, names in PUBLIC.items() for name in names.split()]
 NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
-NEW_NAMES = {"calibrate_views", "detect", "rotation_from_vector", "vector_from_rotation"}
+NEW_NAMES = {"PositionColumns", "calibrate_views", "detect", "rotation_from_vector", "vector_from_rotation"}
 # Types of attributes in which only those look who work on kcal.
 INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline"}
 # What functions return, and blocks of files: examples are those of the functions.
@@ -134,6 +134,7 @@ RECORDS = {
     "ObjectPairs",
     "OutlierRejection",
     "Position",
+    "PositionColumns",
     "PositionStatus",
     "RefinedPoint",
     "RejectedCorner",

@@ -19,7 +19,7 @@ FLOORS = {
     "capture": 8,
     "web": 1,
     "pipeline": 8,
-    "nets": 7,
+    "nets": 2,
     "locate": 7,
     "calibrate/batch": 6,
     "calibrate/camera": 5,

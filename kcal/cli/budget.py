@@ -55,12 +55,10 @@ def budget_command(
     """
     import math
 
-    import torch
-
     from kcal.io.rig_file import load_rig
     from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
     from kcal.locate.range_sigmas import range_sigmas, usual_ranges
-    from kcal.report.budget import save_budget_picture
+    from kcal.report.budget import plotted_ranges, save_budget_picture
     from kcal.report.figures import check_picture
     from kcal.report.tables import range_sigma_rows
 
@@ -94,11 +92,7 @@ def budget_command(
         out.print(f"\nWhat the rig file knows, and {disparity:g} px of disparity as a standard deviation, in meters:")
         print_table(range_sigma_rows(range_sigmas(chosen, far, pixel_sigma=disparity / math.sqrt(2.0))))
     if picture is not None:
-        sweep = torch.logspace(math.log10(min(far)), math.log10(max(far)), 121, dtype=torch.float64)
-        # The ends themselves, which rounding of the logarithm may push out of view.
-        sweep = sweep.clamp(min(far), max(far))
-        if len(far) < 2:
-            raise InputError("distances: a plot needs at least two")
+        sweep = plotted_ranges(far)
         save_budget_picture(picture, sweep, range_errors(chosen, sweep, errors), labels)
     print_wrote(picture)
 

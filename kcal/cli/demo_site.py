@@ -82,16 +82,15 @@ def simulated_site(output: Path, seed: int) -> None:
 def _more_draws(scene: DemoScene, rig: StereoRig) -> str:
     """How many intervals of this rig contain the true range over many draws of the noise in the marks."""
     from kcal.locate.localizer import StereoLocalizer
+    from kcal.locate.truth import interval_coverage
     from kcal.sim.scene import mark_points
 
     draws, targets = 200, scene.points_rig(scene.targets)
     marks = mark_points(scene.rig, targets.repeat(draws, 1), scene.mark_sigma, scene.generator(-30))
-    found = StereoLocalizer(rig, pixel_sigma=scene.mark_sigma)(marks.left, marks.right)
-    true = targets.norm(dim=-1).repeat(draws)
-    inside = ((found.range_low <= true) & (true <= found.range_high)).double().mean()
-    return (
-        f"With {draws} other draws of the noise in the marks, {100 * float(inside):.0f} % of the intervals contain it."
-    )
+    ranges = targets.norm(dim=-1).repeat(draws)
+    localize = StereoLocalizer(rig, pixel_sigma=scene.mark_sigma)
+    share = interval_coverage(localize, marks.left, marks.right, ranges)
+    return f"With {draws} other draws of the noise in the marks, {100 * share:.0f} % of the intervals contain it."
 
 
 class _Clock:
@@ -112,13 +111,13 @@ class _Clock:
 
 
 def _render(scene: DemoScene, folder: Path) -> None:
-    """Write the site's images, a folder for each camera and kind of board."""
+    """Write the site's images, a folder for each camera."""
     from kcal.io.images import write_png
     from kcal.sim.scene import render_demo
 
     with steps("rendering", scene.images) as advance:
         for view in render_demo(scene, advance):
-            place = make_folder(folder / f"{view.camera}-{view.kind}")
+            place = make_folder(folder / f"{view.camera}-near")
             write_png(place / f"{view.name}.png", view.image.numpy())
 
 

@@ -148,17 +148,13 @@ def locate_command(
     `kcal locate rig.json detections.csv -o - --format geojsonl | head`
     """
     import json
-    import math
-
-    import torch
 
     from kcal.io.rig_file import load_rig
     from kcal.lens.mounting import Origin
-    from kcal.lens.rig import RigCovariance
     from kcal.locate.datum import find_geoid, true_from_grid
     from kcal.locate.export import STREAM, check_format, open_writers
     from kcal.locate.marks import filled, read_mark_chunks
-    from kcal.locate.mounting import mounting_covariance
+    from kcal.locate.mounting import run_errors
     from kcal.locate.positions import located_by
     from kcal.locate.sample import PositionSample
     from kcal.locate.survey import read_survey
@@ -194,29 +190,21 @@ def locate_command(
     doubts = solved.calibration.warnings if solved.calibration else ()
     for text in doubts:
         warn(f"{rig}: {text}")
-    calibration, link = solved.covariance, None
-    if yaw_sigma:
-        yaw = torch.zeros(6, 6, dtype=torch.float64)
-        yaw[1, 1] = math.radians(yaw_sigma) ** 2
-        calibration = (calibration or RigCovariance.of(solved)).with_pose(yaw)
-    mounting = mounting_covariance(origin_m=[origin_sigma] * 3, attitude_deg=(0.0, 0.0, heading_sigma))
     if place is None or heading is None:
-        stored = solved.mounting
-        if stored is None:
+        if solved.mounting is None:
             raise InputError(
                 f"{rig}: the file has no position of the rig; give --origin and --heading (or --origin 0,0,0 "
                 "--heading 0, if you only need meters from the left camera: the columns east_m, north_m and up_m)"
             )
-        if stored.covariance is not None:
-            more = len(stored.covariance) - len(mounting)
-            mounting = torch.nn.functional.pad(mounting, (0, more, 0, more)) + stored.covariance
-        link = stored.link
     elif grid is not None:
         heading = true_from_grid(heading, place, grid)
+    errors = run_errors(
+        solved, yaw_deg=yaw_sigma, heading_deg=heading_sigma, origin_m=origin_sigma, elsewhere=place is not None
+    )
     locate = Locator(
         solved, geoid=find_geoid(geoid), origin=place, heading_deg=heading, pitch_deg=pitch, roll_deg=roll,
-        pixel_sigma=pixel_sigma, calibration=calibration, mounting=mounting if bool(mounting.any()) else None,
-        link=link, refraction=refraction, refraction_sigma=refraction_sigma,
+        pixel_sigma=pixel_sigma, calibration=errors.calibration, mounting=errors.mounting, link=errors.link,
+        refraction=refraction, refraction_sigma=refraction_sigma,
     )  # fmt: skip
     survey = None if truth is None else read_survey(truth, locate.localize.origin, measured=False)
     sample = PositionSample(frozenset(survey.names if survey else ()))

@@ -12,7 +12,7 @@ from kcal.errors import InputError
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.drift import Drift
-    from kcal.calibrate.rig.sources import Features, Landmarks
+    from kcal.calibrate.rig.sources import Landmarks
     from kcal.lens.rig import StereoRig
     from kcal.locate.marks import Marks
 
@@ -60,7 +60,7 @@ def check(
     from kcal.files import check_writable
     from kcal.io.rig_file import load_rig
     from kcal.locate.marks import read_marks
-    from kcal.locate.relock import check_rig
+    from kcal.locate.relock import check_rig, seen_again
 
     if reference is None and landmarks is None:
         raise InputError("give --reference (marks of the same things in old images) or --landmarks (a survey)")
@@ -70,7 +70,7 @@ def check(
         check_writable(rig, marks, *(path for path in (reference, landmarks) if path is not None))
     old = load_rig(rig)
     now = read_marks(marks, single=True)
-    features = None if reference is None else _features(read_marks(reference, single=True), now, mark_sigma)
+    features = None if reference is None else seen_again(read_marks(reference, single=True), now, mark_sigma)
     surveyed = None if landmarks is None else _landmarks(old, landmarks, now, mark_sigma)
     drift = check_rig(old, features=features, landmarks=surveyed)
     _print_turns(old, drift)
@@ -94,25 +94,6 @@ def check(
         out.print(f"kept the old rig as {kept}", markup=False)
         print_wrote(rig)
     raise typer.Exit(_DRIFTED)
-
-
-def _features(then: Marks, now: Marks, sigma: float) -> Features:
-    import torch
-
-    from kcal.calibrate.rig.sources import Features
-
-    common = [name for name in then.names if name in now.names]
-    if not common:
-        raise InputError("no name is in both files of marks; give the same things the same names")
-    before = then.pixels[[then.names.index(name) for name in common]]
-    after = now.pixels[[now.names.index(name) for name in common]]
-    return Features(
-        names=tuple(common),
-        pixels=torch.cat([before, after], 1),
-        inverse_range=torch.zeros(len(common), dtype=torch.float64),
-        inverse_range_sigma=torch.full((len(common),), torch.inf, dtype=torch.float64),
-        pixel_sigma=sigma,
-    )
 
 
 def _landmarks(rig: StereoRig, path: Path, now: Marks, sigma: float) -> Landmarks:

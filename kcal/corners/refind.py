@@ -8,17 +8,9 @@ import torch
 from torch import Tensor
 
 from kcal.checks import as_points
-from kcal.corners.match import (
-    RIVAL_DISTANCE,
-    Matches,
-    MatchOptions,
-    MatchStatus,
-    PatchMatch,
-    blurred_window,
-    fit_shift,
-    patch_correlation,
-    sample_window,
-)
+from kcal.corners.match import Matches, MatchOptions, MatchStatus, PatchMatch, fit_peak, joined, textured_patch
+from kcal.corners.patch_correlation import highest_peak, weighted_correlation
+from kcal.corners.patch_windows import grid_of, has_samples, image_windows, sample
 from kcal.errors import InputError
 
 
@@ -58,47 +50,19 @@ def find_again(
             f"pixels (N, 2) and two images of one size are needed, got {tuple(pixels.shape)}, {tuple(before.shape)} "
             f"and {tuple(after.shape)}"
         )
-    numbers = torch.full((len(pixels), 8), math.nan, dtype=torch.float64)
-    found = Matches(
-        numbers[:, :2], numbers[:, 2:6].unflatten(1, (2, 2)), torch.zeros(len(pixels), dtype=torch.int64),
-        numbers[:, 6], numbers[:, 7],
-    )  # fmt: skip
-    for row, pixel in enumerate(pixels):
-        match = _found_again(before, after, pixel, reach, options)
-        found.status[row], found.score[row], found.off_line[row] = int(match.status), match.score, match.off_line
-        found.pixels[row], found.covariance[row] = match.pixel, match.covariance
-    return found
+    return joined([_found_again(before, after, pixel, reach, options) for pixel in pixels])
 
 
 def _found_again(before: Tensor, after: Tensor, pixel: Tensor, reach: int, options: MatchOptions) -> PatchMatch:
     if not bool(torch.isfinite(pixel).all()):
         return PatchMatch(MatchStatus.NO_RAY)
-    axis = torch.arange(-options.half, options.half + 1, dtype=torch.float64)
-    y, x = torch.meshgrid(axis, axis, indexing="ij")
-    patch = pixel + torch.stack([x, y], -1).reshape(-1, 2)
-    size = torch.tensor([before.shape[1], before.shape[0]])
-    if not bool(((patch >= 1) & (patch <= size - 2)).all()):
-        return PatchMatch(MatchStatus.OUTSIDE)
-    template = sample_window(blurred_window(before, patch), patch)
-    if not float(template.std()) > 1e-6 * max(1.0, float(template.abs().max())):
-        return PatchMatch(MatchStatus.FLAT)
-    steps = torch.arange(-reach, reach + 1, dtype=torch.float64)
-    dy, dx = torch.meshgrid(steps, steps, indexing="ij")
-    moves = torch.stack([dx, dy], -1).reshape(-1, 2)
-    window = blurred_window(after, patch, reach + 2)
-    scores = []
-    for part in moves.split(512):
-        where = patch + part[:, None]
-        usable = ((where >= 1) & (where <= size - 2)).all(-1).all(-1)
-        scores.append(torch.where(usable, patch_correlation(sample_window(window, where), template), -torch.inf))
-    score = torch.cat(scores)
-    best = int(score.argmax())
-    top = float(score[best])
-    if not top >= options.min_score:
-        return PatchMatch(MatchStatus.OUTSIDE if top == -math.inf else MatchStatus.NO_MATCH, top)
-    board = score.reshape(len(steps), -1)
-    peaks = (torch.nn.functional.max_pool2d(board[None, None], 3, 1, 1)[0, 0] == board).reshape(-1)
-    away = torch.linalg.vector_norm(moves - moves[best], dim=-1) > RIVAL_DISTANCE
-    if bool((peaks & away & (score > options.max_rival * top)).any()):
-        return PatchMatch(MatchStatus.AMBIGUOUS, top)
-    return fit_shift(window, template, patch + moves[best], torch.zeros(2, dtype=torch.float64), top, options)
+    patch = pixel + grid_of((options.half,) * 2, pixel.device)
+    template = textured_patch(before, patch)
+    if isinstance(template, MatchStatus):
+        return PatchMatch(template)
+    wide = pixel + grid_of((options.half + reach,) * 2, pixel.device)
+    window = image_windows(after, wide[None], 0, math.inf)
+    usable = has_samples(window, wide[None])
+    scores = weighted_correlation(template[None], torch.ones_like(template)[None], sample(window, wide[None]), usable)
+    peak = highest_peak(scores, grid_of((reach,) * 2, pixel.device))
+    return fit_peak(window, template, patch + peak.place[0], torch.zeros(2, dtype=torch.float64), peak, options)

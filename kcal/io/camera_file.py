@@ -199,45 +199,36 @@ def camera_to_file(
     camera: Camera,
     *,
     name: str | None = None,
-    standard_deviations: Mapping[str, float | None] | None = None,
-    covariance: torch.Tensor | None = None,
     calibration: CalibrationRecord | None = None,
 ) -> CameraFile:
     """Put a camera in the form in which it is stored.
 
     Args:
-        camera: a single camera, not a batch. What is not given below is taken from its `calibration`.
-        name: free text that tells cameras apart.
-        standard_deviations: parameter name -> one sigma; names left out, and None, stand for parameters held fixed.
-        covariance: (5 + P, 5 + P) in the order of `Camera.names`; parameters whose variance is zero are held fixed.
-        calibration: how the camera was calibrated.
+        camera: a single camera, not a batch, with its `calibration`: names without a sigma, and parameters whose
+            variance is zero, were held fixed.
+        name: free text that tells cameras apart, in place of the one in `calibration`.
+        calibration: how the camera was calibrated, in place of the record there.
 
     Raises:
-        InputError: a batch of cameras, a parameter that is not finite, a name that the camera does not have, or a
-            matrix that is no covariance of its parameters.
+        InputError: a batch of cameras, a parameter that is not finite, or a name that the camera does not have.
 
     Example:
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-        >>> camera_to_file(camera, standard_deviations={"fx": 0.5}).standard_deviations["fy"] is None
+        >>> camera.calibration = CameraCalibration(sigma={"fx": 0.5})
+        >>> camera_to_file(camera).standard_deviations["fy"] is None
         True
     """
     values = camera.params.detach()
     if values.ndim != 1:
         raise InputError(f"a camera file contains one camera, got a batch of shape {tuple(values.shape[:-1])}")
     known = camera.calibration or CameraCalibration()
-    standard_deviations = known.sigma if standard_deviations is None else standard_deviations
-    information = known.information if covariance is None else None
+    sigma, information = known.sigma, known.information
     # What is derived from the information is not stored beside it.
-    covariance = known.covariance if covariance is None and information is None else covariance
-    if standard_deviations is not None:
-        unknown = [key for key in standard_deviations if key not in camera.names]
+    covariance = known.covariance if information is None else None
+    if sigma is not None:
+        unknown = [key for key in sigma if key not in camera.names]
         if unknown:
             raise InputError(f"standard deviation of {unknown[0]!r}: the camera has {', '.join(camera.names)}")
-        standard_deviations = {key: standard_deviations.get(key) for key in camera.names}
-    if covariance is not None and tuple(covariance.shape) != (len(camera.names),) * 2:
-        raise InputError(
-            f"covariance: this camera has {len(camera.names)} parameters, got shape {tuple(covariance.shape)}"
-        )
     stored = dict(zip(camera.names, values.tolist(), strict=True))
     try:
         return CameraFile(
@@ -246,7 +237,7 @@ def camera_to_file(
             model=LensOrders.of(camera.model),
             intrinsics=IntrinsicsRecord(**{key: stored[key] for key in INTRINSICS}),
             coefficients={key: stored[key] for key in camera.model.names},
-            standard_deviations=standard_deviations,
+            standard_deviations=None if sigma is None else {key: sigma.get(key) for key in camera.names},
             covariance=None if covariance is None else CovarianceRecord.of(covariance.detach(), camera.names),
             information=None if information is None else InformationRecord.of(information, camera.names),
             valid_region=ValidRegion(

@@ -188,11 +188,6 @@ class RigFile(NativeFile):
     def _size(self) -> int:
         return len(self.left.coefficients) + len(self.right.coefficients) + 2 * len(INTRINSICS) + 6
 
-    def joint_covariance(self) -> Tensor | None:
-        """The stored covariance as a matrix, float64."""
-        known = self.known()
-        return None if known is None else known.matrix
-
     def known(self) -> RigCovariance | None:
         """The stored covariance."""
         if self.half is not None:
@@ -211,27 +206,11 @@ class RigFile(NativeFile):
         return rig
 
 
-def rig_to_file(
-    rig: StereoRig,
-    *,
-    left: CameraFile | None = None,
-    right: CameraFile | None = None,
-    covariance: RigCovariance | None = None,
-    mounting: RigMounting | None = None,
-    calibration: RigCalibration | None = None,
-) -> RigFile:
-    """Put a rig in the form in which it is stored.
-
-    Args:
-        rig: the rig. What is not given below is taken from it and from its cameras.
-        left: the left camera's file, to keep its name, error bars and record; it must contain the same camera.
-        right: likewise for the right camera.
-        covariance: see `RigFile`.
-        mounting: see `RigFile`.
-        calibration: how the rig was solved.
+def rig_to_file(rig: StereoRig) -> RigFile:
+    """Put a rig, with all that is known of it and of its cameras, in the form in which it is stored.
 
     Raises:
-        InputError: a camera file that contains another camera than the rig, or values that do not fit together.
+        InputError: values that do not fit together.
 
     Example:
         >>> from kcal import Camera
@@ -240,16 +219,11 @@ def rig_to_file(
         >>> rig_to_file(rig).right_from_left.translation
         (-1.0, 0.0, 0.0)
     """
-    for name, file, camera in (("left", left, rig.left), ("right", right, rig.right)):
-        if file is not None and file.camera().fingerprint != camera.fingerprint:
-            raise InputError(f"the {name} camera file contains another camera than the rig; pass the file it came from")
-    covariance = rig.covariance if covariance is None else covariance
+    covariance, mounting = rig.covariance, rig.mounting
     try:
-        if mounting is None and rig.mounting is not None:
-            mounting = RigMounting.of(rig.mounting)
         return RigFile(
-            left=left or _camera_to_file(rig.left, "left"),
-            right=right or _camera_to_file(rig.right, "right"),
+            left=_camera_to_file(rig.left, "left"),
+            right=_camera_to_file(rig.right, "right"),
             right_from_left=RigPose.model_validate(
                 {
                     "rotation": rig.right_from_left_rotation.tolist(),
@@ -257,8 +231,8 @@ def rig_to_file(
                 }
             ),
             half=None if covariance is None else Packed.of(covariance.half),
-            mounting=mounting,
-            calibration=calibration or rig.calibration,
+            mounting=None if mounting is None else RigMounting.of(mounting),
+            calibration=rig.calibration,
         )
     except pydantic.ValidationError as error:
         first = error.errors()[0]

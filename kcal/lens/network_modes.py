@@ -2,9 +2,9 @@
 
     f = Σ_k w_k tanh(a_k x + b_k y + c_k),   likewise g with weights of its own
 
-The hidden layer is fixed: random features (Rahimi and Recht 2007), or trained (`kcal.nets.field_features`). So the
-field is linear in the weights of the last layer. They get Gaussian priors whose widths the evidence sets, as the
-weights of every field do.
+The hidden layer is fixed: random features (Rahimi and Recht 2007), or one trained beforehand. So the field is linear in
+the weights of the last layer. They get Gaussian priors whose widths the evidence sets, as the weights of every field
+do.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@
 from kcal.locate.localizer import Localization as Localization
 from kcal.locate.localizer import Sensitivity as Sensitivity
 from kcal.locate.positions import Position as Position
+from kcal.locate.columns import PositionColumns as PositionColumns
 from kcal.locate.tabulate import Viewpoint as Viewpoint
 from kcal.locate.marks import read_marks as read_marks
 from kcal.locate.marks import Marks as Marks

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -24,7 +25,7 @@ _LARGEST = sys.float_info.max
 
 
 class PositionColumns(NamedTuple):
-    """Located pairs.
+    """Located pairs, column by column.
 
     Attributes:
         names: one for each pair.
@@ -61,6 +62,17 @@ class PositionColumns(NamedTuple):
             part = slice(start, start + size)
             extras = {name: cells[part] for name, cells in self.extras.items()}
             yield PositionColumns(self.names[part], self.status[part], self.reasons[part], self.numbers[part], extras)
+
+    @classmethod
+    def joined(cls, parts: Sequence[PositionColumns]) -> PositionColumns:
+        """The rows of some columns, one after the other, with the further columns of the first."""
+        if not parts:
+            return cls((), np.zeros(0, np.int8), (), np.zeros((0, len(NUMBERS))), {})
+        names, status, reasons, numbers, extras = zip(*parts, strict=True)
+        return cls(
+            [*itertools.chain(*names)], np.concatenate(status), [*itertools.chain(*reasons)], np.concatenate(numbers),
+            {name: [*itertools.chain(*(each[name] for each in extras))] for name in extras[0]},
+        )  # fmt: skip
 
     @property
     def located(self) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from kcal.errors import InputError
 from kcal.locate.columns import PositionColumns
-from kcal.locate.positions import Located, columns_of
+from kcal.locate.positions import Located
 from kcal.texts import one_line
 
 COT_END = "</events>\n"
@@ -23,24 +23,6 @@ _TYPE = "a-u-G"
 _HOW = "m-g"
 
 
-def to_cot(located: Located, *, time: datetime.datetime | None = None, stale_s: float = 300.0) -> str:
-    """One event for each position, in an `events` element; send them one by one.
-
-    `hae` is the ellipsoidal height. `ce` is the radius of the horizontal circle that contains the true position with
-    95 %, `le` half the vertical 95 % interval, both in meters; the format's definition names no probability, so that
-    the remark in each event states it. Pairs without a position are left out.
-
-    Args:
-        located: from `kcal.locate_points`.
-        time: of the marks, with its time zone; now if left out.
-        stale_s: seconds for which an event counts.
-
-    Raises:
-        InputError: a time without a time zone, or a `stale_s` that is not positive.
-    """
-    return cot_start() + cot_events(columns_of(located.positions), located, time=time, stale_s=stale_s) + COT_END
-
-
 def cot_start() -> str:
     """The beginning of the document."""
     return '<?xml version="1.0" encoding="UTF-8"?>\n<events>\n'
@@ -49,7 +31,21 @@ def cot_start() -> str:
 def cot_events(
     columns: PositionColumns, run: Located, *, time: datetime.datetime | None = None, stale_s: float = 300.0
 ) -> str:
-    """An event for each row that has a position; see `to_cot`."""
+    """An event for each row that has a position.
+
+    `hae` is the ellipsoidal height. `ce` is the radius of the horizontal circle that contains the true position with
+    95 %, `le` half the vertical 95 % interval, both in meters; the format's definition names no probability, so that
+    the remark in each event states it. Pairs without a position are left out.
+
+    Args:
+        columns: the rows.
+        run: how they were located.
+        time: of the marks, with its time zone; now if left out.
+        stale_s: seconds for which an event counts.
+
+    Raises:
+        InputError: a time without a time zone, or a `stale_s` that is not positive.
+    """
     moment = datetime.datetime.now(datetime.UTC) if time is None else time
     if moment.tzinfo is None:
         raise InputError("time: a time zone is needed; write for example datetime.now(datetime.UTC)")

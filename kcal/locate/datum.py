@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -57,20 +55,19 @@ def find_geoid(path: str | Path | None = None) -> Geoid | None:
     return None
 
 
-def geoid_heights(geoid: Geoid, places: Sequence[tuple[float, float]]) -> list[float | None]:
-    """Height of the geoid above the WGS84 ellipsoid at (latitude, longitude), meters; None outside the grid.
+def geoid_column(geoid: Geoid, lat: NDArray[np.float64], lon: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Height (N,) of the geoid above the WGS84 ellipsoid, meters; NaN outside the grid.
 
     Height above the geoid, which is close to height above mean sea level, is ellipsoidal height minus this.
+
+    Args:
+        geoid: the grid.
+        lat: (N,) degrees.
+        lon: (N,) degrees.
 
     Raises:
         FileError: PROJ cannot read the grid.
     """
-    heights = geoid_column(geoid, *np.asarray(places, dtype=np.float64).reshape(-1, 2).T)
-    return [height if math.isfinite(height) else None for height in heights.tolist()]
-
-
-def geoid_column(geoid: Geoid, lat: NDArray[np.float64], lon: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same for arrays (N,) of latitudes and longitudes in one call; NaN outside the grid."""
     try:
         shift = pyproj.Transformer.from_pipeline(
             f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "

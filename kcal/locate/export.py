@@ -5,7 +5,6 @@ Rows are written in chunks, so that a table may be longer than memory.
 
 from __future__ import annotations
 
-import io
 import re
 import shutil
 import sys
@@ -14,9 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
-
-import orjson
+from typing import BinaryIO, NamedTuple
 
 from kcal.errors import InputError
 from kcal.files import open_atomic
@@ -24,7 +21,7 @@ from kcal.locate.columns import NUMBERS, TEXTS, PositionColumns, number_lines
 from kcal.locate.cot import COT_END, cot_events, cot_start
 from kcal.locate.geojson import camera_features, point_features, region_features
 from kcal.locate.kml import KML_END, kml_points, kml_regions, kml_start
-from kcal.locate.positions import Located, columns_of
+from kcal.locate.positions import Located
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.tables import guarded, is_number
 from kcal.texts import csv_line
@@ -211,44 +208,15 @@ def open_writers(paths: Sequence[Path], run: Located, stream_suffix: str = ".csv
             writer.close()
 
 
-def _written(suffix: str, located: Located) -> bytes:
-    file = io.BytesIO()
-    writer = PositionWriter(file, suffix, located)
-    writer.add(columns_of(located.positions))
-    writer.close()
-    return file.getvalue()
-
-
-def to_geojson(located: Located) -> dict[str, Any]:
-    """A FeatureCollection after RFC 7946: coordinates are [longitude, latitude, ellipsoidal WGS84 height in meters].
-
-    The cameras come first (`kind` is "camera"), then one feature for each pair of marks (`kind` is "point"), and last
-    a polygon for each position (`kind` is "region"): its 95 % region, a long and slightly skewed ellipse. A
-    pair without a position has a null geometry, its status and the reason. `range_high_m` is null where it is
-    infinite, because JSON has no infinity; `range_high_infinite` is then true.
-
-    Example:
-        >>> from kcal import Origin
-        >>> from kcal.locate import Viewpoint
-        >>> left = Viewpoint(name="left", enu=(0, 0, 0), geodetic=(19.07, 72.87, 14.0), azimuths_deg=None)
-        >>> located = Located(positions=(), cameras=(left, left), origin=Origin(lat=19.07, lon=72.87, height=14.0),
-        ...                   heading_deg=0.0, pitch_deg=0.0, roll_deg=0.0, pixel_sigma=0.3)
-        >>> to_geojson(located)["features"][0]["geometry"]
-        {'type': 'Point', 'coordinates': [72.87, 19.07, 14.0]}
-    """
-    content: dict[str, Any] = orjson.loads(_written(".geojson", located))
-    return content
-
-
-def to_csv(located: Located) -> str:
-    """Comma-separated text, one line for each pair; unknown fields are empty and an infinite range is `inf`."""
-    return _written(".csv", located).decode()
-
-
 def write_positions(path: str | Path, located: Located) -> Path:
     """Write positions, atomically, in the format of the suffix: .geojson, .json, .geojsonl, .csv, .kml or .cot.
 
-    `.geojsonl` is GeoJSON with one feature a line, each region behind its point; `.cot` is Cursor-on-Target.
+    GeoJSON follows RFC 7946: coordinates are [longitude, latitude, ellipsoidal WGS84 height in meters]. The cameras
+    come first (`kind` is "camera"), then one feature for each pair of marks (`kind` is "point"), and last a polygon for
+    each position (`kind` is "region"): its 95 % region, a long and slightly skewed ellipse. A pair without a position
+    has a null geometry, its status and the reason. `range_high_m` is null where it is infinite, because JSON has no
+    infinity; `range_high_infinite` is then true. `.geojsonl` has one feature a line, each region behind its point. In
+    CSV unknown fields are empty and an infinite range is `inf`. `.cot` is Cursor-on-Target.
 
     Raises:
         InputError: another suffix.
@@ -267,5 +235,7 @@ def write_positions(path: str | Path, located: Located) -> Path:
     """
     check_format(path)
     with open_atomic(path) as file:
-        file.write(_written(Path(path).suffix, located))
+        writer = PositionWriter(file, Path(path).suffix, located)
+        writer.add(located.columns)
+        writer.close()
     return Path(path)

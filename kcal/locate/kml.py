@@ -1,4 +1,9 @@
-"""Positions as KML 2.2 (OGC 07-147r2), for Google Earth and every GIS: points, 95 % regions, cameras."""
+"""Positions as KML 2.2 (OGC 07-147r2), for Google Earth and every GIS: points, 95 % regions, cameras.
+
+KML counts absolute altitudes from the EGM96 geoid. With a geoid grid, positions are written with `altitudeMode`
+absolute and their height above that geoid; without one they are `clampToGround`, because an ellipsoidal height taken
+for a height above the sea would be wrong by up to 100 m. Regions lie on the ground.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +12,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from kcal.locate.columns import PositionColumns, number_lines
-from kcal.locate.positions import Located, columns_of
+from kcal.locate.positions import Located
 from kcal.locate.region import CORNER_DECIMALS, ring_blocks
 from kcal.texts import visible
 
@@ -23,17 +28,6 @@ _STYLES = """  <Style id="camera">
    <PolyStyle><color>33271811</color></PolyStyle>
   </Style>
 """
-
-
-def to_kml(located: Located) -> str:
-    """A KML document: longitude, latitude, height; heights are those of KML's own datum, see below.
-
-    KML counts absolute altitudes from the EGM96 geoid. With a geoid grid, positions are written with `altitudeMode`
-    absolute and their height above that geoid; without one they are `clampToGround`, because an ellipsoidal height
-    taken for a height above the sea would be wrong by up to 100 m. Regions lie on the ground.
-    """
-    columns = columns_of(located.positions)
-    return kml_start(located) + kml_points(columns) + kml_regions(columns, located) + KML_END
 
 
 def kml_start(run: Located) -> str:

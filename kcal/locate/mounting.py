@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from torch import Tensor
 from kcal.calibrate.rig.result import RigResult
 from kcal.errors import InputError
 from kcal.lens.mounting import Mounting, Origin
-from kcal.lens.rig import StereoRig
+from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.ellipsoid import ecef_from_enu_rotation
 from kcal.locate.geodesy import enu_to_geodetic
 
@@ -124,6 +125,51 @@ def mounting_covariance(
     if values.shape != (6,) or not bool((torch.isfinite(values) & (values >= 0)).all()):
         raise InputError("mounting: three sigmas of the origin and three of the attitude are needed, none negative")
     return torch.diag(torch.cat([values[:3], torch.deg2rad(values[3:])]) ** 2)
+
+
+class RunErrors(NamedTuple):
+    """What `kcal.locate.tabulate.Locator` is told of a rig's errors.
+
+    Attributes:
+        calibration: of cameras and relative pose; None where nothing is known.
+        mounting: (6, 6) or (7, 7) of origin and attitude, as in `Mounting`; None where all is exact.
+        link: of the two with each other, as in `Mounting`.
+    """
+
+    calibration: RigCovariance | None
+    mounting: Tensor | None
+    link: Tensor | None
+
+
+def run_errors(
+    rig: StereoRig, *, yaw_deg: float = 0.0, heading_deg: float = 0.0, origin_m: float = 0.0, elsewhere: bool = False
+) -> RunErrors:
+    """The errors that a rig knows of itself, and independent ones that are stated besides.
+
+    Args:
+        rig: with its covariance and mounting, as far as they are known.
+        yaw_deg: standard deviation of the relative yaw.
+        heading_deg: of the heading.
+        origin_m: of the origin along each axis.
+        elsewhere: the rig does not stand as its mounting says, so that the mounting's errors are not its own.
+
+    Example:
+        >>> from kcal.rig import planned_rig
+        >>> errors = run_errors(planned_rig(), origin_m=0.02)
+        >>> errors.calibration is None, round(float(errors.mounting[0, 0]), 6)
+        (True, 0.0004)
+    """
+    calibration, stored = rig.covariance, None if elsewhere else rig.mounting
+    if yaw_deg:
+        yaw = torch.zeros(6, 6, dtype=torch.float64)
+        yaw[1, 1] = math.radians(yaw_deg) ** 2
+        calibration = (calibration or RigCovariance.of(rig)).with_pose(yaw)
+    mounting = mounting_covariance(origin_m=[origin_m] * 3, attitude_deg=(0.0, 0.0, heading_deg))
+    if stored is not None and stored.covariance is not None:
+        more = len(stored.covariance) - len(mounting)
+        mounting = torch.nn.functional.pad(mounting, (0, more, 0, more)) + stored.covariance
+    link = None if stored is None else stored.link
+    return RunErrors(calibration, mounting if bool(mounting.any()) else None, link)
 
 
 def by_mounting(enu: Tensor) -> Tensor:

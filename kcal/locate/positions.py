@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -57,15 +57,17 @@ class Position:
     reprojection_px: tuple[float, float] | None = None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Located:
     """Result of `locate_points`: one position for each pair of marks, in order, and where the rig stood.
+
+    `columns` contains the positions as arrays, `positions` gives each row as a `Position`.
 
     `included` names the errors that intervals and covariances cover; `geoid` is the grid of the geoid heights, None
     without one. `rows` is the length of the table of which the positions are a sample, None if they are all.
     """
 
-    positions: tuple[Position, ...]
+    columns: PositionColumns
     cameras: tuple[Viewpoint, Viewpoint]
     origin: Origin
     heading_deg: float
@@ -76,10 +78,15 @@ class Located:
     geoid: str | None = None
     rows: int | None = None
 
+    @functools.cached_property
+    def positions(self) -> tuple[Position, ...]:
+        """The rows, one object each."""
+        return tuple(_positions_of(self.columns))
+
     @property
     def count_note(self) -> str:
         """How many points are located, and of how long a table they are a sample."""
-        note = f"{self.count} of {len(self.positions)} points located"
+        note = f"{self.count} of {len(self.columns.names)} points located"
         return note if self.rows is None else f"{note}, a sample of the {self.rows:,} in the table"
 
     @property
@@ -93,14 +100,13 @@ class Located:
     @property
     def count(self) -> int:
         """How many pairs have a position."""
-        return sum(position.status == PositionStatus.OK for position in self.positions)
+        return int((self.columns.status == PositionStatus.OK).sum())
 
     @property
     def enu(self) -> Tensor:
         """East, north, up in meters, (N, 3) float64; NaN where there is no position."""
-        nowhere = (math.nan,) * 3
-        rows = [nowhere if position.enu is None else position.enu for position in self.positions]
-        return torch.tensor(rows, dtype=torch.float64).reshape(-1, 3)
+        first = NUMBERS.index("east_m")
+        return torch.from_numpy(self.columns.numbers[:, first : first + 3].copy())
 
 
 def locate_points(
@@ -176,18 +182,16 @@ def locate_points(
     pixels = torch.stack([pixels_left, pixels_right], 1)
     if cov is not None:
         cov = cov.expand(len(pixels), 4, 4)
-    positions: list[Position] = []
-    for start in range(0, len(pixels), CHUNK_ROWS):
-        piece = slice(start, start + CHUNK_ROWS)
-        positions += positions_of(locate(names[piece], pixels[piece], None if cov is None else cov[piece]))
-    return located_by(locate, positions)
+    pieces = [slice(start, start + CHUNK_ROWS) for start in range(0, len(pixels), CHUNK_ROWS)]
+    found = [locate(names[piece], pixels[piece], None if cov is None else cov[piece]) for piece in pieces]
+    return located_by(locate, PositionColumns.joined(found))
 
 
-def located_by(locate: Locator, positions: Sequence[Position] = ()) -> Located:
+def located_by(locate: Locator, columns: PositionColumns | None = None) -> Located:
     """Positions with what they were located by: where the rig stood, and which errors are covered."""
     heading, pitch, roll = locate.localize.attitude_deg
     return Located(
-        positions=tuple(positions),
+        columns=columns or PositionColumns.joined([]),
         cameras=locate.cameras,
         origin=locate.localize.origin,
         heading_deg=heading,
@@ -199,9 +203,7 @@ def located_by(locate: Locator, positions: Sequence[Position] = ()) -> Located:
     )
 
 
-def positions_of(columns: PositionColumns) -> list[Position]:
-    """A `Position` for each row of columns."""
-    found = []
+def _positions_of(columns: PositionColumns) -> Iterator[Position]:
     rows = zip(columns.names, columns.status.tolist(), columns.reasons, columns.numbers.tolist(), strict=True)
     for name, status, reason, numbers in rows:
         lat, lon, height, geoid, distance, low, high, cep50, cep95, by_pixel, by_degree, azimuth, elevation = (
@@ -210,7 +212,7 @@ def positions_of(columns: PositionColumns) -> list[Position]:
         east, north, up = numbers[4:7]
         ee, en, eu, nn, nu, uu = numbers[10:16]
         left, right = numbers[22:]
-        position = Position(
+        yield Position(
             name=name, status=PositionStatus(status), reason=reason, lat=lat, lon=lon, height=height,
             geoid_height=geoid, enu=None if math.isnan(east) else (east, north, up),
             covariance=None if math.isnan(ee) else ((ee, en, eu), (en, nn, nu), (eu, nu, uu)),
@@ -218,25 +220,3 @@ def positions_of(columns: PositionColumns) -> list[Position]:
             range_m=distance, range_low_m=low, range_high_m=high, azimuth_deg=azimuth, elevation_deg=elevation,
             reprojection_px=None if math.isnan(left) else (left, right),
         )  # fmt: skip
-        found.append(position)
-    return found
-
-
-def columns_of(positions: Sequence[Position]) -> PositionColumns:
-    """The columns of positions: the reverse of `positions_of`."""
-    nowhere = (None, None, None)
-    rows = []
-    for p in positions:
-        first, second, third = p.covariance or (nowhere, nowhere, nowhere)
-        rows.append((
-            p.lat, p.lon, p.height, p.geoid_height, *(p.enu or nowhere), p.range_m, p.range_low_m, p.range_high_m,
-            *first, *second[1:], third[2], p.cep50_m, p.cep95_m, p.meters_per_pixel, p.meters_per_degree,
-            p.azimuth_deg, p.elevation_deg, *(p.reprojection_px or nowhere[:2]),
-        ))  # fmt: skip
-    return PositionColumns(
-        [p.name for p in positions],
-        np.array([int(p.status) for p in positions], dtype=np.int8),
-        [p.reason for p in positions],
-        np.array(rows, dtype=np.float64).reshape(-1, len(NUMBERS)),
-        {},
-    )

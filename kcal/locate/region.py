@@ -15,7 +15,7 @@ from kcal.lens.mounting import Origin
 from kcal.locate.columns import NUMBERS, PositionColumns
 from kcal.locate.ellipsoid import latitude_longitude
 from kcal.locate.geodesy import anchor
-from kcal.locate.positions import Located, Position, columns_of
+from kcal.locate.positions import Located
 
 REGION_SHARE = 0.95
 # In files, of the degrees of a region's corners: 0.1 mm (RFC 7946, section 11.2). Positions keep all digits. The last
@@ -79,12 +79,10 @@ def _covariance_root(matrix: Tensor) -> Tensor:
     return vectors * values.clamp_min(0.0).sqrt()[..., None, :]
 
 
-def region_rings(located: Located) -> list[tuple[Position, Ring]]:
-    """Each position with its ring: (latitude, longitude), closed, counterclockwise, longitudes without a jump."""
-    columns = columns_of(located.positions)
-    known = [position for position, known in zip(located.positions, columns.located.tolist(), strict=True) if known]
-    rings = (ring for block in ring_blocks(columns, located.origin) for ring in block.tolist())
-    return [(position, [(lat, lon) for lat, lon in ring]) for position, ring in zip(known, rings, strict=True)]
+def region_rings(located: Located) -> list[Ring]:
+    """The ring of each position: (latitude, longitude), closed, counterclockwise, longitudes without a jump."""
+    blocks = ring_blocks(located.columns, located.origin)
+    return [[(lat, lon) for lat, lon in ring] for block in blocks for ring in block.tolist()]
 
 
 def ring_blocks(columns: PositionColumns, origin: Origin) -> Iterator[NDArray[np.float64]]:

@@ -9,9 +9,11 @@ from torch import Tensor
 
 from kcal.calibrate.rig.drift import Drift, measure_drift
 from kcal.calibrate.rig.sources import Features, Landmarks
+from kcal.errors import InputError
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA
 from kcal.lens.rig import StereoRig
 from kcal.locate.geodesy import enu_from_cam
+from kcal.locate.marks import Marks
 from kcal.locate.mounting import attitude
 
 
@@ -56,6 +58,32 @@ def check_rig(rig: StereoRig, *, features: Features | None = None, landmarks: La
             )
     before = None if rig.covariance is None else (rig.covariance.matrix[-6:-3, -6:-3], left)
     return measure_drift(rig, features=features, landmarks=landmarks, pose=pose, before=before, refraction=refraction)
+
+
+def seen_again(then: Marks, now: Marks, sigma: float) -> Features:
+    """Things of unknown range that are marked in old and new images, for `check_rig`; `sigma` of a mark, pixels.
+
+    Raises:
+        InputError: no name is in both.
+
+    Example:
+        >>> pixels = torch.tensor([[10.0, 20.0], [30.0, 40.0]], dtype=torch.float64)
+        >>> found = seen_again(Marks(("a", "b"), pixels, pixels), Marks(("b", "c"), pixels, pixels), 0.3)
+        >>> found.names, found.pixels[0].tolist()
+        (('b',), [[30.0, 40.0], [30.0, 40.0], [10.0, 20.0], [10.0, 20.0]])
+    """
+    common = tuple(name for name in then.names if name in now.names)
+    if not common:
+        raise InputError("no name is in both files of marks; give the same things the same names")
+    pixels = [marks.pixels[[marks.names.index(name) for name in common]] for marks in (then, now)]
+    unknown = torch.zeros(len(common), dtype=torch.float64)
+    return Features(
+        names=common,
+        pixels=torch.cat(pixels, 1),
+        inverse_range=unknown,
+        inverse_range_sigma=torch.full_like(unknown, torch.inf),
+        pixel_sigma=sigma,
+    )
 
 
 def relocked(rig: StereoRig, drift: Drift, note: str) -> StereoRig:

@@ -6,9 +6,10 @@ import dataclasses
 from collections.abc import Set as AbstractSet
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kcal.locate.columns import PositionColumns
-from kcal.locate.positions import Located, Position, located_by, positions_of
+from kcal.locate.positions import Located, located_by
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.tabulate import Locator
 
@@ -27,7 +28,7 @@ class PositionSample:
     def __init__(self, named: AbstractSet[str] = frozenset(), most: int = SAMPLE_ROWS) -> None:
         self._named, self._most = named, most
         self._stride = 1
-        self._kept: dict[int, Position] = {}
+        self._numbers, self._kept = np.zeros(0, dtype=np.int64), PositionColumns.joined([])
         self.count = 0
         self._statuses = np.zeros(len(PositionStatus), dtype=np.int64)
 
@@ -38,13 +39,17 @@ class PositionSample:
         self._statuses += np.bincount(columns.status, minlength=len(self._statuses))
         while self.count > self._stride * self._most:
             self._stride *= 2
-        kept = self._kept.items()
-        self._kept = {i: known for i, known in kept if i % self._stride == 0 or known.name in self._named}
+        parts = [self._wanted(self._numbers, self._kept), self._wanted(numbers, columns._replace(extras={}))]
+        self._numbers = np.concatenate([which for which, _ in parts])
+        self._kept = PositionColumns.joined([rows for _, rows in parts])
+
+    def _wanted(
+        self, numbers: NDArray[np.int64], columns: PositionColumns
+    ) -> tuple[NDArray[np.int64], PositionColumns]:
         wanted = numbers % self._stride == 0
         if self._named:
-            wanted |= np.array([name in self._named for name in columns.names])
-        which = np.flatnonzero(wanted)
-        self._kept.update(zip(numbers[which].tolist(), positions_of(columns.rows(which)), strict=True))
+            wanted |= np.array([name in self._named for name in columns.names], dtype=bool)
+        return numbers[wanted], columns.rows(np.flatnonzero(wanted))
 
     @property
     def statuses(self) -> dict[str, int]:
@@ -53,5 +58,5 @@ class PositionSample:
 
     def located(self, locate: Locator) -> Located:
         """What was kept, in the order of the table."""
-        found = located_by(locate, tuple(self._kept.values()))
-        return found if len(self._kept) == self.count else dataclasses.replace(found, rows=self.count)
+        found = located_by(locate, self._kept)
+        return found if len(self._numbers) == self.count else dataclasses.replace(found, rows=self.count)

@@ -52,12 +52,8 @@ class TableRow(NamedTuple):
             raise FileError(f"{self.where}: {column} is {cell!r}; {what} is needed, for example 960.5")
         return value
 
-    def optional(self, column: str, what: str = "a number") -> float | None:
-        """The same, None where the column is absent or the cell is empty."""
-        return self.number(column, what) if self.cells.get(column) else None
-
     def positive(self, column: str) -> float | None:
-        """The same, positive; `inf` counts."""
+        """The positive number in a column, `inf` counts; None where the column is absent or the cell is empty."""
         cell = self.cells.get(column)
         if not cell:
             return None

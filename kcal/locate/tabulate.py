@@ -94,34 +94,16 @@ class Locator:
         return PositionColumns(names, found.status.numpy(), reasons, numbers, extras or {})
 
     def _numbers(self, found: Localization, slopes: Sensitivity) -> NDArray[np.float64]:
-        status = found.status
-        ok = (status == int(PositionStatus.OK)).numpy()
-        weak = (status == int(PositionStatus.BEARING_ONLY)).numpy()
-        aimed = ok | weak | (status == int(PositionStatus.PARALLEL)).numpy()
-        some_range = aimed & torch.isfinite(found.range_low).numpy()
-        covariance = found.covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-        circles = torch.full((len(ok), 2), math.nan, dtype=torch.float64)
-        circles[torch.from_numpy(ok)] = circular_error(found.enu[ok], found.covariance[ok])
-        geodetic = found.geodetic.numpy()
-        geoid = np.full(len(ok), np.nan)
+        ok = (found.status == int(PositionStatus.OK)).numpy()
+        weak = (found.status == int(PositionStatus.BEARING_ONLY)).numpy()
+        geodetic, geoid = found.geodetic.numpy(), np.full(len(ok), np.nan)
         if self.geoid is not None:
             geoid[ok] = geoid_column(self.geoid, geodetic[ok, 0], geodetic[ok, 1])
-        table = np.full((len(NUMBERS), len(ok)), np.nan)
-        for first, where, values in (
-            ("lat", ok, geodetic.T),
+        return number_table(found, (
             ("geoid_height_m", ok, geoid[None]),
-            ("east_m", ok, found.enu.T.numpy()),
-            ("range_m", ok, 1.0 / np.where(ok, found.inverse_range.numpy(), 1.0)[None]),
-            ("range_low_m", some_range, np.stack([found.range_low.numpy(), found.range_high.numpy()])),
-            ("cov_ee_m2", ok, covariance.T.numpy()),
-            ("cep50_m", ok, circles.T.numpy()),
             ("range_m_per_px", ok, np.stack([value.numpy() for value in slopes])),
-            ("azimuth_deg", aimed, azimuth_elevation(found.bearing).T.numpy()),
             ("reprojection_left_px", ok | weak, found.reprojection.T.numpy()),
-        ):
-            row = NUMBERS.index(first)
-            np.copyto(table[row : row + len(values)], values, where=where)
-        return np.ascontiguousarray(table.T)
+        ))  # fmt: skip
 
     def _reasons(self, found: Localization, sigmas: NDArray[np.float64]) -> list[str]:
         reasons = [""] * len(sigmas)
@@ -131,6 +113,39 @@ class Locator:
         for i in np.flatnonzero((status != int(PositionStatus.OK)) | doubtful).tolist():
             reasons[i] = _explanation(PositionStatus(int(status[i])), found, i, baseline)
         return reasons
+
+
+Group = tuple[str, NDArray[np.bool_], NDArray[np.float64]]
+
+
+def number_table(found: Localization, more: Sequence[Group] = ()) -> NDArray[np.float64]:
+    """(N, 24) the columns `NUMBERS` of localized pairs or tracks on the CPU; NaN where unknown.
+
+    Args:
+        found: (N,) of them; the reprojection is not read.
+        more: other columns: name of the first, (N,) where they are known, and values (columns, N).
+    """
+    status = found.status
+    ok = (status == int(PositionStatus.OK)).numpy()
+    aimed = ok | torch.isin(status, status.new_tensor([PositionStatus.BEARING_ONLY, PositionStatus.PARALLEL])).numpy()
+    circles = torch.full((len(ok), 2), math.nan, dtype=torch.float64)
+    circles[torch.from_numpy(ok)] = circular_error(found.enu[ok], found.covariance[ok])
+    interval = torch.stack([found.range_low, found.range_high])
+    groups: tuple[Group, ...] = (
+        ("lat", ok, found.geodetic.T.numpy()),
+        ("east_m", ok, found.enu.T.numpy()),
+        ("range_m", ok, 1.0 / np.where(ok, found.inverse_range.numpy(), 1.0)[None]),
+        ("range_low_m", aimed & torch.isfinite(found.range_low).numpy(), interval.numpy()),
+        ("cov_ee_m2", ok, found.covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].T.numpy()),
+        ("cep50_m", ok, circles.T.numpy()),
+        ("azimuth_deg", aimed, azimuth_elevation(found.bearing).T.numpy()),
+        *more,
+    )
+    table = np.full((len(NUMBERS), len(ok)), np.nan)
+    for first, where, values in groups:
+        row = NUMBERS.index(first)
+        np.copyto(table[row : row + len(values)], values, where=where)
+    return np.ascontiguousarray(table.T)
 
 
 def _marks_sigma(cov: Tensor, count: int) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.mounting import Origin
+from kcal.locate.localizer import StereoLocalizer
 from kcal.locate.positions import Located
 from kcal.locate.survey import read_survey
 
@@ -73,3 +74,24 @@ def position_errors(located: Located, truth: Tensor) -> list[tuple[float, float,
         low, high = position.range_low_m or 0.0, position.range_high_m or math.inf
         out.append((math.hypot(east, north), position.range_m - away, low <= away <= high))
     return out
+
+
+@torch.no_grad()
+def interval_coverage(localize: StereoLocalizer, left: Tensor, right: Tensor, ranges: Tensor) -> float:
+    """The share of pairs whose 95 % range interval contains the true range.
+
+    Args:
+        localize: what locates them.
+        left: (N, 2) marks in the left image.
+        right: (N, 2) in the right one.
+        ranges: (N,) true ranges, meters.
+
+    Example:
+        >>> from kcal.rig import planned_rig
+        >>> points = torch.tensor([[0.0, 0.0, 500.0], [9.0, 0.0, 800.0], [0.0, 9.0, 900.0]]).double()
+        >>> localize = StereoLocalizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> round(interval_coverage(localize, *planned_rig()(points)[:2], torch.tensor([500.0, 2000.0, 900.0])), 3)
+        0.667
+    """
+    found = localize(left, right)
+    return float(((found.range_low <= ranges) & (ranges <= found.range_high)).double().mean())

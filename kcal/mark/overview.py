@@ -38,7 +38,7 @@ def map_content(rig: StereoRig, located: Located | None, survey: Survey | None, 
     right = -rig.right_from_left_rotation.T @ rig.right_from_left_translation
     centers = torch.stack([torch.zeros_like(right), right]) @ turn.T
     frame = _NOWHERE if survey is None or survey.origin is None else survey.origin
-    rings = [] if located is None else region_rings(located)
+    rings = iter([] if located is None else region_rings(located))
     targets = []
     for position in () if located is None else located.positions:
         if position.azimuth_deg is None:
@@ -49,7 +49,7 @@ def map_content(rig: StereoRig, located: Located | None, survey: Survey | None, 
         line = torch.tensor([[math.sin(angle), math.cos(angle), 0.0]]).double() * torch.tensor([[ends[0]], [far]])
         spot = None if position.lat is None or position.lon is None else (position.lat, near(position.lon, origin.lon))
         targets.append({"name": position.name, "place": spot, "line": places(line, origin),
-                        "ring": next((ring for p, ring in rings if p.name == position.name), None)})  # fmt: skip
+                        "ring": None if position.lat is None else next(rings)})  # fmt: skip
     # Landmarks in a frame of their own cannot be drawn with a rig that stands nowhere.
     drawn = survey is not None and rig.mounting is not None
     return {

@@ -1,1 +1,1 @@
-"""The paper's networks, one file each with its fit: residual (Eq. 11), inverse (Eq. 12), pure network lens (4.3.1)."""
+"""The learned inverse of a lens (Eq. 12 of the paper), with its network and fit."""

@@ -31,7 +31,7 @@ class NetValues(NamedTuple):
 
 
 class Network(Float64Module):
-    """Base of the paper's networks: one vector of float64 weights, without gradients until asked."""
+    """Base of networks: one vector of float64 weights, without gradients until asked."""
 
     weights: Tensor
 

@@ -17,19 +17,13 @@ import torch
 from torch import Tensor, nn
 
 from kcal.checks import as_points, keep_float64, require_finite
-from kcal.corners.match import RIVAL_DISTANCE, MatchStatus
+from kcal.corners.match import MatchStatus
+from kcal.corners.patch_correlation import highest_peak, is_textured, weighted_correlation
+from kcal.corners.patch_windows import grid_of, has_samples, image_windows, sample
+from kcal.corners.shift_fit import fit_shifts
 from kcal.errors import InputError
 from kcal.lens.rig import StereoRig
-from kcal.pipeline.patches import (
-    grid_of,
-    has_samples,
-    image_windows,
-    object_planes,
-    plane_pixels,
-    plane_places,
-    sample,
-)
-from kcal.pipeline.shift_fit import fit_shifts, is_textured, weighted_correlation
+from kcal.pipeline.patches import object_planes, plane_pixels, plane_places
 
 # Steps of a patch from its middle at most; larger objects get steps of powers of two pixels.
 _LARGEST_HALF = 24
@@ -206,7 +200,7 @@ class ObjectDisparity(nn.Module):
             clear = torch.where(saturated, 0.0, base)
             usable = shown & has_samples(second, there)
             scores = weighted_correlation(template, clear, sample(second, there), usable)
-            best, score, rival, edge = _peak(scores, search)
+            _, best, score, rival, edge = highest_peak(scores, grid_of(search, device))
             start = aim + planes.step[:, None] * best
             beyond = grid_of((objects.half + 1,) * 2, device)
             places, _ = plane_pixels(rig.right, planes, start[:, None, None] + step * beyond, rotation)
@@ -302,20 +296,3 @@ def _brightest(image: Tensor, options: DisparityOptions) -> float:
     if options.brightest is not None:
         return options.brightest
     return math.inf if image.dtype.is_floating_point else float(torch.iinfo(image.dtype).max)
-
-
-def _peak(scores: Tensor, search: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of correlations (N, rows, columns): best shift (N, 2), its score, the best rival's, whether it is at the edge."""
-    _, rows, columns = scores.shape
-    score, at = scores.flatten(1).max(1)
-    row, column = at // columns, at % columns
-    best = torch.stack([column - search[0], row - search[1]], -1).double()
-    inner = torch.nn.functional.max_pool2d(scores[:, None], 3, stride=1, padding=1)[:, 0]
-    y, x = torch.meshgrid(
-        torch.arange(rows, device=scores.device), torch.arange(columns, device=scores.device), indexing="ij"
-    )
-    away = torch.hypot((x - column[:, None, None]).double(), (y - row[:, None, None]).double()) > RIVAL_DISTANCE
-    peak = (scores >= inner) & away & (x > 0) & (x < columns - 1)
-    rival = torch.where(peak, scores, -1.0).flatten(1).amax(1)
-    edge = (column == 0) | (column == columns - 1)
-    return best, score, rival, edge

@@ -10,10 +10,8 @@ import math
 import secrets
 import threading
 from collections.abc import AsyncIterator
-from typing import Any
 
 import orjson
-import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
@@ -21,16 +19,9 @@ from starlette.routing import Route
 
 from kcal.locate.columns import PositionColumns
 from kcal.locate.positions import Located
-from kcal.web.gate import new_token, page_files
-from kcal.web.listening import listening_socket
+from kcal.web.gate import local_app, page_files
+from kcal.web.serving import LocalServer
 
-_HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-}
 # Seconds between looks for news, and between signs of life while there is none.
 _POLL, _ALIVE = 0.1, 10.0
 
@@ -51,17 +42,11 @@ class LiveMap:
             {"cameras": [{"name": f"{camera.name} camera", "place": camera.geodetic[:2]} for camera in run.cameras]}
         )
         self._news = (0, b"")
-        self._token, self._socket = new_token(), listening_socket(port, fallback=False)
-        bound = self._socket.getsockname()[1]
-        self._hosts = {f"127.0.0.1:{bound}", f"localhost:{bound}"}
-        self.address = f"http://127.0.0.1:{bound}/#{self._token}"
-        routes = [Route("/events", self._events)]
-        pages = page_files(("kcal.pipeline", "page"), ("kcal.report", "leaflet"))
-        routes += [Route(path, self._file(content, kind)) for path, (content, kind) in pages.items()]
-        config = uvicorn.Config(Starlette(routes=routes), log_level="warning", access_log=False, lifespan="off")
-        self._server = uvicorn.Server(config)
+        self._ended = threading.Event()
+        self._server = LocalServer(self._app, port, fallback=False)
+        self.address = self._server.address
         # Signals are those of the stream.
-        self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [self._socket]}, daemon=True)
+        self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._thread.start()
 
     def show(self, columns: PositionColumns, sequence: int) -> None:
@@ -83,29 +68,24 @@ class LiveMap:
 
     def close(self) -> None:
         """End the server."""
-        self._server.should_exit = self._server.force_exit = True
+        self._ended.set()
+        self._server.stop()
         self._thread.join(5.0)
-        self._socket.close()
 
-    def _file(self, content: bytes, kind: str) -> Any:
-        async def answer(request: Request) -> Response:
-            if request.headers.get("host") not in self._hosts:
-                return PlainTextResponse("this host is not served", 403, headers=_HEADERS)
-            return Response(content, media_type=kind, headers=_HEADERS)
+    def _app(self, token: str, hosts: tuple[str, ...]) -> Starlette:
+        async def events(request: Request) -> Response:
+            # The browser's own reader of events sends no headers.
+            if not secrets.compare_digest(request.query_params.get("token", "").encode(), token.encode()):
+                return PlainTextResponse("open the address that kcal live printed", 403)
+            return StreamingResponse(self._told(request), media_type="text/event-stream")
 
-        return answer
-
-    async def _events(self, request: Request) -> Response:
-        given = request.query_params.get("token", "")
-        known = secrets.compare_digest(given.encode(), self._token.encode())
-        if request.headers.get("host") not in self._hosts or not known:
-            return PlainTextResponse("open the address that kcal live printed", 403, headers=_HEADERS)
-        return StreamingResponse(self._told(request), media_type="text/event-stream", headers=_HEADERS)
+        pages = page_files(("kcal.pipeline", "page"), ("kcal.report", "leaflet"))
+        return local_app([Route("/events", events)], pages, token, hosts)
 
     async def _told(self, request: Request) -> AsyncIterator[bytes]:
         yield b"event: site\ndata: " + self._site + b"\n\n"
         seen, quiet = 0, 0.0
-        while not self._server.should_exit and not await request.is_disconnected():
+        while not self._ended.is_set() and not await request.is_disconnected():
             number, text = self._news
             if number != seen:
                 seen, quiet = number, 0.0

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 
-from kcal.locate.cep import circular_error
-from kcal.locate.columns import NUMBERS, PositionColumns
-from kcal.locate.geodesy import azimuth_elevation
+from kcal.locate.columns import PositionColumns
+from kcal.locate.localizer import Localization
 from kcal.locate.stereo import PositionStatus
+from kcal.locate.tabulate import number_table
+from kcal.pipeline.estimates import TrackStates
 from kcal.pipeline.tracks import Tracks
 
 _REASONS = {
@@ -25,25 +25,11 @@ def track_columns(tracks: Tracks, sequence: int) -> PositionColumns:
         tracks: of one moment.
         sequence: number of the moment, which together with the name is never used twice.
     """
-    state = tracks.state
+    state = TrackStates(*(value.cpu() for value in tracks.state))
     ok = state.status == int(PositionStatus.OK)
     count = len(tracks.number)
-    table = np.full((len(NUMBERS), count), np.nan)
-    circles = torch.full((count, 2), torch.nan, dtype=torch.float64)
-    circles[ok] = circular_error(state.enu[ok], state.covariance[ok])
-    covariance = state.covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    everywhere = torch.ones_like(ok)
-    for first, where, values in (
-        ("lat", ok, state.geodetic.T),
-        ("east_m", ok, state.enu.T),
-        ("range_m", ok, 1.0 / torch.where(ok, state.inverse_range, 1.0)[None]),
-        ("range_low_m", torch.isfinite(state.range_low), torch.stack([state.range_low, state.range_high])),
-        ("cov_ee_m2", ok, covariance.T),
-        ("cep50_m", ok, circles.T),
-        ("azimuth_deg", everywhere, azimuth_elevation(state.bearing).T),
-    ):
-        row = NUMBERS.index(first)
-        np.copyto(table[row : row + len(values)], values.cpu().numpy(), where=where.cpu().numpy())
+    shared = {name: value for name, value in state._asdict().items() if name in Localization._fields}
+    numbers = number_table(Localization(**shared, reprojection=torch.zeros(count, 2)))
     velocity = [_texts(state.velocity[:, i], ok) for i in range(3)]
     sigma = state.velocity_covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     extras = {
@@ -59,11 +45,8 @@ def track_columns(tracks: Tracks, sequence: int) -> PositionColumns:
         "velocity_north_sigma_mps": _texts(sigma[:, 1], ok),
         "velocity_up_sigma_mps": _texts(sigma[:, 2], ok),
     }
-    status = state.status.cpu().numpy()
-    names = [f"track {number}" for number in tracks.number]
-    return PositionColumns(
-        names, status, [_REASONS[int(code)] for code in status], np.ascontiguousarray(table.T), extras
-    )
+    names, status = [f"track {number}" for number in tracks.number], state.status.numpy()
+    return PositionColumns(names, status, [_REASONS[int(code)] for code in status], numbers, extras)
 
 
 def _texts(values: torch.Tensor, ok: torch.Tensor) -> list[str]:

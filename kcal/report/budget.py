@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
+import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from torch import Tensor
 
+from kcal.errors import InputError
 from kcal.locate.budget import RangeError
 from kcal.report.figures import new_figure, plain_number, save_picture
 
 _SOURCE_COLORS = {"disparity": "#2b6cb0", "yaw": "#c02a6b", "baseline": "#4b5563", "timing": "#dd7a1f"}
+
+
+def plotted_ranges(distances: Sequence[float]) -> Tensor:
+    """(121,) ranges for a plot, evenly spaced on a logarithmic scale from the nearest to the farthest.
+
+    Raises:
+        InputError: fewer than two distances.
+
+    Example:
+        >>> plotted_ranges([100.0, 10000.0])[[0, 60, 120]].tolist()
+        [100.0, 1000.0, 10000.0]
+    """
+    if len(distances) < 2:
+        raise InputError("distances: a plot needs at least two")
+    near, far = min(distances), max(distances)
+    # The ends themselves, which rounding of the logarithm may push out of view.
+    return torch.logspace(math.log10(near), math.log10(far), 121, dtype=torch.float64).clamp(near, far)
 
 
 def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]) -> Figure:

@@ -183,7 +183,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
         for p in located.positions
         if p.lat is not None and p.lon is not None
     ]
-    rings = [[(lat, near(lon, located.origin.lon)) for lat, lon in ring] for _, ring in region_rings(located)]
+    rings = [[(lat, near(lon, located.origin.lon)) for lat, lon in ring] for ring in region_rings(located)]
     return {
         "cameras": cameras, "arcs": arcs, "regions": rings, "bearings": bearings, "arrows": arrows, "truth": true,
         "points": points,

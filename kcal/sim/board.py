@@ -32,36 +32,6 @@ class LensLike(Protocol):
         """Whether pixels lie on the image."""
 
 
-class RigLike(Protocol):
-    """A `StereoRig`, or a `TrueRig`."""
-
-    @property
-    def left(self) -> LensLike:
-        """The first camera."""
-
-    @property
-    def right(self) -> LensLike:
-        """The second camera."""
-
-    @property
-    def right_from_left_rotation(self) -> Tensor:
-        """(3, 3)."""
-
-    @property
-    def right_from_left_translation(self) -> Tensor:
-        """(3,) meters."""
-
-    @property
-    def baseline(self) -> Tensor:
-        """Distance between the cameras, meters."""
-
-    def right_from_left(self, points_left: Tensor) -> Tensor:
-        """Move points (..., N, 3) from the left camera's frame into the right camera's."""
-
-    def __call__(self, points_left: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Project points (..., N, 3) of the left frame: pixels_left, pixels_right (..., N, 2), valid in both."""
-
-
 class BoardLike(Protocol):
     """Anything with a number of inner corners and a square size in meters."""
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
-from kcal.sim.board import BoardLike, BoardPose, LensLike, RigLike, board_points
+from kcal.sim.board import BoardLike, BoardPose, LensLike, board_points
 
 _POSE_DRAWS = 4096
 
@@ -83,68 +83,18 @@ def sample_board_poses(
         True
     """
     options = options or PoseOptions()
-    _check_draws(count, "fill", fill)
+    check_draws(count, "fill", fill)
     width, height = camera.size
     extent = ((board.columns + 1) * board.square, (board.rows + 1) * board.square)
     focal = camera.focal.detach()
     unit = max(float(focal[0]) * extent[0] / width, float(focal[1]) * extent[1] / height)
-    drawn = _draw(camera, board, (unit / fill[1], unit / fill[0]), None, generator, options)
+    drawn = draw_poses(camera, board, (unit / fill[1], unit / fill[0]), None, generator, options)
     still = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    return _choose(drawn, [(camera, *still)], board, count, options)
+    return choose_poses(drawn, [(camera, *still)], board, count, options)
 
 
-def sample_pair_poses(
-    rig: RigLike,
-    board: BoardLike,
-    count: int,
-    generator: torch.Generator,
-    *,
-    distance: tuple[float, float],
-    options: PoseOptions | None = None,
-) -> list[BoardPose]:
-    """Choose poses that both cameras of a rig see completely, tilted against the line from the rig's middle.
-
-    Args:
-        rig: two cameras.
-        board: its size.
-        count: how many poses.
-        generator: source of the draws; the same state gives the same poses.
-        distance: nearest and farthest distance of the board's center from the left camera, meters.
-        options: limits of tilt, roll and margins.
-
-    Returns:
-        left_from_board poses; `rig_pose` gives those of the right camera.
-
-    Raises:
-        InputError: fewer than `count` of 4096 drawn boards are completely seen by both, or an argument out of range.
-
-    Example:
-        >>> from kcal import Camera
-        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
-        >>> from kcal import StereoRig
-        >>> rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
-        >>> from kcal.sim.board import BoardSize, project_board
-        >>> board = BoardSize(9, 6, 0.1)
-        >>> poses = sample_pair_poses(rig, board, 4, torch.Generator().manual_seed(1), distance=(4.0, 6.0))
-        >>> bool(project_board(rig.right, rig_pose(rig, poses[0]), board)[1].all())
-        True
-    """
-    options = options or PoseOptions()
-    _check_draws(count, "distance", distance)
-    rotation, translation = rig.right_from_left_rotation, rig.right_from_left_translation
-    middle = -0.5 * rotation.T @ translation
-    drawn = _draw(rig.left, board, distance, middle, generator, options)
-    still = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    return _choose(drawn, [(rig.left, *still), (rig.right, rotation, translation)], board, count, options)
-
-
-def rig_pose(rig: RigLike, left_from_board: tuple[Tensor, Tensor]) -> BoardPose:
-    """Convert left_from_board to right_from_board."""
-    rotation, translation = left_from_board
-    return BoardPose(rig.right_from_left_rotation @ rotation, rig.right_from_left(translation))
-
-
-def _check_draws(count: int, name: str, limits: tuple[float, float]) -> None:
+def check_draws(count: int, name: str, limits: tuple[float, float]) -> None:
+    """Raise `InputError` for a number of poses, or limits called `name`, that cannot be."""
     if not isinstance(count, int) or not 1 <= count <= _POSE_DRAWS:
         raise InputError(f"count: a whole number from 1 to {_POSE_DRAWS} is needed, got {count!r}")
     if not 0 < limits[0] <= limits[1] < math.inf:
@@ -152,7 +102,7 @@ def _check_draws(count: int, name: str, limits: tuple[float, float]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Drawn:
+class DrawnPoses:
     """Random poses, and where they lie in the space in which they are to be spread out (draws, 3)."""
 
     rotation: Tensor
@@ -160,14 +110,15 @@ class _Drawn:
     features: Tensor
 
 
-def _draw(
+def draw_poses(
     camera: LensLike,
     board: BoardLike,
     distance: tuple[float, float],
     eye: Tensor | None,
     generator: torch.Generator,
     options: PoseOptions,
-) -> _Drawn:
+) -> DrawnPoses:
+    """Draw poses over the image, at distances of the board's center, tilted against the line from `eye` (3,)."""
     random = torch.rand((_POSE_DRAWS, 6), dtype=torch.float64, generator=generator)
     with torch.no_grad():
         aim = random[:, :2] * torch.tensor(camera.size, dtype=torch.float64) - 0.5
@@ -192,12 +143,17 @@ def _draw(
         tilt / max(options.max_tilt, 1e-9) * torch.sin(towards),
         random[:, 2],
     ]
-    return _Drawn(rotation=rotation, translation=translation, features=0.4 * torch.stack(features, -1))
+    return DrawnPoses(rotation=rotation, translation=translation, features=0.4 * torch.stack(features, -1))
 
 
-def _choose(
-    drawn: _Drawn, cameras: list[tuple[LensLike, Tensor, Tensor]], board: BoardLike, count: int, options: PoseOptions
+def choose_poses(
+    drawn: DrawnPoses,
+    cameras: list[tuple[LensLike, Tensor, Tensor]],
+    board: BoardLike,
+    count: int,
+    options: PoseOptions,
 ) -> list[BoardPose]:
+    """Choose drawn poses, far from each other, that all cameras (lens, rotation, translation) see completely."""
     points = board_points(board, options.border)
     columns = board.columns + 2 * options.border
     # Most draws end here: the outermost four points are a few percent of the work.
@@ -221,7 +177,7 @@ def _choose(
 
 
 def _see(
-    drawn: _Drawn,
+    drawn: DrawnPoses,
     index: Tensor,
     cameras: list[tuple[LensLike, Tensor, Tensor]],
     points: Tensor,

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
-from kcal.sim.board import BoardLike, BoardPose, BoardSize, PrintedBoard, RigLike, project_board
-from kcal.sim.poses import PoseOptions, rig_pose, sample_board_poses, sample_pair_poses
+from kcal.sim.board import BoardLike, BoardPose, PrintedBoard, project_board
+from kcal.sim.poses import sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
 from kcal.sim.true_rig import TrueRig, drawn_rig
 
@@ -47,16 +47,7 @@ _LANDMARKS = (
     ("bridge", 1150.0, -8.0, -24.0),
     ("hill", 2100.0, 19.0, 120.0),
 )
-# Surveyed too, but used for checks only.
-_CHECKS = (
-    ("stake", 200.0, 5.0, -13.0),
-    ("trough", 300.0, 22.0, -10.0),
-    ("gable", 550.0, -29.0, 14.0),
-    ("lamp", 800.0, -1.0, 22.0),
-    ("crane", 1300.0, 16.0, 55.0),
-    ("cairn", 2400.0, -16.0, 100.0),
-)
-_NEAR_BOARD, _PAIR_BOARD = PrintedBoard(9, 6, 0.06, seed=1), BoardSize(9, 6, 0.4)
+_NEAR_BOARD = PrintedBoard(9, 6, 0.06, seed=1)
 # mm: the focal length that 1600 px are on a sensor of 1/2.8 inch, whose pixels measure 2.9 µm.
 FOCAL_MM = 4.64
 _RENDER = RenderOptions(blur=1.0, noise=4.0, vignetting=0.3, gamma=2.2)
@@ -83,15 +74,13 @@ class DemoView(NamedTuple):
     """One rendered image.
 
     Attributes:
-        kind: "near" (one camera's own calibration) or "pair" (seen by both cameras at once).
         camera: "left" or "right".
-        name: of the view, for example "near-07"; both images of a pair have the same.
+        name: of the view, for example "near-07".
         image: (height, width) uint8.
         corners: (N, 2) true pixels of the inner corners, row by row.
         cam_from_board: true pose.
     """
 
-    kind: Literal["near", "pair"]
     camera: Literal["left", "right"]
     name: str
     image: Tensor
@@ -130,27 +119,23 @@ class DemoScene:
         roll_deg: turn of the left camera about its axis, degrees, clockwise as seen from behind it.
         near_board: board for close views of one camera each, held at 0.7 to 1.6 m.
         near_views: how many per camera.
-        pair_board: board for views of both cameras at once; every square is larger than 15 px in the image.
-        pair_views: how many; none by default, because few sites have a board of 3 m.
-        pair_distance: nearest and farthest distance of that board, meters.
         render: how images look.
         mark_sigma: noise of marks in pixels along each axis in each image.
         survey_sigma: error of surveyed positions in meters, along each axis.
         targets_at: points to locate: name, distance in meters, bearing in degrees to the right of the heading, height
             in meters.
         landmarks_at: points surveyed to orient the rig, likewise.
-        checks_at: points surveyed to check the rig, likewise; not used for anything else.
 
     Example:
-        >>> scene = DemoScene(seed=1, near_views=4, pair_views=2)
+        >>> scene = DemoScene(seed=1, near_views=4)
         >>> scene.images
-        12
+        8
         >>> scene.targets.names[-1], [round(value) for value in scene.targets.enu[-1].tolist()]
         ('drone', [1545, 4755, 180])
     """
 
     seed: int = 0
-    rig: RigLike = field(default_factory=demo_rig)
+    rig: TrueRig = field(default_factory=demo_rig)
     lat: float = 40.762
     lon: float = -113.896
     height: float = 1282.0
@@ -159,20 +144,16 @@ class DemoScene:
     roll_deg: float = 0.4
     near_board: BoardLike = _NEAR_BOARD
     near_views: int = 20
-    pair_board: BoardSize = _PAIR_BOARD
-    pair_views: int = 0
-    pair_distance: tuple[float, float] = (13.0, 25.0)
     render: RenderOptions = _RENDER
     mark_sigma: float = 0.1
     survey_sigma: float = 0.02
     targets_at: Places = _TARGETS
     landmarks_at: Places = _LANDMARKS
-    checks_at: Places = _CHECKS
 
     @property
     def images(self) -> int:
         """How many images `render_demo` yields."""
-        return 2 * (self.near_views + self.pair_views)
+        return 2 * self.near_views
 
     @property
     def enu_from_rig(self) -> Tensor:
@@ -190,17 +171,12 @@ class DemoScene:
     @property
     def targets(self) -> NamedPoints:
         """Points to be located, from 100 m to 5 km; two of them near the image's left and right edge."""
-        return self._points(self.targets_at)
+        return self.places(self.targets_at)
 
     @property
     def landmarks(self) -> NamedPoints:
         """Points for the orientation of the rig, from 120 m to 2.6 km, where they truly are."""
-        return self._points(self.landmarks_at)
-
-    @property
-    def checks(self) -> NamedPoints:
-        """Points to check the rig with, where they truly are."""
-        return self._points(self.checks_at)
+        return self.places(self.landmarks_at)
 
     def surveyed(self, points: NamedPoints) -> NamedPoints:
         """Add the surveyor's errors to points."""
@@ -211,17 +187,12 @@ class DemoScene:
     @property
     def target_marks(self) -> SceneMarks:
         """The targets marked in both images, with the scene's noise."""
-        return self._marks(self.targets, -1)
+        return self.marked(self.targets, -1)
 
     @property
     def landmark_marks(self) -> SceneMarks:
         """The landmarks marked in both images, with the scene's noise."""
-        return self._marks(self.landmarks, -2)
-
-    @property
-    def check_marks(self) -> SceneMarks:
-        """The check points marked in both images, with the scene's noise."""
-        return self._marks(self.checks, -3)
+        return self.marked(self.landmarks, -2)
 
     def points_rig(self, points: NamedPoints) -> Tensor:
         """(N, 3) positions in the left camera's frame."""
@@ -231,10 +202,12 @@ class DemoScene:
         """Make the random source of one part of the scene, so that the parts do not depend on each other."""
         return torch.Generator().manual_seed((self.seed + 1) * 1_000_003 + stream)
 
-    def _marks(self, points: NamedPoints, stream: int) -> SceneMarks:
+    def marked(self, points: NamedPoints, stream: int) -> SceneMarks:
+        """Points marked in both images, with the scene's noise."""
         return mark_points(self.rig, self.points_rig(points), self.mark_sigma, self.generator(stream))
 
-    def _points(self, table: Places) -> NamedPoints:
+    def places(self, table: Places) -> NamedPoints:
+        """Points of a table such as `targets_at`, where they truly are."""
         azimuth = [math.radians(self.heading_deg + bearing) for _, _, bearing, _ in table]
         rows = [
             [distance * math.sin(angle), distance * math.cos(angle), up]
@@ -243,7 +216,7 @@ class DemoScene:
         return NamedPoints(tuple(name for name, *_ in table), torch.tensor(rows, dtype=torch.float64))
 
 
-def mark_points(rig: RigLike, points_rig: Tensor, sigma: float, generator: torch.Generator) -> SceneMarks:
+def mark_points(rig: TrueRig, points_rig: Tensor, sigma: float, generator: torch.Generator) -> SceneMarks:
     """Mark points in both images with Gaussian noise.
 
     Args:
@@ -275,7 +248,7 @@ def mark_points(rig: RigLike, points_rig: Tensor, sigma: float, generator: torch
 
 
 def render_demo(scene: DemoScene, progress: Callable[[str], None] | None = None) -> Iterator[DemoView]:
-    """Render all images of a scene, one after the other: left's near views, right's, then the pairs.
+    """Render all images of a scene, one after the other: left's views of the board, then right's.
 
     Args:
         scene: what to render.
@@ -288,43 +261,24 @@ def render_demo(scene: DemoScene, progress: Callable[[str], None] | None = None)
         InputError: the scene's boards cannot be seen as asked.
 
     Example:
-        >>> view = next(render_demo(DemoScene(seed=1, near_views=1, pair_views=1)))
-        >>> view.kind, view.camera, view.name, tuple(view.image.shape), tuple(view.corners.shape)
-        ('near', 'left', 'near-01', (1080, 1920), (54, 2))
+        >>> view = next(render_demo(DemoScene(seed=1, near_views=1)))
+        >>> view.camera, view.name, tuple(view.image.shape), tuple(view.corners.shape)
+        ('left', 'near-01', (1080, 1920), (54, 2))
     """
-    for index, (kind, side, name, pose) in enumerate(_scene_views(scene)):
-        camera, board = getattr(scene.rig, side), scene.near_board if kind == "near" else scene.pair_board
-        image = render_board(camera, pose, board, scene.render, scene.generator(index))
-        corners, _ = project_board(camera, pose, board)
+    for index, (side, name, pose) in enumerate(scene_views(scene)):
+        camera = getattr(scene.rig, side)
+        image = render_board(camera, pose, scene.near_board, scene.render, scene.generator(index))
+        corners, _ = project_board(camera, pose, scene.near_board)
         if progress is not None:
             progress(f"{side} {name}")
-        yield DemoView(kind, side, name, image, corners, pose)
+        yield DemoView(side, name, image, corners, pose)
 
 
-class _View(NamedTuple):
-    kind: Literal["near", "pair"]
-    camera: Literal["left", "right"]
-    name: str
-    pose: BoardPose
-
-
-def _scene_views(scene: DemoScene) -> Iterator[_View]:
+def scene_views(scene: DemoScene) -> Iterator[tuple[Literal["left", "right"], str, BoardPose]]:
+    """Camera, name and pose of each view of the board."""
     sides: tuple[Literal["left", "right"], ...] = ("left", "right")
     for stream, side in enumerate(sides):
         camera = getattr(scene.rig, side)
         poses = sample_board_poses(camera, scene.near_board, scene.near_views, scene.generator(-10 - stream))
         for number, pose in enumerate(poses, 1):
-            yield _View("near", side, f"near-{number:02d}", pose)
-    if not scene.pair_views:
-        return
-    pairs = sample_pair_poses(
-        scene.rig,
-        scene.pair_board,
-        scene.pair_views,
-        scene.generator(-12),
-        distance=scene.pair_distance,
-        options=PoseOptions(max_tilt=math.radians(35.0), max_roll=math.radians(10.0)),
-    )
-    for number, pose in enumerate(pairs, 1):
-        for side in sides:
-            yield _View("pair", side, f"pair-{number:02d}", pose if side == "left" else rig_pose(scene.rig, pose))
+            yield side, f"near-{number:02d}", pose

@@ -23,18 +23,6 @@ class DenseLinearization:
         normal, gradient = scaled.transpose(-1, -2) @ scaled, (scaled * residuals[..., None]).sum(-2)
         self._parts = 0.5 * (residuals * residuals).sum(-1), scale, normal, gradient
 
-    @classmethod
-    def of_rows(cls, rows: Tensor) -> DenseLinearization:
-        """From (..., P + 1, R), the derivatives by each parameter and last the residuals, with a single product."""
-        self = cls.__new__(cls)
-        gram = rows @ rows.transpose(-1, -2)
-        normal = gram[..., :-1, :-1]
-        diagonal = normal.diagonal(dim1=-2, dim2=-1)
-        scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
-        scaled = normal * scale[..., :, None] * scale[..., None, :]
-        self._parts = 0.5 * gram[..., -1, -1], scale, scaled, gram[..., :-1, -1] * scale
-        return self
-
     @property
     def cost(self) -> Tensor:
         """See `Linearization`."""

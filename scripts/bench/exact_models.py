@@ -22,7 +22,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.lens.camera import Camera
 from kcal.sim.board import board_points
 from kcal.sim.captures import PAPER_BOARD, capture_corners
-from kcal.sim.infinity import error_at_infinity
+from scripts.shared.infinity import error_at_infinity
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 from scripts.shared.traced import BOARD, as_observations

@@ -30,7 +30,7 @@ from kcal.lens.gaussian_modes import GaussianModes
 from kcal.lens.network_modes import NetworkModes
 from kcal.lens.projection import from_pixels
 from kcal.lens.zernike import ZernikeModes
-from kcal.nets.field_features import train_features
+from scripts.shared.field_features import train_features
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 from scripts.shared.wide_lens import folds, held_out, load

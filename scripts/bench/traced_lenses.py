@@ -36,8 +36,8 @@ from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.uncertainty import pixel_covariance
 from kcal.sim.captures import drawn_lens
-from kcal.sim.infinity import error_at_infinity
 from kcal.sim.truth import TruthLens
+from scripts.shared.infinity import error_at_infinity
 from scripts.shared.page import table, write_section
 from scripts.shared.timing import show
 from scripts.shared.traced import BOARD, captures, printed

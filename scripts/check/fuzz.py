@@ -37,9 +37,10 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
 from kcal.io.lookup_file import load_lookup, save_lookup
-from kcal.io.rig_file import RigMounting, rig_to_file
+from kcal.io.rig_file import save_rig
 from kcal.lens.baking import bake
 from kcal.lens.camera import Camera
+from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.rig import StereoRig
 
 BOARD = Board(columns=6, rows=5, square=0.02)
@@ -84,8 +85,8 @@ def make_files(folder: Path) -> dict[str, bytes]:
     observations.save(folder / "obs.json")
     calibrate_camera(observations, CalibrationOptions(model="opencv4")).file(name="left").save(folder / "camera.json")
     rig = StereoRig(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
-    mounting = RigMounting(lat=10.0, lon=20.0, height=3.0, heading_deg=30.0, pitch_deg=0.0, roll_deg=0.0)
-    rig_to_file(rig, mounting=mounting).save(folder / "rig.json")
+    rig.mounting = Mounting(origin=Origin(lat=10.0, lon=20.0, height=3.0), heading_deg=30.0)
+    save_rig(rig, folder / "rig.json")
     half = 1e-5 * torch.eye(28, dtype=torch.float64)
     plate = Board(columns=9, rows=6, square=0.025)
     flat = MeasuredBoard(name="A", board=plate, amplitudes=0 * half[0], half=half, log_evidence=0.0)

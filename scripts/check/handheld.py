@@ -8,11 +8,12 @@
 Captures that FILE has are not made again, so that a run can be interrupted, and split over several files.
 
 Truth: three traced lenses in turn, decentered, whose entrance pupils move; printed boards (7 x 6 corners, 5 cm), noise
-of 0.08 px. By hand (`kcal.sim.moving_captures`): the camera or the board is held, in turn; a rolling shutter with a
-readout of 10 to 30 ms; rates of 0.1 to 1 rad/s and 0.05 to 0.3 m/s (standard deviation along each axis, drawn for each
-capture), half of their variance tremor of 2 to 10 Hz; exposures of 5 to 20 ms, pictures with more than 12 px of blur
-taken again; noise grows along the blur, as the views' covariances say. Measure: as in `scripts.bench.traced_lenses`,
-where the camera sees infinitely distant points, all over the image, after the best turn.
+of 0.08 px. By hand (`scripts.shared.moving_captures`): the camera or the board is held, in turn; a rolling shutter with
+a readout of 10 to 30 ms; rates of 0.1 to 1 rad/s and 0.05 to 0.3 m/s (standard deviation along each axis, drawn for
+each capture), half of their variance tremor of 2 to 10 Hz; exposures of 5 to 20 ms, pictures with more than 12 px of
+blur taken again; noise grows along the blur, as the views' covariances say. Measure: as in
+`scripts.bench.traced_lenses`, where the camera sees infinitely distant points, all over the image, after the best
+turn.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python -m scripts.check.handheld_rigs --out FILE --seeds 0-99
     python -m scripts.check.handheld_rigs --out FILE --write     # the table in docs/measured
 
-Truth: two exact cameras of 1280 x 960 pixels, 25 cm apart, which see twelve boards (9 x 6 corners, 5 cm); noise of
-0.1 px; hands as in `kcal.sim.moving_captures`, for each camera its own. Measure: the error of the relative pose (six
+Truth: two exact cameras of 1280 x 960 pixels, 25 cm apart, which see twelve boards (9 x 6 corners, 5 cm); noise of 0.1
+px; hands as in `scripts.shared.moving_captures`, for each camera its own. Measure: the error of the relative pose (six
 numbers) in units of its covariance, squared and divided by six, which is one on the average; and the errors themselves.
 """
 
@@ -27,8 +27,8 @@ from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.sim.board import BoardPose, BoardSize
-from kcal.sim.moving_captures import Hands, MovingCapture, moving_capture
 from kcal.sim.poses import sample_board_poses
+from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
 from scripts.shared.page import table, write_section
 from scripts.shared.records import Record, finish, read, seeds
 from scripts.shared.simulated import view_of

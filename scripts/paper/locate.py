@@ -22,7 +22,7 @@ from kcal.errors import KcalError
 from kcal.lens.camera import Camera
 from kcal.locate.triangulate import Triangulate
 from kcal.sim.scene import DemoScene
-from scripts.paper.site import MARK_SIGMA, SURVEY_SIGMA
+from scripts.paper.site import MARK_SIGMA, SURVEY_SIGMA, PaperScene
 from scripts.shared.long_range import range_sigma
 
 SIDES = ("left", "right")
@@ -35,7 +35,7 @@ Rig = tuple[Callable[[Tensor, Tensor], Tensor], Callable[[Tensor], tuple[Tensor,
 Orient = Callable[[Tensor, Tensor, Tensor], Rig]
 
 
-def judge(scene: DemoScene, orient: Orient) -> dict[str, Any]:
+def judge(scene: PaperScene, orient: Orient) -> dict[str, Any]:
     """Errors of the seven points, of far points all over the image, and of the check points; meters and pixels."""
     targets, marks, far = scene.targets.enu, scene.target_marks, far_points(scene)
     true = marks.true_left, marks.true_right
@@ -75,7 +75,7 @@ def judge(scene: DemoScene, orient: Orient) -> dict[str, Any]:
     return found | {"total": (total / (DRAWS * MARKINGS)).sqrt().tolist()}
 
 
-def nowhere(scene: DemoScene) -> dict[str, Any]:
+def nowhere(scene: PaperScene) -> dict[str, Any]:
     """What is recorded where there is no camera, or no rig."""
     none, places = [NAN] * len(scene.targets.names), [[NAN] * 3] * len(scene.targets.names)
     each = {name: [none] * DRAWS for name in ("range_error", "position_error", "reprojection")}

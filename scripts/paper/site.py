@@ -23,7 +23,7 @@ from kcal.sim.board import PrintedBoard
 from kcal.sim.captures import PAPER_BOARD
 from kcal.sim.poses import sample_board_poses
 from kcal.sim.render import RenderOptions, render_board
-from kcal.sim.scene import FOCAL_MM, DemoScene, Places
+from kcal.sim.scene import FOCAL_MM, DemoScene, NamedPoints, Places, SceneMarks
 from kcal.sim.true_rig import drawn_rig
 
 BOARD = Board(columns=PAPER_BOARD.columns, rows=PAPER_BOARD.rows, square=PAPER_BOARD.square)
@@ -35,6 +35,34 @@ LOOKS = {
     "vision": RenderOptions(blur=0.7, noise=1.5, vignetting=0.1),
 }
 CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+
+
+# Surveyed too, but used for checks only; as `DemoScene.landmarks_at`.
+_CHECKS = (
+    ("stake", 200.0, 5.0, -13.0),
+    ("trough", 300.0, 22.0, -10.0),
+    ("gable", 550.0, -29.0, 14.0),
+    ("lamp", 800.0, -1.0, 22.0),
+    ("crane", 1300.0, 16.0, 55.0),
+    ("cairn", 2400.0, -16.0, 100.0),
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class PaperScene(DemoScene):
+    """The demonstration's site with points to check a rig, surveyed too and used for nothing else."""
+
+    checks_at: Places = _CHECKS
+
+    @property
+    def checks(self) -> NamedPoints:
+        """Points to check the rig with, where they truly are."""
+        return self.places(self.checks_at)
+
+    @property
+    def check_marks(self) -> SceneMarks:
+        """The check points marked in both images, with the scene's noise."""
+        return self.marked(self.checks, -3)
 
 
 class Kind(NamedTuple):
@@ -58,9 +86,9 @@ KINDS = {
 }
 
 
-def paper_scene(kind: Kind, seed: int) -> DemoScene:
+def paper_scene(kind: Kind, seed: int) -> PaperScene:
     """The site of one draw: its own lenses, print of the board, survey and marks."""
-    plain = DemoScene()
+    plain = PaperScene()
 
     def seen(places: Places) -> Places:
         return tuple((label, meters, kind.field * bearing, up) for label, meters, bearing, up in places)

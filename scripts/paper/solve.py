@@ -17,10 +17,10 @@ from kcal.calibrate.camera.compare import compare_models
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from kcal.lens.camera import Camera
-from kcal.sim.infinity import error_at_infinity
 from kcal.sim.truth import TruthLens
 from scripts.paper.locate import bound, by_kcal, by_opencv, judge, nowhere
 from scripts.paper.site import KINDS, observe, paper_scene
+from scripts.shared.infinity import error_at_infinity
 
 # What the paper calls 14, 16, 18, 20, 20 (its second one), 22 and 24 parameters.
 MODELS = {

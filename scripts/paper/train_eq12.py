@@ -35,8 +35,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.projection import from_pixels, project_components
 from kcal.nets.inverse import InverseNet
 from kcal.nets.mlp import evaluate
-from kcal.nets.residual import ResidualNet, train_residual
 from kcal.solve.lm import LMOptions, minimize
+from scripts.paper.residual_net import ResidualNet, train_residual
 from scripts.shared.page import write_section
 from scripts.shared.timing import row, show
 from scripts.shared.wide_lens import folds, held_out, load, subset, warped

@@ -30,9 +30,9 @@ from kcal.calibrate.problem.poses import poses_under
 from kcal.calibrate.problem.views import Views
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
-from kcal.nets.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.result import State
+from scripts.paper.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
 from scripts.shared.page import write_section
 from scripts.shared.timing import median, row, show, spread
 from scripts.shared.views import COLUMNS, NOISE, ROWS, SIZE, simulate

@@ -19,10 +19,10 @@ from kcal.lens.camera import Camera
 from kcal.lens.uncertainty import pixel_covariance
 from kcal.sim.board import PrintedBoard
 from kcal.sim.captures import drawn_lens
-from kcal.sim.infinity import error_at_infinity
-from kcal.sim.moving_captures import Hands, MovingCapture, moving_capture
 from kcal.sim.poses import PoseOptions, sample_board_poses
 from kcal.sim.truth import TruthLens
+from scripts.shared.infinity import error_at_infinity
+from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
 from scripts.shared.records import Record
 
 BOARD = Board(columns=7, rows=6, square=0.05)

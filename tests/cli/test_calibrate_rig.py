@@ -344,7 +344,7 @@ class TestRig:
         assert file.calibration.pairs == 6
         assert file.calibration.baseline_m == pytest.approx(float(RIG.baseline), abs=0.001)
         assert file.mounting is None
-        assert file.joint_covariance() is not None
+        assert file.known() is not None
 
     @pytest.mark.slow
     @pytest.mark.parametrize("keep_all", [False, True])

@@ -5,7 +5,9 @@ import pytest
 import torch
 from skimage.registration import phase_cross_correlation
 
-from kcal.corners.match import MatchOptions, MatchStatus, blurred_window, match_points
+from kcal.corners.filters import filtered, gaussian_kernel
+from kcal.corners.match import MatchOptions, MatchStatus, match_points
+from kcal.corners.patch_windows import has_samples, image_windows, sample
 from kcal.corners.point import enlarge, refine_point
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
@@ -135,10 +137,11 @@ class TestMatch:
         assert float(found.off_line.max()) < 0.02
 
     @pytest.mark.slow
-    def test_covariance_is_the_spread(self):
+    @pytest.mark.parametrize("noise", [1.0, 8.0])
+    def test_covariance_is_the_spread(self, noise):
         errors, predicted = [], []
         for seed in range(12):
-            rig, left, right = stereo(noise=1.0, seed=seed)
+            rig, left, right = stereo(noise=noise, seed=seed)
             found = match_points(rig, left, right, PIXELS, MatchOptions(nearest=40.0))
             good = found.status == MatchStatus.GOOD
             errors.append((found.pixels - truth_of(rig, PIXELS, 60.0))[good])
@@ -146,7 +149,7 @@ class TestMatch:
         errors, predicted = torch.cat(errors), torch.cat(predicted)
         assert len(errors) > 40
         ratio = predicted.diagonal(dim1=-2, dim2=-1).mean().sqrt() / errors.square().mean().sqrt()
-        # 90 numbers know their spread to 8 %. At noise 8 the prediction is half of the truth: slopes are noisy too.
+        # 90 numbers know their spread to 8 %.
         assert 0.75 < float(ratio) < 1.3
 
     def test_brightness_and_contrast_do_not_matter(self):
@@ -214,17 +217,27 @@ class TestMatch:
             MatchOptions(half=0)
 
 
-@pytest.mark.parametrize(
-    ("where", "shape", "corner"),
-    [((3000.0, -900.0), (1, 1), (199, 0)), ((-900.0, 3000.0), (1, 1), (0, 99)), ((100.0, 50.0), None, None)],
-)
-def test_windows_beyond_the_image_hold_its_nearest_pixel(where, shape, corner):
-    """They are never empty, and never larger than what was asked for."""
+def test_windows_cover_what_was_asked_for_and_say_where_they_end():
     image = torch.rand(100, 200, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    window = blurred_window(image, torch.tensor([where], dtype=torch.float64))
-    assert window.size == (200, 100)
-    if shape is None:
-        assert window.values.shape[0] == window.values.shape[1] < 100
-    else:
-        assert tuple(window.values.shape) == shape
-        assert tuple(window.corner.tolist()) == corner
+    asked = torch.tensor([[[20.3, 30.8], [90.0, 41.2]], [[1.0, 1.0], [198.0, 98.0]]], dtype=torch.float64)
+    windows = image_windows(image, asked, 0, math.inf)
+    assert bool(has_samples(windows, asked).all())
+    kernel = gaussian_kernel(0.8, 3)
+    here = filtered(image, kernel, kernel)
+    assert sample(windows, torch.tensor([[[21.0, 40.0]], [[57.0, 98.0]]], dtype=torch.float64)).tolist() == [
+        [pytest.approx(float(here[40, 21]))],
+        [pytest.approx(float(here[98, 57]))],
+    ]
+    # In the image, but beside the first window.
+    assert has_samples(windows, torch.tensor([5.0, 10.0]).double().expand(2, 1, 2)).tolist() == [[False], [True]]
+    # Beyond the image, and where a sample's slope would be.
+    for odd in ((400.0, 35.0), (21.0, 99.0), (21.0, -3.0), (0.5, 30.0)):
+        assert not bool(has_samples(windows, torch.tensor(odd).double().expand(2, 1, 2)).any())
+
+
+def test_a_window_far_beyond_the_image_has_no_samples():
+    image = torch.rand(100, 200, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    asked = torch.tensor([[[3000.0, -900.0]]], dtype=torch.float64)
+    windows = image_windows(image, asked, 0, math.inf)
+    assert windows.values.shape[1] < 10
+    assert not bool(has_samples(windows, asked).any())

@@ -14,6 +14,7 @@ from wrong_files import assert_refused
 from kcal.errors import FileError
 from kcal.io.camera_file import CameraFile, camera_to_file, load_camera, save_camera
 from kcal.io.rig_file import load_rig, save_rig
+from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 
@@ -53,7 +54,8 @@ def test_stored_form() -> None:
 def test_covariance_and_rig(tmp_path: Path) -> None:
     camera = hybrid_camera("webcam", modes=FEW_MODES)
     factor = torch.randn(len(camera.names), 9, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    file = CameraFile.load(camera_to_file(camera, covariance=factor @ factor.T).save(tmp_path / "camera.json"))
+    camera.calibration = CameraCalibration(covariance=factor @ factor.T)
+    file = CameraFile.load(camera_to_file(camera).save(tmp_path / "camera.json"))
     again = file.covariance_matrix()
     assert again is not None
     assert torch.equal(again, factor @ factor.T)

@@ -13,7 +13,7 @@ from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.uncertainty import image_sigma, pixel_covariance, projection_sigma
-from kcal.sim.infinity import error_at_infinity
+from scripts.shared.infinity import error_at_infinity
 
 SIZE = (640, 480)
 

@@ -3,12 +3,13 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+import numpy as np
 import pyproj
 import pytest
 
 from kcal.errors import FileError, InputError
 from kcal.lens.mounting import Origin
-from kcal.locate.datum import find_geoid, geoid_heights, true_from_grid
+from kcal.locate.datum import find_geoid, geoid_column, true_from_grid
 
 
 def grid(path: Path) -> Path:
@@ -23,9 +24,9 @@ def test_heights_of_a_grid_and_outside_of_it(tmp_path: Path) -> None:
     geoid = find_geoid(grid(tmp_path / "here.gtx"))
     assert geoid is not None
     assert geoid.name == "here"
-    heights = geoid_heights(geoid, [(19.0, 73.0), (18.5, 72.25), (50.0, 8.0)])
+    heights = geoid_column(geoid, np.array([19.0, 18.5, 50.0]), np.array([73.0, 72.25, 8.0]))
     assert heights[:2] == pytest.approx([-60.0, -67.5], abs=1e-6)
-    assert heights[2] is None
+    assert np.isnan(heights[2])
 
 
 def test_no_grid_and_bad_grids(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,7 +37,7 @@ def test_no_grid_and_bad_grids(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert find_geoid() == (found, "egm96_15")
     (tmp_path / "bad.gtx").write_bytes(b"no grid")
     with pytest.raises(FileError, match="cannot read this geoid grid"):
-        geoid_heights(find_geoid(tmp_path / "bad.gtx"), [(19.0, 73.0)])
+        geoid_column(find_geoid(tmp_path / "bad.gtx"), np.array([19.0]), np.array([73.0]))
     (tmp_path / "grid.txt").write_text("")
     with pytest.raises(FileError, match=r"ends with \.tif"):
         find_geoid(tmp_path / "grid.txt")

@@ -23,11 +23,11 @@ from kcal.lens.rig import RigCovariance
 from kcal.locate import marks, stereo, tables, tabulate
 from kcal.locate.cep import circular_error
 from kcal.locate.columns import NUMBERS, number_lines
-from kcal.locate.export import PositionWriter, to_csv
+from kcal.locate.export import PositionWriter, write_positions
 from kcal.locate.geodesy import azimuth_elevation
 from kcal.locate.marks import read_mark_chunks, read_marks
 from kcal.locate.mounting import mounting_covariance
-from kcal.locate.positions import columns_of, locate_points, located_by, positions_of
+from kcal.locate.positions import locate_points, located_by
 from kcal.locate.sample import PositionSample
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.tabulate import Locator
@@ -127,10 +127,30 @@ def test_numbers_are_those_of_the_localizer_to_the_last_bit() -> None:
 
 def test_positions_and_columns_are_the_same() -> None:
     columns = locator_of_everything()([str(i) for i in range(ROWS)], pixels())
-    back = columns_of(positions_of(columns))
-    assert np.array_equal(back.numbers, columns.numbers, equal_nan=True)
-    assert (back.names, back.reasons) == (columns.names, columns.reasons)
-    assert np.array_equal(back.status, columns.status)
+    located = located_by(locator_of_everything(), columns)
+    fields = {
+        "lat": "lat", "lon": "lon", "height": "height_ellipsoidal_m", "geoid_height": "geoid_height_m",
+        "range_m": "range_m", "range_low_m": "range_low_m", "range_high_m": "range_high_m", "cep50_m": "cep50_m",
+        "cep95_m": "cep95_m", "meters_per_pixel": "range_m_per_px", "meters_per_degree": "range_m_per_deg_yaw",
+        "azimuth_deg": "azimuth_deg", "elevation_deg": "elevation_deg",
+    }  # fmt: skip
+    groups = {
+        "enu": ("east_m", "north_m", "up_m"),
+        "covariance": tuple(f"cov_{key}_m2" for key in ("ee", "en", "eu", "en", "nn", "nu", "eu", "nu", "uu")),
+        "reprojection_px": ("reprojection_left_px", "reprojection_right_px"),
+    }
+    assert len(located.positions) == ROWS
+    for row, position in enumerate(located.positions):
+        assert (position.name, position.reason) == (columns.names[row], columns.reasons[row])
+        assert int(position.status) == columns.status[row]
+        for field, name in fields.items():
+            value, wanted = getattr(position, field), columns.column(name)[row]
+            assert math.isnan(wanted) if value is None else value == wanted
+        for field, names in groups.items():
+            value, wanted = getattr(position, field), [columns.column(name)[row] for name in names]
+            assert np.isnan(wanted).all() if value is None else np.ravel(value).tolist() == wanted
+    assert np.array_equal(located.enu.numpy(), columns.numbers[:, 4:7], equal_nan=True)
+    assert located.count == sum(position.lat is not None for position in located.positions)
 
 
 def test_a_long_list_of_points_is_located_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,7 +161,7 @@ def test_a_long_list_of_points_is_located_in_pieces(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr("kcal.locate.positions.CHUNK_ROWS", 50)
         pieces = locate_points(real_rig(), both[:, 0], both[:, 1], origin=ORIGIN, heading_deg=0.0, **options)
         monkeypatch.undo()
-        one, other = columns_of(whole.positions), columns_of(pieces.positions)
+        one, other = whole.columns, pieces.columns
         assert (one.names, one.status.tolist()) == (other.names, other.status.tolist())
         # The piece decides when Newton's method ends.
         assert np.allclose(one.numbers, other.numbers, rtol=1e-9, atol=1e-9, equal_nan=True)
@@ -190,7 +210,8 @@ def test_names_that_would_act_are_texts_and_come_back(tmp_path: Path) -> None:
     assert [name for chunk in read_mark_chunks(again) for name in chunk.names] == names
     # A name that begins as if it had been guarded is guarded once more.
     located = locate_points(real_rig(), *pixels()[:1].unbind(1), names=["'=1"], origin=ORIGIN, heading_deg=0.0)
-    assert to_csv(located).splitlines()[1].startswith("''=1,")
+    text = write_positions(tmp_path / "guarded.csv", located).read_text(encoding="utf-8")
+    assert text.splitlines()[1].startswith("''=1,")
 
 
 def test_columns_that_positions_have_too_are_refused(tmp_path: Path) -> None:
@@ -285,7 +306,8 @@ def test_a_sample_is_even_and_does_not_depend_on_chunks() -> None:
     assert whole.count_note.endswith(", a sample of the 250 in the table")
     for size in (1, 10, 100):
         sample = sampled(size)
-        assert sample.located(locate) == whole
+        assert sample.located(locate).positions == whole.positions
+        assert sample.located(locate).rows == whole.rows
         assert sum(sample.statuses.values()) == ROWS
     assert sample.statuses["outside_image"] == 1
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from locate_rigs import real_rig, tensor
 
 from kcal.errors import InputError
-from kcal.lens.mounting import Origin
+from kcal.lens.mounting import Mounting, Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import StereoLocalizer
+from kcal.locate.mounting import run_errors
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 POINTS = tensor([10.0, -3.0, 120.0], [-150.0, 20.0, 900.0], [300.0, 60.0, 2500.0])
@@ -72,3 +75,23 @@ def test_a_link_must_fit() -> None:
             StereoLocalizer(
                 rig, origin=ORIGIN, heading_deg=0.0, calibration=known, mounting=mounting, link=link.double()
             )
+
+
+def test_stated_errors_are_added_to_what_the_rig_knows() -> None:
+    rig, whole = real_rig(), joint()
+    assert run_errors(rig) == (None, None, None)
+    rig.covariance = RigCovariance.of(rig, pose=whole[:6, :6])
+    stored = torch.block_diag(whole[6:, 6:], tensor(0.01)[None])
+    link = torch.zeros(len(rig.covariance.matrix), 7, dtype=torch.float64)
+    rig.mounting = Mounting(origin=ORIGIN, heading_deg=35.0, covariance=stored, link=link)
+    found = run_errors(rig, yaw_deg=0.1, heading_deg=0.2, origin_m=3.0)
+    assert found.link is link
+    yaw = torch.zeros_like(rig.covariance.matrix)
+    yaw[-5, -5] = math.radians(0.1) ** 2
+    torch.testing.assert_close(found.calibration.matrix, rig.covariance.matrix + yaw, rtol=0, atol=1e-12)
+    more = torch.diag(tensor(9.0, 9.0, 9.0, 0.0, 0.0, math.radians(0.2) ** 2, 0.0))
+    torch.testing.assert_close(found.mounting, stored + more)
+    # Elsewhere the rig's own mounting says nothing.
+    other = run_errors(rig, elsewhere=True)
+    assert (other.mounting, other.link) == (None, None)
+    assert other.calibration is rig.covariance

@@ -12,15 +12,18 @@ from kcal.corners.match import MatchStatus
 from kcal.corners.refind import find_again
 from kcal.errors import InputError
 from kcal.io.images import write_png
+from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.marks import Marks, write_marks
-from kcal.locate.relock import check_rig
+from kcal.locate.positions import locate_points
+from kcal.locate.relock import check_rig, seen_again
 from kcal.locate.survey import Survey
 from kcal.mark.guide import RigBand, at_shape, propose
 from kcal.mark.items import Add, Mark, Place, Put, Side, SurveyPlace
 from kcal.mark.live import Promise, solve_live, verdict
 from kcal.mark.marking_service import Desk
+from kcal.mark.overview import map_content
 from kcal.mark.pictures import open_pictures
 from kcal.mark.reference import Reference
 from kcal.mark.session import Session
@@ -225,9 +228,7 @@ class TestDrift:
         now = session.marks("feature", single=False)
         desk.close()
         assert len(now.names) >= 10
-        from kcal.cli.rig_check import _features
-
-        drift = check_rig(site.rig, features=_features(then, now, 0.05))
+        drift = check_rig(site.rig, features=seen_again(then, now, 0.05))
         assert drift.significant
         found_turn = drift.rig.right_from_left_rotation @ site.rig.right_from_left_rotation.T
         expected = moved @ site.rig.right_from_left_rotation.T
@@ -246,6 +247,24 @@ class TestDrift:
         assert int(find_again(smooth, other, pixels[:1], reach=12).status[0]) == MatchStatus.NO_MATCH
         flat = torch.full((120, 160), 5.0)
         assert int(find_again(flat, smooth, pixels[:1], reach=12).status[0]) == MatchStatus.FLAT
+
+
+def test_the_map_shows_each_region_at_its_target(site: MarkingSite) -> None:
+    """Also behind a target that has a bearing only, and no region."""
+    left, right = (torch.tensor(marks, dtype=torch.float64) for marks in zip(*site.pixels.values(), strict=True))
+    far = site.rig.left.project(torch.tensor([[0.0, 0.0, 1e7]]).double())[0]
+    left = torch.cat([far, left])
+    right = torch.cat([site.rig(torch.tensor([[0.0, 0.0, 1e7]]).double())[1], right])
+    names = ["far", *site.pixels]
+    located = locate_points(site.rig, left, right, names=names, origin=Origin(lat=0, lon=0, height=0), heading_deg=0.0)
+    shown = {target["name"]: target for target in map_content(site.rig, located, None, anchored=False)["targets"]}
+    assert shown["far"]["ring"] is None
+    assert sum(target["ring"] is not None for target in shown.values()) == located.count > 3
+    for target in shown.values():
+        if target["ring"] is not None:
+            ring = np.array(target["ring"])
+            assert (ring.min(0) < target["place"]).all()
+            assert (target["place"] < ring.max(0)).all()
 
 
 def test_a_desk_from_clicks_to_positions(site: MarkingSite, tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ from calibrate_scenes import BOARD, camera, motions, pixels_of
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.nets.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
 from kcal.solve.lm import LMOptions, minimize
+from scripts.paper.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
 
 INTRINSICS = torch.tensor([500.0, 505.0, 325.0, 236.0], dtype=torch.float64)
 

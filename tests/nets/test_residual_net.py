@@ -12,8 +12,8 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.nets.mlp import initial_weights
-from kcal.nets.residual import ResidualNet, ResidualProblem, train_residual
 from kcal.solve.lm import LMOptions, minimize
+from scripts.paper.residual_net import ResidualNet, ResidualProblem, train_residual
 
 
 def scene(model: str = "opencv5", free_warp: bool = True) -> tuple[BoardProblem, BoardState, Camera]:

@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal.corners import shift_fit
 from kcal.corners.match import MatchStatus
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import StereoRig
 from kcal.locate.triangulate import Triangulate
-from kcal.pipeline import shift_fit
 from kcal.pipeline.disparity import DisparityOptions, ObjectDisparities, ObjectDisparity
 from scripts.shared.marking_scene import background
 from scripts.shared.object_scene import exposed, paint_plate, plate, texture_gradient, true_box

@@ -8,7 +8,7 @@ import torch
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.sim.infinity import error_at_infinity
+from scripts.shared.infinity import error_at_infinity
 
 SIZE = (640, 480)
 

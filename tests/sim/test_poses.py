@@ -9,8 +9,9 @@ from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
 from kcal.sim.board import BoardSize, board_points, project_board
-from kcal.sim.poses import PoseOptions, rig_pose, sample_board_poses, sample_pair_poses
+from kcal.sim.poses import PoseOptions, sample_board_poses
 from kcal.sim.scene import demo_rig
+from scripts.shared.pair_poses import rig_pose, sample_pair_poses
 
 CAMERA = Camera.build(focal=(800, 810), center=(330, 235), size=(640, 480), coefficients=[-0.25, 0.07, 1e-3, -1e-3])
 BOARD = BoardSize(9, 6, 0.025)

@@ -1,4 +1,4 @@
-"""Dense normal equations, made from a Jacobian and made from rows."""
+"""Dense normal equations."""
 
 from __future__ import annotations
 
@@ -12,29 +12,19 @@ JACOBIAN = torch.randn(2, 9, 4, generator=GENERATOR, dtype=torch.float64) * torc
 RESIDUALS = torch.randn(2, 9, generator=GENERATOR, dtype=torch.float64)
 
 
-def rows_of(jacobian: torch.Tensor, residuals: torch.Tensor) -> torch.Tensor:
-    return torch.cat([jacobian, residuals[..., None]], -1).mT
-
-
-@pytest.mark.parametrize("damping", [0.0, 1e-3, 10.0])
-@pytest.mark.parametrize("idle", [False, True])
-def test_rows_and_jacobian_give_the_same(damping: float, idle: bool) -> None:
-    """Also where one parameter has no effect: it does not move."""
+@pytest.mark.parametrize("damping", [1e-9, 1e-3, 10.0])
+def test_a_parameter_without_effect_does_not_move(damping: float) -> None:
     jacobian = JACOBIAN.clone()
-    jacobian[..., 1] *= 0.0 if idle else 1.0
-    lam = torch.full((2,), damping + (1e-9 if idle else 0.0), dtype=torch.float64)
-    plain, packed = DenseLinearization(RESIDUALS, jacobian), DenseLinearization.of_rows(rows_of(jacobian, RESIDUALS))
-    torch.testing.assert_close(packed.cost, 0.5 * RESIDUALS.square().sum(-1), rtol=1e-14, atol=0)
-    torch.testing.assert_close(packed.cost, plain.cost, rtol=1e-14, atol=0)
-    (step,), decrease = packed.step(lam)
-    (expected,), predicted = plain.step(lam)
-    torch.testing.assert_close(step, expected, rtol=1e-12, atol=0)
-    torch.testing.assert_close(decrease, predicted, rtol=1e-12, atol=0)
-    assert bool((step[:, 1] == 0).all()) == idle
+    jacobian[..., 1] = 0.0
+    plain = DenseLinearization(RESIDUALS, jacobian)
+    torch.testing.assert_close(plain.cost, 0.5 * RESIDUALS.square().sum(-1), rtol=1e-14, atol=0)
+    (step,), _ = plain.step(torch.full((2,), damping, dtype=torch.float64))
+    assert bool((step[:, 1] == 0).all())
+    assert bool((step[:, [0, 2, 3]] != 0).all())
 
 
 def test_the_undamped_step_is_that_of_least_squares() -> None:
-    (step,), decrease = DenseLinearization.of_rows(rows_of(JACOBIAN, RESIDUALS)).step(torch.zeros(2).double())
+    (step,), decrease = DenseLinearization(RESIDUALS, JACOBIAN).step(torch.zeros(2).double())
     expected = torch.linalg.lstsq(JACOBIAN, -RESIDUALS[..., None]).solution[..., 0]
     torch.testing.assert_close(step, expected, rtol=1e-10, atol=0)
     left = RESIDUALS + (JACOBIAN @ step[..., None])[..., 0]

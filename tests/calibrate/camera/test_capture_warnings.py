@@ -9,8 +9,8 @@ from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
 from kcal.lens.camera import Camera
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.board import BoardSize, board_points
-from kcal.sim.moving_captures import Hands, moving_capture
 from kcal.sim.poses import sample_board_poses
+from scripts.shared.moving_captures import Hands, moving_capture
 
 BOARD = BoardSize(9, 6, 0.05)
 CAMERA = Camera.build(focal=(1100, 1100), center=(639.5, 479.5), size=(1280, 960), coefficients=[-0.1])

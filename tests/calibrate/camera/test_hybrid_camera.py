@@ -18,8 +18,8 @@ from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import load_camera
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.sim.infinity import error_at_infinity
 from kcal.solve.lm import LMOptions
+from scripts.shared.infinity import error_at_infinity
 
 NOISE = 0.1
 

@@ -19,7 +19,7 @@ from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.network_modes import NetworkModes
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.zernike import ZernikeModes
-from kcal.nets.field_features import train_features
+from scripts.shared.field_features import train_features
 
 BOARD = Board(columns=8, rows=6, square=0.05)
 SIZE, NOISE = (1280, 960), 0.05

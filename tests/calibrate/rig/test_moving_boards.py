@@ -20,8 +20,8 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.sim.board import BoardPose, BoardSize
-from kcal.sim.moving_captures import Hands, moving_capture
 from kcal.sim.poses import sample_board_poses
+from scripts.shared.moving_captures import Hands, moving_capture
 
 F64 = torch.float64
 BOARD, SIZE = Board(columns=9, rows=6, square=0.05), BoardSize(9, 6, 0.05)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcal.corners.filters import gaussian_kernel
-from kcal.pipeline.patches import IMAGE_BLUR, ImageWindows, sample
+from kcal.corners.patch_windows import IMAGE_BLUR, ImageWindows, sample
 
 _MOST_STEPS = 25
 _CONVERGED = 1e-4  # steps
@@ -37,41 +37,6 @@ class ShiftFit(NamedTuple):
     covariance: Tensor
     converged: Tensor
     share: Tensor
-
-
-@torch.no_grad()
-def is_textured(template: Tensor, weight: Tensor) -> Tensor:
-    """(N,) whether templates (N, h, w) are not flat where they count."""
-    full = weight.sum((1, 2)).clamp_min(1e-12)
-    level = (weight * template).sum((1, 2)) / full
-    contrast = (weight * (template - level[:, None, None]).square()).sum((1, 2)) / full
-    return contrast.sqrt() > 1e-6 * (1.0 + level.abs())
-
-
-def weighted_correlation(template: Tensor, weight: Tensor, wide: Tensor, usable: Tensor) -> Tensor:
-    """Normalized correlation (N, rows, columns) of templates (N, h, w) with wider patches, at every whole shift.
-
-    Shifts that touch what is not usable have -1, and so have flat templates.
-    """
-    count = len(template)
-    total = weight.sum((1, 2)).clamp_min(1e-12)
-    mean = (weight * template).sum((1, 2)) / total
-    centered = weight * (template - mean[:, None, None])
-    # Centered, so that squares do not cancel.
-    other = wide - (wide.mean((1, 2)))[:, None, None]
-
-    def over(values: Tensor, kernel: Tensor) -> Tensor:
-        found: Tensor = torch.nn.functional.conv2d(values[None], kernel[:, None], groups=count)[0]
-        return found
-
-    product = over(other, centered)
-    average = over(other, weight) / total[:, None, None]
-    power = (over(other.square(), weight) / total[:, None, None] - average.square()).clamp_min(0.0)
-    own = ((weight * (template - mean[:, None, None]).square()).sum((1, 2)) / total).clamp_min(0.0)
-    norm = total[:, None, None] * (power * own[:, None, None]).sqrt()
-    blocked = over((~usable).double(), (weight > 0).double()) > 0.5
-    good = ~blocked & (norm > 1e-9 * total[:, None, None] * (1.0 + template.abs().amax((1, 2))[:, None, None]))
-    return torch.where(good, product / torch.where(good, norm, 1.0), -1.0)
 
 
 class _Patches(NamedTuple):
@@ -129,7 +94,14 @@ def _balance(patches: _Patches, theta: Tensor, scale: Tensor) -> Tensor:
 
 
 def fit_shifts(
-    template: Tensor, right: ImageWindows, moved: Tensor, slopes: Tensor, weight: Tensor, wanted: Tensor
+    template: Tensor,
+    right: ImageWindows,
+    moved: Tensor,
+    slopes: Tensor,
+    weight: Tensor,
+    wanted: Tensor,
+    *,
+    robust: bool = True,
 ) -> ShiftFit:
     """Fit right(moved + slopes shift) = gain template + offset.
 
@@ -140,6 +112,7 @@ def fit_shifts(
         slopes: (N, h, w, 2, 2) their derivatives by a step along the plane's axes (last axis).
         weight: (N, h, w) of the pixels.
         wanted: (N,) bool: objects to fit. Others have not converged, and zeros.
+        robust: pixels that do not fit lose their weight.
     """
     which = wanted.nonzero()[:, 0]
     nothing = torch.zeros_like(moved[:, 0, 0])
@@ -149,13 +122,13 @@ def fit_shifts(
     with torch.no_grad():
         values = patches.right.values.detach()
         still = patches._replace(template=patches.template.detach(), right=patches.right._replace(values=values))
-        theta, scale, step = _fitted_shifts(still)
+        theta, scale, step = _fitted_shifts(still, robust)
         residual, slope, _ = _residual(still, theta)
         weight = still.weight.flatten(1)
-        robust = weight * _biweight(residual, scale, still)
-        covariance, sound = _covariance(still, theta, residual, slope, robust)
+        kept = weight * _biweight(residual, scale, still)
+        covariance, sound = _covariance(still, theta, residual, slope, kept)
         # In a perfect fit a biweight takes a few percent.
-        share = robust.sum(1) / weight.sum(1).clamp_min(1e-12)
+        share = kept.sum(1) / weight.sum(1).clamp_min(1e-12)
         converged = (step < 10 * _CONVERGED) & sound & theta.isfinite().all(1)
         theta = torch.where(converged[:, None], theta, 0.0)
     shift = theta[:, :2]
@@ -165,23 +138,21 @@ def fit_shifts(
     return ShiftFit(*(part.new_zeros(len(wanted), *part.shape[1:]).index_copy(0, which, part) for part in found))
 
 
-def _fitted_shifts(patches: _Patches) -> tuple[Tensor, Tensor, Tensor]:
+def _fitted_shifts(patches: _Patches, robust: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Theta, scale of the residuals and length of the last step; each object stops when it has converged."""
     count = len(patches.weight)
     theta = patches.template.new_zeros(count, 4)
     theta[:, 2] = 1.0
     eye = torch.eye(4, dtype=theta.dtype, device=theta.device)
-    step, scale = theta.new_full((count,), torch.inf), theta.new_ones(count)
+    step, scale = theta.new_full((count,), torch.inf), theta.new_full((count,), torch.inf)  # weights of one
     going = torch.arange(count, device=theta.device)
     for number in range(_MOST_STEPS):
         residual, _, design = _residual(patches, theta[going])
-        weight = robust = patches.weight.flatten(1)
-        if number:  # contrast and brightness are not known before
-            # The scale settles, so that the weights do.
-            if number < 6:
-                scale[going] = _scale(residual, weight)
-            robust = weight * _biweight(residual, scale[going], patches)
-        weighted = robust[..., None] * design
+        weight = patches.weight.flatten(1)
+        # Contrast and brightness are not known before the first step. Then the scale settles, so that the weights do.
+        if robust and 0 < number < 6:
+            scale[going] = _scale(residual, weight)
+        weighted = (weight * _biweight(residual, scale[going], patches))[..., None] * design
         normal = weighted.mT @ design
         size = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).sqrt()
         normal = normal / (size[:, :, None] * size[:, None, :]) + 1e-9 * eye
