@@ -55,9 +55,9 @@ _MOVED = {
 _RENAMED = {"detect_images": "kcal.detect"}
 # Parts of kcal that no user needs, and where they are defined.
 _INTERNAL = {
-    "kcal.calibrate.lensfit.board_modes": "BoardModes",
-    "kcal.calibrate.lensfit.families": "PriorFamilies",
-    "kcal.calibrate.lensfit.hybrid_fit": "HybridFit",
+    "kcal.calibrate.hybrid.board_modes": "BoardModes",
+    "kcal.calibrate.hybrid.families": "PriorFamilies",
+    "kcal.calibrate.hybrid.fit": "HybridFit",
     "kcal.calibrate.problem.readout": "Readout",
     "kcal.lens.field_modes": "FieldModes",
     "kcal.lens.gaussian_modes": "GaussianModes",

@@ -33,7 +33,7 @@ LOOKS = {
     "capture": (5.7, "guided photography"),
     "web": (5.7, "local pages"),
     "calibrate/batch": (4.0, "many cameras"),
-    "calibrate/lensfit": (2.95, "hybrid lens"),
+    "calibrate/hybrid": (2.95, "hybrid lens"),
     "locate": (1.0, "pixels to positions"),
     "calibrate/camera": (2.8, "one camera"),
     "calibrate/rig": (1.0, "several cameras"),

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.lensfit.cameras_fit import measure_board
+from kcal.calibrate.hybrid.cameras_fit import measure_board
 from kcal.lens.pupil import pupil_depth
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.board import save_board_picture

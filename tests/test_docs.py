@@ -192,7 +192,7 @@ MEASURED = sorted((ROOT / "docs" / "measured").glob("*.md"))
 
 @pytest.mark.parametrize("page", MEASURED, ids=[page.stem for page in MEASURED])
 def test_a_measured_page_concludes_and_then_shows(page: Path) -> None:
-    """First the conclusion, then a table or a picture with a caption at most, and what makes it before the next title."""
+    """The conclusion, a table or a picture with a caption at most, and before the next title what makes it."""
     text = re.sub(r"<!--.*?-->\n", "", page.read_text(encoding="utf-8"))
     beginning = re.split(r"\n## ", text)[0]
     _, conclusion, *shown = beginning.split("\n\n")

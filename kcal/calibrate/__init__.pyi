@@ -21,10 +21,10 @@ from kcal.calibrate.camera.trust import HalvesDifference as HalvesDifference
 from kcal.calibrate.camera.trust import ResidualStructure as ResidualStructure
 
 # Measured boards
-from kcal.calibrate.lensfit.cameras_fit import measure_board as measure_board
-from kcal.calibrate.lensfit.measured_board import MeasuredBoard as MeasuredBoard
-from kcal.calibrate.lensfit.measured_board import load_measured_board as load_measured_board
-from kcal.calibrate.lensfit.measured_board import save_measured_board as save_measured_board
+from kcal.calibrate.hybrid.cameras_fit import measure_board as measure_board
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard as MeasuredBoard
+from kcal.calibrate.hybrid.measured_board import load_measured_board as load_measured_board
+from kcal.calibrate.hybrid.measured_board import save_measured_board as save_measured_board
 
 # Calibrate with gradients
 from kcal.calibrate.camera.layer import CalibrationLayer as CalibrationLayer

@@ -97,8 +97,8 @@ def measure_command(
 
     `kcal board measure left.obs.json right.obs.json -o plate.board.json --picture plate.png`
     """
-    from kcal.calibrate.lensfit.cameras_fit import fit_cameras
-    from kcal.calibrate.lensfit.measured_board import save_measured_board
+    from kcal.calibrate.hybrid.cameras_fit import fit_cameras
+    from kcal.calibrate.hybrid.measured_board import save_measured_board
     from kcal.corners.observations import Observations
     from kcal.report.board import board_text, save_board_picture
     from kcal.report.figures import check_picture

@@ -200,7 +200,7 @@ def calibrate_command(
 
     from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.camera.outliers import OutlierRejection
-    from kcal.calibrate.lensfit.measured_board import load_measured_board
+    from kcal.calibrate.hybrid.measured_board import load_measured_board
     from kcal.corners.observations import Observations
     from kcal.solve.robust import RobustLoss
 

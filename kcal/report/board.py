@@ -9,7 +9,7 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from kcal.calibrate.lensfit.measured_board import Measured, MeasuredBoard
+from kcal.calibrate.hybrid.measured_board import Measured, MeasuredBoard
 from kcal.report.figures import GRAY, INK, draw_arrows, new_figure, save_picture
 
 _ACROSS = 160

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
 from kcal.corners.images import expand_images

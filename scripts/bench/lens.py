@@ -22,7 +22,7 @@ import torch
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
-from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
+from kcal.calibrate.hybrid.fit import fit_hybrid
 from kcal.lens.camera import Camera
 from kcal.lens.distortion import distort
 from kcal.lens.modules import Unproject

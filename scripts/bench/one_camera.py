@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
+from kcal.calibrate.hybrid.fit import fit_hybrid
 from kcal.calibrate.rig.from_boards import calibrate_rig
 from kcal.calibrate.rig.solve import RigOptions
 from kcal.corners.board import Board

@@ -23,7 +23,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from kcal.calibrate.lensfit.base_fit import fit_projection
+from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import free_parameters

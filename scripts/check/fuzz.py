@@ -31,7 +31,7 @@ import numpy as np
 import torch
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.lensfit.measured_board import MeasuredBoard, load_measured_board, save_measured_board
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_board, save_measured_board
 from kcal.cli.main import main as command_line
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
+from kcal.calibrate.hybrid.fit import fit_hybrid
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
 from kcal.corners.observations import Observations

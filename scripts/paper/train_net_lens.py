@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.lensfit.base_fit import fit_projection
+from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.problem.poses import poses_under
 from kcal.calibrate.problem.views import Views
 from kcal.corners.board import Board

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.calibrate.hybrid.board_modes import board_modes
 
 BOARD_PRIOR, TWIST_PRIOR = 1e-3, 2e-3  # of the board's extent; radians, and distances of the board
 NOISE = 0.1  # pixels: how much priors weigh against corners, the same for all cameras and captures

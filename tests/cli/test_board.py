@@ -11,7 +11,7 @@ from click.testing import Result
 from printed_boards import printed_points, printed_views
 from typer.testing import CliRunner
 
-from kcal.calibrate.lensfit.measured_board import load_measured_board
+from kcal.calibrate.hybrid.measured_board import load_measured_board
 from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.errors import FileError

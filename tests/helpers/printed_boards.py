@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
+from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData
 
 
 def standing(data: Quadratic) -> ViewData:

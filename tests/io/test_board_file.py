@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from kcal.calibrate.lensfit.board_modes import BENDING, board_modes
-from kcal.calibrate.lensfit.measured_board import MeasuredBoard, load_measured_board, save_measured_board
+from kcal.calibrate.hybrid.board_modes import BENDING, board_modes
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_board, save_measured_board
 from kcal.corners.board import Board
 from kcal.errors import FileError, InputError
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from matplotlib.quiver import Quiver
 
-from kcal.calibrate.lensfit.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.report.board import board_figure, board_text, save_board_picture

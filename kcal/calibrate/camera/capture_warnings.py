@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit
+from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.problem.readout import FELT, LARGEST
 
 # Of fewer views that moved, 95 % ellipses contain the truth in 86 to 93 % (`scripts.check.handheld`).

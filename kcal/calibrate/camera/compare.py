@@ -17,8 +17,8 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.options import HYBRID, CalibrationOptions, Progress
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit
-from kcal.calibrate.lensfit.moving_poses import moving_residuals
+from kcal.calibrate.hybrid.fit import HybridFit
+from kcal.calibrate.hybrid.moving_poses import moving_residuals
 from kcal.calibrate.problem.poses import poses_under
 from kcal.calibrate.problem.views import Views
 from kcal.calibrate.problem.weights import whitening

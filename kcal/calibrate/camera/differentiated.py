@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.options import CalibrationOptions
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
-from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem
-from kcal.calibrate.lensfit.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.unknowns import hybrid_problem
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
 from kcal.errors import InputError

@@ -2,8 +2,8 @@
 
 The lens is a base projection between pinhole and fisheye, corrected by a smooth field and by an entrance pupil that
 moves with the angle (`kcal.lens.hybrid_terms`); the board may be bent and misprinted
-(`kcal.calibrate.lensfit.board_modes`). How large each of these may be is told by the evidence of the views themselves
-(`kcal.calibrate.lensfit.evidence`), so a few views give a plain lens with wide error bars, and many views a detailed
+(`kcal.calibrate.hybrid.board_modes`). How large each of these may be is told by the evidence of the views themselves
+(`kcal.calibrate.hybrid.evidence`), so a few views give a plain lens with wide error bars, and many views a detailed
 one.
 """
 
@@ -23,7 +23,7 @@ from kcal.calibrate.camera.outliers import leave_out_outliers, noise_scale
 from kcal.calibrate.camera.pupil_check import pupil_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.warnings import general_warnings, hybrid_warnings, outlier_warnings
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.corners.observations import Observations
 from kcal.solve.result import SolverStatus
 

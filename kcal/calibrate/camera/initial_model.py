@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.base_fit import fit_projection
+from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.problem.coefficient_prior import CoefficientPrior
 from kcal.calibrate.problem.poses import poses_under
 from kcal.calibrate.problem.priors import FoldBarrier, Term

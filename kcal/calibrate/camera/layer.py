@@ -12,7 +12,7 @@ from kcal.calibrate.camera.differentiated import Backward, differentiated, hybri
 from kcal.calibrate.camera.exact_minimum import exact_minimum
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.solve import solve_corners
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit
+from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.coefficient_prior import CoefficientPrior, is_overparameterized
 from kcal.calibrate.problem.priors import GaussianPrior, Term

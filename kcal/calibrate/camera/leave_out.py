@@ -17,7 +17,7 @@ from kcal.calibrate.camera.hybrid import calibrate_hybrid
 from kcal.calibrate.camera.options import CalibrationOptions, Progress
 from kcal.calibrate.camera.outliers import corners_beyond, views_beyond
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedView
-from kcal.calibrate.lensfit.hybrid_fit import fit_hybrid
+from kcal.calibrate.hybrid.fit import fit_hybrid
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 

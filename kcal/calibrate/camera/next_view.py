@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Literal
 
-from kcal.calibrate.lensfit.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.problem.parameters import ParameterConstraints, natural_value
 from kcal.errors import InputError
 from kcal.lens.camera import Camera

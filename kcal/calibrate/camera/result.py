@@ -10,8 +10,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit
-from kcal.calibrate.lensfit.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.fit import HybridFit
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.problem.state import warp_modes
 from kcal.calibrate.problem.views import among
 from kcal.corners.observations import Observations

@@ -1,7 +1,7 @@
 """Cameras that are calibrated together: they share the boards that they saw, and what lenses of one type have alike.
 
 Each camera is calibrated alone first. Whether two saw one board is told by the evidence; each camera is then fitted
-again with the board as the others measured it (`kcal.calibrate.lensfit.cameras_fit`).
+again with the board as the others measured it (`kcal.calibrate.hybrid.cameras_fit`).
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from kcal.calibrate.camera.leave_out import lasting_warnings
 from kcal.calibrate.camera.options import CalibrationOptions
 from kcal.calibrate.camera.repeats import copied_views, copy_warnings, pose_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult, SharedBoard
-from kcal.calibrate.lensfit.board_orders import turned_corners
-from kcal.calibrate.lensfit.cameras_fit import Run, fit_cameras
-from kcal.calibrate.lensfit.fleet import LEAST_CAMERAS
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit
+from kcal.calibrate.hybrid.board_orders import turned_corners
+from kcal.calibrate.hybrid.cameras_fit import Run, fit_cameras
+from kcal.calibrate.hybrid.fit import HybridFit
+from kcal.calibrate.hybrid.fleet import LEAST_CAMERAS
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 

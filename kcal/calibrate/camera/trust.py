@@ -18,7 +18,7 @@ from torch import Tensor
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.options import CalibrationOptions, OutlierRejection, Progress
 from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.calibrate.lensfit.moving_poses import moving_residuals
+from kcal.calibrate.hybrid.moving_poses import moving_residuals
 from kcal.calibrate.problem.poses import poses_under
 from kcal.calibrate.problem.views import Views
 from kcal.corners.observations import Observations

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.outliers import corners_beyond
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit
+from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.problem.priors import GaussianPrior, Term
 from kcal.calibrate.problem.state import BoardState
 from kcal.lens.camera import Camera

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.amplitudes import expected_maximum
-from kcal.calibrate.lensfit.evidence import WORTH, evidence_of_motion, maximize_evidence
-from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
-from kcal.calibrate.lensfit.quadratic import ViewData, view_data
+from kcal.calibrate.hybrid.amplitudes import expected_maximum
+from kcal.calibrate.hybrid.evidence import WORTH, evidence_of_motion, maximize_evidence
+from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
+from kcal.calibrate.hybrid.quadratic import ViewData, view_data
 from kcal.calibrate.problem.readout import AMPLITUDES, FELT, MEDIAN, MOTION, MotionSigma, Readout, motion_sigma
 from kcal.lens.model import LensModel
 from kcal.lens.projection import project_components

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
-from kcal.calibrate.lensfit.board_orders import CLEAR, mode_turn, quarter_turns
-from kcal.calibrate.lensfit.board_prior import BoardMessage, message_from_rows, printed_board, printed_prior
-from kcal.calibrate.lensfit.families import BOARD, typical_hyperprior
+from kcal.calibrate.hybrid.board_modes import BoardModes, board_modes
+from kcal.calibrate.hybrid.board_orders import CLEAR, mode_turn, quarter_turns
+from kcal.calibrate.hybrid.board_prior import BoardMessage, message_from_rows, printed_board, printed_prior
+from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
 from kcal.calibrate.rig.unknowns import SharedUnknowns, held
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera

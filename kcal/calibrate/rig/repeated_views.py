@@ -7,7 +7,7 @@ import math
 
 import torch
 
-from kcal.calibrate.lensfit.board_modes import board_modes
+from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters
 from kcal.calibrate.problem.state import BoardState

@@ -20,7 +20,7 @@ from kcal.calibrate.camera.calibrate import (
     calibrate_cameras,
 )
 from kcal.calibrate.camera.options import OutlierRejection
-from kcal.calibrate.lensfit.board_orders import turned_corners
+from kcal.calibrate.hybrid.board_orders import turned_corners
 from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
 from kcal.cli.main import app
 from kcal.corners.board import Board

@@ -10,14 +10,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.base_fit import fit_base
-from kcal.calibrate.lensfit.board_modes import board_modes
-from kcal.calibrate.lensfit.evidence import maximize_evidence
-from kcal.calibrate.lensfit.evidence_rounds import FittedViews, motion_is_worth, run_rounds
-from kcal.calibrate.lensfit.families import prior_families, typical_hyperprior
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
-from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem
-from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData, view_data
+from kcal.calibrate.hybrid.base_fit import fit_base
+from kcal.calibrate.hybrid.board_modes import board_modes
+from kcal.calibrate.hybrid.evidence import maximize_evidence
+from kcal.calibrate.hybrid.evidence_rounds import FittedViews, motion_is_worth, run_rounds
+from kcal.calibrate.hybrid.families import prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData, view_data
+from kcal.calibrate.hybrid.unknowns import hybrid_problem
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.readout import (
     AMPLITUDES,
@@ -252,7 +252,7 @@ def test_motion_is_found_and_taken_out() -> None:
 def test_few_views_that_moved_are_less_sure(monkeypatch: pytest.MonkeyPatch) -> None:
     """All variances alike, in the covariance and in what other fits take of the camera."""
     found = fitted(2e-3)
-    monkeypatch.setattr("kcal.calibrate.lensfit.hybrid_fit.widening", lambda _: 1.0)
+    monkeypatch.setattr("kcal.calibrate.hybrid.fit.widening", lambda _: 1.0)
     plain = fit_hybrid(BOARD.points, capture(2e-3), SIZE, modes=MODES)
     wider = widening(12)
     assert 1.05 < wider < 1.2

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import BoardModes
-from kcal.calibrate.lensfit.families import PriorFamilies, prior_families, typical_hyperprior
-from kcal.calibrate.lensfit.fleet import LensPrior
-from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem, hybrid_unknowns
+from kcal.calibrate.hybrid.board_modes import BoardModes
+from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.fleet import LensPrior
+from kcal.calibrate.hybrid.unknowns import hybrid_problem, hybrid_unknowns
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.closed_form import homographies, poses_from_homographies
 from kcal.calibrate.problem.state import BoardState

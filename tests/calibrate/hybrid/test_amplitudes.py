@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from kcal.calibrate.lensfit.amplitudes import Loss, expected_amplitudes
+from kcal.calibrate.hybrid.amplitudes import Loss, expected_amplitudes
 
 WIDE: list[tuple[float, float | None]] = [(-12.0, 12.0), (-12.0, 12.0), (-40.0, None)]
 

@@ -16,9 +16,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from kcal.calibrate.lensfit.evidence import Maximum, evidence_loss, hyper_bounds
-from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
-from kcal.calibrate.lensfit.quadratic import ViewData
+from kcal.calibrate.hybrid.evidence import Maximum, evidence_loss, hyper_bounds
+from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
+from kcal.calibrate.hybrid.quadratic import ViewData
 
 Loss = Callable[[np.ndarray], tuple[float, np.ndarray]]
 

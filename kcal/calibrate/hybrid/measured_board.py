@@ -11,8 +11,8 @@ import pydantic
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import board_modes, undetermined_modes
-from kcal.calibrate.lensfit.board_prior import BoardPrior
+from kcal.calibrate.hybrid.board_modes import board_modes, undetermined_modes
+from kcal.calibrate.hybrid.board_prior import BoardPrior
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.native_file import NativeFile
@@ -143,7 +143,7 @@ class BoardFile(NativeFile):
     Args:
         name: of the board.
         board: as it was ordered.
-        amplitudes: of the modes of bending and print, meters; see `kcal.calibrate.lensfit.board_modes`.
+        amplitudes: of the modes of bending and print, meters; see `kcal.calibrate.hybrid.board_modes`.
         half: rows of a matrix whose transpose times itself is their covariance.
         log_evidence: nats by which the data prefer this board over the ordered one.
         observations: names of the observations that it was measured from.

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.evidence import negative_log_evidence
-from kcal.calibrate.lensfit.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies
-from kcal.calibrate.lensfit.quadratic import Quadratic
+from kcal.calibrate.hybrid.evidence import negative_log_evidence
+from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies
+from kcal.calibrate.hybrid.quadratic import Quadratic
 from kcal.lens.hybrid_terms import HybridForm
 
 # Fewer tell no spread.

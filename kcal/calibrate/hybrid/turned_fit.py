@@ -9,13 +9,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_orders import find_turns, turned_corners
-from kcal.calibrate.lensfit.board_prior import BoardMessage, BoardPrior, message_from_rows, printed_prior
-from kcal.calibrate.lensfit.families import BOARD
-from kcal.calibrate.lensfit.fleet import LensPrior, Likelihood, hyper_likelihood
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
-from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem
-from kcal.calibrate.lensfit.quadratic import Quadratic
+from kcal.calibrate.hybrid.board_orders import find_turns, turned_corners
+from kcal.calibrate.hybrid.board_prior import BoardMessage, BoardPrior, message_from_rows, printed_prior
+from kcal.calibrate.hybrid.families import BOARD
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.fleet import LensPrior, Likelihood, hyper_likelihood
+from kcal.calibrate.hybrid.quadratic import Quadratic
+from kcal.calibrate.hybrid.unknowns import hybrid_problem
 from kcal.corners.observations import Observations
 from kcal.lens.zernike import ZernikeModes
 

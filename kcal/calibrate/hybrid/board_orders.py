@@ -12,8 +12,8 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import board_modes, undetermined_modes
-from kcal.calibrate.lensfit.board_prior import BoardPrior
+from kcal.calibrate.hybrid.board_modes import board_modes, undetermined_modes
+from kcal.calibrate.hybrid.board_prior import BoardPrior
 from kcal.corners.board import Board
 
 # Nats that turned views must gain, beyond the choices that there were: by chance they do once in e^10 = 22,000 times.

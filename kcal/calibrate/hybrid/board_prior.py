@@ -17,8 +17,8 @@ import torch
 from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import KNOWN, BoardModes
-from kcal.calibrate.lensfit.families import BOARD, Hyperprior, typical_hyperprior
+from kcal.calibrate.hybrid.board_modes import KNOWN, BoardModes
+from kcal.calibrate.hybrid.families import BOARD, Hyperprior, typical_hyperprior
 from kcal.lens.information import CameraInformation
 
 

@@ -14,13 +14,13 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_groups import compared, grouped, others_of
-from kcal.calibrate.lensfit.board_prior import BoardPrior, multiplied, printed_board, told_by_others
-from kcal.calibrate.lensfit.families import Hyperprior, typical_hyperprior
-from kcal.calibrate.lensfit.fleet import LEAST_CAMERAS, LensPrior, fleet_priors, typical_lens
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit
-from kcal.calibrate.lensfit.measured_board import MeasuredBoard
-from kcal.calibrate.lensfit.turned_fit import CameraFit, Shape, fit_turned
+from kcal.calibrate.hybrid.board_groups import compared, grouped, others_of
+from kcal.calibrate.hybrid.board_prior import BoardPrior, multiplied, printed_board, told_by_others
+from kcal.calibrate.hybrid.families import Hyperprior, typical_hyperprior
+from kcal.calibrate.hybrid.fit import HybridFit
+from kcal.calibrate.hybrid.fleet import LEAST_CAMERAS, LensPrior, fleet_priors, typical_lens
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.turned_fit import CameraFit, Shape, fit_turned
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.lens.zernike import ZernikeModes

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.aspect import square_pixels, with_square_pixels
-from kcal.calibrate.lensfit.base_fit import Estimate, fit_base
-from kcal.calibrate.lensfit.board_modes import BoardModes, board_modes
-from kcal.calibrate.lensfit.board_prior import BoardPrior
-from kcal.calibrate.lensfit.evidence_rounds import (
+from kcal.calibrate.hybrid.aspect import square_pixels, with_square_pixels
+from kcal.calibrate.hybrid.base_fit import Estimate, fit_base
+from kcal.calibrate.hybrid.board_modes import BoardModes, board_modes
+from kcal.calibrate.hybrid.board_prior import BoardPrior
+from kcal.calibrate.hybrid.evidence_rounds import (
     LAST,
     FittedViews,
     Rounds,
@@ -25,11 +25,11 @@ from kcal.calibrate.lensfit.evidence_rounds import (
     motion_is_worth,
     run_rounds,
 )
-from kcal.calibrate.lensfit.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, typical_hyperprior
-from kcal.calibrate.lensfit.fleet import LensPrior
-from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_unknowns
-from kcal.calibrate.lensfit.measured_board import MeasuredBoard
-from kcal.calibrate.lensfit.quadratic import posterior_root, quadratic_of
+from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS, Hyperprior, PriorFamilies, typical_hyperprior
+from kcal.calibrate.hybrid.fleet import LensPrior
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.quadratic import posterior_root, quadratic_of
+from kcal.calibrate.hybrid.unknowns import hybrid_unknowns
 from kcal.calibrate.problem.information import information_of
 from kcal.calibrate.problem.readout import MotionSigma, Readout, motion_sigma, stillness, widening
 from kcal.calibrate.problem.state import BoardState
@@ -202,7 +202,7 @@ def fit_hybrid(
             such a fit mean nothing; it tells which corners to leave out.
         hyperprior: of the amplitudes; the typical one if not given.
         lens: what is known of it from cameras of its type; its modes are used.
-        expected: state error bars for amplitudes as they are to be expected (`kcal.calibrate.lensfit.amplitudes`).
+        expected: state error bars for amplitudes as they are to be expected (`kcal.calibrate.hybrid.amplitudes`).
             False: another fit will begin at this one, which then needs neither these nor to come to rest entirely.
         progress: called after each step.
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import board_modes
-from kcal.calibrate.lensfit.families import SQUARE, prior_families, typical_hyperprior
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.board_modes import board_modes
+from kcal.calibrate.hybrid.families import SQUARE, prior_families, typical_hyperprior
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.corners.board import Board
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import KNOWN, BoardModes
+from kcal.calibrate.hybrid.board_modes import KNOWN, BoardModes
 from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.zernike import ZernikeModes

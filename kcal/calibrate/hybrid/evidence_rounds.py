@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.amplitudes import expected_maximum
-from kcal.calibrate.lensfit.base_fit import NO_MOTION, Estimate, cauchy_weights
-from kcal.calibrate.lensfit.board_modes import BoardModes
-from kcal.calibrate.lensfit.evidence import WORTH, Maximum, evidence_of_motion, maximize_evidence
-from kcal.calibrate.lensfit.families import Hyperprior
-from kcal.calibrate.lensfit.hybrid_unknowns import hybrid_problem
-from kcal.calibrate.lensfit.quadratic import ViewData, overdispersion, view_data
+from kcal.calibrate.hybrid.amplitudes import expected_maximum
+from kcal.calibrate.hybrid.base_fit import NO_MOTION, Estimate, cauchy_weights
+from kcal.calibrate.hybrid.board_modes import BoardModes
+from kcal.calibrate.hybrid.evidence import WORTH, Maximum, evidence_of_motion, maximize_evidence
+from kcal.calibrate.hybrid.families import Hyperprior
+from kcal.calibrate.hybrid.quadratic import ViewData, overdispersion, view_data
+from kcal.calibrate.hybrid.unknowns import hybrid_problem
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.readout import AMPLITUDES, LARGEST, MOTION, Readout, motion_sigma, stillness
 from kcal.solve.lm import LMOptions, minimize

@@ -12,10 +12,10 @@ from calibrate_scenes import observe
 from printed_boards import printed_points, printed_views
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_orders import turned_corners
-from kcal.calibrate.lensfit.cameras_fit import CamerasFit, fit_cameras, measure_board
-from kcal.calibrate.lensfit.hybrid_fit import HybridFit, fit_hybrid
-from kcal.calibrate.lensfit.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.board_orders import turned_corners
+from kcal.calibrate.hybrid.cameras_fit import CamerasFit, fit_cameras, measure_board
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import InputError

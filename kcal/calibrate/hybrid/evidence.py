@@ -1,6 +1,6 @@
 """How large each family of unknowns may be, told by the data: amplitudes and noise that maximize the evidence.
 
-Near a solution residuals are linear in lens and board (`kcal.calibrate.lensfit.quadratic`), poses eliminated. With
+Near a solution residuals are linear in lens and board (`kcal.calibrate.hybrid.quadratic`), poses eliminated. With
 Gaussian priors of variances D(h) the unknowns can be integrated out, and
 
     -2 ln p(data | h, σ²) = ν ln σ² + rss/σ² + |y|² + ln |I + √D K √D / σ²|,   x = √D y at its best,
@@ -20,8 +20,8 @@ import torch
 from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
-from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies, typical_hyperprior
-from kcal.calibrate.lensfit.quadratic import Quadratic, ViewData
+from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies, typical_hyperprior
+from kcal.calibrate.hybrid.quadratic import Quadratic, ViewData
 from kcal.calibrate.problem.readout import LARGEST, MEDIAN, SMALLEST, SPREAD
 from kcal.calibrate.problem.views import LEAST_NOISE
 

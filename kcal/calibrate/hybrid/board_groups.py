@@ -6,9 +6,9 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-from kcal.calibrate.lensfit.board_orders import CLEAR, mode_turn, quarter_turns
-from kcal.calibrate.lensfit.board_prior import BoardMessage, BoardPrior, merged, multiplied, printed_board
-from kcal.calibrate.lensfit.turned_fit import CameraFit
+from kcal.calibrate.hybrid.board_orders import CLEAR, mode_turn, quarter_turns
+from kcal.calibrate.hybrid.board_prior import BoardMessage, BoardPrior, merged, multiplied, printed_board
+from kcal.calibrate.hybrid.turned_fit import CameraFit
 from kcal.corners.board import Board
 
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.calibrate.lensfit.board_modes import board_modes
-from kcal.calibrate.lensfit.board_orders import find_turns, mode_turn, quarter_turns, turned_corners
-from kcal.calibrate.lensfit.board_prior import (
+from kcal.calibrate.hybrid.board_modes import board_modes
+from kcal.calibrate.hybrid.board_orders import find_turns, mode_turn, quarter_turns, turned_corners
+from kcal.calibrate.hybrid.board_prior import (
     BoardMessage,
     BoardPrior,
     message_from_rows,
@@ -18,7 +18,7 @@ from kcal.calibrate.lensfit.board_prior import (
     printed_board,
     printed_prior,
 )
-from kcal.calibrate.lensfit.families import BOARD, typical_hyperprior
+from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
 from kcal.corners.board import Board
 
 F64 = torch.float64

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from standing_views import standing
 
-from kcal.calibrate.lensfit.evidence import Quadratic, maximize_evidence, negative_log_evidence
-from kcal.calibrate.lensfit.families import Hyperprior, PriorFamilies
-from kcal.calibrate.lensfit.fleet import Likelihood, fleet_priors, hyper_likelihood
+from kcal.calibrate.hybrid.evidence import Quadratic, maximize_evidence, negative_log_evidence
+from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
+from kcal.calibrate.hybrid.fleet import Likelihood, fleet_priors, hyper_likelihood
 
 F64 = torch.float64
 TYPICAL = Hyperprior(torch.tensor([0.0, -7.0], dtype=F64), torch.tensor([1.5, 2.0], dtype=F64))
