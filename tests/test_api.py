@@ -75,7 +75,7 @@ PUBLIC = {
     """,
     "kcal.stars": """
         Air Attitude DetectedStars Identification NamedStars SkyView StarCatalog celestial_directions detect_stars
-        identify name_stars observed_directions parse_time
+        identify moments_of name_stars observed_directions parse_time star_source StarEffect StarSource
     """,
     "kcal.solve": """
         LMOptions LevenbergMarquardt RobustLoss SolverStatus
@@ -95,6 +95,9 @@ RECORDS = {
     "DetectedStars",
     "Identification",
     "NamedStars",
+    "StarEffect",
+    "StarSource",
+    "moments_of",
     "Examination",
     "Finding",
     "HalvesDifference",

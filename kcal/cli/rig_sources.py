@@ -31,6 +31,12 @@ class Sources:
     mark_sigma: float = 0.3
     survey_sigma: float | None = None
     geoid: float | None = None
+    stars: tuple[str, str] | None = None
+    star_time: str | None = None
+    clock_sigma: float = 0.1
+    celsius: float | None = None
+    hectopascal: float | None = None
+    dut1: float | None = None
 
     @property
     def files(self) -> list[Path]:
@@ -51,6 +57,7 @@ class RigInput(NamedTuple):
     data: RigData
     origin: Origin | None
     unpaired: int
+    notes: tuple[str, ...] = ()
 
 
 def parse_baseline(text: str) -> Baseline:
@@ -101,6 +108,11 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
         views = seen[0].names, seen[1].names
         matched = pair_by_name(*views) if sources.match is None else read_pairs(sources.match, *views)
         boards, unpaired = paired_boards(cameras, seen, matched), len(views[0]) + len(views[1]) - 2 * len(matched)
+    stars, notes = None, list[str]()
+    if sources.stars is not None:
+        from kcal.cli.rig_stars import read_stars
+
+        stars, positions, notes = read_stars(cameras, sources, origin, positions, placed=landmarks is not None)
     data = RigData(
         cameras=cameras,
         names=CAMERAS,
@@ -109,5 +121,6 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
         features=None if sources.features is None else read_features(sources.features, sources.mark_sigma),
         baselines=() if sources.baseline is None else (parse_baseline(sources.baseline),),
         positions=positions,
+        stars=stars,
     )
-    return RigInput(data, origin, unpaired)
+    return RigInput(data, origin, unpaired, tuple(notes))

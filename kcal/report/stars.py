@@ -36,7 +36,7 @@ def stars_figure(
     height, width = image.shape
     figure = new_figure(9.0, 9.0 * height / width + 0.9)
     axes = figure.add_axes((0.07, 0.07, 0.91, 0.86))
-    levels = to_8bit(image) if image.dtype in (np.uint8, np.uint16) else _stretched(image)
+    levels = to_8bit(image) if image.dtype in (np.uint8, np.uint16) else _sixteen_bits(image)
     axes.imshow(255 - levels.astype(np.int64), cmap="gray", vmin=-60, vmax=255, interpolation="nearest")
     frame_image(axes, (width, height))
     known = np.array([bool(name) for name in names], bool)
@@ -54,7 +54,7 @@ def stars_figure(
     return figure
 
 
-def _stretched(image: NDArray[Any]) -> NDArray[np.uint8]:
+def _sixteen_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
     low, high = np.percentile(image, (0.1, 99.9))
     return to_8bit(np.rint(np.clip((image - low) / max(high - low, 1e-9), 0, 1) * 65535).astype(np.uint16))
 

@@ -17,3 +17,9 @@ from kcal.stars.sky import Air as Air
 from kcal.stars.sky import observed_directions as observed_directions
 from kcal.stars.sky import celestial_directions as celestial_directions
 from kcal.stars.sky import parse_time as parse_time
+
+# What rigs are solved from
+from kcal.stars.rig_stars import star_source as star_source
+from kcal.stars.rig_stars import moments_of as moments_of
+from kcal.calibrate.rig.star_source import StarSource as StarSource
+from kcal.calibrate.rig.star_source import StarEffect as StarEffect

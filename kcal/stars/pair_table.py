@@ -60,7 +60,7 @@ def pair_table(catalog: StarCatalog, field: float) -> PairTable:
     directions = catalog.directions()[order]
     content = hashlib.sha256(directions.tobytes()).hexdigest()[:12]
     path = cache_folder() / f"stars-{_VERSION}-{content}-{degrees:g}.npz"
-    found = _read_table(path)
+    found = _table_on_disk(path)
     if found is None:
         found = _pairs(directions, np.radians(degrees))
         _keep_table(path, found)
@@ -83,7 +83,7 @@ def _pairs(directions: NDArray[np.float64], largest: float) -> _Pairs:
     return pairs[order].astype(np.uint16), angle[order], stars
 
 
-def _read_table(path: Path) -> _Pairs | None:
+def _table_on_disk(path: Path) -> _Pairs | None:
     """What the file contains; None if it is not there or not whole."""
     try:
         with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as table:
