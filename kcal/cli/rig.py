@@ -139,6 +139,7 @@ def solve_command(
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
     from kcal.cli.console import print_table, print_wrote, steps, tell, warn
     from kcal.cli.rig_sources import Sources, read_sources
+    from kcal.cli.rig_stars import NightOptions
     from kcal.files import check_writable
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
@@ -146,10 +147,15 @@ def solve_command(
     from kcal.locate.range_sigmas import range_sigmas
     from kcal.report.tables import range_sigma_rows
 
+    night = None
+    if stars is not None:
+        night = NightOptions(
+            images=stars, time=star_time, clock_sigma=clock_sigma, celsius=celsius, hectopascal=hectopascal, dut1=dut1
+        )
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=mark_sigma, survey_sigma=survey_sigma, geoid=geoid,
-        stars=stars, star_time=star_time, clock_sigma=clock_sigma, celsius=celsius, hectopascal=hectopascal, dut1=dut1,
+        stars=night,
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     needs = required(require)

@@ -10,6 +10,7 @@ from kcal.errors import InputError
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData
+    from kcal.cli.rig_stars import NightOptions
     from kcal.lens.camera import Camera
     from kcal.lens.mounting import Origin
 
@@ -31,12 +32,7 @@ class Sources:
     mark_sigma: float = 0.3
     survey_sigma: float | None = None
     geoid: float | None = None
-    stars: tuple[str, str] | None = None
-    star_time: str | None = None
-    clock_sigma: float = 0.1
-    celsius: float | None = None
-    hectopascal: float | None = None
-    dut1: float | None = None
+    stars: NightOptions | None = None
 
     @property
     def files(self) -> list[Path]:
@@ -112,7 +108,7 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
     if sources.stars is not None:
         from kcal.cli.rig_stars import read_stars
 
-        stars, positions, notes = read_stars(cameras, sources, origin, positions, placed=landmarks is not None)
+        stars, positions, notes = read_stars(cameras, sources.stars, origin, positions, placed=landmarks is not None)
     data = RigData(
         cameras=cameras,
         names=CAMERAS,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,6 @@ from kcal.errors import InputError, KcalError
 if TYPE_CHECKING:
     from kcal.calibrate.rig.sources import MeasuredPosition
     from kcal.calibrate.rig.star_source import StarSource
-    from kcal.cli.rig_sources import Sources
     from kcal.lens.camera import Camera
     from kcal.lens.mounting import Origin
     from kcal.stars.night import NamedStars
@@ -19,9 +19,21 @@ if TYPE_CHECKING:
 _PLACE_SIGMA = 3.0
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NightOptions:
+    """What the user gave of night images, as on the command line."""
+
+    images: tuple[str, str]
+    time: str | None = None
+    clock_sigma: float = 0.1
+    celsius: float | None = None
+    hectopascal: float | None = None
+    dut1: float | None = None
+
+
 def read_stars(
     cameras: tuple[Camera, Camera],
-    sources: Sources,
+    night: NightOptions,
     origin: Origin | None,
     positions: tuple[MeasuredPosition, ...],
     *,
@@ -31,7 +43,7 @@ def read_stars(
 
     Args:
         cameras: left and right.
-        sources: what the user gave.
+        night: what the user gave.
         origin: of the rig's frame; None if nothing is known on the Earth.
         positions: measured ones.
         placed: whether landmarks or anything else places the rig already.
@@ -41,9 +53,8 @@ def read_stars(
     from kcal.calibrate.rig.sources import MeasuredPosition
     from kcal.stars.rig_stars import moments_of, star_source
 
-    assert sources.stars is not None
-    images = [_named(side, given, camera, sources, origin)
-              for side, given, camera in zip(("left", "right"), sources.stars, cameras, strict=True)]  # fmt: skip
+    images = [_named_images(side, given, camera, night, origin)
+              for side, given, camera in zip(("left", "right"), night.images, cameras, strict=True)]  # fmt: skip
     moments, alone = moments_of(images)
     if not any(len(moment) == 2 for moment in moments):
         raise InputError(
@@ -54,20 +65,22 @@ def read_stars(
         there = torch.zeros(3, dtype=torch.float64)
         positions = (MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, _PLACE_SIGMA)),)
     frame = origin if placed or positions else None
-    source = star_source(moments, cameras, clock_sigma=sources.clock_sigma, origin=frame)
+    source = star_source(moments, cameras, clock_sigma=night.clock_sigma, origin=frame)
     named = int(source.named.sum())
     lines = [
         f"stars: {len(moments)} moments, {len(source.names)} stars, {named} with a direction on the Earth"
         + (f"; {alone} images without partner" if alone else ""),
-        f"clocks of the cameras against each other: ± {sources.clock_sigma:g} s, which no residual shows: up to "
-        f"{math.degrees(7.292e-5 * sources.clock_sigma):.5f}° of relative attitude, and part of every σ below",
+        f"clocks of the cameras against each other: ± {night.clock_sigma:g} s, which no residual shows: up to "
+        f"{math.degrees(7.292e-5 * night.clock_sigma):.5f}° of relative attitude, and part of every σ below",
     ]
-    if on_earth and sources.dut1 is None:
+    if on_earth and night.dut1 is None:
         lines.append("UT1 - UTC is not known (--dut1): 8″ of heading, part of its σ")
     return source, positions, lines
 
 
-def _named(side: str, given: str, camera: Camera, sources: Sources, origin: Origin | None) -> list[NamedStars]:
+def _named_images(
+    side: str, given: str, camera: Camera, night: NightOptions, origin: Origin | None
+) -> list[NamedStars]:
     from kcal.cli.console import steps, warn
     from kcal.cli.stars import sky_view
     from kcal.stars.night import name_stars
@@ -76,13 +89,13 @@ def _named(side: str, given: str, camera: Camera, sources: Sources, origin: Orig
     files = expand_nights([given])
     found: list[NamedStars] = []
     # A place without a time tells nothing.
-    place = origin if sources.star_time is not None else None
+    place = origin if night.time is not None else None
     where = (None, None, 0.0) if place is None else (place.lat, place.lon, place.height)
     with steps(f"naming stars of {side}", len(files)) as advance:
         for path in files:
             view = sky_view(
-                path, sources.star_time, *where, dut1=sources.dut1, celsius=sources.celsius,
-                pressure=sources.hectopascal,
+                path, night.time, *where, dut1=night.dut1, celsius=night.celsius,
+                pressure=night.hectopascal,
             )  # fmt: skip
             try:
                 image = name_stars(read_night(path), camera, view)

@@ -44,8 +44,8 @@ def star_source(
 
     If all images have their attitude on the Earth (`NamedStars.on_earth`), named stars are known in east, north, up,
     and the clock, UT1 and the air's temperature and pressure are unknowns with their sigmas. Otherwise stars only tell
-    how the cameras are turned against each other. In both cases the offset between the cameras' clocks is an unknown: no
-    residual shows it, and a second of it is 15 seconds of arc.
+    how the cameras are turned against each other. In both cases the offset between the cameras' clocks is an unknown:
+    no residual shows it, and a second of it is 15 seconds of arc.
 
     Args:
         moments: images of each moment by the number of their camera.
