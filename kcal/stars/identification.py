@@ -22,8 +22,8 @@ Floats = NDArray[np.float64]
 
 # Expected number of attitudes that agree as well by chance.
 _BY_CHANCE = 1e-9
-# The brightest stars of an image make triangles, and those after them only test.
-_CORNERS, _TESTED = 10, 80
+# More stars of an image are not needed.
+_TESTED = 80
 # Triangles with a side below this share of the field propose attitudes that are too rough.
 _SHORTEST = 0.06
 # Stars of the catalogue in the field for each star of the image, of which not all are the brightest.
@@ -53,7 +53,13 @@ class Identification(NamedTuple):
 
 
 def identify(
-    rays: Floats, reach: float, *, catalog: StarCatalog | None = None, scale_error: float = 0.0, field: float = 0.0
+    rays: Floats,
+    reach: float,
+    *,
+    catalog: StarCatalog | None = None,
+    scale_error: float = 0.0,
+    field: float = 0.0,
+    corners: int = 10,
 ) -> Identification | None:
     """Find which stars of the catalogue are seen, and from that where the camera looks; nothing need be known of it.
 
@@ -63,6 +69,7 @@ def identify(
         catalog: the stars; kcal's own if left out.
         scale_error: share by which the focal length may be wrong.
         field: angle in radians between opposite corners of the image; by the stars themselves if left out.
+        corners: how many of the brightest stars make triangles; the others only test.
 
     Returns:
         None where no attitude agrees with more stars than by chance: fewer than five or six stars never do.
@@ -85,8 +92,8 @@ def identify(
     in_field = max(_DEEPER * len(rays), _LEAST_IN_FIELD)
     pool = int(min(in_field * 4.0 * math.pi / area, len(table.order)))
     tree = cKDTree(table.directions[:pool])
-    corners, proposals, best = rays[: min(_CORNERS, len(rays))], 0, None
-    triples = sorted(itertools.combinations(range(len(corners)), 3), key=lambda triple: triple[2])
+    proposals, best = 0, None
+    triples = sorted(itertools.combinations(range(min(corners, len(rays))), 3), key=lambda triple: triple[2])
     for triple in triples:
         at = list(triple)
         stars = _triangles(rays[at], table, min(pool, table.stars), reach, scale_error, _SHORTEST * field)
