@@ -28,7 +28,13 @@ def stars_command(
             show_default=False,
         ),
     ],
-    camera: Annotated[str, typer.Option(metavar="CAMERA", help="Camera file; FILE:left names one of a rig.")],
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CAMERA",
+            help="Camera file; FILE:left names one of a rig. Without one, the lens is found from the stars first.",
+        ),
+    ] = None,
     time: Annotated[str | None, typer.Option(metavar="TIME", help=TIME_HELP)] = None,
     lat: Annotated[float | None, typer.Option(metavar="DEG", help="Latitude of the camera.")] = None,
     lon: Annotated[float | None, typer.Option(metavar="DEG", help="Longitude of the camera.")] = None,
@@ -74,7 +80,13 @@ def stars_command(
         sky_view(path, time, lat, lon, height, dut1=dut1, time_sigma=time_sigma, celsius=celsius, pressure=hectopascal)
         for path in files
     ]
-    lens, catalog = single_camera(camera), StarCatalog.bundled()
+    catalog = StarCatalog.bundled()
+    if camera is None:
+        from kcal.cli.calibrate_stars import calibrated
+
+        lens = calibrated(files, views, "finding the lens")[0].lens.camera
+    else:
+        lens = single_camera(camera)
     told: list[dict[str, Any]] = []
     rows = [["image", "stars", "named", "RMS px", *_heads(views[0])]]
     drawn = picture is None
