@@ -74,6 +74,7 @@ PUBLIC = {
         stored_verdict
     """,
     "kcal.stars": """
+        NightPlan PlannedStars StarCamera StarLens calibrate_by_stars planned_stars
         Air Attitude DetectedStars Identification NamedStars SkyView StarCatalog celestial_directions detect_stars
         identify moments_of name_stars observed_directions parse_time star_source StarEffect StarSource
     """,
@@ -96,6 +97,9 @@ RECORDS = {
     "Identification",
     "NamedStars",
     "StarEffect",
+    "StarCamera",
+    "StarLens",
+    "PlannedStars",
     "StarSource",
     "moments_of",
     "Examination",

@@ -23,3 +23,11 @@ from kcal.stars.rig_stars import star_source as star_source
 from kcal.stars.rig_stars import moments_of as moments_of
 from kcal.calibrate.rig.star_source import StarSource as StarSource
 from kcal.calibrate.rig.star_source import StarEffect as StarEffect
+
+# Lenses, and what to expect
+from kcal.stars.lens import calibrate_by_stars as calibrate_by_stars
+from kcal.stars.lens import StarCamera as StarCamera
+from kcal.stars.lens_fit import StarLens as StarLens
+from kcal.stars.budget import planned_stars as planned_stars
+from kcal.stars.budget import NightPlan as NightPlan
+from kcal.stars.budget import PlannedStars as PlannedStars
