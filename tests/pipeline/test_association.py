@@ -13,17 +13,15 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.stereo import fit_pairs
 from kcal.pipeline.association import (
-    _FORBIDDEN,
     Association,
     AssociationOptions,
-    _assigned,
-    _best_assignment,
     associate,
     epipolar_cost,
     pair_costs,
 )
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.epipolar_band import near_epipolar_lines
+from kcal.pipeline.one_to_one import assign_groups, best_assignment
 
 SIZE = (1920, 1080)
 
@@ -119,7 +117,8 @@ def test_the_band_leaves_out_no_pair_that_is_possible(kind: str, share: float) -
     options = AssociationOptions(box_sigma=2.0, nearest=5.0)
     size = torch.tensor(SIZE, dtype=torch.float64)
     left, right = (seen(torch.rand(120, 2, generator=random, dtype=torch.float64) * size) for _ in range(2))
-    near = near_epipolar_lines(rig, left.anchors(), right.anchors(), options.box_sigma, options.gate)
+    anchors, ranges = (left.anchors(), right.anchors()), (5.0, options.farthest)
+    near = near_epipolar_lines(rig, *anchors, options.box_sigma, options.gate, ranges)
     every = pair_costs(rig, left, right, options)
     possible = every < options.gate**2
     for i, j in (possible & ~near).nonzero().tolist():
@@ -139,19 +138,18 @@ def test_the_band_leaves_out_no_pair_that_is_possible(kind: str, share: float) -
 def test_groups_are_assigned_as_the_whole_is() -> None:
     """Costs of three groups in one matrix: columns, ambiguity and sum are those of one large problem."""
     random = np.random.default_rng(0)
-    options = AssociationOptions()
     for _ in range(20):
-        cost = np.full((9, 8), _FORBIDDEN)
+        cost = np.full((9, 8), np.inf)
         for rows, columns in ((slice(0, 4), slice(0, 3)), (slice(4, 7), slice(3, 7)), (slice(8, 9), slice(7, 8))):
             part = random.uniform(0.0, 16.0, cost[rows, columns].shape)
-            cost[rows, columns] = np.where(random.random(part.shape) < 0.7, part, _FORBIDDEN)
-        chosen, ambiguous = _assigned(cost, options)
-        whole, least = _best_assignment(cost, 16.0)
+            cost[rows, columns] = np.where(random.random(part.shape) < 0.7, part, np.inf)
+        chosen, ambiguous = assign_groups(cost, 16.0, 2.0 * np.log(20.0))
+        whole, least = best_assignment(cost, 16.0)
         assert chosen.tolist() == whole.tolist()
         for i in np.flatnonzero(chosen >= 0):
             without = cost.copy()
-            without[i, chosen[i]] = _FORBIDDEN
-            other, more = _best_assignment(without, 16.0)
+            without[i, chosen[i]] = np.inf
+            other, more = best_assignment(without, 16.0)
             rival = other[i] >= 0 or chosen[i] in other
             assert ambiguous[i] == (rival and more - least < 2.0 * np.log(20.0))
 
