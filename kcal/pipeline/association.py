@@ -30,7 +30,7 @@ _SIZE_SPREAD = 0.15
 # Spread of 1 - correlation between two views of one object; of two objects it is 0.5 to 1.
 _LOOKS_SPREAD = 0.25
 # Of one image: more are a detector's fault, and their pairs grow with the square.
-MOST_BOXES = 5000
+MOST_BOXES = 2000
 # Numbers that are held at once while pairs are compared, some 100 MB with what is derived from them.
 _AT_ONCE = 1 << 19
 
@@ -104,7 +104,7 @@ def associate(
         images: gray levels (H, W) of both, if looks shall count.
 
     Raises:
-        InputError: detections or images that are not of the cameras' size, more than 5,000 boxes in an image, or a
+        InputError: detections or images that are not of the cameras' size, more than 2,000 boxes in an image, or a
             missing keypoint.
 
     Example:
@@ -136,7 +136,9 @@ def associate(
         gray = [as_gray(f"{word} image", image) for word, image in zip(("left", "right"), images, strict=True)]
         if [image.shape[::-1] for image in gray] != [rig.left.size, rig.right.size]:
             raise InputError("association: images of the cameras' sizes are needed")
-        cost = cost + ((1.0 - appearance(gray[0], left.boxes, gray[1], right.boxes)) / _LOOKS_SPREAD).square()
+        parts = right.boxes.split(64)
+        looks = torch.cat([appearance(gray[0], left.boxes, gray[1], some) for some in parts], 1)
+        cost = cost + ((1.0 - looks) / _LOOKS_SPREAD).square()
     possible = cost < options.gate**2
     costs = torch.where(possible, cost, torch.inf).numpy()
     chosen, ambiguous = assign_groups(costs, options.gate**2, 2.0 * math.log(options.odds))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 
 import numpy as np
 import pytest
@@ -152,6 +153,53 @@ def test_groups_are_assigned_as_the_whole_is() -> None:
             other, more = best_assignment(without, 16.0)
             rival = other[i] >= 0 or chosen[i] in other
             assert ambiguous[i] == (rival and more - least < 2.0 * np.log(20.0))
+
+
+def test_one_that_stays_alone_costs_half_of_what_two_do() -> None:
+    """Where some pairs cost more than staying alone, the columns and the sum are those of trying everything."""
+    random = np.random.default_rng(1)
+    for shape in ((3, 3), (4, 2), (2, 4), (4, 3)):
+        for _ in range(10):
+            cost = random.uniform(0.0, 9.0, shape)
+            chosen, least = best_assignment(cost, 4.0)
+            pairs = [(i, j) for i, j in enumerate(chosen.tolist()) if j >= 0]
+            assert least == pytest.approx(brute(torch.from_numpy(cost), 4.0))
+            assert least == pytest.approx(sum(cost[pair] for pair in pairs) + 2.0 * (sum(shape) - 2 * len(pairs)))
+            assert all(cost[pair] < 4.0 for pair in pairs)
+
+
+def test_a_pair_has_no_rival_where_staying_alone_is_likelier_than_another_partner() -> None:
+    """A second left detection is near the right one's: a rival if it costs little more than the first, alone or not."""
+    for second, rival in ((5.0, True), (9.0, False)):
+        assert assign_groups(np.array([[1.0], [second]]), 16.0, 6.0)[1].tolist() == [rival, False]
+    # Both alone, at 4 more, is likelier than the exchange, at 5 more; where neither is likely, the exchange counts.
+    costs = np.array([[12.0, 14.6], [14.6, 12.2]])
+    assert assign_groups(costs, 16.0, 6.0)[1].tolist() == [False, False]
+    assert assign_groups(costs - 2.0, 16.0, 6.0)[1].tolist() == [True, True]
+
+
+def test_a_crowd_takes_bounded_time_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """400 boxes in one row, of which most could be most: 6.8 CPU seconds when every rival was an assignment."""
+    random = torch.Generator().manual_seed(0)
+    rows = [torch.rand(400, 2, generator=random).double() * torch.tensor([1800.0, 20.0]) + 500.0 for _ in range(2)]
+    left, right = (seen(row - torch.tensor([440.0, 0.0])) for row in rows)
+    sizes = []
+
+    def counted(rig: StereoRig, *pixels: Tensor, **options: bool) -> object:
+        sizes.append(len(pixels[0]))
+        return fit_pairs(rig, *pixels, **options)
+
+    monkeypatch.setattr("kcal.pipeline.association.fit_pairs", counted)
+    begin = time.process_time()
+    found = associate(rig_of(), left, right)
+    assert time.process_time() - begin < 3.0
+    assert len(found.left) > 300
+    assert found.ambiguous.double().mean() > 0.8
+    # Pairs that diverge or are too near are not fitted, and others some at a time.
+    assert sum(sizes) < 0.3 * 400**2
+    assert max(sizes) < 40_000
+    with pytest.raises(InputError, match="2,100 left detections in one image"):
+        associate(rig_of(), seen(torch.full((2100, 2), 500.0).double()), right)
 
 
 def test_two_that_could_be_swapped_are_ambiguous() -> None:
