@@ -17,24 +17,50 @@ from typing import Any, BinaryIO
 from kcal.errors import FileError, InputError
 
 
-def read_bytes(path: str | Path, most: int = 4 * 2**30) -> bytes:
+def read_bytes(path: str | Path, most: int = 2**30) -> bytes:
     """The bytes of a regular file; a pipe or a device, which may never end, is refused.
 
     Raises:
         FileError: missing, no regular file, larger than `most` bytes, or not readable.
     """
+    with _regular_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise FileError(f"{path}: {size / 2**20:.0f} MiB; at most {most / 2**20:.0f} MiB are read")
+        return file.read(most)
+
+
+def read_text(path: str | Path, most: int) -> str:
+    """The UTF-8 text of a regular file, without a byte order mark.
+
+    Raises:
+        FileError: as `read_bytes`, or another encoding.
+    """
+    try:
+        return read_bytes(path, most).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileError(f"{path}: not UTF-8 text") from error
+
+
+def read_head(path: str | Path, count: int) -> bytes:
+    """The first bytes of a regular file, at most so many; with 0, check that it is one and can be read.
+
+    Raises:
+        FileError: missing, no regular file, or not readable.
+    """
+    with _regular_file(path) as file:
+        return file.read(count)
+
+
+@contextmanager
+def _regular_file(path: str | Path) -> Iterator[BinaryIO]:
     try:
         with open(path, "rb", opener=_open_at_once) as file:
-            about = os.fstat(file.fileno())
-            if not stat.S_ISREG(about.st_mode):
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 raise FileError(f"{path}: not a regular file; a pipe or a device cannot be read here")
-            if about.st_size > most:
-                size = about.st_size / 2**20
-                raise FileError(f"{path}: {size:.0f} MiB; at most {most / 2**20:.0f} MiB are read")
-            data = file.read(most)
+            yield file
     except (OSError, ValueError) as error:
         raise FileError(f"{path}: cannot read: {_reason(error)}") from error
-    return data
 
 
 def _open_at_once(path: str, flags: int) -> int:

@@ -110,8 +110,8 @@ def live_command(
     nothing is lost or written twice. Receivers of `--to` may get the last moments twice. Only one process at a time may
     write an output.
 
-    Times are seconds. A time that the moments before and after contradict is left out; a clock that was set is followed,
-    with new tracks. Both are counted.
+    Times are seconds. A time that the moments before and after contradict is left out; a clock that was set is
+    followed, with new tracks. Both are counted.
 
     **Examples**
 

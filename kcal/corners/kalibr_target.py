@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from kcal.errors import FileError
-from kcal.files import read_bytes
+from kcal.files import read_text
 
 _MOST_BYTES = 1 << 20
 
@@ -32,10 +32,9 @@ def target_fields(path: str | Path) -> dict[str, Any]:
         ...     target_fields(path)
         {'pattern': 'aprilgrid', 'columns': 12, 'rows': 8, 'square': 0.08, 'gap': 0.02}
     """
-    data = read_bytes(Path(path), _MOST_BYTES)
     try:
-        content = yaml.safe_load(data.decode("utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        content = yaml.safe_load(read_text(path, _MOST_BYTES))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise FileError(f"{path}: no YAML file: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict) or "target_type" not in content:
         raise FileError(f"{path}: not a target file of Kalibr: target_type is missing")

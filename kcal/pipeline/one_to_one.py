@@ -7,8 +7,6 @@ n assignments.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
@@ -70,8 +68,7 @@ def best_assignment(cost: Floats, alone: float) -> tuple[NDArray[np.int64], floa
 
 
 def _has_rival(saved: Floats, best: NDArray[np.int64], near: float) -> NDArray[np.bool_]:
-    """(N,) bool: the best assignment in which a member of the row's pair has another partner costs at most `near` more,
-    and no more than that in which both are alone.
+    """(N,) bool: giving a member of the row's pair another partner costs at most `near`, and less than leaving both.
 
     In the graph of the pairs, an edge from a to b says that the row of a takes the column of b. One more node stands
     for whatever is alone: an edge to it frees a row, or gives it a column that was alone; an edge from it frees a

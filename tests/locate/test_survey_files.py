@@ -53,7 +53,7 @@ def test_three_formats_of_the_same_places(tmp_path: Path) -> None:
         ("a.geojson", collection(feature("p", 72.0, 19.0, 1.0, sigma=1), crs={"type": "name"}), "crs"),
         ("a.geojson", collection(*[feature("p", 72.0, 19.0, 1.0, sigma=1)] * 2), "occurs twice"),
         ("a.geojson", collection(), "no places"),
-        ("a.geojson", "[", "bad survey"),
+        ("a.geojson", "[", "not a JSON file"),
         ("a.gpx", "<gpx", "not XML"),
         ("a.gpx", "<!DOCTYPE a><gpx/>", "document types"),
         ("a.gpx", GPX.replace("<ele>80</ele>", ""), "post: no elevation"),
