@@ -84,10 +84,10 @@ def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] |
         if len(corners) != board.corners:
             raise FileError(f"{path}: {name} has {len(corners)} corners, the board {board.corners}")
     weighted = any(corner is not None and corner[2] != 1.0 for corners in views.values() for corner in corners)
-    found = [_view(name, corners, weighted) for name, corners in views.items() if any(corners)]
-    if not found:
-        raise FileError(f"{path}: no view with corners")
     try:
+        found = [_view(name, corners, weighted) for name, corners in views.items() if any(corners)]
+        if not found:
+            raise FileError(f"{path}: no view with corners")
         return Observations(board=board, image_size=size, refinement="none", views=tuple(found))
     except pydantic.ValidationError as error:
         raise FileError(f"{path}: bad corners file: {error.errors()[0]['msg']}") from error

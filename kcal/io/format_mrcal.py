@@ -21,7 +21,6 @@ from kcal.errors import InputError
 from kcal.files import read_text, write_atomic
 from kcal.io.foreign import (
     MOST_BYTES,
-    MOST_YAML,
     CameraPose,
     Hints,
     ImportedCameras,
@@ -38,6 +37,8 @@ from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 
 MODELS = ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12")
 _TEXT = re.compile(r"'(?:[^'\\]|\\.)*+'|\"(?:[^\"\\]|\\.)*+\"")
+# Characters besides texts.
+_MOST_NUMBERS = 2**20
 _LENSES = {"LENSMODEL_PINHOLE": "pinhole"} | {f"LENSMODEL_OPENCV{n}": f"opencv{n}" for n in (4, 5, 8, 12)}
 
 
@@ -45,8 +46,8 @@ def read_mrcal(path: Path, hints: Hints) -> ImportedCameras:
     """Read one camera and its pose."""
     text = read_text(path, MOST_BYTES)
     # What a model was made from is stored as long texts; numbers take Python a hundred times their length in memory.
-    if len(_TEXT.sub("", text)) > MOST_YAML:
-        raise ValueError(f"more than {MOST_YAML // 2**20} MiB of numbers and names")
+    if len(_TEXT.sub("", text)) > _MOST_NUMBERS:
+        raise ValueError(f"more than {_MOST_NUMBERS // 2**20} MiB of numbers and names")
     try:
         content = ast.literal_eval(text)
     except (SyntaxError, MemoryError, RecursionError):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -75,8 +76,8 @@ def import_survey(
     if not places:
         raise FileError(f"{path}: no places")
     names = [place.name for place in places]
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(names).items():
+        if count > 1:
             raise FileError(f"{path}: the name {name!r} occurs twice; names must differ")
     spreads = [_spread(place, sigma, path) for place in places]
     origin = origin or places[0].origin
