@@ -22,6 +22,8 @@ except ImportError:
 else:
     _msvcrt = None
 
+# Windows does not rename a file that is open and locked.
+PARTS_ARE_LOCKED = _fcntl is not None
 # Windows locks bytes against reading, too: one that no text reaches.
 _FAR = 1 << 20
 
@@ -81,7 +83,7 @@ def _locked(lock: Path, path: Path, work: str) -> int:
         except OSError as error:
             raise FileError(f"{path}: cannot lock it with {lock}: {error.strerror or error}") from error
         try:
-            if not _try_lock(handle):
+            if not try_lock(handle):
                 raise FileError(f"{path}: {_holder(handle)} writes it; end that first, or choose another output")
             # The one before may have removed the file after it was opened here.
             if lock.exists() and os.path.samestat(os.fstat(handle), lock.stat()):
@@ -95,7 +97,8 @@ def _locked(lock: Path, path: Path, work: str) -> int:
         os.close(handle)
 
 
-def _try_lock(handle: int) -> bool:
+def try_lock(handle: int) -> bool:
+    """Lock an open file until it is closed; False if another process has it."""
     try:
         if _fcntl is not None:
             _fcntl.flock(handle, _fcntl.LOCK_EX | _fcntl.LOCK_NB)

@@ -55,7 +55,7 @@ def read_storage(data: bytes, source: str) -> dict[str, Any]:
     return found
 
 
-def _matrix(value: Any) -> Any:
+def _stored_matrix(value: Any) -> Any:
     """A map as it is, or the matrix that it describes."""
     if not isinstance(value, Mapping) or "dt" not in value or "data" not in value:
         return value
@@ -89,7 +89,7 @@ def _scalar(text: str) -> Any:
 def _plain(value: Any) -> Any:
     """JSON's values with matrices and floats."""
     if isinstance(value, dict):
-        return _matrix({key: _plain(inside) for key, inside in value.items()})
+        return _stored_matrix({key: _plain(inside) for key, inside in value.items()})
     if isinstance(value, list):
         return [_plain(inside) for inside in value]
     if isinstance(value, str):
@@ -120,7 +120,7 @@ def _of_element(element: Element) -> Any:
         if child.tag == "data" and isinstance(value, float):
             value = [value]
         _add(found, str(child.tag), value)
-    return _matrix(found)
+    return _stored_matrix(found)
 
 
 def _add(found: dict[str, Any], key: str, value: Any) -> None:
@@ -178,7 +178,7 @@ class _YamlLines:
                 raise self.wrong("a name and a colon are needed")
             name = str(_scalar(key[1])) if key[1].startswith('"') else key[1].strip()
             _add(found, name, self.value(text[key.end() :].strip(), indent, depth, False))
-        return _matrix(found)
+        return _stored_matrix(found)
 
     def value(self, rest: str, indent: int, depth: int, item: bool) -> Any:
         """What stands behind a name or a dash, and on the lines below."""
@@ -205,11 +205,11 @@ class _YamlLines:
         """A sequence or map in brackets, which may go on over lines."""
         begin, parts = self.at, [rest]
         # Brackets in texts end it too late at worst, and are then found to be missing.
-        balance = _balance(rest)
+        balance = _open_brackets(rest)
         while balance > 0 and self.at + 1 < len(self.lines):
             self.at += 1
             parts.append(self.lines[self.at][2])
-            balance += _balance(parts[-1])
+            balance += _open_brackets(parts[-1])
         text = " ".join(parts)
         self.at += 1
         inside = text[1:-1]
@@ -223,7 +223,7 @@ class _YamlLines:
         return value
 
 
-def _balance(text: str) -> int:
+def _open_brackets(text: str) -> int:
     bare = re.sub(r"\"(?:[^\"\\]|\\.)*\"|'[^']*'", "", text)
     return bare.count("[") + bare.count("{") - bare.count("]") - bare.count("}")
 
@@ -265,7 +265,7 @@ def _flow(tokens: list[str], at: int, depth: int) -> tuple[Any, int]:
             at += 1
         elif _at(tokens, at) != closing:
             raise ValueError(f"{closing!r} or a comma is missing before {_at(tokens, at)[:40]!r}")
-    return (items if opening == "[" else _matrix(found)), at + 1
+    return (items if opening == "[" else _stored_matrix(found)), at + 1
 
 
 def _at(tokens: list[str], at: int) -> str:

@@ -112,7 +112,7 @@ def _from_geojson(content: Any) -> list[_Place]:
 def _position_in(coordinates: Sequence[Any], name: str) -> tuple[float, float, float]:
     if len(coordinates) != 3:
         raise ValueError(f"{name}: [longitude, latitude, height] are needed, got {len(coordinates)} numbers")
-    lon, lat, height = (_number(value, f"a coordinate of {name!r}") for value in coordinates)
+    lon, lat, height = (_stated_number(value, f"a coordinate of {name!r}") for value in coordinates)
     return lat, lon, height
 
 
@@ -126,12 +126,12 @@ def _origin(name: str, lat: float, lon: float, height: float) -> Origin:
 def _stated(properties: dict[str, Any], name: str) -> tuple[float, float] | None:
     if properties.get("sigma") in (None, ""):
         return None
-    level = _number(properties["sigma"], f"the sigma of {name!r}")
+    level = _stated_number(properties["sigma"], f"the sigma of {name!r}")
     up = properties.get("sigma_up")
-    return level, level if up in (None, "") else _number(up, f"the sigma_up of {name!r}")
+    return level, level if up in (None, "") else _stated_number(up, f"the sigma_up of {name!r}")
 
 
-def _number(value: Any, what: str) -> float:
+def _stated_number(value: Any, what: str) -> float:
     """A number, also one that a program has written as a text."""
     try:
         if isinstance(value, int | float | str) and not isinstance(value, bool):
