@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,9 @@ _CELL, _STRUCT, _CHARACTERS = 1, 2, 4
 _NUMBERS = range(6, 16)
 
 
+ByteOrder = Literal["<", ">"]
+
+
 class _Element(NamedTuple):
     kind: int
     data: bytes
@@ -33,7 +36,7 @@ class _Element(NamedTuple):
 class _Reader:
     """Elements one after the other in bytes of one byte order."""
 
-    def __init__(self, data: bytes, order: str) -> None:
+    def __init__(self, data: bytes, order: ByteOrder) -> None:
         self.data, self.order, self.at = data, order, 0
 
     def more(self) -> bool:
@@ -83,7 +86,8 @@ def read_mat(data: bytes, source: str) -> dict[str, Any]:
     """
     if data[:4] == b"\x89HDF" or data[:19] == b"MATLAB 7.3 MAT-file":
         raise FileError(f"{source}: a .mat file of version 7.3; save it with -v7")
-    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
+    orders: dict[bytes, ByteOrder] = {b"IM": "<", b"MI": ">"}
+    order = orders.get(data[126:128])
     if order is None or len(data) < 136:
         raise FileError(f"{source}: not a .mat file of version 5 to 7.2; save it with -v7")
     found: dict[str, Any] = {}
