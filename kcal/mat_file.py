@@ -128,12 +128,19 @@ def _array(reader: _Reader, depth: int) -> tuple[str, Any]:
     if len(sides) < 2 or min(sides) < 0:
         raise ValueError(f"{name}: an array without rows and columns")
     count = math.prod(sides)
-    if kind in _NUMBERS or kind == _CHARACTERS:
+    if kind == _CHARACTERS:
+        coding, text = reader.element()
+        # Old files have a number for each character.
+        name_of_coding = {1: "utf-8", 2: "utf-8", 16: "utf-8", 4: "utf-16", 17: "utf-16", 18: "utf-32"}.get(coding)
+        if name_of_coding is None:
+            raise ValueError(f"{name}: characters of kind {coding}")
+        endings = {"<": "-le", ">": "-be"}
+        suffix = "" if name_of_coding == "utf-8" else endings[reader.order]
+        return name, text.decode(name_of_coding + suffix, "replace")
+    if kind in _NUMBERS:
         values = reader.values()
-        if len(values) != count and kind != _CHARACTERS:
+        if len(values) != count:
             raise ValueError(f"{name}: {len(values)} numbers for {count} places")
-        if kind == _CHARACTERS:
-            return name, "".join(chr(value) if value < 0xD800 else "?" for value in values.tolist())
         # Arrays are stored down the columns first.
         return name, values.reshape(sides, order="F")
     if kind == _CELL:

@@ -10,13 +10,14 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import orjson
 import pytest
 import torch
 from track_scenes import seen_by, tracked_site
 
-from kcal.errors import FileError
+from kcal.errors import FileError, InputError
 from kcal.locate.positions import located_by
 from kcal.locate.tabulate import Locator
 from kcal.pipeline.association import AssociationOptions
@@ -184,3 +185,51 @@ def test_one_process_at_a_time_writes_an_output(tmp_path: Path) -> None:
     (tmp_path / "journal").unlink()
     assert follow(tmp_path, STEADY).moments == 20
     assert not list(tmp_path.glob(".*.lock"))
+
+
+def test_a_line_with_anything_is_a_moment_or_an_input_error() -> None:
+    """Any value of two good lines replaced by something else: what is read goes through the tracker, too."""
+    good = [
+        {"time": 3.5, "left": [[960, 540]], "right": [[944, 540]], "sigma": 0.3, "scores": [0.5], "categories": ["a"]},
+        {side: {"time": 3.5, "boxes": [[900, 500, 920, 520]], "scores": [0.5], "categories": ["a"]}
+         for side in ("left", "right")},
+    ]  # fmt: skip
+    odd = [
+        "1e308",
+        "1e-308",
+        "-1",
+        str(2**64),
+        "9" * 400,
+        "null",
+        "true",
+        '"x"',
+        "[]",
+        "{}",
+        "[[1]]",
+        "NaN",
+        "[" * 3000,
+    ]
+    tracker, counts = Tracker(SITE), {True: 0, False: 0}
+    for line in good:
+        for path in _paths(line):
+            for text in odd:
+                changed = orjson.loads(orjson.dumps(line))
+                holder = changed
+                for key in path[:-1]:
+                    holder = holder[key]
+                holder[path[-1]] = "@"
+                try:
+                    moment = read(orjson.dumps(changed).replace(b'"@"', text.encode()))
+                except InputError:
+                    counts[False] += 1
+                    continue
+                counts[True] += 1
+                if abs(moment.time) < 1e11:
+                    tracker.set_clock(moment.time)
+                    tracker(moment.pairs, moment.time)
+    assert min(counts.values()) > 20
+
+
+def _paths(value: Any) -> list[list[Any]]:
+    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path for key, inside in pairs for path in ([key], *([key, *more] for more in _paths(inside)))]
