@@ -99,7 +99,7 @@ def test_the_last_moment_waits_for_the_next_run(tmp_path: Path) -> None:
 def test_interrupted_anywhere_the_same_moments_are_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One run, and one for each moment, with wrong times, a gap and a clock that is set."""
     monkeypatch.setattr("kcal.pipeline.stream._CHECKPOINT", 7)
-    stamps = [*STEADY[:8], 5e9, *STEADY[8:14], *(stamp + 40.0 for stamp in STEADY[14:17]), *(s - DAY for s in STEADY)]
+    stamps = [*STEADY[:6], 5e9, *STEADY[6:9], *(s + 40.0 for s in STEADY[9:12]), *(s - DAY for s in STEADY[12:])]
     (tmp_path / "whole").mkdir()
     whole = follow(tmp_path / "whole", stamps)
     assert (whole.moments, whole.contradicted, whole.jumps) == (len(stamps) - 1, 1, 2)
