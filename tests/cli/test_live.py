@@ -101,6 +101,30 @@ def test_what_is_wrong(
         live(folder, *options)
 
 
+def test_wrong_times_are_told(folder: Path) -> None:
+    """One moment a day ahead and one in milliseconds leave all others as they are; a clock that is set is said."""
+    lines = (folder / "lines.jsonl").read_text().splitlines()
+    stamped = [json.loads(line) for line in lines[:20]]
+    texts = [json.dumps(line) for line in stamped]
+    texts[10:10] = [json.dumps(stamped[10] | {"time": stamped[10]["time"] + 86400.0})]
+    texts[5:5] = [json.dumps(stamped[5] | {"time": 1e13})]
+    texts += [json.dumps(line | {"time": line["time"] + 3600.0}) for line in stamped]
+    (folder / "lines.jsonl").write_text("\n".join(texts) + "\n")
+    told = " ".join(live(folder, "--clock-sigma", "0.1").split())
+    assert "40 moments, 68 positions; 1 moments left out, whose times the ones before and after contradict" in told
+    assert "times jumped 1 times and stayed: followed, with new tracks; the last jump was 3,598.1 s ahead" in told
+    assert "last malformed line: time 1e+13: seconds are needed" in told
+
+
+def test_nothing_that_can_be_read_is_an_error(folder: Path) -> None:
+    lines = [json.loads(line) for line in (folder / "lines.jsonl").read_text().splitlines()[:20]]
+    texts = [json.dumps(line | {"time": 1e3 * line["time"]}) for line in lines]
+    (folder / "lines.jsonl").write_text("\n".join(texts) + "\n")
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"none of 20 lines could be read; the last one: time 1\.7e\+12: seconds"):
+            live(folder)
+
+
 def test_a_rig_that_does_not_say_where_it_stands(folder: Path) -> None:
     save_rig(tracked_site().rig, folder / "rig.json")
     with pytest.raises(InputError, match="give origin and heading_deg"):
