@@ -176,14 +176,15 @@ def marks_of(state: MarkingState, kinds: tuple[Kind, ...], *, single: bool = Tru
 
 
 def pair_covariance(item: Item) -> Tensor:
-    """(4, 4) px² of left u, v and right u, v; NaN unless both are marked.
+    """(4, 4) px² of left u, v and right u, v; NaN where it is not marked.
 
     A mark that was matched has the error of the mark that it was matched to, and that of the match besides.
     """
-    if item.left is None or item.right is None:
-        return torch.full((4, 4), math.nan, dtype=torch.float64)
     left, right = (
-        torch.tensor([[m.cov[0], m.cov[1]], [m.cov[1], m.cov[2]]], dtype=torch.float64) for m in (item.left, item.right)
+        torch.full((2, 2), math.nan, dtype=torch.float64)
+        if mark is None
+        else torch.tensor([[mark.cov[0], mark.cov[1]], [mark.cov[1], mark.cov[2]]], dtype=torch.float64)
+        for mark in (item.left, item.right)
     )
     zero = torch.zeros_like(left)
     if item.cross is None:
