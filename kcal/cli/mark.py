@@ -87,6 +87,8 @@ def mark_command(
         out.print(f"marking page: {server.address}", markup=False, soft_wrap=True)
         if session.version:
             err.print(f"continued after {session.version} actions in {session.files.log}", markup=False)
+        for note in (*session.notes, *filter(None, [session.trouble])):
+            err.print(f"Warning: {note}", markup=False, soft_wrap=True)
         if browser:
             webbrowser.open(server.address)
         server.run()

@@ -105,6 +105,7 @@ class Desk:
             "columns": self.session.columns,
             "cameras": self._cameras is not None,
             "hand_sigma": self.session.hand_sigma,
+            "notes": self.session.notes,
             "reference": [] if self.reference is None else self.reference.marks.names,
         }  # fmt: skip
 
@@ -117,6 +118,7 @@ class Desk:
         return {
             "version": self.session.version,
             "pending": self._solved < self.session.version,
+            "trouble": self.session.trouble,
             "undo": undo,
             "redo": redo,
             "items": [
