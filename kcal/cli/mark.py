@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from kcal.cli.console import err, out
+from kcal.cli.console import err, out, warn
 from kcal.errors import InputError
 
 _PORT = 8347
@@ -88,7 +88,7 @@ def mark_command(
         if session.version:
             err.print(f"continued after {session.version} actions in {session.files.log}", markup=False)
         for note in (*session.notes, *filter(None, [session.trouble])):
-            err.print(f"Warning: {note}", markup=False, soft_wrap=True)
+            warn(note)
         if browser:
             webbrowser.open(server.address)
         server.run()
