@@ -40,7 +40,7 @@ export function listen(app) {
     run();
   });
   document.addEventListener("pointerdown", () => { app.byKeyboard = false; });
-  const press = {"new-target": commands.n, "new-feature": commands.f, undo: commands.u, redo: () => app.act({do: "redo"}), fit, interpolate: commands.i,
+  const press = {"new-target": commands.n, "new-feature": commands.f, undo: commands.u, redo: () => app.act({do: "redo"}), fit, nearer: commands["+"], farther: commands["-"], accept: commands.Enter, reject: commands.r, interpolate: commands.i,
     contrast: commands.c, link: commands.k, again, "show-keys": commands["?"], drop: () => app.selected && app.act({do: "drop", name: app.selected})};
   for (const [id, run] of Object.entries(press)) byId(id).addEventListener("click", run);
   byId("frame").addEventListener("input", (event) => app.show(Number(event.target.value)));

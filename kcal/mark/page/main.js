@@ -125,7 +125,11 @@ class App {
       try { this.take(await get("state")); } catch (error) { this.poll(); }
     }, 250);
   }
-  draw() { for (const side of SIDES) this.views[side].draw(); }
+  draw() {
+    const proposed = SIDES.some((side) => this.proposals[side] && !this.proposals[side].refusal);
+    for (const id of ["accept", "reject"]) byId(id).hidden = !proposed;
+    for (const side of SIDES) this.views[side].draw();
+  }
   act(action) { return this.actions.push(action); }
 
   select(name, look = true) {
