@@ -18,8 +18,6 @@ from kcal.lens.zernike import unbind_last
 
 _DEGREE = 11
 _NODES = 96
-# Parts into which each round of the search for D splits an interval.
-_PLACES = 32
 # Largest distorted radius for a lens without a camera: 56° through a pinhole.
 _DEFAULT_REACH = 1.5
 
@@ -37,8 +35,7 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = _D
         (..., 1 + 12): D², then the coefficients by rising powers of 2 √(1 - r_D² / D²) - 1.
     """
     if model.hybrid:
-        symmetric = model.hybrid.radial_names
-        radial, kept = model, torch.tensor([name in symmetric for name in model.names])
+        radial, kept = model, torch.tensor([name in model.hybrid.radial_names for name in model.names])
         own = torch.where(kept.to(coefficients.device), coefficients, 0.0)
     else:
         radial = LensModel(numerator=model.numerator, denominator=model.denominator, fisheye=model.fisheye)
@@ -51,12 +48,10 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = _D
     # D lies a little beyond the reach, or at the fold.
     wanted = torch.as_tensor(reach, dtype=torch.float64, device=own.device)[..., None]
     low, high = torch.zeros_like(limit), limit
-    places = torch.arange(1, _PLACES, dtype=torch.float64, device=own.device)
-    # Each round leaves one of 32 parts: twelve reach rounding.
-    for _ in range(12):
-        part = (high - low) / _PLACES
-        within = (distorted(low + part * places) <= 1.1 * wanted).to(torch.int64).cumprod(-1).sum(-1, keepdim=True)
-        low, high = low + within * part, torch.where(within < _PLACES - 1, low + (within + 1) * part, high)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        beyond = distorted(middle) > 1.1 * wanted
+        low, high = torch.where(beyond, low, middle), torch.where(beyond, middle, high)
     # Evenly in angle: for a wide lens, equal steps on the plane would nearly all lie at its edge.
     steps = torch.linspace(1.0 / _NODES, 1.0, _NODES, dtype=torch.float64, device=own.device)
     radius = high * steps if model.wide else torch.tan(torch.atan(high) * steps)

@@ -27,7 +27,6 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.dispatch import may_overwrite
 from kcal.lens.field_modes import WeightPrior
-from kcal.lens.zernike_few import FEW, FewLayout, columns_of_few, few_layout, field_of_few
 
 RADIAL, DECENTERED, ASTIGMATIC, OTHER, TILTED, ASPECT = range(6)
 
@@ -92,7 +91,6 @@ class ZernikeModes:
     names: tuple[str, ...] = dataclasses.field(init=False, repr=False, compare=False)
     _chains: tuple[tuple[_Place, ...], tuple[_Place, ...]] = dataclasses.field(init=False, repr=False, compare=False)
     _matrix: Tensor = dataclasses.field(init=False, repr=False, compare=False)
-    _few: FewLayout = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("radial", "decentered", "astigmatic", "other"):
@@ -109,15 +107,13 @@ class ZernikeModes:
                 family = ASPECT if (j, n) == (-1, 1) else _family(m, n, part)
                 real_modes.append((i, part, family, n))
         modes = ((*complex_modes[i], part) for i, part, _, _ in real_modes)
-        parts = [(i, part) for i, part, _, _ in real_modes]
-        places, chains, matrix = _polynomial_layout(complex_modes, parts)
+        chains, matrix = _polynomial_layout(complex_modes, [(i, part) for i, part, _, _ in real_modes])
         derived = {
             "complex_modes": complex_modes,
             "real_modes": tuple(real_modes),
             "names": tuple(f"z{n}{j:+d}{'i' * part}" for j, n, part in modes),
             "_chains": chains,
             "_matrix": matrix,
-            "_few": few_layout(complex_modes, parts, places),
         }
         for name, value in derived.items():
             object.__setattr__(self, name, value)
@@ -165,8 +161,6 @@ class ZernikeModes:
 
     def columns(self, x: Tensor, y: Tensor) -> Tensor:
         """See `FieldModes`."""
-        if _are_few(x) and may_overwrite(x, y):
-            return columns_of_few(self._few, x, y)
         highest: dict[int, int] = {}
         for j, n in self.complex_modes:
             highest[abs(j)] = max(highest.get(abs(j), 0), (n - abs(j)) // 2)
@@ -186,11 +180,9 @@ class ZernikeModes:
 
     def field(self, weights: Tensor, x: Tensor, y: Tensor, slopes: bool = True) -> tuple[Tensor, ...]:
         """See `FieldModes`."""
-        reuse = may_overwrite(weights, x, y)
-        if reuse and weights.ndim == 1 and _are_few(x):
-            return field_of_few(self._few, weights @ self._matrix, x, y, slopes)
         t = 2.0 * torch.addcmul(x * x, y, y) - 1.0
         coefficients = unbind_last(weights @ self._matrix.to(weights.device))
+        reuse = may_overwrite(weights, x, y)
         # Σ z^j Q_j(t) by Horner's rule in z, with complex polynomials Q_j of t; then the same in the conjugate of z.
         ahead, back = (
             _horner_in_z(places, coefficients, z, t, slopes, reuse)
@@ -209,10 +201,6 @@ class ZernikeModes:
         )  # fmt: skip
 
 
-def _are_few(x: Tensor) -> bool:
-    return x.numel() <= FEW and x.device.type == "cpu" and x.dtype == torch.float64
-
-
 def _family(m: int, degree: int, part: int) -> int:
     """Of a mode that turns m times about the axis."""
     if m == 1:
@@ -222,11 +210,8 @@ def _family(m: int, degree: int, part: int) -> int:
 
 def _polynomial_layout(
     complex_modes: Sequence[tuple[int, int]], real_modes: Sequence[tuple[int, int]]
-) -> tuple[dict[int, tuple[slice, slice]], tuple[tuple[_Place, ...], tuple[_Place, ...]], Tensor]:
-    """The places of the polynomials Q_j, in the order j = J, ..., 0 and j = -J, ..., -1 and 0, and their coefficients.
-
-    The last is the matrix (M, Q) from real weights to the coefficients of all polynomials.
-    """
+) -> tuple[tuple[tuple[_Place, ...], tuple[_Place, ...]], Tensor]:
+    """The polynomials Q_j for j = J, ..., 0 and for j = -J, ..., -1 and 0; the matrix (M, Q) of their coefficients."""
     places: dict[int, tuple[slice, slice]] = {}
     begin = 0
     for j in sorted({j for j, _ in complex_modes}):
@@ -241,7 +226,7 @@ def _polynomial_layout(
         matrix[row, start : start + k + 1] = math.sqrt(n + 1) * np.array(_jacobi_coefficients(k, abs(j)))
     ahead, back = (range(top, -1, -1) for top in (max(0, *places), max(0, *(-j for j in places))))
     chains = tuple(places.get(j) for j in ahead), tuple(places.get(-j) if j else None for j in back)
-    return places, chains, torch.from_numpy(matrix)
+    return chains, torch.from_numpy(matrix)
 
 
 def unbind_last(values: Tensor) -> tuple[Tensor, ...]:
