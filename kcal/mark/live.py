@@ -95,6 +95,8 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
     items = tuple(item for item in result.items if item.source == "landmarks")
     promises = promised(rig, sigma)
     text, enough = verdict(promises, count)
+    if result.exact:
+        text += "; errors of the lenses are not in it"
     wrong = [item.name for item in items if not item.used]
     if wrong:
         enough = False
