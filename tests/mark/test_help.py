@@ -7,7 +7,6 @@ from typing import cast
 import numpy as np
 import pytest
 import torch
-
 from lenses import FEW_MODES, hybrid_camera
 
 from kcal.corners.match import Matches, MatchStatus
@@ -119,7 +118,6 @@ class TestCurve:
         across = torch.stack(offsets) @ torch.stack([-along[1], along[0]])
         # 400 draws: 3.5 % of a standard deviation.
         assert float(across.std()) == pytest.approx(float(curve.sigma[0]), rel=0.12)
-
 
     @pytest.mark.parametrize("side", ["left", "right"])
     def test_the_band_of_a_default_lens_is_that_of_moved_rigs(self, side: Side) -> None:
@@ -267,9 +265,9 @@ class TestLiveRig:
             assert max(b / a for a, b in zip(before, after, strict=True)) < 1.01
 
     def test_marks_have_their_own_sigmas(self) -> None:
-        one = Marks(("a", "b"), torch.zeros(2, 2), torch.tensor([[1.0, 1.0], [math.nan, math.nan]]),
-                    torch.diag_embed(torch.tensor([[0.04, 0.02, 0.25, 0.25], [0.01, 0.01, math.nan, math.nan]])))  # fmt: skip
-        found = mark_sigmas(one, 0.3)
+        right = torch.tensor([[1.0, 1.0], [math.nan, math.nan]])
+        variances = torch.tensor([[0.04, 0.02, 0.25, 0.25], [0.01, 0.01, math.nan, math.nan]]).double()
+        found = mark_sigmas(Marks(("a", "b"), torch.zeros(2, 2), right, torch.diag_embed(variances)), 0.3)
         torch.testing.assert_close(found[0], torch.tensor([math.sqrt(0.03), 0.5]).double())
         assert float(found[1, 0]) == pytest.approx(0.1)
         assert math.isnan(float(found[1, 1]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -26,9 +25,9 @@ NO_POSE = "no relative pose yet"
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Desk, MarkingSite, str]]:
-    with desk_of(tmp_path_factory.mktemp("site")) as (desk, scene):
-        with served(lambda token, hosts: marking_app(desk, token, hosts)) as address:
-            yield desk, scene, address
+    folder = tmp_path_factory.mktemp("site")
+    with desk_of(folder) as (desk, scene), served(lambda token, hosts: marking_app(desk, token, hosts)) as address:
+        yield desk, scene, address
 
 
 def opened(page: Any, address: str) -> None:
@@ -114,9 +113,7 @@ def test_a_refusal_ends_with_its_reason(site: tuple[Desk, MarkingSite, str]) -> 
         assert not page.is_visible("#accept")
 
 
-def test_a_full_disk_is_on_the_page(
-    site: tuple[Desk, MarkingSite, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_on_the_page(site: tuple[Desk, MarkingSite, str], monkeypatch: pytest.MonkeyPatch) -> None:
     """The mark waits on the page and is sent again; tables that could not be written are told in words."""
     desk, _, address = site
 
