@@ -61,9 +61,9 @@ def seen_landmarks(rig: StereoRig, count: int, random: np.random.Generator) -> I
 
 def make_site(folder: Path, count: int) -> Marks:
     """Write pictures, a survey and a rig with its covariance, and return the marks of the landmarks."""
-    cameras = [calibrate_camera(simulated(seed, 25, 0.1, False).seen).camera for seed in _SEEDS]
+    left, right = (calibrate_camera(simulated(seed, 25, 0.1, False).seen).camera for seed in _SEEDS)
     rotation = rotation_from_vector(torch.tensor([0.003, 0.006, -0.008], dtype=torch.float64))
-    rig = StereoRig(*cameras, rotation, -rotation @ torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64))
+    rig = StereoRig(left, right, rotation, -rotation @ torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64))
     random = np.random.default_rng(0)
     points, pixels = (torch.stack(part) for part in zip(*seen_landmarks(rig, count, random), strict=True))
     points = points + _SURVEY * torch.from_numpy(random.normal(size=points.shape))
@@ -76,7 +76,7 @@ def make_site(folder: Path, count: int) -> Marks:
     solved = solve_live((rig.left, rig.right), survey, marks, 0.3)
     assert solved.rig is not None, solved.text
     save_rig(solved.rig, folder / "rig.json")
-    for side, camera in zip(SIDES, cameras, strict=True):
+    for side, camera in zip(SIDES, (left, right), strict=True):
         save_camera(camera, folder / f"{side}.camera.json")
         write_png(folder / f"{side}.png", random.integers(0, 255, camera.size[::-1]).astype(np.uint8))
     return marks

@@ -1,5 +1,6 @@
 // The page: what is selected, what a click, a drag and a key do. The server knows everything that lasts.
-import {Actions, AWAY, Refused, get, latest, post} from "/page/api.js";
+import {Actions, get, latest, post} from "/page/api.js";
+import {followOthers} from "/page/windows.js";
 import {View} from "/page/view.js";
 import {listen} from "/page/keys.js";
 import {drawPanel, drawTable} from "/page/panel.js";
@@ -27,19 +28,7 @@ class App {
     this.version = -1;
     this.views = {};
     for (const side of SIDES) this.views[side] = new View(side, about.images[side], this);
-    // Windows on the same marks tell each other at once, and ask the server besides: they may be in two browsers.
-    this.others = new BroadcastChannel("kcal-mark:" + about.files.log);
-    this.others.onmessage = () => this.refresh();
-    this.refresh = latest(async () => {
-      if (this.dragged || this.actions.waiting.length) return;
-      let state;
-      try { state = await get("state"); } catch (error) { this.away = true; this.say(error instanceof Refused ? error.message : AWAY, true); return; }
-      if (this.away) { this.away = false; this.settle("bad"); }
-      if (state.version > this.version && this.version >= 0 && !this.actions.waiting.length) this.say("another window changed the marks");
-      this.take(state);
-    });
-    setInterval(() => { if (!document.hidden) this.refresh(); }, 2000);
-    document.addEventListener("visibilitychange", () => { if (!document.hidden) this.refresh(); });
+    followOthers(this);
     this.actions = new Actions(about.files.log, (state) => this.answered(state), (text, kept) => this.failed(text, kept));
     this.askCurve = latest(async (side, u, v, key) => {
       const found = await post("curve", {side, frame: this.frame, u, v});
@@ -376,20 +365,6 @@ class App {
     this.guide();
   }
 
-  contrast() {
-    const pressed = byId("contrast").getAttribute("aria-pressed") !== "true";
-    byId("contrast").setAttribute("aria-pressed", pressed);
-    for (const side of SIDES) {
-      const view = this.views[side], level = view.level();
-      const [left, top] = view.image(0, 0), [right, bottom] = view.image(view.canvas.width, view.canvas.height);
-      let span = pressed ? view.tiles.span(this.frame, level, left, top, right, bottom) : null;
-      const image = this.about.images[side];
-      if (span && image.deep) { const step = (image.span[1] - image.span[0]) / 255; span = span.map((v) => image.span[0] + v * step); }
-      view.tiles.stretch(span);
-      view.enlarged = null;
-      view.draw();
-    }
-  }
   toggle(name) {
     this[name] = !this[name];
     byId(name === "linked" ? "link" : "interpolate").setAttribute("aria-pressed", this[name]);

@@ -43,7 +43,7 @@ export const drawMap = latest(async (app) => {
     if (item.place) dot(item.name, item.place, "#e69f00", "● ");
   }
   // The list selects by keyboard what the map selects by pointer.
-  layer.eachLayer((shape) => shape.getElement()?.removeAttribute("tabindex"));
+  layer.eachLayer((shape) => shape.getElement()?.setAttribute("tabindex", "-1"));
   const key = spots.map((spot) => spot.map((v) => v.toFixed(4)).join()).join(" ");
   if (spots.length > 2 && key !== fitted) {
     fitted = key;
