@@ -147,12 +147,12 @@ def verdict(folder: Path) -> Iterator[Opened]:
 @contextmanager
 def written_map(folder: Path) -> Iterator[Opened]:
     """The map of `kcal locate`, with true positions."""
-    truth = torch.tensor([[20, 0, 100], [26, 0, 104], [-300, 5, 1000], [900, 0, 5000], [0, 0, 60_000]]).double()
+    truth = torch.tensor([[20, 0, 100], [26, 0, 104], [-300, 5, 1000], [900, 0, 5000]]).double()
     rig = pinhole_rig()
     left, right, _ = rig(truth)
     located = locate_points(
-        rig, left, right + torch.tensor([0.3, 0.0]), origin=ORIGIN, heading_deg=0.0,
-        names=["gate", "a second gate beside it", "mast", "ship", "cloud"],
+        rig, left, right + torch.tensor([0.6, 0.0]), origin=ORIGIN, heading_deg=0.0,
+        names=["gate", "a second gate beside it", "mast", "ship"],
     )  # fmt: skip
     yield save_map(folder / "map.html", located, truth[:, [0, 2, 1]] * torch.tensor([1, 1, -1])).as_uri(), DRAWN
 

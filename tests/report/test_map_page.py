@@ -234,3 +234,17 @@ def test_bad_arguments(tmp_path: Path) -> None:
     (tmp_path / "text.tif").write_text("no image")
     with pytest.raises(FileError, match="cannot read this image"):
         map_page(located, image=tmp_path / "text.tif")
+
+
+@needs_browser
+def test_numbers_are_within_the_keyboards_reach(tmp_path: Path) -> None:
+    located, truth = scene()
+    with chromium_page() as page:
+        page.goto(save_map(tmp_path / "map.html", located, truth).as_uri())
+        page.wait_for_function("() => document.documentElement.dataset.drawn", timeout=60_000)
+        for _ in range(40):
+            page.keyboard.press("Tab")
+            if page.evaluate("document.activeElement.getAttribute('aria-label')") == "ship":
+                break
+        page.keyboard.press("Enter")
+        assert page.locator(".leaflet-popup-content").inner_text().startswith("latitude")
