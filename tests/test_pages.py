@@ -53,6 +53,11 @@ def test_axe_finds_nothing_in_the_documentation(site: Path) -> None:
         for name in ("index", "tutorial/guide", "reference/rig", "measured/lens"):
             page.goto((site / f"{name}.html").as_uri())
             found += faults(page, name.replace("/", "-"))
+    with chromium_page() as page:
+        page.emulate_media(color_scheme="dark")
+        page.goto((site / "tutorial/guide.html").as_uri())
+        assert page.evaluate("document.body.dataset.mdColorScheme") == "slate"
+        found += faults(page, "dark")
     assert not found, "\n".join(found)
 
 
