@@ -1,4 +1,4 @@
-"""Every page that kcal serves or writes, in a real browser: axe finds nothing, and nothing is wider than a telephone."""
+"""Every page that kcal serves or writes, in a real browser: axe finds nothing, also on a telephone."""
 
 from __future__ import annotations
 
@@ -41,11 +41,46 @@ def test_axe_finds_nothing(name: str, tmp_path: Path) -> None:
     assert not found, "\n".join(found)
 
 
-def test_axe_finds_nothing_in_the_documentation(tmp_path: Path) -> None:
-    site = build_site(tmp_path / "site")
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_site(tmp_path_factory.mktemp("docs") / "site")
+
+
+@pytest.mark.slow
+def test_axe_finds_nothing_in_the_documentation(site: Path) -> None:
+    found = []
     with chromium_page() as page:
-        found = []
-        for name in ("index", "tutorial/guide", "reference/lens", "measured/one-camera"):
+        # A page of each kind: commands with what they print, long options, docstrings, wide tables with empty corners.
+        for name in ("tutorial/guide", "reference/commands", "reference/solve", "measured/lens"):
             page.goto((site / f"{name}.html").as_uri())
             found += faults(page, name.replace("/", "-"))
+    with chromium_page() as page:
+        page.emulate_media(color_scheme="dark")
+        page.goto((site / "tutorial/guide.html").as_uri())
+        assert page.evaluate("document.body.dataset.mdColorScheme") == "slate"
+        found += faults(page, "dark")
     assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("width", [width for width, _ in SIZES])
+def test_the_tutorial_is_found_and_read(site: Path, width: int) -> None:
+    with chromium_page(width, 844) as page:
+        page.goto((site / "index.html").as_uri())
+        if width < 1000:
+            page.locator("label.md-header__button[for=__drawer]").click()
+            page.locator(".md-nav__link:has-text('Tutorial'):visible").first.click()
+            page.locator(".md-nav__link:has-text('From a board to a position'):visible").first.click()
+        else:
+            page.locator(".md-tabs__link:has-text('Tutorial')").click()
+        page.wait_for_url("**/tutorial/guide.html")
+        assert page.inner_text("h1").startswith("From a board to a position")
+        assert page.evaluate("[...document.images].every((image) => image.complete && image.naturalWidth > 0)")
+        commands = page.locator(".language-sh code").all_inner_texts()
+        assert [next(c for c in commands if f"kcal {word} " in c) for word in ("detect", "calibrate", "rig", "locate")]
+        # The search works from the disk, and leads to a page.
+        if width < 1000:
+            page.locator("label.md-header__button[for=__search]").click()
+        page.locator(".md-search__input").click()
+        page.keyboard.type("baseline")
+        page.locator(".md-search-result__link").first.wait_for(timeout=60_000)
+        assert page.complaints == []

@@ -35,7 +35,7 @@ _FIELD_REACH_M = 100_000.0
 
 
 class LiveMap:
-    """The server; `address` is what to open.
+    """The server; `address` is what to open, `readers` the number of pages that are open.
 
     Args:
         run: where the cameras stand.
@@ -54,13 +54,12 @@ class LiveMap:
             }
             for camera in run.cameras
         ]
-        self._origin = run.origin
+        self.run, self.readers = run, 0
         self._site = orjson.dumps({"cameras": cameras})
         # Number of the news, its columns and its moment; the last that was written for pages.
         self._news: tuple[int, PositionColumns | None, int] = (0, None, 0)
         self._written = (0, b"")
         self._ending = b""
-        self._readers = 0
         self._server = LocalServer(self._app, port, fallback=False)
         self.address = self._server.address
         # Signals are those of the stream.
@@ -75,7 +74,7 @@ class LiveMap:
         """Tell each page how it ended, and end the server."""
         self._ending = orjson.dumps({"words": words})
         until = time.monotonic() + _FAREWELL
-        while self._readers and time.monotonic() < until:
+        while self.readers and time.monotonic() < until:
             time.sleep(_POLL / 2)
         self._server.stop()
         self._thread.join(5.0)
@@ -91,7 +90,7 @@ class LiveMap:
         return local_app([Route("/events", events)], pages, token, hosts)
 
     async def _told(self, request: Request) -> AsyncIterator[bytes]:
-        self._readers += 1
+        self.readers += 1
         try:
             yield b"event: site\ndata: " + self._site + b"\n\n"
             seen, quiet = 0, 0.0
@@ -110,12 +109,12 @@ class LiveMap:
                 await asyncio.sleep(_POLL)
                 quiet += _POLL
         finally:
-            self._readers -= 1
+            self.readers -= 1
 
     def _text(self, number: int, columns: PositionColumns, sequence: int) -> bytes:
         """News as JSON, written once for all pages."""
         if self._written[0] != number:
-            self._written = number, _tracks_text(columns, sequence, self._origin)
+            self._written = number, _tracks_text(columns, sequence, self.run.origin)
         return self._written[1]
 
 

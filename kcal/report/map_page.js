@@ -71,7 +71,7 @@
   }
   for (const arrow of data.arrows) {
     L.polyline(arrow.line, {color: "#c02a6b", weight: 1.6, interactive: false}).addTo(layer("true positions"));
-    const tip = L.marker(arrow.line[1], {interactive: false,
+    const tip = L.marker(arrow.line[1], {interactive: false, keyboard: false,
       icon: L.divIcon({className: "head", iconSize: [12, 12], html: head(arrow.azimuth)})});
     small.push([tip.addTo(layer("true positions")), arrow.line[0], arrow.line[1], 16]);
   }
