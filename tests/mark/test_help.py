@@ -127,7 +127,7 @@ class TestCurve:
         cameras = [lens.with_parameters(value) for lens, value in zip(lenses, values, strict=True)]
         turn = rotation_from_vector(torch.tensor([0.01, -0.03, 0.02]).double())
         shift = torch.tensor([-10.0, 0.1, 0.3]).double()
-        rig = StereoRig(*cameras, turn, shift)
+        rig = StereoRig(cameras[0], cameras[1], turn, shift)
         ends = [len(value) for value in values]
         size = torch.cat([*(1e-3 * value.abs() + 1e-5 for value in values), torch.full((6,), 1e-3).double()])
         generator = torch.Generator().manual_seed(0)

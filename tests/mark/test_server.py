@@ -151,7 +151,7 @@ def test_a_full_disk_is_told_and_what_was_answered_stays(
     assert {200, 503} == set(answers)
     assert client.get("/api/state").json()["items"][0]["left"]["u"] == last
     assert client.get("/api/state").json()["version"] == 1 + answers.count(200)
-    again = Journal(shutil.copy(tmp_path / "marks.log", tmp_path / "copy.log"))
+    again = Journal(Path(shutil.copy(tmp_path / "marks.log", tmp_path / "copy.log")))
     assert (again.count, again.notes) == (1 + answers.count(200), [])
     mark = again.state.items["a"].left
     assert mark is not None
