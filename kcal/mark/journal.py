@@ -186,7 +186,7 @@ class Journal:
                     self._states = [*self._states, self.state]
                 continue
             self._take(states, undone, key)
-        if damaged and not self.count:
+        if damaged and damaged[0].startswith("line 1 ") and not self.count:
             raise FileError(f"{self.path}: not a log of `kcal mark`, or nothing of it can be read; give another -o")
         self.notes += [f"{self.path}: {text}" for text in damaged]
 

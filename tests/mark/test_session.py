@@ -157,6 +157,20 @@ def test_a_damaged_line_loses_itself_alone(tmp_path: Path, survey: Path, damaged
     kept.close()
 
 
+def test_the_only_line_may_be_the_damaged_one(tmp_path: Path) -> None:
+    session = Session(tmp_path / "marks.csv")
+    session.close()
+    with session.files.log.open("ab") as log:
+        log.write(b"nonsense\n")
+    again = Session(tmp_path / "marks.csv")
+    again.do(Add(do="add", name="a", kind="target"), "key-0001")
+    again.close()
+    # A head that was damaged loses nothing either.
+    lines = session.files.log.read_bytes().splitlines(keepends=True)
+    session.files.log.write_bytes(b"".join([b"nonsense\n", *lines[1:]]))
+    assert list(Session(tmp_path / "marks.csv").state.items) == ["a"]
+
+
 def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
     (tmp_path / "marks.log").write_text("something else\nand more\n")
     with pytest.raises(FileError, match="give another -o"):
