@@ -163,15 +163,25 @@ def live_command(
         stream.shown = _progress(advance, stream.counts, page)
         if stream.ledger.place.sequence:
             err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)
-        before = {number: signal.signal(number, lambda *_: stream.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
+        ending = "finished"
+
+        def stop(*_: object) -> None:
+            nonlocal ending
+            ending = "stopped"
+            stream.stop()
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
             live = pairs is not None and pairs.live
             counts = stream.follow(source, waits=not live, resumes=not live and detections != "-")
+        except BaseException:
+            ending = "ended by an error: see the terminal"
+            raise
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
             if page is not None:
-                page.close()
+                page.close(ending)
     err.print(summary(counts), markup=False)
     if counts.jumps:
         ahead = "ahead" if counts.last_jump_s > 0 else "back"

@@ -234,11 +234,12 @@ class Stream:
         self.ledger.append(parts, moment.time, offset)
         for sender in self.senders:
             sender.send(columns, self.run, when)
-        if self.shown is not None:
-            self.shown(columns, tracks)
         self.counts.moments += 1
         self.counts.positions += len(columns.names)
         self.counts.unsent = sum(sender.failed for sender in self.senders)
+        # Last: what is told counts this moment, too.
+        if self.shown is not None:
+            self.shown(columns, tracks)
 
     def _calendar(self, time: float) -> datetime.datetime:
         if self.start is not None:

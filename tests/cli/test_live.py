@@ -82,6 +82,36 @@ def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: p
     assert (folder / "tracks.csv").read_bytes() == whole
 
 
+@pytest.mark.parametrize("how", ["finished", "stopped", "ended by an error: see the terminal"])
+def test_the_map_is_told_how_it_ended(folder: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("uvicorn")
+    from kcal.pipeline.live_map import LiveMap
+
+    close, write, told, shown = LiveMap.close, Stream._write, [], []
+
+    def ended(page: LiveMap, words: str) -> None:
+        told.append(words)
+        close(page, words)
+
+    def disturbed(self: Stream, *what: object) -> None:
+        write(self, *what)  # type: ignore[arg-type]
+        if self.counts.moments == 7 and how == "stopped":
+            os.kill(os.getpid(), signal.SIGTERM)
+        if self.counts.moments == 7 and how.startswith("ended"):
+            raise FileError("the disk is full")
+
+    monkeypatch.setattr(LiveMap, "close", ended)
+    monkeypatch.setattr(LiveMap, "show", lambda page, columns, sequence: shown.append(sequence))
+    monkeypatch.setattr(Stream, "_write", disturbed)
+    if how.startswith("ended"):
+        with pytest.raises(FileError, match="disk is full"):
+            live(folder, "--map", "0")
+    else:
+        live(folder, "--map", "0")
+    assert told == [how]
+    assert shown == list(range(1, 21 if how == "finished" else 8))
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
