@@ -12,8 +12,8 @@ from rich.markup import escape
 from kcal.cli.calibrate_result import calibration_numbers, print_calibration
 from kcal.cli.calibrate_stars import by_night
 from kcal.cli.console import out, print_wrote, steps, tell, warn
+from kcal.cli.night_images import TIME_HELP
 from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
-from kcal.cli.stars import TIME_HELP
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_writable, make_folder
 

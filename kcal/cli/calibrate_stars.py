@@ -6,14 +6,12 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kcal.cli.console import out, print_wrote, steps, tell, warn
-from kcal.errors import InputError, KcalError
+from kcal.cli.console import out, print_wrote, tell, warn
+from kcal.errors import InputError
 from kcal.files import check_writable
 
 if TYPE_CHECKING:
-    from kcal.stars.detect import DetectedStars
     from kcal.stars.lens import StarCamera
-    from kcal.stars.night import SkyView
 
 # Parts of the image, across and down, whose stars are counted for the advice.
 _PARTS = 3
@@ -62,10 +60,10 @@ def calibrate_by_night(
 
     files = expand_nights(images)
     check_writable(output, *files)
-    from kcal.cli.stars import sky_view
+    from kcal.cli.night_images import camera_by_stars, sky_view
 
     where: tuple[Any, Any, float] = (None, None, 0.0) if place is None else place
-    found, size = calibrated(files, [sky_view(path, time, *where) for path in files], "calibrating by stars")
+    found, size = camera_by_stars(files, [sky_view(path, time, *where) for path in files], "calibrating by stars")
     camera = found.lens.camera
     if camera.calibration is not None and name:
         import dataclasses
@@ -90,30 +88,6 @@ def calibrate_by_night(
     for text in sparse_parts(found, size):
         warn(text)
     print_wrote(output)
-
-
-def calibrated(files: list[Path], views: list[SkyView], what: str) -> tuple[StarCamera, tuple[int, int]]:
-    """The camera of night images, and their size."""
-    from kcal.stars.detect import detect_stars
-    from kcal.stars.lens import calibrate_by_stars
-    from kcal.stars.night_image import read_night
-
-    stars: list[DetectedStars] = []
-    sizes = set()
-    with steps("finding stars", len(files)) as advance:
-        for path in files:
-            try:
-                image = read_night(path)
-                stars.append(detect_stars(image))
-            except KcalError as error:
-                raise InputError(f"{path.name}: {error}") from error
-            sizes.add((image.shape[1], image.shape[0]))
-            advance(path.name)
-    if len(sizes) > 1:
-        raise InputError(f"the images have several sizes ({sorted(sizes)}): one camera has one")
-    (size,) = sizes
-    with steps(what, None) as advance:
-        return calibrate_by_stars(stars, views, size, progress=advance), size
 
 
 def sparse_parts(found: StarCamera, size: tuple[int, int]) -> list[str]:

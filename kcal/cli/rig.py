@@ -10,9 +10,9 @@ import typer
 
 from kcal.cli.console import with_inputs, with_json
 from kcal.cli.groups import group_with_default
+from kcal.cli.night_images import TIME_HELP
 from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
 from kcal.cli.rig_check import check
-from kcal.cli.stars import TIME_HELP
 from kcal.errors import InputError
 
 if TYPE_CHECKING:

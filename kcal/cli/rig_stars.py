@@ -82,7 +82,7 @@ def _named_images(
     side: str, given: str, camera: Camera, night: NightOptions, origin: Origin | None
 ) -> list[NamedStars]:
     from kcal.cli.console import steps, warn
-    from kcal.cli.stars import sky_view
+    from kcal.cli.night_images import sky_view
     from kcal.stars.night import name_stars
     from kcal.stars.night_image import expand_nights, read_night
 

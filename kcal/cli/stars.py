@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.night_images import TIME_HELP, sky_view
 from kcal.errors import InputError, KcalError
 from kcal.files import check_writable
 
 if TYPE_CHECKING:
     from kcal.stars.catalog import StarCatalog
     from kcal.stars.night import NamedStars, SkyView
-
-TIME_HELP = "When, with its zone: 2026-11-24T20:47:26Z; name:Z or name:+02:00 reads it from each file's name."
 
 
 def stars_command(
@@ -82,9 +81,9 @@ def stars_command(
     ]
     catalog = StarCatalog.bundled()
     if camera is None:
-        from kcal.cli.calibrate_stars import calibrated
+        from kcal.cli.night_images import camera_by_stars
 
-        lens = calibrated(files, views, "finding the lens")[0].lens.camera
+        lens = camera_by_stars(files, views, "finding the lens")[0].lens.camera
     else:
         lens = single_camera(camera)
     told: list[dict[str, Any]] = []
@@ -116,33 +115,6 @@ def stars_command(
     print_table(rows)
     _say_unknown(views[0])
     print_wrote(picture)
-
-
-def sky_view(
-    path: Path,
-    time: str | None,
-    lat: float | None,
-    lon: float | None,
-    height: float,
-    *,
-    dut1: float | None = None,
-    time_sigma: float = 0.1,
-    celsius: float | None = None,
-    pressure: float | None = None,
-) -> SkyView:
-    """When and where an image was taken, from options of the command line."""
-    from kcal.lens.mounting import Origin
-    from kcal.stars.night import SkyView
-    from kcal.stars.night_image import time_of
-    from kcal.stars.sky import Air
-
-    if (lat is None) != (lon is None):
-        raise InputError("--lat and --lon belong together")
-    origin = None if lat is None or lon is None else Origin(lat=lat, lon=lon, height=height)
-    known = {} if celsius is None else {"celsius": celsius, "celsius_sigma": 1.0}
-    known |= {} if pressure is None else {"hectopascal": pressure, "hectopascal_sigma": 1.0}
-    air = None if origin is None else Air.at_height(origin.height, **known)
-    return SkyView(time=time_of(time, path), origin=origin, air=air, dut1=dut1, time_sigma=time_sigma)
 
 
 def _heads(view: SkyView) -> list[str]:

@@ -59,7 +59,7 @@ class NightPlan:
 
 
 class PlannedStars(NamedTuple):
-    """What a plan gives.
+    """How many stars a plan shows, and how well they tell the relative yaw.
 
     Attributes:
         stars: in an image, on average over the sky.

@@ -96,7 +96,7 @@ def calibrate_by_stars(
             f"in none of {len(images)} images stars have names: too few are seen, or this is not the night sky"
         )
     first = next(iter(named))
-    camera, rotations = _grown(images, views, size, focal, {first: named[first].rotation}, catalog)
+    camera, rotations = _from_middle_outward(images, views, size, focal, {first: named[first].rotation}, catalog)
     refused: dict[int, str] = {}
     for number in order:
         if number in rotations:
@@ -171,7 +171,7 @@ def _by_camera(found: DetectedStars, camera: Camera, catalog: StarCatalog) -> Id
     return identify(rays.numpy(), _ROUGH_PX / focal, catalog=catalog, scale_error=0.003)
 
 
-def _grown(
+def _from_middle_outward(
     images: Sequence[DetectedStars],
     views: Sequence[SkyView],
     size: tuple[int, int],
@@ -182,7 +182,7 @@ def _grown(
     """A camera from one image, whose stars get names from the middle outward while the lens becomes better known."""
     camera = _pinhole(focal, size)
     for share in (0.6, 0.8, 1.0, 1.2):
-        near = {n: _within(images[n], size, share) for n in rotations}
+        near = {n: _near_middle(images[n], size, share) for n in rotations}
         fields, _, _, kept = _fields(near, views, camera, rotations, catalog)
         lens = fit_star_lens(fields, [rotation for _, rotation in kept], size, float(camera.params[0]))
         camera = lens.camera
@@ -190,7 +190,7 @@ def _grown(
     return camera, rotations
 
 
-def _within(found: DetectedStars, size: tuple[int, int], share: float) -> DetectedStars:
+def _near_middle(found: DetectedStars, size: tuple[int, int], share: float) -> DetectedStars:
     away = np.linalg.norm(found.pixels - [(size[0] - 1) / 2, (size[1] - 1) / 2], axis=1)
     use = away < share * 0.5 * math.hypot(*size)
     return found._replace(pixels=found.pixels[use], sigma=found.sigma[use], flux=found.flux[use])

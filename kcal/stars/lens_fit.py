@@ -214,7 +214,7 @@ def fit_star_lens(
     model = model_of(shape)
     families = _families(model, focal, nothing, size)
     for turn in range(_ROUNDS):
-        parameters = fit.minimize(parameters, model, families.mean, _held(families.deviation(h)), 10)
+        parameters = fit.minimize(parameters, model, families.mean, _without_pupil(families.deviation(h)), 10)
         rows = fit.reduced(parameters, model)[0]
         rows[:-1][_PUPIL] = 0.0
         freedom = sum(2.0 * float((w > 0).sum()) - 3.0 for w in fit.weights)
@@ -227,7 +227,7 @@ def fit_star_lens(
         fit.variance = variance
         if float((h - before).abs().max()) < 0.05:
             break
-    deviation = _held(families.deviation(h))
+    deviation = _without_pupil(families.deviation(h))
     parameters = fit.minimize(parameters, model, families.mean, deviation, 10)
     return _star_lens(fit, parameters, model, families, deviation, size)
 
@@ -238,7 +238,7 @@ def _families(model: LensModel, focal: float, nothing: BoardModes, size: tuple[i
     return prior_families(form, focal, nothing, size, 1.0)
 
 
-def _held(deviation: Tensor) -> Tensor:
+def _without_pupil(deviation: Tensor) -> Tensor:
     deviation = deviation.clone()
     deviation[_PUPIL] = 0.0
     return deviation

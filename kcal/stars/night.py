@@ -211,8 +211,8 @@ def _on_earth(
             detected=found, view=view, attitude=sky, directions=celestial, on_earth=False, covariance=sky.covariance,
             warnings=(text,),
         )  # fmt: skip
-    # Refraction near the horizon is not known well enough.
-    usable = np.where(there[:, 2:] > math.sin(LOWEST_ALTITUDE), there, -there)
+    # Refraction near the horizon is not known well enough: lower stars are put where no camera sees a star.
+    usable = np.where(there[:, 2:] > math.sin(LOWEST_ALTITUDE), there, [0.0, 0.0, -1.0])
     start = sky.rotation.numpy() @ turn_between(there[index], celestial[index])
     scale = float(camera.params[0])
     blurred = np.hypot(found.sigma, scale * float(refraction_sigma(np.arcsin(there[index, 2])).mean()))

@@ -30,9 +30,17 @@ from kcal.stars.identification import identify
 from kcal.stars.lens import StarCamera, calibrate_by_stars
 from kcal.stars.night import SkyView, name_stars
 from kcal.stars.night_image import read_night, time_of
+from scripts.shared.page import write_section
 
 DELFT = Origin(lat=52.0, lon=4.37, height=0.0)
+_said: list[str] = []
 SIZES = {(1600.0, (1920, 1080)), (5110.0, (1024, 768)), (900.0, (1280, 800))}
+
+
+def say(text: str, flush: bool = True) -> None:
+    """Print a line of the page."""
+    print(text, flush=flush)
+    _said.append(text)
 
 
 def real() -> None:
@@ -48,20 +56,22 @@ def real() -> None:
     size = (1024, 768)
     begin = time.process_time()
     whole = calibrate_by_stars(images, views, size)
-    print(f"detection {np.mean(seconds):.2f} CPU s an image; lens and names {time.process_time() - begin:.0f}")
+    say(f"detection {np.mean(seconds):.2f} CPU s an image; lens and names {time.process_time() - begin:.0f}")
     lens = whole.lens
-    print(f"{len(whole.images)} of {len(files)} images, {sum(int(u.sum()) for u in lens.used)} stars, "
+    say(f"{len(whole.images)} of {len(files)} images, {sum(int(u.sum()) for u in lens.used)} stars, "
           f"{sum(int((~u).sum()) for u in lens.used)} left out, RMS along an axis {lens.rms_px:.4f} px, "
           f"{lens.effective:.1f} effective unknowns, f {float(lens.camera.params[0]):.2f} px")  # fmt: skip
-    print("| image | stars | named | RMS px | detect and name, CPU s |\n|---|---|---|---|---|")
+    say("\n| image | stars | named | RMS px | detect and name, CPU s |\n|---|---|---|---|---|")
     for path, view in zip(files, views, strict=True):
         image = read_night(path)
         begin = time.process_time()
         found = name_stars(image, lens.camera, view)
         spent = time.process_time() - begin
         stars = found.attitude
-        print(f"| {path.stem} | {len(found.detected.pixels)} | {stars.count} | {stars.rms_px:.3f} | {spent:.2f} |")
+        say(f"| {path.stem} | {len(found.detected.pixels)} | {stars.count} | {stars.rms_px:.3f} | {spent:.2f} |")
+    say("\n| magnitude | stars | RMS along an axis, px |\n|---|---|---|")
     by_magnitude(whole)
+    say("")
     held_out(images, views, size, float(lens.camera.params[0]))
     peer(files)
 
@@ -74,7 +84,7 @@ def by_magnitude(whole: StarCamera) -> None:
         some = (magnitude >= low) & (magnitude < high)
         if some.any():
             rms = np.sqrt((error[some] ** 2).mean())
-            print(f"magnitude {low} to {high}: {some.sum()} stars, RMS along an axis {rms:.3f} px")
+            say(f"| {low} to {high} | {some.sum()} | {rms:.3f} |")
 
 
 def held_out(images: list, views: list, size: tuple[int, int], focal: float) -> None:
@@ -98,7 +108,7 @@ def held_out(images: list, views: list, size: tuple[int, int], focal: float) -> 
             errors.append(at.numpy() - images[out].pixels[theirs])
     error = np.concatenate(errors)
     rms = np.sqrt((error**2).mean())
-    print(f"held out: {len(error)} stars of {len(images)} images, RMS along an axis {rms:.3f} px, "
+    say(f"held out: {len(error)} stars of {len(images)} images, RMS along an axis {rms:.3f} px, "
           f"median distance {np.median(np.linalg.norm(error, axis=1)):.3f} px")  # fmt: skip
 
 
@@ -107,16 +117,17 @@ def peer(files: list[Path]) -> None:
     try:
         import tetra3  # type: ignore[import-not-found, unused-ignore]
     except ImportError:
-        print("cedar-solve and tetra3 are not installed: not compared")
+        say("cedar-solve and tetra3 are not installed: not compared")
         return
     from PIL import Image
 
+    np.math = math  # type: ignore[attr-defined]  # cedar-solve 0.5 uses what numpy 2 does not have
     solver = tetra3.Tetra3()
     for path in files:
         begin = time.process_time()
         found = solver.solve_from_image(Image.open(path), fov_estimate=11.4, fov_max_error=1.0)
         spent = time.process_time() - begin
-        print(f"tetra3 {path.stem}: {found.get('Matches')} stars, RMSE {found.get('RMSE')}″, {spent:.2f} CPU s")
+        say(f"tetra3 {path.stem}: {found.get('Matches')} stars, RMSE {found.get('RMSE')}″, {spent:.2f} CPU s")
 
 
 def random_points(count: int) -> None:
@@ -131,22 +142,21 @@ def random_points(count: int) -> None:
         field = 2 * math.atan(math.hypot(*size) / 2 / focal)
         wrong += identify(rays, 2.5 / focal, field=field) is not None
         if (number + 1) % 500 == 0:
-            spent = (time.process_time() - begin) / (number + 1)
-            print(f"{number + 1} fields of random points: {wrong} with names; {spent:.2f} CPU s each", flush=True)
+            print(number + 1, wrong, flush=True)
+    spent = (time.process_time() - begin) / count
+    say(f"{count} fields of 4 to 20 random points: {wrong} with names; {spent:.2f} CPU s each")
 
 
 def rigs(count: int) -> None:
     """Coverage of 95 % intervals of range, and errors, of simulated rigs from stars, a baseline and matches."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "helpers"))
-    from night_scenes import night_camera
-    from star_rigs import star_rig
-
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
     from kcal.locate.range_sigmas import range_sigmas
+    from scripts.shared.night_scenes import night_camera
+    from scripts.shared.star_rigs import star_rig
 
     camera: Camera = night_camera(1600.0, (1920, 1080))
     options = RigOptions(refraction=0.0, refraction_sigma=0.0)
-    print(
+    say(
         "| stars | pairs | σ of range % at 1, 2, 5 km | error % | inside 95 % | χ² of attitude / 3 |\n"
         "|---|---|---|---|---|---|"
     )
@@ -170,7 +180,7 @@ def rigs(count: int) -> None:
         text = [
             " / ".join(f"{100 * float(v):.2f}" for v in row) for row in (s.mean(0), e.square().mean(0).sqrt(), inside)
         ]
-        print(f"| {'named' if named else 'unnamed'} | {pairs} | {' | '.join(text)} | {np.mean(chi):.2f} |", flush=True)
+        say(f"| {'named' if named else 'unnamed'} | {pairs} | {' | '.join(text)} | {np.mean(chi):.2f} |", flush=True)
 
 
 def _turn(found: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
@@ -193,12 +203,11 @@ def _range_errors(
 
 def lens(count: int) -> None:
     """A lens from simulated stars: errors at infinity over the image, level and tilted by 30°."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "helpers"))
-    from star_lenses import lens_error
+    from scripts.shared.star_lenses import lens_error
 
     for tilt in (5.0, 30.0):
         for seed in range(count):
-            print(f"tilt {tilt:g}°, seed {seed}: {lens_error(tilt, seed)}", flush=True)
+            say(f"tilt {tilt:g}°, seed {seed}: {lens_error(tilt, seed)}", flush=True)
 
 
 if __name__ == "__main__":
@@ -206,3 +215,4 @@ if __name__ == "__main__":
     {"real": real, "random": lambda: random_points(number), "rigs": lambda: rigs(number), "lens": lambda: lens(number)}[
         what
     ]()
+    write_section("stars.md", what, "Made by `python -m scripts.check.stars`.\n\n" + "\n".join(_said))

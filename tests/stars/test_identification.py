@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
 
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
+from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.attitude import field_angle
 from kcal.stars.catalog import StarCatalog
 from kcal.stars.detect import detect_stars
 from kcal.stars.identification import identify
 from kcal.stars.night import SkyView, name_stars
 from kcal.stars.pair_table import cache_folder, pair_table
+from kcal.stars.sky import observed_directions
+from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
 
 CATALOG = StarCatalog.bundled()
 CAMERA = night_camera()
@@ -82,6 +84,23 @@ def test_attitude_on_earth_within_its_sigma(night: Any) -> None:
     # 0.52 s of UT1 by 15 seconds of arc, times the sine of the latitude about the vertical.
     grown = np.sqrt(unknown.sigma_deg[2] ** 2 - found.sigma_deg[2] ** 2)
     assert grown == pytest.approx(np.hypot(0.52, 0.1) * 15.04 / 3600 * np.sin(np.radians(PLACE.lat)), rel=0.02)
+
+
+def test_stars_below_the_horizon_name_nothing(night: Any) -> None:
+    """Points of light at the antipodes of stars below the horizon have no name."""
+    pixels, index = star_pixels(CAMERA, LOOK)
+    there = observed_directions(CATALOG, TIME, PLACE)
+    rays = torch.from_numpy(-there[there[:, 2] < -0.1]) @ enu_from_cam(*LOOK)
+    at, valid = CAMERA.project(1e9 * rays)
+    phantoms = at[valid & CAMERA.inside(at)].numpy()
+    phantoms = phantoms[np.linalg.norm(phantoms[:, None] - pixels, axis=-1).min(1) > 15][:40]
+    assert len(phantoms) == 40
+    both = np.concatenate([CATALOG.magnitude[index], np.full(40, 5.0)])
+    found = name_stars(
+        rendered(CAMERA, np.concatenate([pixels, phantoms]), both), CAMERA, SkyView(time=TIME, origin=PLACE)
+    )
+    named = found.attitude.star[found.attitude.star >= 0]
+    assert bool((found.directions[named, 2] > 0.08).all())
 
 
 def test_eight_bits_name_stars_too(night: Any) -> None:

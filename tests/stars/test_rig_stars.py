@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
-from star_rigs import LOOKS, star_rig
 from typer.testing import CliRunner
 
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
@@ -26,6 +24,8 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.catalog import StarCatalog
 from kcal.stars.night import NamedStars, SkyView, name_stars
 from kcal.stars.rig_stars import moments_of, star_source
+from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
+from scripts.shared.star_rigs import LOOKS, star_rig
 
 CAMERA = night_camera(1600.0, (1920, 1080))
 STRAIGHT = RigOptions(refraction=0.0, refraction_sigma=0.0)

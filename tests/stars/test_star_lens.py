@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from star_lenses import SIZE, lens_difference, star_images, true_lens
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
@@ -19,6 +18,7 @@ from kcal.stars.budget import NightPlan, planned_stars
 from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import calibrate_by_stars
 from kcal.stars.lens_fit import StarField, fit_star_lens
+from scripts.shared.star_lenses import SIZE, lens_difference, star_images, true_lens
 
 REAL = Path(os.environ.get("KCAL_DATA", ""), "stars")
 

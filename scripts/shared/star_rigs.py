@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import torch
-from night_scenes import PLACE, TIME
 from torch import Tensor
 
 from kcal.calibrate.rig.sources import Baseline, Features, MeasuredPosition, RigData
@@ -17,6 +16,7 @@ from kcal.locate.geodesy import enu_from_cam
 from kcal.stars.attitude import FAR
 from kcal.stars.catalog import StarCatalog
 from kcal.stars.sky import EARTH_RATE, observed_directions, pole_in_enu
+from scripts.shared.night_scenes import PLACE, TIME
 
 BASELINE = 10.0
 LOOKS = ((40.0, 12.0, 1.0), (41.5, 12.5, -0.5))

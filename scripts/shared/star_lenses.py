@@ -6,7 +6,6 @@ import datetime
 
 import numpy as np
 import torch
-from night_scenes import PLACE, TIME
 
 from kcal.lens.camera import Camera
 from kcal.locate.geodesy import enu_from_cam
@@ -16,6 +15,7 @@ from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import StarCamera, calibrate_by_stars
 from kcal.stars.night import SkyView
 from kcal.stars.sky import observed_directions
+from scripts.shared.night_scenes import PLACE, TIME
 
 SIZE = (1280, 800)
 
