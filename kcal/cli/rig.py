@@ -169,16 +169,36 @@ def solve_command(
         warn(f"range errors are not split: {error}")
     print_wrote(output, picture)
     if needs or report is not None:
+        from kcal.cli.report import judged_sides, side_pictures
         from kcal.report.judge_rig import rig_verdict
         from kcal.report.rig import rig_figure
         from kcal.report.verdict_page import camera_tables
         from kcal.report.verdict_pictures import png_bytes
 
-        verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, result=result, subject=output.name.split(".")[0])
+        cameras = judged_sides(rig, pairs, mark_sigma) if pairs is not None and _calibrated_from(rig, pairs) else []
+        verdict = rig_verdict(
+            rig, needs, mark_sigma=mark_sigma, result=result, cameras=[found[0] for found in cameras],
+            subject=output.name.split(".")[0],
+        )  # fmt: skip
         tables = [*camera_tables(rig.left), *camera_tables(rig.right)]
         tell(verdict=verdict.to_dict())
-        if not told_usable(verdict, lambda: {"rig": png_bytes(rig_figure(result))}, tables, report):
+
+        def drawn() -> dict[str, bytes]:
+            return {"rig": png_bytes(rig_figure(result)), **side_pictures(cameras)}
+
+        if not told_usable(verdict, drawn, tables, report):
             raise typer.Exit(NO)
+
+
+def _calibrated_from(rig: StereoRig, pairs: tuple[Path, Path]) -> bool:
+    """Whether these are the views from which both cameras were calibrated, as far as their names tell."""
+    from kcal.corners.observations import Observations
+
+    records = [camera.calibration.record if camera.calibration else None for camera in (rig.left, rig.right)]
+    return all(
+        record is not None and set(record.per_view_rms) <= set(Observations.load(file).names)
+        for record, file in zip(records, pairs, strict=True)
+    )
 
 
 def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:

@@ -44,7 +44,7 @@ def verdict_page(
 
     Args:
         verdict: what it says.
-        pictures: PNG data by name, of those in `CAPTIONS`.
+        pictures: PNG data by name, of those in `CAPTIONS`; after a camera's name and a hyphen where there are several.
         tables: rows of cells, the heads first.
 
     Example:
@@ -63,7 +63,7 @@ def verdict_page(
     return environment.get_template("verdict_page.html").render(
         verdict=verdict,
         pictures={name: base64.b64encode(data).decode("ascii") for name, data in drawn.items()},
-        captions=CAPTIONS,
+        captions={name: _caption(name) for name in drawn},
         tables=tables,
         style=jinja2.filters.Markup(style),
         policy=jinja2.filters.Markup(page_policy(styles=[style])),
@@ -106,7 +106,8 @@ def camera_tables(camera: Camera, result: CameraCalibrationResult | None = None)
     """Tables of a camera: how it was calibrated, its parameters with σ, the strongest correlations."""
     known = camera.calibration
     record = known.record if known else None
-    facts = [["camera", ""], ["image", f"{camera.size[0]} x {camera.size[1]} px"], ["lens model", f"{camera.model}"]]
+    name = (known.name if known else "") or "camera"
+    facts = [[name, ""], ["image", f"{camera.size[0]} x {camera.size[1]} px"], ["lens model", f"{camera.model}"]]
     if record is not None:
         facts += [
             ["calibrated", f"{record.created:%Y-%m-%d %H:%M} UTC, kcal {record.kcal_version}"],
@@ -142,6 +143,11 @@ def _correlations(camera: Camera) -> list[list[str]]:
     # Parameters that are held equal say nothing.
     found = sorted((one for one in found if abs(one[0]) < 0.99999), key=lambda one: -abs(one[0]))[:5]
     return [["strongest correlations", ""], *([f"{a}, {b}", f"{value:+.3f}"] for value, a, b in found)]
+
+
+def _caption(name: str) -> str:
+    side, _, kind = name.rpartition("-")
+    return f"{side.capitalize()} camera. {CAPTIONS[kind]}" if side else CAPTIONS[kind]
 
 
 def _visible_text(value: Any) -> Any:
