@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from kcal.errors import InputError
-from kcal.locate.ranges import BEARING_SIGMAS, range_text
+from kcal.locate.ranges import BEARING_SIGMAS
+from kcal.quantities import range_text
 
 Severity = Literal["stop", "doubt", "fine"]
 # The source of what a camera is wrong by beyond its error bars.

@@ -15,7 +15,7 @@ import kcal
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.files import write_atomic
 from kcal.lens.camera import Camera
-from kcal.locate.ranges import range_text
+from kcal.quantities import length_text, number_text, range_text
 from kcal.report.verdict import RangeAnswer, Verdict
 from kcal.report.verdict_pictures import range_picture
 from kcal.texts import page_policy, visible
@@ -97,7 +97,7 @@ def range_rows(verdict: Verdict) -> list[list[str]]:
     rows = [["range", "answer", "required σ", "σ", *names]]
     for answer in verdict.answers:
         values = [answer.requirement.meters, answer.sigma, *answer.parts.values()]
-        cells = [_meters_plain(value) if math.isfinite(value) else "none" for value in values]
+        cells = [length_text(value, digits=2) if math.isfinite(value) else "not known" for value in values]
         rows.append([range_text(answer.requirement.distance), "yes" if answer.ok else "no", *cells])
     return rows
 
@@ -122,7 +122,7 @@ def camera_tables(camera: Camera, result: CameraCalibrationResult | None = None)
     rows = [["parameter", "value", "σ"]]
     for name, value in list(zip(camera.names, camera.params.detach().tolist(), strict=True))[:_MOST_PARAMETERS]:
         own = sigma.get(name)
-        rows.append([name, f"{value:.6g}", "" if own is None else f"{own:.2g}"])
+        rows.append([name, number_text(value, own, digits=6), "" if own is None else number_text(own, own)])
     tables = [facts, rows]
     if known is not None and known.covariance is not None:
         tables.append(_correlations(camera))
@@ -157,11 +157,7 @@ def _visible_text(value: Any) -> Any:
 def _found(answer: RangeAnswer) -> str:
     if not answer.ranged or not math.isfinite(answer.sigma):
         return "no range can be told"
-    return f"±{_percent(100.0 * answer.sigma / answer.requirement.distance)}, {_meters_plain(answer.sigma)}"
-
-
-def _meters_plain(value: float) -> str:
-    return f"{value:.0f} m" if value >= 100 else f"{value:.2g} m"
+    return f"±{_percent(100.0 * answer.sigma / answer.requirement.distance)}, {length_text(answer.sigma, digits=2)}"
 
 
 def _percent(value: float) -> str:

@@ -15,7 +15,7 @@ from kcal.calibrate.camera.advice import board_tilts
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.trust import Examination
 from kcal.lens.difference import CameraDifference
-from kcal.locate.ranges import range_text
+from kcal.quantities import range_text
 from kcal.report.board import board_figure
 from kcal.report.calibration import draw_coverage, draw_residuals, draw_uncertainty, draw_view_rms
 from kcal.report.figures import (
