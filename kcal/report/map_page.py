@@ -27,7 +27,9 @@ from kcal.report.figures import CAMERA_COLORS
 from kcal.report.tables import interval_text, range_sigma, range_unit
 from kcal.texts import page_data, page_policy, page_text
 
-ARCS_M = (0.1, 0.25, 1.0, 5.0, 25.0, 250.0, 1000.0, 5000.0)
+# Rings of a site and of the sea; on a bench, and where all is nearer than the first of them, round shares of the range.
+ARCS_M = (250.0, 1000.0, 5000.0)
+_ROUND = tuple(k * 10.0**e for e in range(-3, 3) for k in (1.0, 2.5, 5.0))
 _ONLINE = {
     "url": "https://tile.openstreetmap.org/{z}/{x}/{y}.png",
     "attribution": "© OpenStreetMap contributors, openstreetmap.org/copyright",
@@ -148,7 +150,8 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
         return rim + torch.tensor(foot, dtype=torch.float64)
 
     ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
-    reach = 1.15 * max([*ranges, 300.0])
+    farthest = max((one for one in ranges if math.isfinite(one)), default=0.0) or 300.0
+    reach = 1.15 * farthest
     cameras, edges = [], []
     for view, color, side in zip(located.cameras, CAMERA_COLORS, _label_sides(located), strict=False):
         outline = None
@@ -162,7 +165,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
         cameras.append({"name": view.name, "place": place, "fan": outline, "color": color, "side": side})
     low, high = (min(edges), max(edges)) if edges else (-180.0, 180.0)
     sweep = torch.linspace(low, high, 90, dtype=torch.float64) + located.heading_deg
-    arcs = [{"name": range_text(arc), "line": places(fan((0, 0, 0), sweep, arc))} for arc in ARCS_M if arc < reach]
+    arcs = [{"name": range_text(arc), "line": places(fan((0, 0, 0), sweep, arc))} for arc in arcs_within(reach)]
     bearings = [
         places(fan((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0) * ends)
         for p in located.positions
@@ -190,6 +193,17 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
         "cameras": cameras, "arcs": arcs, "regions": rings, "bearings": bearings, "arrows": arrows, "truth": true,
         "points": points,
     }  # fmt: skip
+
+
+def arcs_within(reach: float) -> list[float]:
+    """Ranges at which arcs are drawn, meters.
+
+    Example:
+        >>> arcs_within(2000.0), arcs_within(0.5)
+        ([250.0, 1000.0], [0.05, 0.1, 0.25])
+    """
+    known = [arc for arc in ARCS_M if arc < reach]
+    return known or [arc for arc in _ROUND if reach / 12.0 < arc < reach]
 
 
 def _label_sides(located: Located) -> tuple[str, str]:

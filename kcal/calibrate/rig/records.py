@@ -147,8 +147,8 @@ def _contradiction(work: Adjustment, kind: Kind, pixels: Sequence[float | None],
         most = f"{sigmas:.2f} sigma on average, where so many corners allow {sigmas / math.sqrt(over):.2f}"
         return f"it does not fit the other boards: off by {text} ({most}): {why}"
     return (
-        f"it does not fit the other boards: with it, these fit worse than chance explains, though it is off by only {text} "
-        f"({sigmas:.2f} sigma on average): {why}"
+        "it does not fit the other boards: with it, these fit worse than chance explains, though it is off by only "
+        f"{text} ({sigmas:.2f} sigma on average): {why}"
     )
 
 
