@@ -9,8 +9,8 @@ import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
-# Beyond so many decimals a number is written with an exponent.
-_MOST_DECIMALS = 5
+# With more decimals, and below this power of ten, a number is written with an exponent.
+_MOST_DECIMALS, _LEAST_POWER = 5, -4
 
 
 class Unit(NamedTuple):
@@ -70,10 +70,10 @@ def number_text(value: float, sigma: float | None = None, *, digits: int = 3, si
         return "0"
     places = _decimals(sigma, 2) if known and sigma is not None else _decimals(value, digits)
     plus = "+" if sign else ""
-    if places > _MOST_DECIMALS and value:
-        first = math.floor(math.log10(abs(value)))
-        return f"{value:{plus}.{max(first + places + 1, 1)}g}"
-    return f"{round(value, places):{plus}z.{max(min(places, _MOST_DECIMALS), 0)}f}"
+    first = math.floor(math.log10(abs(value))) if value else 0
+    if places > _MOST_DECIMALS and first < _LEAST_POWER:
+        return f"{value:{plus}.{max(first + places, 0)}e}"
+    return f"{round(value, places):{plus}z.{max(places, 0)}f}"
 
 
 def _decimals(value: float, digits: int) -> int:

@@ -175,7 +175,7 @@ def judged(
         result, options, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name, examination=examination,
         stored=stored,
     )  # fmt: skip
-    return verdict, lambda: camera_pictures(result, examination), camera_tables(result.camera, result)
+    return verdict, lambda: camera_pictures(result, examination), camera_tables(result.camera, result, name)
 
 
 def _judged_again(
@@ -211,7 +211,6 @@ def judged_rig(
 ) -> Judged:
     """The verdict on a rig and, with the observations of its left and right camera, on these as well."""
     from kcal.report.judge_rig import rig_verdict
-    from kcal.report.verdict_page import camera_tables
 
     cameras = judged_sides(rig, observations, mark_sigma)
     pairs, unpaired = _pairs(rig, observations) if observations else (None, "")
@@ -220,7 +219,7 @@ def judged_rig(
         subject=name,
     )  # fmt: skip
     tables = [table for found in cameras for table in found[2]]
-    return verdict, lambda: side_pictures(cameras), tables or [*camera_tables(rig.left), *camera_tables(rig.right)]
+    return verdict, lambda: side_pictures(cameras), tables or stored_tables(rig)
 
 
 def judged_sides(rig: StereoRig, observations: Sequence[Path], mark_sigma: float) -> list[Judged]:
@@ -230,6 +229,13 @@ def judged_sides(rig: StereoRig, observations: Sequence[Path], mark_sigma: float
         _judged_again(camera, file, (), mark_sigma=mark_sigma, name=side)
         for (side, camera), file in zip(sides, observations, strict=False)
     ]
+
+
+def stored_tables(rig: StereoRig) -> list[list[list[str]]]:
+    """Tables of both cameras, as the rig's file has them."""
+    from kcal.report.verdict_page import camera_tables
+
+    return [*camera_tables(rig.left, name="left"), *camera_tables(rig.right, name="right")]
 
 
 def side_pictures(cameras: Sequence[Judged]) -> dict[str, bytes]:

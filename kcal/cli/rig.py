@@ -169,10 +169,9 @@ def solve_command(
         warn(f"range errors are not split: {error}")
     print_wrote(output, picture)
     if needs or report is not None:
-        from kcal.cli.report import judged_sides, side_pictures
+        from kcal.cli.report import judged_sides, side_pictures, stored_tables
         from kcal.report.judge_rig import rig_verdict
         from kcal.report.rig import rig_figure
-        from kcal.report.verdict_page import camera_tables
         from kcal.report.verdict_pictures import png_bytes
 
         cameras = judged_sides(rig, pairs, mark_sigma) if pairs is not None and _calibrated_from(rig, pairs) else []
@@ -180,7 +179,7 @@ def solve_command(
             rig, needs, mark_sigma=mark_sigma, result=result, cameras=[found[0] for found in cameras],
             subject=output.name.split(".")[0],
         )  # fmt: skip
-        tables = [*camera_tables(rig.left), *camera_tables(rig.right)]
+        tables = stored_tables(rig)
         tell(verdict=verdict.to_dict())
 
         def drawn() -> dict[str, bytes]:

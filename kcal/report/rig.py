@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kcal.calibrate.rig.result import ItemResidual, RigResult
 from kcal.lens.camera import Camera
 from kcal.quantities import length_text, measured_length, range_text
-from kcal.report.figures import new_figure, save_picture
+from kcal.report.figures import new_figure, save_picture, wrapped
 
 Array = NDArray[np.float64]
 
@@ -220,6 +220,5 @@ def _footer(result: RigResult) -> str:
         values += [] if source.rms_px is None else [f"{source.rms_px:.3f} px"]
         values += [] if source.rms_m is None else [length_text(source.rms_m)]
         parts.append(f"{source.source}: {', '.join(values)}, {source.sigmas:.2f} sigma")
-    lines = ["   ".join(parts)]
-    lines += [f"{item.label}: {item.reason}" for item in result.left_out[:3]]
-    return "\n".join(lines)
+    texts = ["   ".join(parts), *(f"{item.label}: {item.reason}" for item in result.left_out[:2])]
+    return "\n".join(line for text in texts for line in wrapped(text, 12.6, 9.0))

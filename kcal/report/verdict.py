@@ -193,9 +193,21 @@ class Verdict:
         named, worst = self._forbidding, self._worst
         if named is not None and named.action:
             return named.action
-        if worst is None or worst.most not in _NEXT:
+        if worst is None:
             return "nothing is needed" if self.usable else _NEXT["lenses"]
-        return self.advice[0] if worst.most == "lenses" and self.advice else _NEXT[worst.most]
+        return self._against(worst.most)
+
+    @property
+    def improvement(self) -> str:
+        """What would make ranges better known where they are known well enough: against most of their error."""
+        if not self.answers:
+            return self.advice[0] if self.advice else "nothing is needed"
+        return self._against(max(self.answers, key=lambda answer: answer.sigma / answer.requirement.meters).most)
+
+    def _against(self, source: str) -> str:
+        if source == "lenses" and self.advice:
+            return self.advice[0]
+        return _NEXT.get(source, _NEXT["lenses"])
 
     @property
     def _worst(self) -> RangeAnswer | None:

@@ -102,11 +102,13 @@ def range_rows(verdict: Verdict) -> list[list[str]]:
     return rows
 
 
-def camera_tables(camera: Camera, result: CameraCalibrationResult | None = None) -> list[list[list[str]]]:
+def camera_tables(
+    camera: Camera, result: CameraCalibrationResult | None = None, name: str = ""
+) -> list[list[list[str]]]:
     """Tables of a camera: how it was calibrated, its parameters with σ, the strongest correlations."""
     known = camera.calibration
     record = known.record if known else None
-    name = (known.name if known else "") or "camera"
+    name = name or (known.name if known else "") or "camera"
     facts = [[name, ""], ["image", f"{camera.size[0]} x {camera.size[1]} px"], ["lens model", f"{camera.model}"]]
     if record is not None:
         facts += [

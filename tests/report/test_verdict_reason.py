@@ -79,3 +79,10 @@ def test_what_is_not_known_is_no_yes() -> None:
     assert not given.ranged
     assert not given.ok
     assert given.text == "at 5 km no range can be told; 10 % are required"
+
+
+def test_what_would_improve_a_yes_is_against_most_of_its_error() -> None:
+    advice = ("show the board at the top",)
+    assert verdict(answer(500.0, marks=100.0, lenses=20.0), advice=advice).improvement.startswith(MARKS)
+    assert verdict(answer(500.0, marks=10.0, lenses=20.0), advice=advice).improvement == advice[0]
+    assert Verdict(subject="left", advice=advice).improvement == advice[0]

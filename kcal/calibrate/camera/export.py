@@ -170,7 +170,7 @@ def export_cameras(
     exact = [held_exactly(camera, [model] if model else known.models, known.skew) for camera in several]
     if name == "mrcal" and model is None and None in exact:
         return _write_splines(several, exact, poses, path, _lost(several, rig, known))
-    found = _alike(several, exact, name, model)
+    found = _in_one_model(several, exact, name, model)
     if name == "kalibr" and model is None and (omni := _nearer_omni(several, found)) is not None:
         values, omni_misfits = omni
         return ExportedCameras(
@@ -207,7 +207,7 @@ def _mixed(cameras: Sequence[Camera]) -> tuple[str, ...]:
     )
 
 
-def _alike(
+def _in_one_model(
     cameras: Sequence[Camera], exact: Sequence[Camera | None], name: str, model: str | None
 ) -> list[tuple[Camera, Misfit | None]]:
     """Each camera in a model of the format, in one model for all unless every camera is held exactly."""
