@@ -75,10 +75,10 @@ def building(
         windows: see `Facet`.
     """
     width, height = size
-    front = facing(place, box_outline((0.0, -height, width, 0.0)), color, turn=turn, texture=0.04)
+    front = facing(place, box_outline((0.0, -height, width, 0.0)), color, turn=turn)
     shade = (0.62 * color[0], 0.62 * color[1], 0.66 * color[2])
     edge = place + width * front.along
-    wall = facing(edge, box_outline((0.0, -height, side * width, 0.0)), shade, turn=turn - 62.0, texture=0.04)
+    wall = facing(edge, box_outline((0.0, -height, side * width, 0.0)), shade, turn=turn - 62.0)
     if windows is None:
         return [wall, front]
     # Far enough from the corner that this is all that one sees around it.

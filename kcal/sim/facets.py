@@ -7,6 +7,7 @@ mixed as they are: a pixel half covered has the mean of both, so that blur moves
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -23,6 +24,7 @@ from kcal.sim.window import invert_window
 Floats = NDArray[np.float64]
 Color = tuple[float, float, float]
 _EDGE = 3  # pixels around the corners of a piece that are painted too
+_FAR = 8.0  # times the distance of a piece: nothing of it is farther away
 _COARSE = 8  # pixels between those that tell roughly where a large piece is
 _BATCH = 200_000  # pixels inverted at a time
 
@@ -55,7 +57,7 @@ class Facet:
     glass: Color = (62.0, 72.0, 84.0)
     top: Callable[[Floats], Floats] | None = None
 
-    @property
+    @functools.cached_property
     def corners(self) -> Floats:
         """(K, 3) corners in the scene's frame; points along the upper edge too where it is not straight."""
         outline = self.outline
@@ -65,11 +67,14 @@ class Facet:
         at: Floats = self.origin + outline[:, :1] * self.along + outline[:, 1:] * self.up
         return at
 
-    @property
+    @functools.cached_property
     def distance(self) -> float:
-        """Level distance from the scene's origin, meters: of its middle, of level land that of its farthest corner."""
-        away = np.hypot(*self.corners[:, :2].T)
-        return float(away.max() if self.up[2] == 0 else away.mean())
+        """Level distance from the scene's origin, meters; of level land that of its farthest corner.
+
+        What is farther away is painted first; pieces at one place are painted in the order in which they were made.
+        """
+        at = self.corners if self.up[2] == 0 else self.origin[None]
+        return float(np.hypot(at[:, 0], at[:, 1]).max())
 
 
 class Eye(NamedTuple):
@@ -135,33 +140,14 @@ def facet_windows(camera: Eye, facets: Sequence[Facet]) -> list[tuple[slice, sli
 def _seen_part(camera: Eye, facet: Facet) -> tuple[slice, slice] | None:
     """Rows and columns around what a coarse grid of pixels sees of a large piece that reaches out of sight."""
     height, width = camera.looks.shape[:2]
-    a, b, far = _on_plane(camera, facet, (slice(0, height, _COARSE), slice(0, width, _COARSE)))
-    rows, columns = np.nonzero((_covered(facet, a, b) > 0) & (far > 0))
+    coarse = slice(0, height, _COARSE), slice(0, width, _COARSE)
+    rows, columns = np.nonzero(_covered(facet, cut(camera, facet, coarse)))
     if not len(rows):
         return None
     return tuple(  # type: ignore[return-value]
         slice(max(0, _COARSE * (int(at.min()) - 1)), min(size, _COARSE * (int(at.max()) + 2)))
         for at, size in ((rows, height), (columns, width))
     )
-
-
-def paint(image: Floats, camera: Eye, facet: Facet, window: tuple[slice, slice], haze: Haze) -> None:
-    """Paint a piece over a window of an image (H, W, 3)."""
-    a, b, far = _on_plane(camera, facet, window)
-    share = _covered(facet, a, b) * (far > 0)
-    if not share.any():
-        return
-    color = np.broadcast_to(np.array(facet.color), (*a.shape, 3))
-    if facet.windows is not None:
-        glass = _windows(facet, a, b)[..., None]
-        color = color + glass * (np.array(facet.glass) - color)
-    if facet.texture:
-        # What is finer than a pixel is not seen.
-        fine = np.clip(facet.grain / np.maximum(_slope(a), 1e-9), 0.0, 1.0)
-        color = color * (1 + facet.texture * fine * smooth_noise(a / facet.grain, b / facet.grain))[..., None]
-    color = haze.seen(color, far)
-    part = image[window]
-    part += share[..., None] * (color - part)
 
 
 class Haze(NamedTuple):
@@ -182,50 +168,98 @@ class Haze(NamedTuple):
         return air
 
 
-def _on_plane(camera: Eye, facet: Facet, window: tuple[slice, slice]) -> tuple[Floats, Floats, Floats]:
-    """Where lines of sight meet the plane of a piece, meters along and up, and how far away; behind, it is negative."""
+class Cut(NamedTuple):
+    """Where the lines of sight of a window of pixels meet the plane of a piece; each is (H, W).
+
+    Attributes:
+        along: meters along the piece.
+        up: meters up.
+        far: meters from the camera; negative behind it.
+        slopes: change of `along` down and across, and of `up` down and across, per pixel; or (1, 1) for all pixels.
+    """
+
+    along: Floats
+    up: Floats
+    far: Floats
+    slopes: tuple[Floats, Floats, Floats, Floats]
+
+    def part(self, window: tuple[slice, ...]) -> Cut:
+        """The same in rows and columns of the window."""
+        down, across, up_down, up_across = (each if each.size == 1 else each[window] for each in self.slopes)
+        slopes = down, across, up_down, up_across
+        return Cut(self.along[window], self.up[window], self.far[window], slopes)
+
+    def slope(self, by_along: float, by_up: float) -> Floats:
+        """Change per pixel of `by_along` along + `by_up` up, in the direction in which it is largest."""
+        down, across, up_down, up_across = self.slopes
+        steep: Floats = np.hypot(by_along * down + by_up * up_down, by_along * across + by_up * up_across)
+        return np.maximum(steep, 1e-12)
+
+
+def cut(camera: Eye, facet: Facet, window: tuple[slice, slice], *, small: bool = False) -> Cut:
+    """Cut the lines of sight of a window with the plane of a piece; all pieces on that plane share the result.
+
+    In a small window slopes are taken as the same everywhere, which widens edges by a few percent and moves none.
+    """
     origin = camera.to_camera(facet.origin)
     along, up = camera.rotation @ facet.along, camera.rotation @ facet.up
     normal = np.cross(along, up)
-    x, y, start_x, start_y = np.moveaxis(camera.looks[window], -1, 0)
+    looks = camera.looks[window]
+    x, y, start_x, start_y = (looks[..., i] for i in range(4))
     toward = normal[0] * x + normal[1] * y + normal[2]
     depth = (normal @ origin - normal[0] * start_x - normal[1] * start_y) / np.where(toward == 0, 1e-12, toward)
     depth = np.clip(depth, -1e7, 1e7)
     at_x, at_y, at_z = start_x + depth * x - origin[0], start_y + depth * y - origin[1], depth - origin[2]
     a = along[0] * at_x + along[1] * at_y + along[2] * at_z
     b = up[0] * at_x + up[1] * at_y + up[2] * at_z
-    return a, b, depth * np.sqrt(1 + x**2 + y**2)
+    far = depth * np.sqrt(1 + x**2 + y**2)
+    if not small:
+        return Cut(a, b, far, (*np.gradient(a), *np.gradient(b)))
+    down, across, up_down, up_across = (
+        np.array([[np.diff(values.mean(1 - axis)).mean()]]) for values in (a, b) for axis in (0, 1)
+    )
+    return Cut(a, b, far, (down, across, up_down, up_across))
 
 
-def _slope(values: Floats) -> Floats:
-    """Change per pixel, in the direction in which it is largest."""
-    down, across = np.gradient(values)
-    steep: Floats = np.maximum(np.hypot(down, across), 1e-12)
-    return steep
+def paint(part: Floats, facet: Facet, at: Cut, haze: Haze) -> None:
+    """Paint a piece over a part (H, W, 3) of an image, whose lines of sight were cut with its plane."""
+    share = _covered(facet, at)
+    if not share.any():
+        return
+    color = np.array(facet.color)
+    if facet.windows is not None:
+        color = color + _windows(facet, at)[..., None] * (np.array(facet.glass) - color)
+    if facet.texture:
+        # What is finer than a pixel is not seen.
+        fine = np.clip(facet.grain / at.slope(1.0, 0.0), 0.0, 1.0)
+        waves = smooth_noise(at.along / facet.grain, at.up / facet.grain)
+        color = color * (1 + facet.texture * fine * waves)[..., None]
+    part += share[..., None] * (haze.seen(color, at.far) - part)
 
 
-def _covered(facet: Facet, a: Floats, b: Floats) -> Floats:
+def _covered(facet: Facet, at: Cut) -> Floats:
     """Share of each pixel that the piece covers."""
-    share = np.ones_like(a)
+    # Toward the horizon a level plane has no end.
+    share = ((at.far > 0) & (at.far < _FAR * facet.distance)).astype(np.float64)
     corners = facet.outline
     following = np.roll(corners, -1, 0)
     turn = np.sign(np.sum(corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]))
     for (x, y), (next_x, next_y) in zip(corners, following, strict=True):
         # Inside is to the left of each edge if the corners turn left.
-        inside = turn * ((next_x - x) * (b - y) - (next_y - y) * (a - x))
-        share *= np.clip(0.5 + inside / _slope(inside), 0.0, 1.0)
+        by_along, by_up = -turn * (next_y - y), turn * (next_x - x)
+        inside = by_along * (at.along - x) + by_up * (at.up - y)
+        share *= np.clip(0.5 + inside / at.slope(by_along, by_up), 0.0, 1.0)
     if facet.top is not None:
-        below = facet.top(a) - b
-        share *= np.clip(0.5 + below / _slope(b), 0.0, 1.0)
+        share *= np.clip(0.5 + (facet.top(at.along) - at.up) / at.slope(0.0, 1.0), 0.0, 1.0)
     return share
 
 
-def _windows(facet: Facet, a: Floats, b: Floats) -> Floats:
+def _windows(facet: Facet, at: Cut) -> Floats:
     """Share of each pixel that is glass."""
     assert facet.windows is not None
-    share = np.ones_like(a)
-    for values, period in zip((a, b), facet.windows, strict=True):
-        wide = _slope(values) / period
+    share = np.ones_like(at.far)
+    for values, period, axis in zip((at.along, at.up), facet.windows, ((1.0, 0.0), (0.0, 1.0)), strict=True):
+        wide = at.slope(*axis) / period
         low, high = (_glass_before(values / period + sign * 0.5 * wide) for sign in (-1, 1))
         share *= (high - low) / wide
     return share

@@ -32,7 +32,7 @@ from kcal.sim.coast_objects import (
     ridge,
     ship,
 )
-from kcal.sim.facets import Color, Eye, Facet, eye, facet_windows, paint
+from kcal.sim.facets import Color, Eye, Facet, cut, eye, facet_windows, paint
 from kcal.sim.scene import FOCAL_MM, DemoScene
 from kcal.sim.true_rig import drawn_rig
 
@@ -64,7 +64,7 @@ LANDMARKS = (
     Thing("hut", 260.0, -4.0, -9.0, "upper left corner of its front"),
     Thing("barn", 340.0, -18.0, -8.0, "upper left corner of its front"),
     Thing("chimney", 420.0, 28.0, 20.0, "middle of its top"),
-    Thing("depot", 650.0, -13.0, -3.0, "upper left corner of its front"),
+    Thing("depot", 650.0, -13.0, 8.0, "upper left corner of its front"),
     Thing("silo", 900.0, 13.5, 6.0, "upper left corner of its front"),
     Thing("beacon", 1150.0, -8.5, 8.0, "top of the pole on the mole"),
     Thing("antenna", 1500.0, -23.0, 95.0, "top of the mast on the left headland"),
@@ -75,7 +75,7 @@ TARGETS = (
     Thing("gate", 100.0, -9.0, -12.6, "top of the white post"),
     Thing("yawl", 250.0, 14.5, -9.5, "top of the mast of the moored boat"),
     Thing("buoy", 500.0, -23.5, -11.0, "top of the yellow spar buoy"),
-    Thing("ferry", 1000.0, 6.0, -2.0, "upper left corner of its white deckhouse"),
+    Thing("ferry", 1000.0, 6.0, 12.0, "upper left corner of its blue deckhouse"),
     Thing("tower", 2000.0, -31.5, 72.0, "upper left corner of the tower on the left headland"),
     Thing("turbine", 3500.0, 30.5, 185.0, "tip of the blade that points up"),
     Thing("freighter", 5000.0, 0.4, 40.0, "upper left corner of its dark deckhouse"),
@@ -169,7 +169,7 @@ class PracticeSite:
         image = backdrop(camera, self.coast)
         for facet, window in zip(self.facets, facet_windows(camera, self.facets), strict=True):
             if window is not None:
-                paint(image, camera, facet, window, self.coast.haze)
+                paint(image[window], facet, cut(camera, facet, window), self.coast.haze)
         return image
 
     def picture(self, side: Side) -> NDArray[np.uint8]:
@@ -235,11 +235,11 @@ class PracticeSite:
         found += [
             part for x in range(-60, 60, 6) for part in ground((x, 78.0, x + 0.2, 83.0), _QUAY, mark, heading=heading)
         ]
-        for bearing in (-35.0, -25.0, -15.2, -2.4, 11.5, 24.6, 33.5):
+        for bearing in (-35.0, -23.0, -15.2, -2.4, 14.6, 24.6, 33.5):
             lamp = self.at(76.0 / math.cos(math.radians(bearing)), bearing, -6.5)
             found += [*pole(lamp, 0.16, _QUAY, (72.0, 76.0, 80.0))]
             found += [facing(lamp, np.array([[-0.08, -0.1], [1.6, 0.05], [1.6, 0.25], [-0.08, 0.1]]), (72.0, 76.0, 80.0))]
-        for bearing, color in ((-31.0, RED), (-22.0, WHITE), (-19.5, (44.0, 62.0, 96.0)), (13.6, (60.0, 64.0, 70.0)),
+        for bearing, color in ((-31.0, RED), (-22.0, WHITE), (-19.5, (44.0, 62.0, 96.0)), (10.6, (60.0, 64.0, 70.0)),
                                (28.5, WHITE), (1.2, (150.0, 132.0, 60.0))):  # fmt: skip
             found += _car(self.at(80.0 / math.cos(math.radians(bearing)), bearing, _QUAY), color)
         # A crane at the edge of the quay.
@@ -280,11 +280,11 @@ class PracticeSite:
             *panel(place["panel 1"], 2.4, _QUAY),
             *panel(place["panel 2"], 3.0, _QUAY),
             *panel(place["panel 3"], 3.2, _QUAY),
-            *building(place["hut"], (11.0, 6.0), (176.0, 84.0, 62.0), windows=(3.6, 4.4)),
+            *building(place["hut"], (11.0, 6.0), (228.0, 222.0, 208.0), windows=(3.6, 4.4)),
             *building(place["barn"], (18.0, 7.0), (196.0, 170.0, 120.0), windows=(4.5, 5.0)),
             *pole(place["chimney"], 1.6, _QUAY, (128.0, 70.0, 56.0)),
             *building(self.at(424.0, 28.6, -6.0), (24.0, 9.0), (170.0, 160.0, 146.0), windows=(4.0, 4.4)),
-            *building(place["depot"], (30.0, 11.0), (214.0, 208.0, 196.0), windows=(5.0, 5.4)),
+            *building(place["depot"], (26.0, 22.0), (176.0, 88.0, 66.0), windows=(5.0, 5.4)),
             *building(place["silo"], (30.0, 19.0), (226.0, 224.0, 218.0), side=0.5),
             *pole(place["beacon"], 2.6, -18.0, BLACK),
             *pole(place["antenna"], 3.0, 10.0, (110.0, 44.0, 40.0)),
@@ -306,10 +306,11 @@ class PracticeSite:
             *ship(self.sea_at(250.0, 14.5), 10.0, 3, 1.0)[:1],
             facing(yawl, np.array([[-0.25, -8.0], [0.25, -8.0], [0.25, 0.0], [-0.25, 0.0]]), (214.0, 206.0, 190.0)),
             *pole(place["buoy"], 1.3, -18.4, (226.0, 206.0, 70.0)),
-            facing(ferry, np.array([[-14.0, -16.4], [58.0, -16.4], [64.0, -9.0], [-16.0, -9.0]]), (36.0, 52.0, 88.0)),
-            facing(ferry, box_outline((0.0, -9.5, 50.0, 0.0)), WHITE),
-            facing(ferry, box_outline((15.0, -9.0, 48.0, -4.6)), WHITE, windows=(5.0, 4.4)),
-            facing(ferry, np.array([[30.0, 0.0], [36.0, 0.0], [36.0, 7.0], [30.0, 7.0]]), RED),
+            facing(ferry, np.array([[-16.0, -30.4], [62.0, -30.4], [68.0, -20.0], [-18.0, -20.0]]), (36.0, 52.0, 88.0)),
+            facing(ferry, box_outline((0.0, -20.5, 52.0, 0.0)), (58.0, 84.0, 136.0)),
+            facing(ferry, box_outline((14.0, -19.0, 50.0, -9.0)), WHITE, windows=(5.0, 5.0)),
+            facing(ferry, np.array([[-12.0, -20.0], [-1.0, -20.0], [-1.0, -15.0], [-12.0, -15.0]]), WHITE),
+            facing(ferry, np.array([[34.0, 0.0], [41.0, 0.0], [41.0, 8.0], [34.0, 8.0]]), RED),
             *building(place["tower"], (16.0, 50.0), (72.0, 66.0, 62.0), side=0.4),
             facing(turbine, np.array([[-3.0, -160.0], [3.0, -160.0], [3.0, -56.0], [-3.0, -56.0]]), (96.0, 98.0, 102.0)),
             *others,
