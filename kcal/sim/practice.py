@@ -111,12 +111,13 @@ PASSAGES = (
 )
 
 
-def practice_scene(seed: int = 1, views: int = 12) -> DemoScene:
+def practice_scene(seed: int = 1, views: int = 12, scale: float = 1.0) -> DemoScene:
     """The site of a seed: its cameras, boards, landmarks and targets.
 
     Args:
         seed: of lenses, poses, noise and survey.
         views: of the board by each camera.
+        scale: of the images, see `kcal.sim.captures.drawn_lens`.
 
     Example:
         >>> scene = practice_scene()
@@ -125,7 +126,7 @@ def practice_scene(seed: int = 1, views: int = 12) -> DemoScene:
     """
     return DemoScene(
         seed=seed,
-        rig=drawn_rig("surveillance", 1.0, 10 + seed, focal_mm=FOCAL_MM, wander=1.0),
+        rig=drawn_rig("surveillance", 1.0, 10 + seed, focal_mm=FOCAL_MM, wander=1.0, scale=scale),
         lat=58.094, lon=6.571, height=61.0, heading_deg=236.0, pitch_deg=2.2, roll_deg=0.3,
         near_board=PrintedBoard(9, 6, 0.06, seed=10 + seed), near_views=views,
         targets_at=tuple(thing[:4] for thing in TARGETS), landmarks_at=tuple(thing[:4] for thing in LANDMARKS),
