@@ -46,9 +46,9 @@ def find_ships(image):
     change = min((gray - empty for empty in EMPTY), key=lambda change: np.abs(change[::16, ::16]).mean())
     height, width = (size // 2 for size in change.shape)
     blocks = change[: 2 * height, : 2 * width].reshape(height, 2, width, 2).mean((1, 3))
-    moved = np.abs(ndimage.uniform_filter(blocks, 2)) > 5
+    moved = np.abs(ndimage.uniform_filter(blocks, 2)) > 3.5
     # Parts of a ship that look like what is behind it do not part it.
-    labels, _ = ndimage.label(ndimage.binary_dilation(moved, iterations=4))
+    labels, _ = ndimage.label(ndimage.binary_dilation(moved, np.ones((3, 9))))
     labels[~moved] = 0
     boxes = [(2 * x.start, 2 * y.start, 2 * x.stop, 2 * y.stop) for y, x in ndimage.find_objects(labels)]
     return np.array([box for box in boxes if box[2] - box[0] > 7 and box[3] - box[1] > 5], float).reshape(-1, 4)

@@ -105,9 +105,9 @@ class Passage:
 
 PASSAGES = (
     Passage(name="sailing boat", style=3, length=11.0, start=(520.0, -3.0), end=(640.0, 21.0), bow=25.0),
-    Passage(name="trawler", style=1, length=24.0, start=(760.0, 24.0), end=(820.0, -6.0), bow=-40.0),
-    Passage(name="cruiser", style=0, length=90.0, start=(1700.0, -17.0), end=(1850.0, 14.0)),
-    Passage(name="coaster", style=2, length=140.0, start=(3300.0, 16.0), end=(3100.0, -4.0)),
+    Passage(name="trawler", style=1, length=24.0, start=(690.0, 25.0), end=(700.0, -6.0), bow=-30.0),
+    Passage(name="patrol boat", style=0, length=32.0, start=(930.0, 12.6), end=(970.0, -9.3), bow=-30.0),
+    Passage(name="coaster", style=2, length=140.0, start=(3260.0, -7.0), end=(3140.0, 4.6)),
 )
 
 

@@ -42,7 +42,7 @@ def ships_at(site: PracticeSite, share: float) -> list[ShipAt]:
         >>> from kcal.sim.practice import practice_scene
         >>> ships = ships_at(PracticeSite(practice_scene()), 0.5)
         >>> [round(float(np.hypot(*each.middle[:2])), -2) for each in ships]
-        [3200.0, 1800.0, 800.0, 600.0]
+        [3200.0, 900.0, 700.0, 600.0]
     """
     found = []
     for passage in PASSAGES:
