@@ -121,10 +121,8 @@ def _score_tracks(folder: Path, truth: dict[str, Any]) -> None:
     rows = [["ship", "range m", "followed", "tracks", "off on the map m", "off in range m", "intervals with the truth"]]
     for found in scores:
         share = "" if math.isnan(found.contained) else f"{100 * found.contained:.0f} %"
-        rows.append(
-            [found.name, f"{found.range_m:.0f}", f"{100 * found.followed:.0f} %", f"{found.tracks}"]
-            + [_meters(found.level), _meters(found.range_off), share]
-        )
+        counts = [f"{found.range_m:.0f}", f"{100 * found.followed:.0f} %", f"{found.tracks}"]
+        rows.append([found.name, *counts, _meters(found.level), _meters(found.range_off), share])
     print_table(rows)
     if strays:
         warn(f"{strays} tracks are near no ship")

@@ -14,6 +14,7 @@ from kcal.sim.noise import smooth_noise
 
 Floats = NDArray[np.float64]
 EARTH = 6_371_000.0  # meters
+_HAZE = Haze((196.0, 206.0, 214.0), 16_000.0)
 _FEW = 4  # pixels between those for which clouds are computed
 
 
@@ -33,7 +34,7 @@ class Coast:
     refraction: float = 0.13
     zenith: Color = (96.0, 138.0, 186.0)
     water: Color = (52.0, 82.0, 96.0)
-    haze: Haze = Haze((196.0, 206.0, 214.0), 16_000.0)
+    haze: Haze = _HAZE
 
     @property
     def bend(self) -> float:

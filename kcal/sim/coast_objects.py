@@ -87,8 +87,8 @@ def building(
 
 
 def ridge(
-    bearings: tuple[float, float], distance: float, heights: Sequence[tuple[float, float]], foot: float, color: Color, *,
-    heading: float, rough: float, texture: float = 0.25, grain: float = 20.0, seed: float = 0.0,
+    bearings: tuple[float, float], distance: float, heights: Sequence[tuple[float, float]], foot: float, color: Color,
+    *, heading: float, rough: float, texture: float = 0.25, grain: float = 20.0, seed: float = 0.0,
 ) -> Facet:  # fmt: skip
     """Land in front of the sky: an upright piece whose upper edge runs through heights, with rocks on it.
 

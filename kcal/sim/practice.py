@@ -223,7 +223,7 @@ class PracticeSite:
 
     def _harbor(self) -> list[Facet]:
         """What stands on the quay."""
-        heading, mark = self.scene.heading_deg, (206.0, 204.0, 196.0)
+        heading, mark, dark = self.scene.heading_deg, (206.0, 204.0, 196.0), (72.0, 76.0, 80.0)
         found = [
             *ground((-300.0, 203.0, 300.0, 204.2), _QUAY, mark, heading=heading),
             *ground((-300.0, 15.0, 300.0, 64.0), _QUAY, (86.0, 104.0, 58.0), heading=heading, grain=0.7),
@@ -238,8 +238,8 @@ class PracticeSite:
         ]
         for bearing in (-35.0, -23.0, -15.2, -2.4, 14.6, 24.6, 33.5):
             lamp = self.at(76.0 / math.cos(math.radians(bearing)), bearing, -6.5)
-            found += [*pole(lamp, 0.16, _QUAY, (72.0, 76.0, 80.0))]
-            found += [facing(lamp, np.array([[-0.08, -0.1], [1.6, 0.05], [1.6, 0.25], [-0.08, 0.1]]), (72.0, 76.0, 80.0))]
+            arm = np.array([[-0.08, -0.1], [1.6, 0.05], [1.6, 0.25], [-0.08, 0.1]])
+            found += [*pole(lamp, 0.16, _QUAY, dark), facing(lamp, arm, dark)]
         for bearing, color in ((-31.0, RED), (-22.0, WHITE), (-19.5, (44.0, 62.0, 96.0)), (10.6, (60.0, 64.0, 70.0)),
                                (28.5, WHITE), (1.2, (150.0, 132.0, 60.0))):  # fmt: skip
             found += _car(self.at(80.0 / math.cos(math.radians(bearing)), bearing, _QUAY), color)
@@ -248,7 +248,8 @@ class PracticeSite:
         foot = self.at(198.0, -34.5, _QUAY)
         for shape in (
             [(-5.0, 0.0), (-4.0, 0.0), (-4.0, 22.0), (-5.0, 22.0)], [(4.0, 0.0), (5.0, 0.0), (5.0, 22.0), (4.0, 22.0)],
-            [(-5.0, 20.5), (5.0, 20.5), (5.0, 22.0), (-5.0, 22.0)], [(-1.6, 22.0), (2.4, 22.0), (2.4, 25.5), (-1.6, 25.5)],
+            [(-5.0, 20.5), (5.0, 20.5), (5.0, 22.0), (-5.0, 22.0)],
+            [(-1.6, 22.0), (2.4, 22.0), (2.4, 25.5), (-1.6, 25.5)],
             [(-1.0, 24.6), (-18.0, 37.6), (-18.4, 36.8), (-1.4, 23.2)],
         ):  # fmt: skip
             found.append(facing(foot, np.array(shape), steel))
@@ -267,11 +268,11 @@ class PracticeSite:
             size = (float(random.uniform(16, 34)), float(random.uniform(10, 18)))
             paint_ = paints[int(random.integers(len(paints)))]
             found += building(self.at(distance, bearing, up + size[1] / 2), size, paint_, windows=(4.0, 3.4))
+        rust, green, blue = (158.0, 70.0, 48.0), (92.0, 110.0, 84.0), (58.0, 92.0, 124.0)
         for bearing, distance, color in (
-            (-34.0, 150.0, (158.0, 70.0, 48.0)), (-32.4, 150.0, (92.0, 110.0, 84.0)), (-36.5, 160.0, (58.0, 92.0, 124.0)),
-            (-14.5, 170.0, (58.0, 92.0, 124.0)), (-19.5, 165.0, (158.0, 70.0, 48.0)), (25.0, 160.0, (92.0, 110.0, 84.0)),
-            (-24.0, 300.0, (58.0, 92.0, 124.0)), (-21.9, 300.0, (158.0, 70.0, 48.0)), (-11.5, 280.0, (92.0, 110.0, 84.0)),
-            (24.5, 250.0, (158.0, 70.0, 48.0)), (26.0, 252.0, (58.0, 92.0, 124.0)), (31.5, 330.0, (188.0, 184.0, 172.0)),
+            (-34.0, 150.0, rust), (-32.4, 150.0, green), (-36.5, 160.0, blue),
+            (-14.5, 170.0, blue), (-19.5, 165.0, rust), (25.0, 160.0, green), (-24.0, 300.0, blue),
+            (-21.9, 300.0, rust), (-11.5, 280.0, green), (24.5, 250.0, rust), (26.0, 252.0, blue), (31.5, 330.0, (188.0, 184.0, 172.0)),
         ):  # fmt: skip
             found += building(self.at(distance, bearing, _QUAY + 2.8), (9.0, 2.8), color)
         return found
@@ -294,32 +295,34 @@ class PracticeSite:
         ]
 
     def _targets(self, place: dict[str, Floats]) -> list[Facet]:
+        hull = (44.0, 40.0, 46.0)
         ferry, freighter = place["ferry"], place["freighter"]
         turbine, yawl = place["turbine"], place["yawl"]
-        blade = np.array([[-2.6, -56.0], [2.6, -56.0], [2.6, 0.0], [-2.6, 0.0]])
+        blade = box_outline((-2.6, -56.0, 2.6, 0.0))
         hub = turbine - np.array([0.0, 0.0, 58.0])
+        white = (206.0, 208.0, 210.0)
         others = [
-            facing(hub, np.array([[0.0, -2.6], [s * 49.0, -30.9], [s * 47.0, -34.0], [0.0, 2.6]]), (206.0, 208.0, 210.0))
+            facing(hub, np.array([[0.0, -2.6], [s * 49.0, -30.9], [s * 47.0, -34.0], [0.0, 2.6]]), white)
             for s in (-1.0, 1.0)
         ]
         return [
             *pole(place["gate"], 0.36, _QUAY, WHITE),
             *ship(self.sea_at(250.0, 14.5), 10.0, 3, 1.0)[:1],
-            facing(yawl, np.array([[-0.25, -8.0], [0.25, -8.0], [0.25, 0.0], [-0.25, 0.0]]), (214.0, 206.0, 190.0)),
+            facing(yawl, box_outline((-0.25, -8.0, 0.25, 0.0)), (214.0, 206.0, 190.0)),
             *pole(place["buoy"], 1.3, -18.4, (226.0, 206.0, 70.0)),
             facing(ferry, np.array([[-16.0, -30.4], [62.0, -30.4], [68.0, -20.0], [-18.0, -20.0]]), (36.0, 52.0, 88.0)),
             facing(ferry, box_outline((0.0, -20.5, 52.0, 0.0)), (58.0, 84.0, 136.0)),
             facing(ferry, box_outline((14.0, -19.0, 50.0, -9.0)), WHITE, windows=(5.0, 5.0)),
-            facing(ferry, np.array([[-12.0, -20.0], [-1.0, -20.0], [-1.0, -15.0], [-12.0, -15.0]]), WHITE),
-            facing(ferry, np.array([[34.0, 0.0], [41.0, 0.0], [41.0, 8.0], [34.0, 8.0]]), RED),
+            facing(ferry, box_outline((-12.0, -20.0, -1.0, -15.0)), WHITE),
+            facing(ferry, box_outline((34.0, 0.0, 41.0, 8.0)), RED),
             *building(place["tower"], (16.0, 50.0), (72.0, 66.0, 62.0), side=0.4),
-            facing(turbine, np.array([[-3.0, -160.0], [3.0, -160.0], [3.0, -56.0], [-3.0, -56.0]]), (96.0, 98.0, 102.0)),
+            facing(turbine, box_outline((-3.0, -160.0, 3.0, -56.0)), (96.0, 98.0, 102.0)),
             *others,
             facing(turbine, blade, (88.0, 90.0, 96.0)),
-            facing(freighter, np.array([[-60.0, -60.5], [220.0, -60.5], [236.0, -36.0], [-66.0, -36.0]]), (44.0, 40.0, 46.0)),
-            facing(freighter, np.array([[0.0, -37.0], [48.0, -37.0], [48.0, 0.0], [0.0, 0.0]]), BLACK),
-            facing(freighter, np.array([[70.0, -36.0], [150.0, -36.0], [150.0, -14.0], [70.0, -14.0]]), (150.0, 66.0, 48.0)),
-            facing(freighter, np.array([[158.0, -36.0], [214.0, -36.0], [214.0, -18.0], [158.0, -18.0]]), (60.0, 98.0, 128.0)),
+            facing(freighter, np.array([[-60.0, -60.5], [220.0, -60.5], [236.0, -36.0], [-66.0, -36.0]]), hull),
+            facing(freighter, box_outline((0.0, -37.0, 48.0, 0.0)), BLACK),
+            facing(freighter, box_outline((70.0, -36.0, 150.0, -14.0)), (150.0, 66.0, 48.0)),
+            facing(freighter, box_outline((158.0, -36.0, 214.0, -18.0)), (60.0, 98.0, 128.0)),
         ]  # fmt: skip
 
 

@@ -78,9 +78,7 @@ def frames(site: PracticeSite, side: Side, count: int = RATE * SECONDS) -> Itera
         places = iter(facet_windows(camera, pieces))
         for ships in moments:
             frame = still.copy()
-            moving = [
-                (facet, place) for each in ships for facet in each.facets if (place := next(places)) is not None
-            ]
+            moving = [(facet, place) for each in ships for facet in each.facets if (place := next(places)) is not None]
             for each in ships:
                 own = [place for facet, place in moving if facet in each.facets]
                 if own:

@@ -1,4 +1,4 @@
-"""`kcal demo --practice` and `--score`: a folder that is filled, continued and never written over; the stranger's walk."""
+"""`kcal demo --practice` and `--score`: a folder that is filled, continued, never written over; a stranger's walk."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_other_folders_are_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(FileError, match="other files"):
         make(tmp_path / "work")
     assert [path.name for path in (tmp_path / "work").iterdir()] == ["thesis.tex"]
-    with pytest.raises(FileError, match="no practice site.*kcal demo --practice"):
+    with pytest.raises(FileError, match=r"no practice site.*kcal demo --practice"):
         practice_score(tmp_path / "work")
 
 
@@ -136,7 +136,7 @@ def test_positions_are_compared_with_the_truth(tmp_path: Path, truth: dict[str, 
     np.testing.assert_allclose([score.level for score in scores], shift, atol=1e-6)
     for score in scores:
         place = np.array(truth["targets"][score.name.lower()])
-        expected = np.linalg.norm(place + [0, shift, 0]) - np.linalg.norm(place)
+        expected = np.linalg.norm(place + np.array([0.0, shift, 0.0])) - np.linalg.norm(place)
         assert score.range_off == pytest.approx(expected, abs=1e-6)
         assert score.contains == (abs(expected) <= 10)
 
