@@ -188,7 +188,7 @@ def _sketch(site: PracticeSite, path: Path, _: Callable[[], None]) -> None:
         ([thing.name for thing in things], site.true_pixels("left", points.enu))
         for things, points in ((LANDMARKS, scene.landmarks), (TARGETS, scene.targets))
     ]
-    save_site_sketch(path, site.picture("left"), *groups)
+    save_site_sketch(path, site.picture("left", noise=0.0), *groups)
 
 
 def _film(site: PracticeSite, side: Side, count: int, path: Path, step: Callable[[], None]) -> None:

@@ -22,7 +22,7 @@ def save_site_sketch(path: str | Path, image: NDArray[np.uint8], landmarks: Name
         targets: the same of what is to be located.
     """
     height, width = image.shape[:2]
-    figure = new_figure(width / 120, height / 120, 100)
+    figure = new_figure(width / 160, height / 160, 100)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.imshow(image)
     axes.set_axis_off()

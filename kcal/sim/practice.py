@@ -173,10 +173,10 @@ class PracticeSite:
                 paint(image[window], facet, cut(camera, facet, window), self.coast.haze)
         return image
 
-    def picture(self, side: Side) -> NDArray[np.uint8]:
+    def picture(self, side: Side, noise: float = NOISE) -> NDArray[np.uint8]:
         """The site in color, (H, W, 3), with blur and noise."""
         random = np.random.default_rng([self.scene.seed, SIDES.index(side), 1])
-        return exposed(self.light(side), BLUR, NOISE, random)
+        return exposed(self.light(side), BLUR, noise, random)
 
     def at(self, distance: float, bearing: float, up: float) -> Floats:
         """East, north, up of a place, as it seems to be."""
@@ -272,7 +272,8 @@ class PracticeSite:
         for bearing, distance, color in (
             (-34.0, 150.0, rust), (-32.4, 150.0, green), (-36.5, 160.0, blue),
             (-14.5, 170.0, blue), (-19.5, 165.0, rust), (25.0, 160.0, green), (-24.0, 300.0, blue),
-            (-21.9, 300.0, rust), (-11.5, 280.0, green), (24.5, 250.0, rust), (26.0, 252.0, blue), (31.5, 330.0, (188.0, 184.0, 172.0)),
+            (-21.9, 300.0, rust),
+            (-11.5, 280.0, green), (24.5, 250.0, rust), (26.0, 252.0, blue), (31.5, 330.0, (188.0, 184.0, 172.0)),
         ):  # fmt: skip
             found += building(self.at(distance, bearing, _QUAY + 2.8), (9.0, 2.8), color)
         return found
