@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from kcal.cli.console import out, print_table, warn
 from kcal.cli.demo_practice import read_truth_file
-from kcal.cli.practice_files import STEPS, Step
+from kcal.cli.practice_files import STEPS, Exercise
 
 if TYPE_CHECKING:
     from kcal.lens.rig import StereoRig
@@ -39,7 +39,7 @@ def practice_score(folder: Path) -> None:
         out.print(f"  {command}", markup=False)
 
 
-def next_step(folder: Path) -> Step | None:
+def next_step(folder: Path) -> Exercise | None:
     """The first step whose files are not all there."""
     others = {"positions.geojson": POSITIONS, "tracks.csv": TRACKS}
     for step in STEPS:
@@ -79,8 +79,8 @@ def _score_rig(folder: Path, truth: dict[str, Any]) -> StereoRig | None:
     rig = load_rig(path)
     rows = [["at", "mean m", "RMS m", "one sigma as stated m"]]
     for found in score_rig(rig, truth):
-        stated = "none" if found.stated is None else _meters(found.stated)
-        rows.append([f"{found.range_m / 1000:g} km", _signed(found.mean), _meters(found.rms), stated])
+        stated = "none" if found.stated is None else _short_meters(found.stated)
+        rows.append([f"{found.range_m / 1000:g} km", _signed(found.mean), _short_meters(found.rms), stated])
     print_table(rows)
     true, own = truth["baseline_m"], float(rig.baseline)
     out.print(f"baseline {own:.4f} m, {1e3 * (own - true):+.1f} mm off")
@@ -98,7 +98,7 @@ def _score_positions(folder: Path, truth: dict[str, Any]) -> None:
     scores = score_positions(path, truth)
     rows = [["target", "range m", "off on the map m", "off in range m", "95 % interval contains it"]]
     for found in scores:
-        cells = [f"{found.range_m:.0f}", _meters(found.level), _signed(found.range_off)]
+        cells = [f"{found.range_m:.0f}", _short_meters(found.level), _signed(found.range_off)]
         rows.append([found.name, *cells, "yes" if found.contains else "no"])
     _print_or_missing(rows)
     if scores:
@@ -122,7 +122,7 @@ def _score_tracks(folder: Path, truth: dict[str, Any]) -> None:
     for found in scores:
         share = "" if math.isnan(found.contained) else f"{100 * found.contained:.0f} %"
         counts = [f"{found.range_m:.0f}", f"{100 * found.followed:.0f} %", f"{found.tracks}"]
-        rows.append([found.name, *counts, _meters(found.level), _meters(found.range_off), share])
+        rows.append([found.name, *counts, _short_meters(found.level), _short_meters(found.range_off), share])
     print_table(rows)
     if strays:
         warn(f"{strays} tracks are near no ship")
@@ -139,11 +139,11 @@ def _print_or_missing(rows: list[list[str]]) -> None:
         out.print("not done yet")
 
 
-def _meters(value: float) -> str:
+def _short_meters(value: float) -> str:
     if math.isnan(value):
         return ""
     return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}" if abs(value) >= 0.01 else f"{value:.3f}"
 
 
 def _signed(value: float) -> str:
-    return f"{'-' if value < 0 else '+'}{_meters(abs(value))}"
+    return f"{'-' if value < 0 else '+'}{_short_meters(abs(value))}"

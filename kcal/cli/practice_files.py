@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from kcal.sim.scene import DemoScene
 
 
-class Step(NamedTuple):
+class Exercise(NamedTuple):
     """A step of the exercise.
 
     Attributes:
@@ -23,18 +23,18 @@ class Step(NamedTuple):
 
 
 STEPS = (
-    Step("find the board", ("left.obs.json", "right.obs.json"), tuple(
+    Exercise("find the board", ("left.obs.json", "right.obs.json"), tuple(
         f"kcal detect boards/{side} --board 9x6 --square 60mm -o {side}.obs.json" for side in ("left", "right"))),
-    Step("calibrate", ("left.camera.json", "right.camera.json"), tuple(
+    Exercise("calibrate", ("left.camera.json", "right.camera.json"), tuple(
         f"kcal calibrate {side}.obs.json -o {side}.camera.json" for side in ("left", "right"))),
-    Step("mark", ("marks.csv",), (
+    Exercise("mark", ("marks.csv",), (
         "kcal mark site/left.png site/right.png --cameras left.camera.json right.camera.json --landmarks survey.csv "
         "-o marks.csv",)),
-    Step("solve the rig", ("rig.json",), (
+    Exercise("solve the rig", ("rig.json",), (
         "kcal rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv -o rig.json",)),
-    Step("locate", ("positions.geojson",), (
+    Exercise("locate", ("positions.geojson",), (
         "kcal locate rig.json marks.points.csv -o positions.geojson --map map.html",)),
-    Step("follow", ("tracks.csv",), (
+    Exercise("follow", ("tracks.csv",), (
         "kcal live rig.json video/left.mp4 video/right.mp4 --detector find_ships:find_ships -o tracks.csv",)),
 )  # fmt: skip
 

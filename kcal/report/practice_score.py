@@ -152,7 +152,7 @@ def score_positions(path: Path, truth: dict[str, Any]) -> list[PositionScore]:
     """Compare positions with the true ones, by name."""
     true = {name.casefold(): np.array(place) for name, place in truth["targets"].items()}
     found = []
-    for row in position_rows(path, truth):
+    for row in located_rows(path, truth):
         place = true.get(row.name.strip().casefold())
         if place is not None:
             found.append(_position_score(row.name, row, place))
@@ -186,7 +186,7 @@ def score_tracks(path: Path, truth: dict[str, Any]) -> tuple[list[TrackScore], i
     times = np.array(truth["ships"]["times"])
     ships = {name: np.array(places) for name, places in truth["ships"]["places"].items()}
     tracks: dict[str, list[PositionRow]] = defaultdict(list)
-    for row in position_rows(path, truth):
+    for row in located_rows(path, truth):
         if row.time is not None:
             tracks[row.name].append(row)
     scores: dict[str, list[tuple[str, float, PositionScore]]] = defaultdict(list)
@@ -246,7 +246,7 @@ class PositionRow(NamedTuple):
     time: float | None
 
 
-def position_rows(path: Path, truth: dict[str, Any]) -> list[PositionRow]:
+def located_rows(path: Path, truth: dict[str, Any]) -> list[PositionRow]:
     """The located rows of a CSV, GeoJSON or GeoJSONL of `kcal locate` or `kcal live`.
 
     Raises:

@@ -83,13 +83,13 @@ def _sky(heading: Floats, coast: Coast) -> Floats:
     # Clouds on a level layer: its places are the slopes of the lines of sight.
     steep = np.maximum(heading[..., 2], 0.02)
     few = heading[::_FEW, ::_FEW] / steep[::_FEW, ::_FEW, None]
-    cloud = _between(smooth_noise(0.55 * few[..., 0], 0.8 * few[..., 1], 5), up.shape)
+    cloud = _joined_values(smooth_noise(0.55 * few[..., 0], 0.8 * few[..., 1], 5), up.shape)
     cover = np.clip(1.6 * cloud + 0.1, 0.0, 1.0) * np.clip((heading[..., 2] - 0.03) / 0.1, 0.0, 1.0)
     mixed: Floats = color + 0.75 * cover[..., None] * (np.array([238.0, 240.0, 242.0]) - color)
     return mixed
 
 
-def _between(values: Floats, shape: tuple[int, ...]) -> Floats:
+def _joined_values(values: Floats, shape: tuple[int, ...]) -> Floats:
     """Values of every fourth pixel, joined by straight lines."""
     for axis, size in enumerate(shape):
         at = np.arange(size) / _FEW

@@ -12,7 +12,7 @@ _SIZE = 256
 
 
 @functools.cache
-def _lattice() -> NDArray[np.float32]:
+def _random_lattice() -> NDArray[np.float32]:
     return np.random.default_rng(7).uniform(-1.0, 1.0, _SIZE * _SIZE).astype(np.float32)
 
 
@@ -34,7 +34,7 @@ def smooth_noise(x: Floats, y: Floats, octaves: int = 3) -> Floats:
 
 
 def _one_octave(x: Floats, y: Floats) -> NDArray[np.float32]:
-    lattice = _lattice()
+    lattice = _random_lattice()
     column, row = np.floor(x), np.floor(y)
     u, v = (x - column).astype(np.float32), (y - row).astype(np.float32)
     u, v = u * u * (3 - 2 * u), v * v * (3 - 2 * v)

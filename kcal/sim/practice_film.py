@@ -82,7 +82,7 @@ def frames(site: PracticeSite, side: Side, count: int = RATE * SECONDS) -> Itera
             for each in ships:
                 own = [place for facet, place in moving if facet in each.facets]
                 if own:
-                    window = _around(own, frame.shape)
+                    window = _ship_window(own, frame.shape)
                     light = _with_ships(site, side, window, fixed, moving)
                     seen = exposed(light @ _LUMA, BLUR, NOISE, random)
                     inner = tuple(slice(_AROUND, size - _AROUND) for size in seen.shape)
@@ -114,7 +114,7 @@ def _with_ships(
     return part
 
 
-def _around(windows: list[tuple[slice, slice]], shape: tuple[int, ...]) -> tuple[slice, slice]:
+def _ship_window(windows: list[tuple[slice, slice]], shape: tuple[int, ...]) -> tuple[slice, slice]:
     sides = [
         slice(
             max(0, min(window[axis].start for window in windows) - _AROUND),

@@ -24,7 +24,7 @@ def practice_truth(site: PracticeSite, frames: int) -> dict[str, Any]:
         frames: of the film.
     """
     scene, rig = site.scene, site.scene.rig
-    things = {**_named(scene.landmarks), **_named(scene.targets)}
+    things = {**_places_by_name(scene.landmarks), **_places_by_name(scene.targets)}
     pixels = {side: site.true_pixels(side, np.array([*things.values()])) for side in SIDES}
     return {
         "kcal": "practice truth",
@@ -35,8 +35,8 @@ def practice_truth(site: PracticeSite, frames: int) -> dict[str, Any]:
         "cameras": {side: _lens_record(getattr(rig, side)) for side in SIDES},
         "baseline_m": float(rig.baseline),
         "pairs": [_pairs_record(site, distance) for distance in DISTANCES],
-        "landmarks": _named(scene.landmarks),
-        "targets": _named(scene.targets),
+        "landmarks": _places_by_name(scene.landmarks),
+        "targets": _places_by_name(scene.targets),
         "marks": {
             name: [*pixels["left"][row].tolist(), *pixels["right"][row].tolist()] for row, name in enumerate(things)
         },
@@ -55,7 +55,7 @@ def ship_boxes(site: PracticeSite, side: Side, frames: int) -> NDArray[np.float6
     return camera.project(points)[0].reshape(frames, -1, 2)
 
 
-def _named(points: Any) -> dict[str, list[float]]:
+def _places_by_name(points: Any) -> dict[str, list[float]]:
     return dict(zip(points.names, points.enu.tolist(), strict=True))
 
 
