@@ -40,10 +40,14 @@ def practice_score(folder: Path) -> None:
 
 
 def next_step(folder: Path) -> Exercise | None:
-    """The first step whose files are not all there."""
+    """The first step whose files are not all there; what only leads to a step that is done counts as done."""
     others = {"positions.geojson": POSITIONS, "tracks.csv": TRACKS}
-    for step in STEPS:
-        if not all(any((folder / name).exists() for name in others.get(made, (made,))) for made in step.makes):
+    done = [
+        all(any((folder / name).exists() for name in others.get(made, (made,))) for made in step.makes)
+        for step in STEPS
+    ]
+    for step, own, later in zip(STEPS, done, [*done[1:], False], strict=True):
+        if not own and not (step.leads_on and later):
             return step
     return None
 

@@ -15,21 +15,23 @@ class Exercise(NamedTuple):
         name: of the step.
         makes: files of which one must be there when it is done.
         commands: what to paste, in the folder of the site.
+        leads_on: whether its files serve the next step alone, so that they may have other names.
     """
 
     name: str
     makes: tuple[str, ...]
     commands: tuple[str, ...]
+    leads_on: bool = False
 
 
 STEPS = (
     Exercise("find the board", ("left.obs.json", "right.obs.json"), tuple(
-        f"kcal detect boards/{side} --board 9x6 --square 60mm -o {side}.obs.json" for side in ("left", "right"))),
+        f"kcal detect boards/{side} --board 9x6 --square 60mm -o {side}.obs.json" for side in ("left", "right")), True),
     Exercise("calibrate", ("left.camera.json", "right.camera.json"), tuple(
         f"kcal calibrate {side}.obs.json -o {side}.camera.json" for side in ("left", "right"))),
     Exercise("mark", ("marks.csv",), (
         "kcal mark site/left.png site/right.png --cameras left.camera.json right.camera.json --landmarks survey.csv "
-        "-o marks.csv",)),
+        "-o marks.csv",), True),
     Exercise("solve the rig", ("rig.json",), (
         "kcal rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv -o rig.json",)),
     Exercise("locate", ("positions.geojson",), (
@@ -68,6 +70,7 @@ Run the commands in this folder:
 
 How well did you do? This may be asked after each step:
    kcal demo --score .
+The truth is in the hidden folder .truth; look there afterwards.
 """
 
 

@@ -14,8 +14,8 @@ import torch
 from practice_marks import mark_practice
 from typer.testing import CliRunner
 
-import kcal.cli.demo_practice
 import kcal.io.images
+import kcal.io.video_file
 from kcal.cli.demo_practice import TRUTH, practice_site
 from kcal.cli.demo_score import next_step, practice_score
 from kcal.cli.main import app
@@ -113,6 +113,28 @@ def test_what_comes_next_is_said_step_by_step(folder: Path, capsys: pytest.Captu
         for name in step.makes:
             (folder / name).touch()
     assert next_step(folder) is None
+    # Marks may have other names; positions and tracks do not stand for each other.
+    for name in ("marks.csv", "left.obs.json"):
+        (folder / name).unlink()
+    assert next_step(folder) is None
+    (folder / "positions.geojson").unlink()
+    assert next_step(folder) == STEPS[4]
+
+
+def test_without_the_extra_for_videos_the_rest_is_made(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def missing(*arguments: Any) -> None:
+        raise ImportError(name="av")
+
+    (folder / "video" / "left.mp4").unlink()
+    (folder / "survey.csv").unlink()
+    monkeypatch.setattr(kcal.io.video_file, "write_video", missing)
+    make(folder)
+    said = capsys.readouterr()
+    assert "wrote 1 files" in said.out
+    assert "video/left.mp4 needs av, which is not installed: pip install 'kcal[video]'" in said.err
+    assert (folder / "survey.csv").exists()
 
 
 def table(truth: dict[str, Any], rows: list[tuple[str, list[float], float | None]], shift: float) -> str:
