@@ -193,7 +193,9 @@ def score_tracks(path: Path, truth: dict[str, Any]) -> tuple[list[TrackScore], i
     strays = 0
     for name, rows in tracks.items():
         each = {
-            ship: [(row.time or 0.0, _position_score(name, row, _at(places, times, row.time or 0.0))) for row in rows]
+            ship: [
+                (row.time or 0.0, _position_score(name, row, _place_at(places, times, row.time or 0.0))) for row in rows
+            ]
             for ship, places in ships.items()
         }
         nearest = min(each, key=lambda ship: float(np.median([score.level for _, score in each[ship]])))
@@ -224,7 +226,7 @@ def _median(values: list[float]) -> float:
     return float(np.median(values)) if values else math.nan
 
 
-def _at(places: Floats, times: Floats, time: float) -> Floats:
+def _place_at(places: Floats, times: Floats, time: float) -> Floats:
     return np.array([np.interp(time, times, column) for column in places.T])
 
 
