@@ -123,6 +123,16 @@ def _doubts(rig: StereoRig, result: RigResult | None) -> list[Finding]:
                     action="check that both images of each pair were taken at the same moment, and the survey",
                 )
             )
+        found += [
+            Finding(
+                name="contradiction",
+                severity="stop",
+                text=text,
+                action="measure again what contradicts, correct it or its sigma, and solve the rig again",
+                picture="rig",
+            )
+            for text in record.contradictions
+        ]
     if result is None:
         return found
     if result.exact:
