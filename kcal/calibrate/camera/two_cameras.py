@@ -33,7 +33,7 @@ _INDICES, _SIZE = (0, 1, 2, 3), 3
 # Standard deviations of ln scale and, in shares of the image's diagonal, of the principal point, by which the estimates
 # of single views are held together before they are grouped.
 _SPREAD, _SPREAD_CENTER = 0.1, 0.02
-# Nats beyond chance. Measured (scripts/check/two_cameras.py): what groups of good captures bring stays 5 below chance.
+# Nats beyond chance. Measured (scripts/check/faults.py): what groups of good captures bring stays 5 below chance.
 _BEYOND = 5.0
 # Share of the image's diagonal that corners must be apart: a lens that was touched moves by less.
 _APART = 0.002

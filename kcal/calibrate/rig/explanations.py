@@ -17,7 +17,7 @@ import torch
 from kcal.calibrate.rig.adjustment import Adjustment, chi2_quantile
 from kcal.calibrate.rig.blocks import KINDS, Kind, PerKind, RigState
 from kcal.calibrate.rig.contradictions import still_determined
-from kcal.calibrate.rig.outliers import MOST_WRONG, without_wrong
+from kcal.calibrate.rig.outliers import LOSS, MOST_WRONG, ROUGHLY, without_wrong
 from kcal.calibrate.rig.redundancy import least_redundancy
 from kcal.calibrate.rig.resection import consensus_pose
 from kcal.calibrate.rig.uncertainty import goodness_of_fit
@@ -58,11 +58,11 @@ def explained(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKind:
     except InputError as error:
         failure = error
     few = decided_by_few(work, masks)
+    gone = _count(masks) - _count(kept)
+    if not few and (failure is not None or gone):
+        _refuse_terms(work, masks, None if failure is not None else kept, robust, solver)
     if failure is not None and not few:
         raise failure
-    gone = _count(masks) - _count(kept)
-    if failure is None and gone and not few:
-        _refuse_terms(work, masks, kept, robust, solver)
     if not few or (failure is None and not gone and _agree(work, masks)):
         return kept
     marks = int(masks.landmarks.sum())
@@ -110,32 +110,64 @@ def _against(names: tuple[str, ...], chi2: float) -> str:
     )
 
 
-def _refuse_terms(work: Adjustment, masks: PerKind, kept: PerKind, robust: RigState, solver: LMOptions) -> None:
-    """Raise `InputError` if one baseline or position is as likely to be wrong as the items that were left out."""
-    problem, state = work.problem(kept), work.part(kept)
-    now = goodness_of_fit(problem, state)
-    for term, determined in enumerate(still_determined(problem, state)):
+def _refuse_terms(work: Adjustment, masks: PerKind, kept: PerKind | None, robust: RigState, solver: LMOptions) -> None:
+    """Raise `InputError` if a baseline or position is as likely to be wrong as items that were left out.
+
+    Args:
+        work: at the solution of what was kept.
+        masks: items that may take part.
+        kept: those that agree; None if not a few of them are wrong.
+        robust: state to begin with.
+        solver: options of the solver.
+    """
+    ways: list[_Way] = []
+    if kept is not None:
+        names = tuple(name for kind in KINDS for name in _gone(work, masks, kept, kind))
+        ways.append(_way(work, kept, names, len(names)))
+    some = masks if kept is None else kept
+    for term, determined in enumerate(still_determined(work.problem(some), work.part(some))):
         if not determined:
             continue
         trial = copy.copy(work)
         trial.state, trial.without = robust, frozenset([term])
+        # What it bent towards itself is bent back.
+        trial.solve(masks, ROUGHLY, LOSS)
         try:
             others = without_wrong(trial, masks, solver)
         except InputError:
             continue
-        more = 1 + _count(masks) - _count(others) - (_count(masks) - _count(kept))
-        then = goodness_of_fit(trial.problem(others), trial.part(others))
-        better = (now.chi2 - now.freedom) - (then.chi2 - then.freedom)
-        label = work.term_labels[term]
-        if more < 0 or (more == 0 and better > AS_GOOD):
-            raise InputError(_against((label,), then.chi2))
-        if more == 0 and better > -AS_GOOD:
-            names = [name for kind in KINDS for name in _gone(work, masks, kept, kind)]
-            raise InputError(
-                f"something is wrong, and the data do not tell what: all the rest agrees without {' and '.join(names)} "
-                f"(χ² {now.chi2:.3g}, {now.freedom} degrees of freedom); or {label} (χ² {then.chi2:.3g}, "
-                f"{then.freedom}). Check these, or add landmarks"
-            )
+        ways.append(_way(trial, others, (work.term_labels[term],), 1 + _count(masks) - _count(others)))
+    fewest = min((way.size for way in ways), default=0)
+    ways = sorted((way for way in ways if way.size == fewest), key=lambda way: way.chi2 - way.freedom)
+    if not ways:
+        return
+    ways = [way for way in ways if way.chi2 - way.freedom < ways[0].chi2 - ways[0].freedom + AS_GOOD]
+    stated = [way for way in ways if not way.items]
+    if len(ways) == 1 and stated:
+        raise InputError(_against(stated[0].names, stated[0].chi2))
+    if stated:
+        told = "; or ".join(
+            f"{' and '.join(way.names)} (χ² {way.chi2:.3g}, {way.freedom} degrees of freedom)" for way in ways
+        )
+        raise InputError(
+            f"something is wrong, and the data do not tell what: all the rest agrees without {told}. Check these, or "
+            "add landmarks"
+        )
+
+
+class _Way(NamedTuple):
+    """An explanation: what is left out, how many things, whether they are items, and how well the rest agrees."""
+
+    names: tuple[str, ...]
+    size: int
+    items: bool
+    chi2: float
+    freedom: int
+
+
+def _way(work: Adjustment, kept: PerKind, names: tuple[str, ...], size: int) -> _Way:
+    fit = goodness_of_fit(work.problem(kept), work.part(kept))
+    return _Way(names, size, not work.without, fit.chi2, fit.freedom)
 
 
 def _gone(work: Adjustment, masks: PerKind, kept: PerKind, kind: Kind) -> list[str]:
