@@ -91,7 +91,7 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
             if not any(_from_features(data, c, known, tried, placed=placed) for c in waiting):
                 raise DegenerateError(
                     f"nothing tells where {', '.join(data.names[c] for c in waiting)} stands: it needs boards seen "
-                    "together with another camera, three or better four landmarks, or features together with its "
+                    "together with another camera, four or better six landmarks, or features together with its "
                     "position or the baseline"
                 )
         starts = _other_places(data, _starts(known, tried))
