@@ -102,7 +102,7 @@ def contradictions(work: Adjustment, problem: RigProblem, state: RigState) -> li
     # What supports itself no more, or no less, is as likely to be wrong.
     equal = [other for other in suspects[1:] if not set(other) & set(named) and (own[other] <= 0 or own[named] > 0)]
     rest = [part.name for i, part in enumerate(parts) if i not in named]
-    text = _sentence(parts, named, found[named], problem, state, known, rest)
+    text = _what_contradicts(parts, named, found[named], problem, state, known, rest)
     if equal:
         names = " and ".join(_name(parts, group) for group in equal)
         text += f"; it may as well be {names} that is wrong"
@@ -177,7 +177,7 @@ def _name(parts: list[_Part], group: tuple[int, ...]) -> str:
     return parts[group[0]].name if len(group) == 1 else "the measured positions"
 
 
-def _sentence(
+def _what_contradicts(
     parts: list[_Part],
     group: tuple[int, ...],
     test: _Test,

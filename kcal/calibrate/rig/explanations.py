@@ -76,7 +76,7 @@ def explained(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKind:
             return kept
         raise InputError(
             "the landmarks contradict each other, and whichever are left out, the rest does not agree, or too few are "
-            f"left to check it with ({marks} landmarks; worst: {_listed(work, masks, kept)}): check names, "
+            f"left to check it with ({marks} landmarks; worst: {_worst_names(work, masks, kept)}): check names, "
             "coordinates and marks, and add landmarks"
         )
     if len(found) > 1:
@@ -87,7 +87,7 @@ def explained(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKind:
         )
     (best,) = found
     if best.terms:
-        raise InputError(_against(best.names, best.chi2))
+        raise InputError(_blamed(best.names, best.chi2))
     work.state = robust
     work.solve(best.masks, solver)
     work.fit_corners(best.masks)
@@ -103,7 +103,7 @@ def _agree(work: Adjustment, masks: PerKind) -> bool:
     return goodness_of_fit(work.problem(masks), work.part(masks)).variance == 1.0
 
 
-def _against(names: tuple[str, ...], chi2: float) -> str:
+def _blamed(names: tuple[str, ...], chi2: float) -> str:
     return (
         f"{' and '.join(names)} contradict{'s' if len(names) == 1 else ''} the rest, which agrees otherwise (χ² "
         f"{chi2:.3g}): measure again, correct the value or its sigma, or leave it out"
@@ -144,7 +144,7 @@ def _refuse_terms(work: Adjustment, masks: PerKind, kept: PerKind | None, robust
     ways = [way for way in ways if way.chi2 - way.freedom < ways[0].chi2 - ways[0].freedom + AS_GOOD]
     stated = [way for way in ways if not way.items]
     if len(ways) == 1 and stated:
-        raise InputError(_against(stated[0].names, stated[0].chi2))
+        raise InputError(_blamed(stated[0].names, stated[0].chi2))
     if stated:
         told = "; or ".join(
             f"{' and '.join(way.names)} (χ² {way.chi2:.3g}, {way.freedom} degrees of freedom)" for way in ways
@@ -178,7 +178,7 @@ def _gone(work: Adjustment, masks: PerKind, kept: PerKind, kind: Kind) -> list[s
     ]
 
 
-def _listed(work: Adjustment, masks: PerKind, kept: PerKind) -> str:
+def _worst_names(work: Adjustment, masks: PerKind, kept: PerKind) -> str:
     return ", ".join(_gone(work, masks, kept, "landmarks")) or "all of them"
 
 

@@ -94,7 +94,7 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
                     "together with another camera, four or better six landmarks, or features together with its "
                     "position or the baseline"
                 )
-        starts = _other_places(data, _starts(known, tried))
+        starts = _in_all_places(data, _starts(known, tried))
         if data.absolute and not placed:
             for start in starts:
                 _into_frame(data, start)
@@ -202,7 +202,7 @@ def _starts(known: _Known, tried: list[int]) -> list[Start]:
     return starts
 
 
-def _other_places(data: RigData, starts: list[Start]) -> list[Start]:
+def _in_all_places(data: RigData, starts: list[Start]) -> list[Start]:
     """The starts, also with cameras that see three landmarks in all the places that these allow."""
     marks = data.landmarks
     for c, camera in enumerate(data.cameras if marks is not None else ()):
