@@ -15,6 +15,10 @@ from kcal.errors import InputError
 MOST_PIXELS = 500_000_000
 
 
+# Pixels: a telescope of 100 m has 1e8.
+MOST_FOCAL = 1e8
+
+
 def check_pixel_count(size: tuple[int, int]) -> tuple[int, int]:
     """Return (width, height) unless no camera has so many pixels.
 

@@ -7,7 +7,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from kcal.checks import check_pixel_count
+from kcal.checks import MOST_PIXELS, check_pixel_count
 from kcal.errors import FileError
 
 Size = tuple[int, int]
@@ -43,7 +43,11 @@ def check_image_header(data: bytes, source: str | Path) -> None:
 
 
 def _png(data: bytes) -> Size:
-    return struct.unpack_from(">II", data, 16)
+    width, height = struct.unpack_from(">II", data, 16)
+    # Deflate makes a byte of 1032 at most: a larger image is damaged, and would be decoded for long.
+    if MOST_PIXELS >= width * height > 8 * 1032 * len(data):
+        raise ValueError("more pixels than its bytes can have")
+    return width, height
 
 
 def _jpeg(data: bytes) -> Size:

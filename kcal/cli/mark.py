@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from kcal.cli.console import err, out
+from kcal.cli.console import err, out, warn
 from kcal.errors import InputError
 
 _PORT = 8347
@@ -87,6 +87,8 @@ def mark_command(
         out.print(f"marking page: {server.address}", markup=False, soft_wrap=True)
         if session.version:
             err.print(f"continued after {session.version} actions in {session.files.log}", markup=False)
+        for note in (*session.notes, *filter(None, [session.trouble])):
+            warn(note)
         if browser:
             webbrowser.open(server.address)
         server.run()

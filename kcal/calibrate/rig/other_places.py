@@ -105,7 +105,9 @@ def _other_places(work: Adjustment, masks: PerKind) -> Iterator[RigState]:
         use = valid & masks.landmarks
         few = 3 <= int(use.sum()) <= _FEW_MARKS
         distance = (marks.points[use] - state.center[c]).norm(dim=-1).min() if few else torch.ones(())
-        noise = marks.pixel_sigma / float(camera.focal[0].detach()) + float(marks.sigma.max()) / float(distance)
+        mark = torch.as_tensor(marks.pixel_sigma).expand(marks.pixels.shape[:2])[use, c]
+        pixel = float(mark.max()) / float(camera.focal[0].detach()) if few else 0.0
+        noise = pixel + float(marks.sigma.max()) / float(distance)
         most = noise * _AWRY if int(use.sum()) > 3 else math.inf
         own = distinct_poses(rays[use], marks.points[use], state.center[c], _PLACES, most) if few else []
         places.append(own)

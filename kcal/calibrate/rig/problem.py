@@ -114,7 +114,6 @@ class RigProblem:
     """
 
     batch: tuple[int, ...] = ()
-    joint = False
 
     def __init__(
         self,
@@ -128,6 +127,8 @@ class RigProblem:
     ) -> None:
         self.cameras, self.blocks, self.unknowns, self.loss = tuple(cameras), tuple(blocks), unknowns, loss
         self.terms = tuple(terms)
+        # Of some marks, derivatives cost little more than the pixels themselves.
+        self.joint = all(block.kind != "boards" for block in self.blocks)
         self.turn: list[slice | None] = []
         self.shift: list[slice | None] = []
         end = len(unknowns)
@@ -168,13 +169,17 @@ class RigProblem:
     def cost(self, state: State) -> Tensor:
         """See `Problem.cost`."""
         state = RigState(*state)
-        total = self.term_rows(state)[-1].square().sum()
-        for block, squares in zip(self.blocks, self.item_squares(state), strict=True):
+        return self._cost_of(self.term_rows(state)[-1], self.item_squares(state))
+
+    def _cost_of(self, terms: Tensor, squares: Sequence[Tensor]) -> Tensor:
+        """Half the sum of squared terms (Q,) and of items' squares, as the loss counts these."""
+        total = terms.square().sum()
+        for block, own in zip(self.blocks, squares, strict=True):
             if self.loss is None:
-                total = total + squares.sum()
+                total = total + own.sum()
             else:
                 count = block.counts.clamp_min(1)
-                total = total + (count * self.loss.value(squares / count)).sum()
+                total = total + (count * self.loss.value(own / count)).sum()
         return 0.5 * total
 
     def deletions(self, state: RigState) -> list[Tensor]:
@@ -185,7 +190,7 @@ class RigProblem:
         g_iᵀ (N - N_i)⁻¹ g_i of the others'; for a single residual that is its squared external Studentized value
         (Baarda 1968; Cook and Weisberg 1982).
         """
-        gram = self._gram(state)
+        gram, _ = self._gram(state)
         reduced, terms = _reduced(gram), self.term_rows(state)
         rest = (reduced.sum(0) + terms @ terms.T - reduced)[:, :-1, :-1]
         unit = rest.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
@@ -197,33 +202,36 @@ class RigProblem:
 
     def block_grams(self, state: RigState) -> list[Tensor]:
         """For each block (S + 1, S + 1) products of the rows of all its items, their own unknowns eliminated."""
-        parts = _reduced(self._gram(state)).split([len(block) for block in self.blocks])
-        return [part.sum(0) for part in parts]
+        gram, _ = self._gram(state)
+        return [part.sum(0) for part in _reduced(gram).split([len(block) for block in self.blocks])]
 
-    def _gram(self, state: RigState) -> Tensor:
-        """(V, L + S + 1, L + S + 1) products of the rows of all items, with the loss's weights."""
+    def _gram(self, state: RigState) -> tuple[Tensor, list[Tensor]]:
+        """(V, L + S + 1, L + S + 1) products of the rows of all items, with the loss's weights; and `item_squares`."""
         size = LOCAL_SIZE + self.shared_size + 1
         posed, grams = self.posed(state), [state.center.new_zeros(0, size, size)]
+        squares = []
         for block in self.blocks:
             rows = block.rows(posed, state, self.shared_size)
+            squares.append(rows[:, -1].square().sum(-1))
             if self.loss is not None:
                 count = block.counts.clamp_min(1)
-                rows = rows * self.loss.weight(rows[:, -1].square().sum(-1) / count).sqrt()[:, None, None]
+                rows = rows * self.loss.weight(squares[-1] / count).sqrt()[:, None, None]
             missing = LOCAL_SIZE - block.size
             gram = rows.new_zeros((len(block), size, size))
             # Unknowns that smaller items do not have: with a one on the diagonal they change nothing.
             gram[:, range(missing), range(missing)] = 1.0
             gram[:, missing:, missing:] = rows @ rows.transpose(-1, -2)
             grams.append(gram)
-        return torch.cat(grams)
+        return torch.cat(grams), squares
 
     def linearize(self, state: State) -> SchurLinearization:
         """See `Problem.linearize`."""
         state = RigState(*state)
         terms = self.term_rows(state)
-        linear = SchurLinearization.of_gram(self._gram(state), LOCAL_SIZE, terms @ terms.T)
+        gram, squares = self._gram(state)
+        linear = SchurLinearization.of_gram(gram, LOCAL_SIZE, terms @ terms.T)
         if self.loss is not None:
-            linear.cost = self.cost(state)
+            linear.cost = self._cost_of(terms[-1], squares)
         return linear
 
     def select(self, elements: Tensor) -> None:
