@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -60,9 +61,25 @@ def _show_rig_file(file: Path) -> None:
     from kcal.io.rig_file import load_rig
 
     rig = load_rig(file)
+    _take_joint_errors(rig)
     _show_camera(rig.left)
     _show_camera(rig.right)
     _show_pose(rig)
+
+
+def _take_joint_errors(rig: StereoRig) -> None:
+    """Give the cameras the error bars that the rig has of them: those of each alone are of before it was solved."""
+    from kcal.lens.calibration import CameraCalibration
+
+    if rig.covariance is None:
+        return
+    first = 0
+    for camera in (rig.left, rig.right):
+        size = camera.params.shape[-1]
+        half = rig.covariance.half[:, first : first + size]
+        known = camera.calibration or CameraCalibration()
+        camera.calibration = dataclasses.replace(known, sigma=None, information=None, covariance=half.T @ half)
+        first += size
 
 
 def _show_camera(camera: Camera) -> None:
@@ -80,6 +97,7 @@ def _show_camera(camera: Camera) -> None:
         if record.temperature is not None:
             out.print(f"at {record.temperature:g} °C")
     from kcal.lens.paraxial import paraxial_focal
+    from kcal.quantities import number_text
 
     hybrid = ", on its axis; fx and fy below are parameters of the base projection alone" if camera.model.hybrid else ""
     out.print(f"focal length {paraxial_focal(camera)}{hybrid}", markup=False)
@@ -87,7 +105,7 @@ def _show_camera(camera: Camera) -> None:
     values = camera.params.detach().tolist()
     rows = [["parameter", "value", "sigma"]]
     for name, value, error in list(zip(camera.names, values, sigma, strict=True))[:_SHOWN]:
-        rows.append([name, f"{value:.8g}", "" if error is None else f"{error:.2g}"])
+        rows.append([name, number_text(value, error, digits=8), "" if error is None else number_text(error, error)])
     print_table(rows)
     if len(values) > _SHOWN:
         out.print(f"and {len(values) - _SHOWN} more weights of the field")
@@ -99,7 +117,7 @@ def _show_camera(camera: Camera) -> None:
         out.print(
             f"sigma in the image: {float(spread.median()):.3g} px (median), {float(spread.max()):.3g} px (largest)"
         )
-    else:
+    elif not any(sigma):
         out.print("no error bars")
 
 

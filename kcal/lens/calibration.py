@@ -98,6 +98,7 @@ class CalibrationRecord:
         tempering: by how much the corners count less because residuals repeat within views; None if not estimated.
         observations: name of the observations file, if there was one.
         temperature: of the camera when the views were taken, °C; None if nobody said.
+        warnings: what should be doubted of it, a sentence each.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
         created: when, with its time zone.
     """
@@ -116,6 +117,7 @@ class CalibrationRecord:
     tempering: float | None = None
     board_deviation: tuple[tuple[float, float, float], ...] | None = None
     temperature: float | None = None
+    warnings: tuple[str, ...] = ()
     kcal_version: str
     created: datetime.datetime
 
@@ -201,6 +203,7 @@ class RigCalibration:
         excluded: pairs, landmarks and matches left out, with the reason.
         sources: what the rig was solved from, where that is more than boards.
         warnings: what should be doubted of it, a sentence each, for example that its geometry is weak.
+        contradictions: which source contradicts the others beyond reasonable doubt, a sentence each.
         relocked: when only the cameras' attitudes were solved again, and from what.
         baseline_m: distance between the cameras' centers, meters; must be the length of the translation.
         frame: what the rig's frame is.
@@ -217,6 +220,7 @@ class RigCalibration:
     excluded: tuple[Exclusion, ...] = ()
     sources: tuple[RigSource, ...] = ()
     warnings: tuple[str, ...] = ()
+    contradictions: tuple[str, ...] = ()
     relocked: str | None = None
     baseline_m: float
     frame: Literal["left camera"] = "left camera"
