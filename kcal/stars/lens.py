@@ -146,7 +146,11 @@ def _search(
         return None
     steps = round(math.log(_WIDEST / _NARROWEST) / math.log(_STEP))
     angles = [math.radians(_WIDEST * _STEP**-k) for k in range(steps + 1)]
-    tried = [half / math.tan(angle / 2) for angle in angles] if focal is None else [focal]
+    tried = (
+        [half / math.tan(angle / 2) for angle in angles]
+        if focal is None
+        else [focal * _STEP**k for k in (0, 1, -1, 2, -2)]
+    )
     for corners, guess in itertools.product(_CORNERS, tried):
         rays = _rays(found.pixels[inside], size, guess)
         field = 2 * math.atan(_MIDDLE * half / guess)

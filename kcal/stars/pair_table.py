@@ -62,7 +62,7 @@ def pair_table(catalog: StarCatalog, field: float) -> PairTable:
     path = cache_folder() / f"stars-{_VERSION}-{content}-{degrees:g}.npz"
     found = _table_on_disk(path)
     if found is None:
-        found = _pairs(directions, np.radians(degrees))
+        found = _close_pairs(directions, np.radians(degrees))
         _keep_table(path, found)
     pairs, angle, stars = found
     both = np.stack([pairs, pairs[:, ::-1]], 1).reshape(-1, 2)
@@ -72,7 +72,7 @@ def pair_table(catalog: StarCatalog, field: float) -> PairTable:
 _Pairs = tuple[NDArray[np.uint16], NDArray[np.float32], int]
 
 
-def _pairs(directions: NDArray[np.float64], largest: float) -> _Pairs:
+def _close_pairs(directions: NDArray[np.float64], largest: float) -> _Pairs:
     share = (1.0 - np.cos(largest)) / 2.0
     stars = int(min(len(directions), np.sqrt(2.0 * _MOST_PAIRS / share), 2**16 - 1))
     tree = cKDTree(directions[:stars])
