@@ -7,8 +7,8 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from kcal.checks import check_pixel_count
 from kcal.errors import FileError
+from kcal.image_size import check_pixel_count
 
 Size = tuple[int, int]
 

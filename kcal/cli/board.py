@@ -12,7 +12,7 @@ from kcal.cli.board_options import BoardSize, SquareSide
 from kcal.cli.console import out, print_wrote, steps, warn, with_json
 from kcal.cli.groups import group_with_default
 from kcal.errors import InputError
-from kcal.files import check_writable, write_atomic
+from kcal.files import check_picture, check_writable, write_atomic
 
 app = typer.Typer(
     cls=group_with_default("print"), rich_markup_mode="markdown", help="Draw a board to print, and measure it later."
@@ -101,7 +101,6 @@ def measure_command(
     from kcal.calibrate.hybrid.measured_board import save_measured_board
     from kcal.corners.observations import Observations
     from kcal.report.board import board_text, save_board_picture
-    from kcal.report.figures import check_picture
 
     check_writable(output, *observations)
     if picture is not None:

@@ -9,6 +9,7 @@ import typer
 
 from kcal.cli.console import out, print_table, print_wrote
 from kcal.errors import InputError
+from kcal.files import check_picture
 
 # Ranges in the table, if none are given.
 _BASELINES = (10.0, 25.0, 50.0, 100.0, 250.0, 500.0)
@@ -58,8 +59,6 @@ def budget_command(
     from kcal.io.rig_file import load_rig
     from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
     from kcal.locate.range_sigmas import range_sigmas, usual_ranges
-    from kcal.report.budget import plotted_ranges, save_budget_picture
-    from kcal.report.figures import check_picture
     from kcal.report.tables import range_sigma_rows
 
     if picture is not None:
@@ -92,6 +91,8 @@ def budget_command(
         out.print(f"\nWhat the rig file knows, and {disparity:g} px of disparity as a standard deviation, in meters:")
         print_table(range_sigma_rows(range_sigmas(chosen, far, pixel_sigma=disparity / math.sqrt(2.0))))
     if picture is not None:
+        from kcal.report.budget import plotted_ranges, save_budget_picture
+
         sweep = plotted_ranges(far)
         save_budget_picture(picture, sweep, range_errors(chosen, sweep, errors), labels)
     print_wrote(picture)

@@ -13,7 +13,7 @@ from kcal.cli.calibrate_result import calibration_numbers, print_calibration
 from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
 from kcal.errors import DegenerateError, InputError, KcalError
-from kcal.files import check_writable, make_folder
+from kcal.files import check_picture, check_writable, make_folder
 
 if TYPE_CHECKING:
     from kcal.corners.board import Board
@@ -319,8 +319,6 @@ def _camera_files(
         if place.report is not None:
             check_writable(place.report, *observations)
         if place.picture is not None:
-            from kcal.report.figures import check_picture
-
             check_picture(place.picture)
     return places
 

@@ -12,7 +12,7 @@ from rich.markup import escape
 from kcal.cli.board_options import BoardSize, Refine, RefineMethod, SquareSide
 from kcal.cli.console import err, out, steps, tell, warn
 from kcal.errors import FileError, InputError
-from kcal.files import check_writable
+from kcal.files import check_picture, check_writable
 
 
 def detect_command(
@@ -67,8 +67,6 @@ def detect_command(
 
     pictures = [path for path in (gallery, coverage) if path is not None]
     if pictures:
-        from kcal.report.figures import check_picture
-
         for path in pictures:
             check_picture(path)
     check_writable(output)

@@ -10,7 +10,7 @@ import typer
 from kcal.cli.camera_sources import named_source, parse_size, picked
 from kcal.cli.console import out, print_wrote, warn
 from kcal.errors import InputError
-from kcal.files import check_writable
+from kcal.files import check_picture, check_writable
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 
@@ -52,8 +52,6 @@ def export_command(
 
     from kcal.calibrate.camera.export import export_cameras
     from kcal.io.formats import import_cameras
-    from kcal.report.difference import save_difference_picture
-    from kcal.report.figures import check_picture
 
     if picture is not None:
         check_picture(picture)
@@ -75,6 +73,8 @@ def export_command(
         out.print(f"not in the file: {', '.join(done.lost)}")
     misfits = [misfit for misfit in done.misfits if misfit is not None]
     if picture is not None and misfits:
+        from kcal.report.difference import save_difference_picture
+
         print_wrote(save_difference_picture(picture, max(misfits, key=lambda each: each.largest), title=source))
     elif picture is not None:
         out.print("no picture: nothing was refitted")

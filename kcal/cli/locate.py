@@ -10,7 +10,7 @@ import typer
 
 from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
 from kcal.errors import DegenerateError, InputError
-from kcal.files import check_writable
+from kcal.files import check_picture, check_writable
 from kcal.texts import one_line
 
 if TYPE_CHECKING:
@@ -160,9 +160,6 @@ def locate_command(
     from kcal.locate.survey import read_survey
     from kcal.locate.tabulate import Locator
     from kcal.locate.truth import read_truth
-    from kcal.report.figures import check_picture
-    from kcal.report.map_page import check_map_format, save_map
-    from kcal.report.positions import save_positions_picture
 
     outputs = output or []
     streamed = STREAM in outputs
@@ -178,6 +175,8 @@ def locate_command(
     if picture is not None:
         check_picture(picture)
     if web_map is not None:
+        from kcal.report.map_page import check_map_format
+
         check_map_format(web_map)
         check_writable(web_map)
     if (origin is None) != (heading is None):
@@ -226,8 +225,12 @@ def locate_command(
             true = None if truth is None else read_truth(truth, located)
         written += [path for path in outputs if path != STREAM]
         if picture is not None:
+            from kcal.report.positions import save_positions_picture
+
             written.append(save_positions_picture(picture, located, true))
         if web_map is not None:
+            from kcal.report.map_page import save_map
+
             written.append(save_map(web_map, located, true, tiles=tiles, image=image, online=online))
     except KeyboardInterrupt:
         kept = ", ".join(map(str, written)) or "nothing"

@@ -117,7 +117,7 @@ def solve_command(
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
     from kcal.cli.console import print_table, print_wrote, steps, tell, warn
     from kcal.cli.rig_sources import Sources, read_sources
-    from kcal.files import check_writable
+    from kcal.files import check_picture, check_writable
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
     from kcal.locate.mounting import placed_rig
@@ -133,8 +133,6 @@ def solve_command(
     if report is not None:
         check_writable(report, left, right, *sources.files)
     if picture is not None:
-        from kcal.report.figures import check_picture
-
         check_picture(picture)
     if not any((pairs, landmarks, marks, features, positions, baseline)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")

@@ -15,8 +15,8 @@ import pydantic
 import torch
 
 import kcal
-from kcal.checks import ImageSize
 from kcal.errors import InputError
+from kcal.image_size import ImageSize
 from kcal.io.information_record import InformationRecord
 from kcal.io.lens_record import LensOrders
 from kcal.io.record import CovarianceRecord, Record

@@ -9,13 +9,14 @@ import dataclasses
 import datetime
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
-from torch import Tensor
-
-from kcal.checks import as_covariance
 from kcal.errors import InputError
-from kcal.lens.information import CameraInformation
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kcal.lens.information import CameraInformation
 
 
 def _refuse_negative(where: object, names: Iterable[str]) -> None:
@@ -161,6 +162,8 @@ class CameraCalibration:
     def check(self, count: int) -> None:
         """Raise `InputError` unless covariance and information are those of `count` parameters."""
         if self.information is None:
+            from kcal.checks import as_covariance
+
             as_covariance("the camera's covariance", self.covariance, count)
         elif len(self.information.slots) != count:
             raise InputError(f"information on {len(self.information.slots)} parameters; the camera has {count}")
@@ -169,6 +172,8 @@ class CameraCalibration:
         """What is known of a camera with these parameters (5 + P,): its information, or that of its covariance."""
         if self.information is not None or self.covariance is None:
             return self.information
+        from kcal.lens.information import CameraInformation
+
         return CameraInformation.from_covariance(params, self.covariance)
 
 

@@ -23,7 +23,7 @@ from kcal.locate.ranges import range_text
 from kcal.locate.region import near, region_rings
 from kcal.locate.stereo import PositionStatus
 from kcal.report.backdrop import local_image, local_tiles
-from kcal.report.figures import CAMERA_COLORS
+from kcal.report.colors import CAMERA_COLORS
 from kcal.texts import page_data, page_policy, page_text
 
 ARCS_M = (250.0, 1000.0, 5000.0)
