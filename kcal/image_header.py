@@ -42,6 +42,20 @@ def check_image_header(data: bytes, source: str | Path) -> None:
         raise FileError(f"{source}: {error}") from error
 
 
+def is_image(data: bytes) -> bool:
+    """Whether bytes begin like an image of a known format."""
+    start, size_of = next(((start, of) for start, of in _FORMATS.items() if data.startswith(start)), (b"", None))
+    if size_of is None:
+        return False
+    if len(start) > 2 or size_of is _jpeg:
+        return True
+    try:
+        # Two letters begin many a text.
+        return all(0 < side < 2**20 for side in size_of(data))
+    except (struct.error, IndexError, TypeError, ValueError):
+        return False
+
+
 def _png(data: bytes) -> Size:
     return struct.unpack_from(">II", data, 16)
 

@@ -11,6 +11,7 @@ import typer
 from kcal.cli.board_options import BoardSize, SquareSide
 from kcal.cli.console import out, print_wrote, steps, warn, with_json
 from kcal.cli.groups import group_with_default
+from kcal.cli.inputs import OBSERVATIONS, with_inputs
 from kcal.errors import InputError
 from kcal.files import check_picture, check_writable, write_atomic
 
@@ -78,9 +79,10 @@ def print_command(
 
 @app.command("measure")
 @with_json
+@with_inputs
 def measure_command(
     observations: Annotated[
-        list[Path], typer.Argument(metavar="OBS...", help="Observations files of one or several cameras.")
+        list[Path], typer.Argument(metavar="OBS...", help="Observations files of one or several cameras."), OBSERVATIONS
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Board file to write.")],
     picture: Annotated[

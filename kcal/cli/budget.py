@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from kcal.cli.console import out, print_table, print_wrote
+from kcal.cli.inputs import RIG
 from kcal.errors import InputError
 from kcal.files import check_picture
 
@@ -17,7 +18,7 @@ _BASELINES = (10.0, 25.0, 50.0, 100.0, 250.0, 500.0)
 
 def budget_command(
     rig: Annotated[
-        Path | None, typer.Argument(help="Rig file; the planned rig of --focal and --baseline if not given.")
+        Path | None, typer.Argument(help="Rig file; the planned rig of --focal and --baseline if not given."), RIG
     ] = None,
     focal: Annotated[float, typer.Option(metavar="PX", help="Focal length of the planned rig, pixels.")] = 1600.0,
     baseline: Annotated[

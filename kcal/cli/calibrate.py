@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from kcal.cli.calibrate_result import calibration_numbers, print_calibration
 from kcal.cli.console import out, print_wrote, steps, tell, warn
+from kcal.cli.inputs import CAMERA, OBSERVATIONS
 from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_picture, check_writable, make_folder
@@ -25,6 +26,7 @@ def calibrate_command(
     observations: Annotated[
         list[Path],
         typer.Argument(metavar="OBS...", help="Observations file of each camera, from `kcal detect`."),
+        OBSERVATIONS,
     ],
     output: Annotated[
         Path,
@@ -150,6 +152,7 @@ def calibrate_command(
             help="Camera file with known parameters; only board poses and what --free names are estimated.",
             rich_help_panel=_PARAMETRIC,
         ),
+        CAMERA,
     ] = None,
     loss: Annotated[
         str | None,
@@ -194,9 +197,9 @@ def calibrate_command(
         LensModel.named(model)
     known = None
     if camera is not None:
-        from kcal.io.camera_file import load_camera
+        from kcal.cli.camera_sources import calibrated_camera
 
-        known = load_camera(camera)
+        known = calibrated_camera(camera)
 
     from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.camera.outliers import OutlierRejection

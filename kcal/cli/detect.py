@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from kcal.cli.board_options import BoardSize, Refine, RefineMethod, SquareSide
 from kcal.cli.console import err, out, steps, tell, warn
+from kcal.cli.inputs import IMAGES
 from kcal.errors import FileError, InputError
 from kcal.files import check_picture, check_writable
 
@@ -24,6 +25,7 @@ def detect_command(
             "camera:0).",
             show_default=False,
         ),
+        IMAGES,
     ],
     size: BoardSize,
     output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write.")],

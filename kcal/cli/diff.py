@@ -10,6 +10,7 @@ import typer
 
 from kcal.cli.camera_sources import single_camera
 from kcal.cli.console import out, print_wrote, tell
+from kcal.cli.inputs import ANY_CAMERA
 from kcal.files import check_picture
 
 if TYPE_CHECKING:
@@ -17,8 +18,12 @@ if TYPE_CHECKING:
 
 
 def diff_command(
-    first: Annotated[str, typer.Argument(metavar="CAMERA", help="Camera file of kcal or of another program.")],
-    second: Annotated[str, typer.Argument(metavar="CAMERA", help="Another one; RIG.json:left is a camera of a rig.")],
+    first: Annotated[
+        str, typer.Argument(metavar="CAMERA", help="Camera file of kcal or of another program."), ANY_CAMERA
+    ],
+    second: Annotated[
+        str, typer.Argument(metavar="CAMERA", help="Another one; RIG.json:left is a camera of a rig."), ANY_CAMERA
+    ],
     at: Annotated[
         float, typer.Option("--at", min=1e-3, metavar="METERS", help="Distance of what is seen; infinity if not given.")
     ] = math.inf,

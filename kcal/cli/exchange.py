@@ -9,6 +9,7 @@ import typer
 
 from kcal.cli.camera_sources import named_source, parse_size, picked
 from kcal.cli.console import out, print_wrote, warn
+from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN
 from kcal.errors import InputError
 from kcal.files import check_picture, check_writable
 
@@ -19,6 +20,7 @@ def export_command(
     source: Annotated[
         str,
         typer.Argument(metavar="FILE", help="Camera or rig of kcal; RIG.json:left is one of its cameras."),
+        CAMERA_OR_RIG,
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="File to write.")],
     format: Annotated[
@@ -97,7 +99,9 @@ def _subject(path: Path, name: str | None):  # type: ignore[no-untyped-def]
 
 
 def import_command(
-    sources: Annotated[list[Path], typer.Argument(metavar="FILE...", help="File of another program; two of a pair.")],
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="File of another program; two of a pair."), FOREIGN
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Camera or rig file to write.")],
     format: Annotated[
         str | None,

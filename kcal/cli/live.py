@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.console import err, steps
+from kcal.cli.inputs import RIG, VIDEO
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,13 +28,14 @@ if TYPE_CHECKING:
 
 
 def live_command(
-    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
+    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`."), RIG],
     output: Annotated[
         list[Path], typer.Option("-o", "--output", help="File that grows: .geojsonl, .csv or .cot; may be repeated.")
     ],
     videos: Annotated[
         list[str] | None,
         typer.Argument(metavar="[LEFT RIGHT]", help="Two video files or addresses (rtsp://...), with --detector."),
+        VIDEO,
     ] = None,
     detector: Annotated[
         str | None,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
+from kcal.cli.inputs import MARKS, RIG, SURVEY
 from kcal.errors import DegenerateError, InputError
 from kcal.files import check_picture, check_writable
 from kcal.texts import one_line
@@ -20,12 +21,13 @@ if TYPE_CHECKING:
 
 
 def locate_command(
-    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
+    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`."), RIG],
     points: Annotated[
         Path,
         typer.Argument(
             help="CSV with the columns name,left_u,left_v,right_u,right_v; others are carried into GeoJSON and CSV."
         ),
+        MARKS,
     ],
     origin: Annotated[
         str | None,
@@ -93,6 +95,7 @@ def locate_command(
         typer.Option(
             metavar="CSV", help="True positions, name,lat,lon,height, to show errors in the table and on the maps."
         ),
+        SURVEY,
     ] = None,
     output: Annotated[
         list[Path] | None,

@@ -13,6 +13,7 @@ from rich.markup import escape
 from typer.core import TyperGroup
 
 import kcal
+from kcal.cli import inputs
 from kcal.cli.bake import bake_command
 from kcal.cli.batch import batch_command
 from kcal.cli.board import app as board
@@ -20,11 +21,12 @@ from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
 from kcal.cli.compare import compare_command
-from kcal.cli.console import err, with_inputs, with_json
+from kcal.cli.console import err, with_json
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.diff import diff_command
 from kcal.cli.exchange import export_command, import_command
+from kcal.cli.inputs import with_inputs
 from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
@@ -51,6 +53,8 @@ def usage_errors_shown() -> Iterator[None]:
 
 class _Commands(TyperGroup):
     def make_context(self, *arguments: Any, **options: Any) -> Any:
+        words = arguments[1] if len(arguments) > 1 else options.get("args", [])
+        inputs.typed[:] = words
         with usage_errors_shown():
             return super().make_context(*arguments, **options)
 
@@ -109,7 +113,7 @@ app.command("mark")(with_inputs(mark_command))
 app.add_typer(rig, name="rig")
 app.command("locate")(with_inputs(locate_command))
 app.command("live")(with_inputs(live_command))
-app.command("budget")(with_json(budget_command))
+app.command("budget")(with_json(with_inputs(budget_command)))
 app.command("undistort")(with_json(with_inputs(undistort_command)))
 app.command("bake")(with_json(with_inputs(bake_command)))
 app.command("export")(with_json(with_inputs(export_command)))

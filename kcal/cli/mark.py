@@ -8,30 +8,36 @@ from typing import Annotated
 import typer
 
 from kcal.cli.console import err, out
+from kcal.cli.inputs import CALIBRATED, IMAGES, MARKS, RIG, SURVEY
 from kcal.errors import InputError
 
 _PORT = 8347
 
 
 def mark_command(
-    left: Annotated[Path, typer.Argument(help="Image of the left camera, a folder of them, or a video.")],
-    right: Annotated[Path, typer.Argument(help="The same of the right camera.")],
+    left: Annotated[Path, typer.Argument(help="Image of the left camera, a folder of them, or a video."), IMAGES],
+    right: Annotated[Path, typer.Argument(help="The same of the right camera."), IMAGES],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="CSV", help="Marks of landmarks; the other files lie beside it.")
     ],
-    rig: Annotated[Path | None, typer.Option(help="Rig file: cameras, and the relative pose as known so far.")] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="Rig file: cameras, and the relative pose as known so far."), RIG
+    ] = None,
     cameras: Annotated[
         tuple[Path, Path] | None,
         typer.Option(metavar="LEFT RIGHT", help="Camera files, if there is no rig yet: landmarks will give one."),
+        CALIBRATED,
     ] = None,
     landmarks: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Surveyed places: name,lat,lon,height,sigma or east,north,up.")
+        Path | None,
+        typer.Option(metavar="CSV", help="Surveyed places: name,lat,lon,height,sigma or east,north,up."),
+        SURVEY,
     ] = None,
     reference: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Marks in old images, to be found again in these.")
+        Path | None, typer.Option(metavar="CSV", help="Marks in old images, to be found again in these."), MARKS
     ] = None,
     reference_images: Annotated[
-        tuple[Path, Path] | None, typer.Option(metavar="LEFT RIGHT", help="With --reference: the old images.")
+        tuple[Path, Path] | None, typer.Option(metavar="LEFT RIGHT", help="With --reference: the old images."), IMAGES
     ] = None,
     mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks placed by hand, each axis.")] = 0.3,
     port: Annotated[int, typer.Option(help="Of the local address; 0 for any that is free.", min=0, max=65535)] = _PORT,

@@ -10,6 +10,8 @@ import typer
 
 from kcal.cli.camera_sources import single_camera
 from kcal.cli.console import out, print_wrote, steps, tell, warn
+from kcal.cli.inputs import CAMERA_OR_RIG, OBSERVATIONS
+from kcal.cli.sides import check_views
 from kcal.errors import InputError
 from kcal.files import check_writable, read_bytes
 from kcal.strict_json import MOST_BYTES, read_json
@@ -28,7 +30,7 @@ REQUIRE_HELP = "What you need: ranges and the largest σ of each, for example 5k
 
 
 def report_command(
-    subject: Annotated[Path, typer.Argument(metavar="CAMERA-OR-RIG", help="Camera or rig file.")],
+    subject: Annotated[Path, typer.Argument(metavar="CAMERA-OR-RIG", help="Camera or rig file."), CAMERA_OR_RIG],
     observations: Annotated[
         list[Path] | None,
         typer.Option(
@@ -37,6 +39,7 @@ def report_command(
             help="Views that it was calibrated from; for a rig once for left, once for right. Faults of lens model and "
             "board can only be found with them.",
         ),
+        OBSERVATIONS,
     ] = None,
     require: Annotated[str, typer.Option(metavar="RANGE:ERROR", help=REQUIRE_HELP)] = "",
     baseline: Annotated[
@@ -169,8 +172,10 @@ def _again(camera: Camera, observations: Path) -> tuple[CameraCalibrationResult,
     from kcal.lens.difference import camera_difference
 
     options = stored_options(camera)
+    seen = Observations.load(observations)
+    check_views([camera], [seen], [observations])
     with steps("calibrating", None) as advance:
-        result = calibrate_camera(Observations.load(observations), options, advance)
+        result = calibrate_camera(seen, options, advance)
     found = camera_difference(camera, result.camera)
     if found.ratio is None or found.ratio > 0.5:
         warn(
@@ -194,6 +199,7 @@ def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...]
         from kcal.corners.observations import Observations
 
         left, right = (Observations.load(file) for file in observations)
+        check_views((rig.left, rig.right), (left, right), observations)
         boards = paired_boards((rig.left, rig.right), (left, right), pair_by_name(left.names, right.names))
         pairs = boards.points, boards.pixels
     verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, pairs=pairs, subject=path.name.split(".")[0])

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from kcal.cli.console import with_inputs, with_json
+from kcal.cli.console import with_json
 from kcal.cli.groups import group_with_default
+from kcal.cli.inputs import CALIBRATED, MARKS, OBSERVATIONS, SURVEY, TABLE, with_inputs
 from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
 from kcal.cli.rig_check import check
 from kcal.errors import InputError
@@ -23,16 +24,18 @@ app = typer.Typer(cls=group_with_default("solve"), rich_markup_mode="markdown", 
 
 
 def solve_command(
-    left: Annotated[Path, typer.Argument(help="Camera file of the left camera.")],
-    right: Annotated[Path, typer.Argument(help="Camera file of the right camera.")],
+    left: Annotated[Path, typer.Argument(help="Camera file of the left camera."), CALIBRATED],
+    right: Annotated[Path, typer.Argument(help="Camera file of the right camera."), CALIBRATED],
     output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write.")],
     pairs: Annotated[
         tuple[Path, Path] | None,
         typer.Option("--pairs", metavar="LEFT.obs.json RIGHT.obs.json", help="Observations of boards seen by both."),
+        OBSERVATIONS,
     ] = None,
     match: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="Which views belong together: columns left,right. By name if not given."),
+        TABLE,
     ] = None,
     landmarks: Annotated[
         Path | None,
@@ -40,10 +43,12 @@ def solve_command(
             metavar="FILE",
             help="Surveyed places: CSV (name,lat,lon,height,sigma or name,east,north,up,sigma), GeoJSON, GPX.",
         ),
+        SURVEY,
     ] = None,
     marks: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="Where they are in the images: name,left_u,left_v,right_u,right_v."),
+        MARKS,
     ] = None,
     features: Annotated[
         Path | None,
@@ -52,10 +57,12 @@ def solve_command(
             help="Far things matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or "
             "beyond (meters), if known.",
         ),
+        MARKS,
     ] = None,
     positions: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="Measured camera positions (GNSS): as --landmarks, names left and right."),
+        SURVEY,
     ] = None,
     baseline: Annotated[
         str | None, typer.Option(metavar="M±SIGMA", help="Measured distance between the cameras, e.g. 10.02±0.005.")
@@ -117,6 +124,7 @@ def solve_command(
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
     from kcal.cli.console import print_table, print_wrote, steps, tell, warn
     from kcal.cli.rig_sources import Sources, read_sources
+    from kcal.cli.sides import check_sides
     from kcal.files import check_picture, check_writable
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
@@ -140,7 +148,9 @@ def solve_command(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
         refraction_sigma=refraction_sigma,
     )  # fmt: skip
-    data, frame, unpaired = read_sources((load_camera(left), load_camera(right)), sources)
+    cameras = load_camera(left), load_camera(right)
+    check_sides(cameras, (left, right))
+    data, frame, unpaired = read_sources(cameras, sources)
     with steps("solving the rig", 1) as advance:
         result = solve_rig(data, options)
         advance("done")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.console import err, out, print_table, print_wrote, warn
+from kcal.cli.inputs import MARKS, RIG, SURVEY
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,16 +22,17 @@ _DRIFTED = 3
 
 
 def check(
-    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
+    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`."), RIG],
     marks: Annotated[
-        Path, typer.Option(metavar="CSV", help="Marks in new images: name,left_u,left_v,right_u,right_v.")
+        Path, typer.Option(metavar="CSV", help="Marks in new images: name,left_u,left_v,right_u,right_v."), MARKS
     ],
     reference: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="The same static things, marked in images from when the rig was solved."),
+        MARKS,
     ] = None,
     landmarks: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Surveyed places among the marks, as for `kcal rig`.")
+        Path | None, typer.Option(metavar="CSV", help="Surveyed places among the marks, as for `kcal rig`."), SURVEY
     ] = None,
     mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks along each axis.")] = 0.3,
     relock: Annotated[

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kcal.cli.console import out, print_table
+from kcal.cli.inputs import SHOWN
 from kcal.errors import FileError
 from kcal.files import read_bytes
 from kcal.strict_json import MOST_BYTES, read_json
@@ -21,7 +22,7 @@ _SHOWN = 26
 
 
 def show_command(
-    file: Annotated[Path, typer.Argument(help="Camera, rig or observations of kcal, or a foreign camera file.")],
+    file: Annotated[Path, typer.Argument(help="Camera, rig or observations of kcal, or a foreign camera file."), SHOWN],
 ) -> None:
     """Print what is in a file: cameras with their error bars and history, rigs, observations.
 
