@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from kcal.cli.board_options import BoardSize, SquareSide
+from kcal.cli.commands import Command
 from kcal.cli.console import out, print_wrote, steps, warn, with_json
 from kcal.cli.groups import group_with_default
 from kcal.cli.inputs import OBSERVATIONS, with_inputs
@@ -20,7 +21,7 @@ app = typer.Typer(
 )
 
 
-@app.command("print")
+@app.command("print", cls=Command)
 @with_json
 def print_command(
     size: BoardSize,
@@ -77,7 +78,7 @@ def print_command(
         out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
 
 
-@app.command("measure")
+@app.command("measure", cls=Command)
 @with_json
 @with_inputs
 def measure_command(

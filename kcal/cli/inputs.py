@@ -176,6 +176,12 @@ def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
+def check_file(label: str, text: str, wanted: Wanted) -> None:
+    """The same for one file, whose option takes other words as well."""
+    if file_kind(text) != "missing":
+        check_kinds([_Given(label, text, wanted)])
+
+
 def check_kinds(found: Sequence[_Given]) -> None:
     """Refuse the first file that is not what is wanted, with the command that would be right.
 

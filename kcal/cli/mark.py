@@ -9,6 +9,7 @@ import typer
 
 from kcal.cli.console import err, out
 from kcal.cli.inputs import CALIBRATED, IMAGES, MARKS, RIG, SURVEY
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.errors import InputError
 
 _PORT = 8347
@@ -39,7 +40,7 @@ def mark_command(
     reference_images: Annotated[
         tuple[Path, Path] | None, typer.Option(metavar="LEFT RIGHT", help="With --reference: the old images."), IMAGES
     ] = None,
-    mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks placed by hand, each axis.")] = 0.3,
+    pixel_sigma: PixelSigma = None,
     port: Annotated[int, typer.Option(help="Of the local address; 0 for any that is free.", min=0, max=65535)] = _PORT,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
 ) -> None:
@@ -79,13 +80,11 @@ def mark_command(
         raise InputError("give --rig or --cameras, not both: a rig file contains its cameras")
     if (reference is None) != (reference_images is None):
         raise InputError("--reference and --reference-images belong together: old marks, and the images they are in")
-    if not 0 < mark_sigma < 100:
-        raise InputError(f"--mark-sigma {mark_sigma}: a positive number of pixels is needed")
     pictures = open_pictures(left, right)
     known = None if rig is None else load_rig(rig)
     own = None if cameras is None else (load_camera(cameras[0]), load_camera(cameras[1]))
     old = None if reference is None or reference_images is None else Reference(reference, *reference_images)
-    session = Session(output, landmarks, mark_sigma)
+    session = Session(output, landmarks, pixel_sigma_of(pixel_sigma, known))
     desk = Desk(pictures, session, own, known, old)
     try:
         desk.check_sizes()

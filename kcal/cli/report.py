@@ -11,6 +11,7 @@ import typer
 from kcal.cli.camera_sources import single_camera
 from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.inputs import CAMERA_OR_RIG, OBSERVATIONS
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.sides import check_views
 from kcal.errors import InputError
 from kcal.files import check_writable, read_bytes
@@ -45,7 +46,7 @@ def report_command(
     baseline: Annotated[
         float, typer.Option(metavar="M", help="For a camera: distance to a second one like it.", min=1e-3)
     ] = 10.0,
-    mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks along each axis.", min=0)] = 0.3,
+    pixel_sigma: PixelSigma = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="HTML page to write.")] = None,
 ) -> None:
     """May I use this camera or rig? Yes or no for each range, one reason, and the next picture to take.
@@ -61,16 +62,16 @@ def report_command(
 
     `kcal report left.camera.json --observations left.obs.json --require 5km:10% -o report.html`
 
-    `kcal report rig.json --require 800m:2%,5km:10% --mark-sigma 0.1 -o report.html`
+    `kcal report rig.json --require 800m:2%,5km:10% --pixel-sigma 0.1 -o report.html`
     """
     needs = required(require)
     given = observations or []
     if output is not None:
         check_writable(output, subject, *given)
     found = (
-        _of_rig(subject, given, needs, mark_sigma)
+        _of_rig(subject, given, needs, pixel_sigma)
         if _is_rig(subject)
-        else _of_camera(subject, given, needs, baseline, mark_sigma)
+        else _of_camera(subject, given, needs, baseline, pixel_sigma_of(pixel_sigma))
     )
     tell(verdict=found[0].to_dict())
     if not told_usable(*found, output):
@@ -185,12 +186,13 @@ def _again(camera: Camera, observations: Path) -> tuple[CameraCalibrationResult,
     return result, options
 
 
-def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], mark_sigma: float) -> Judged:
+def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], pixel_sigma: float | None) -> Judged:
     from kcal.io.rig_file import load_rig
     from kcal.report.judge_rig import rig_verdict
     from kcal.report.verdict_page import camera_tables
 
     rig = load_rig(path)
+    mark_sigma = pixel_sigma_of(pixel_sigma, rig)
     if observations and len(observations) != 2:
         raise InputError("a rig needs --observations twice: left, then right")
     pairs = None

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from kcal.cli.commands import Command
 from kcal.cli.console import with_json
 from kcal.cli.groups import group_with_default
 from kcal.cli.inputs import CALIBRATED, MARKS, OBSERVATIONS, SURVEY, TABLE, with_inputs
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
 from kcal.cli.rig_check import check
 from kcal.errors import InputError
@@ -34,7 +37,9 @@ def solve_command(
     ] = None,
     match: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="Which views belong together: columns left,right. By name if not given."),
+        typer.Option(
+            metavar="CSV", help="Which views belong together: columns left,right. By name if not given.", hidden=True
+        ),
         TABLE,
     ] = None,
     landmarks: Annotated[
@@ -69,36 +74,48 @@ def solve_command(
     ] = None,
     origin: Annotated[
         str | None,
-        typer.Option(metavar="LAT,LON,HEIGHT", help="Of the local frame; the first surveyed place if not given."),
+        typer.Option(
+            metavar="LAT,LON,HEIGHT", help="Of the local frame; the first surveyed place if not given.", hidden=True
+        ),
     ] = None,
     survey_sigma: Annotated[
         float | None,
-        typer.Option(metavar="M", help="How well places of GeoJSON and GPX files are known, where these do not say."),
+        typer.Option(
+            metavar="M", help="How well places of GeoJSON and GPX files are known, where these do not say.", hidden=True
+        ),
     ] = None,
     geoid: Annotated[
         float | None,
-        typer.Option(metavar="M", help="Height of the geoid above the WGS84 ellipsoid, added to elevations of GPX."),
+        typer.Option(
+            metavar="M", help="Height of the geoid above the WGS84 ellipsoid, added to elevations of GPX.", hidden=True
+        ),
     ] = None,
     require: Annotated[
         str, typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.")
     ] = "",
     report: Annotated[Path | None, typer.Option(help="HTML page to write: may it be used, and why not.")] = None,
-    mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks and matches along each axis.")] = 0.3,
+    pixel_sigma: PixelSigma = None,
     intrinsics: Annotated[
         Literal["prior", "fixed", "free"],
         typer.Option(
             help="Refine the cameras within what their calibrations know, hold them as if they were exact, or let them "
-            "free."
+            "free.",
+            hidden=True,
         ),
     ] = "prior",
     refraction: Annotated[
-        float, typer.Option(metavar="K", help="Refraction of light from landmarks beforehand; 0 for straight lines.")
+        float,
+        typer.Option(
+            metavar="K", help="Refraction of light from landmarks beforehand; 0 for straight lines.", hidden=True
+        ),
     ] = 0.13,
     refraction_sigma: Annotated[
-        float, typer.Option(metavar="K", help="Its standard deviation; 0 holds it.", min=0)
+        float, typer.Option(metavar="K", help="Its standard deviation; 0 holds it.", min=0, hidden=True)
     ] = 0.1,
-    keep_all: Annotated[bool, typer.Option("--keep-all", help="Leave nothing out; only warn.")] = False,
-    board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
+    keep_all: Annotated[bool, typer.Option("--keep-all", help="Leave nothing out; only warn.", hidden=True)] = False,
+    board_warp: Annotated[
+        bool, typer.Option("--board-warp", help="Also estimate how the board bends.", hidden=True)
+    ] = False,
     picture: Annotated[Path | None, typer.Option(help="A .png or .svg file: a plan, and residuals.")] = None,
 ) -> None:
     """Solve a stereo rig: where the right camera stands from the left, and where both stand on the Earth.
@@ -132,9 +149,10 @@ def solve_command(
     from kcal.locate.range_sigmas import range_sigmas
     from kcal.report.tables import range_sigma_rows
 
+    noise = pixel_sigma_of(pixel_sigma)
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
-        baseline=baseline, origin=origin, mark_sigma=mark_sigma, survey_sigma=survey_sigma, geoid=geoid,
+        baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     needs = required(require)
@@ -155,6 +173,8 @@ def solve_command(
         result = solve_rig(data, options)
         advance("done")
     rig = result.stereo() if frame is None else placed_rig(result, frame)
+    if rig.calibration is not None and pixel_sigma is not None:
+        rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=pixel_sigma)
     # Everything that can fail comes before the file.
     lines = rig_lines(result, rig, unpaired)
     tell(
@@ -172,7 +192,7 @@ def solve_command(
         save_rig_picture(picture, result)
     print_rig(result, lines)
     try:
-        print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=mark_sigma)))
+        print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise)))
     except InputError as error:
         warn(f"range errors are not split: {error}")
     print_wrote(output, picture)
@@ -182,7 +202,7 @@ def solve_command(
         from kcal.report.verdict_page import camera_tables
         from kcal.report.verdict_pictures import png_bytes
 
-        verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, result=result, subject=output.name.split(".")[0])
+        verdict = rig_verdict(rig, needs, mark_sigma=noise, result=result, subject=output.name.split(".")[0])
         tables = [*camera_tables(rig.left), *camera_tables(rig.right)]
         tell(verdict=verdict.to_dict())
         if not told_usable(verdict, lambda: {"rig": png_bytes(rig_figure(result))}, tables, report):
@@ -249,5 +269,5 @@ def print_rig(result: RigResult, lines: list[str]) -> None:
         err.print("[yellow]warning:[/]", text)
 
 
-app.command("solve", hidden=True)(with_json(with_inputs(solve_command)))
-app.command("check")(with_json(with_inputs(check)))
+app.command("solve", hidden=True, cls=Command)(with_json(with_inputs(solve_command)))
+app.command("check", cls=Command)(with_json(with_inputs(check)))
