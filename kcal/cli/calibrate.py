@@ -210,7 +210,7 @@ def calibrate_command(
     from kcal.lens.model import LensModel
 
     needs = required(require)
-    if Path(board).suffix:
+    if board not in ("printed", "exact"):
         check_file("--board-shape", board, BOARD)
     places = _camera_files(observations, output, picture, report, name)
     if model != "hybrid":

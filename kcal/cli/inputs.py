@@ -160,7 +160,7 @@ def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
             found = [
                 _Given(label, text, wanted)
                 for name, (label, wanted) in files.items()
-                for text in _among(wanted, _texts(given.get(name)))
+                for text in _checked(wanted, given.get(name))
             ]
             # Beside a stream no files are allowed at all, which the command says.
             if not any(is_stream(one.text) for one in found if not one.label.startswith("-")):
@@ -231,10 +231,14 @@ def _candidates(wrong: _Given, kind: str) -> Iterator[str]:
             yield fitting[0]
 
 
-def _among(wanted: Wanted, texts: list[str]) -> list[str]:
-    """Those that are checked: of many images, one that is none is listed by the command and stops nothing."""
-    fine = [text for text in texts if file_kind(text) in wanted.kinds]
-    return [text for text in texts if file_kind(text) == "missing"] or fine if wanted is IMAGES and fine else texts
+def _checked(wanted: Wanted, value: Any) -> list[str]:
+    """The files that are checked: of a list of images, one that is none is listed by the command and stops nothing."""
+    texts = _texts(value)
+    if wanted is not IMAGES or not isinstance(value, list):
+        return texts
+    kinds = {text: file_kind(text) for text in texts}
+    fine = [text for text in texts if kinds[text] in wanted.kinds]
+    return [text for text in texts if kinds[text] == "missing"] or fine or texts
 
 
 def _texts(value: Any) -> list[str]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import shlex
-import sys
+import shutil
 from pathlib import Path
 
 import cv2
@@ -12,8 +13,9 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
-from kcal import Board, Observations, View, load_rig, save_camera, save_rig
-from kcal.cli.main import app, main
+from kcal import Board, Observations, View, load_camera, load_rig, save_camera, save_rig
+from kcal.cli.main import app
+from kcal.errors import KcalError
 from kcal.file_kind import file_kind
 
 ROOT = Path(__file__).parents[2]
@@ -59,7 +61,7 @@ FILES = {
 # Of these, a file of the other kind will do as well, or the reader says more of what is wrong in it.
 FINE = {
     ("picture.png", "folder"), ("picture.png", "empty.json"), ("picture.png", "foreign.yaml"),
-    ("survey.csv", "other.json"), ("right.json", "camera.json"), ("camera.json", "rig.json:left"),
+    ("survey.csv", "other.json"), ("right.json", "camera.json"), ("rig.json", "camera.json:left"),
     *itertools.product(["foreign.yaml"], ["camera.json", "rig.json", "marks.csv", "survey.csv", "other.json"]),
 }  # fmt: skip
 
@@ -90,13 +92,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
-    """What a command says on the error stream before it ends with exit code 1."""
-    monkeypatch.setattr(sys, "argv", ["kcal", *words])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 1
-    return capsys.readouterr().err
+COMMANDS = get_command(app)
+
+
+def run(words: list[str], monkeypatch: pytest.MonkeyPatch) -> str:
+    """What a command says of an input before it ends."""
+    # A marking page that opens in spite of a wrong file ends at once.
+    monkeypatch.setattr("kcal.web.serving.LocalServer.run", lambda server: None)
+    with pytest.raises(KcalError) as refused:
+        COMMANDS.main(args=words, prog_name="kcal", standalone_mode=False)
+    return str(refused.value)
 
 
 def test_kinds_are_found_by_content(folder: Path) -> None:
@@ -105,7 +110,7 @@ def test_kinds_are_found_by_content(folder: Path) -> None:
 
 def accepted(words: list[str]) -> bool:
     """Whether the command line takes these words."""
-    command = get_command(app)
+    command = COMMANDS
     while hasattr(command, "commands"):
         named = words[0] in command.commands
         command = command.commands[words[0]] if named else next(iter(command.commands.values()))
@@ -119,7 +124,7 @@ def cases() -> list[object]:
     for line in LINES:
         words = line.split()
         for place, wrong in itertools.product(range(len(words)), FILES):
-            right = words[place].partition(":")[0]
+            right = words[place]
             outputs = words[place - 1] == "-o"
             if right not in (*FILES, "right.json") or outputs or right == wrong or (right, wrong) in FINE:
                 continue
@@ -132,13 +137,81 @@ def cases() -> list[object]:
 
 @pytest.mark.parametrize(("words", "place", "wrong"), cases())
 def test_a_wrong_file_is_named(
-    words: list[str], place: int, wrong: str, folder: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    words: list[str], place: int, wrong: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # fmt: skip
     monkeypatch.chdir(folder)
     before = sorted(folder.iterdir())
-    text = run([*words[:place], wrong, *words[place + 1 :]], monkeypatch, capsys)
-    assert text.startswith(f"error: {wrong}: this is ")
+    text = run([*words[:place], wrong, *words[place + 1 :]], monkeypatch)
+    assert text.startswith(f"{wrong}: this is ")
     assert "is needed here" in text
     assert accepted(shlex.split(text.rpartition(": kcal ")[2]))
     assert sorted(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("line", "right"),
+    [
+        ("locate marks.csv rig.json", "kcal locate rig.json marks.csv"),
+        ("undistort camera.json picture.png -o s", "kcal undistort picture.png camera.json -o s"),
+        ("report seen.json --observations=camera.json", "kcal report camera.json --observations=seen.json"),
+        ("bake rig.json -o new.npz", "kcal bake rig.json:left -o new.npz"),
+        (
+            "rig right.json camera.json --baseline 10±1 -o n.json",
+            "kcal rig camera.json right.json --baseline '10±1' -o n.json",
+        ),
+    ],
+)
+def test_files_in_each_others_place_are_exchanged(
+    line: str, right: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    assert run(line.split(), monkeypatch).rpartition(": ")[2] == right
+
+
+def test_the_only_fitting_file_of_a_folder_is_proposed(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "rigs").mkdir()
+    shutil.copyfile(folder / "rig.json", tmp_path / "rigs" / "a.json")
+    shutil.copyfile(folder / "marks.csv", tmp_path / "rigs" / "marks.csv")
+    monkeypatch.chdir(tmp_path)
+    assert run(["budget", "rigs"], monkeypatch).endswith("Perhaps: kcal budget rigs/a.json")
+
+
+def test_views_of_another_camera_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    seen = Observations.load("seen.json")
+    seen.model_copy(update={"image_size": (1280, 720)}).save("small.json")
+    for line in (
+        "report camera.json --observations small.json",
+        "report rig.json --observations seen.json --observations small.json",
+    ):
+        text = run(line.split(), monkeypatch)
+        assert text.startswith("small.json: images of 1280x720 px, but the camera")
+        assert accepted(shlex.split(text.rpartition(": kcal ")[2]))
+    Path("small.json").unlink()
+
+
+def test_views_of_the_left_camera_given_for_the_right_one_are_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    names = {
+        side: load_camera(f"{file}.json").calibration.record.per_view_rms
+        for side, file in (("left", "camera"), ("right", "right"))
+    }
+    seen = Observations.load("seen.json")
+    for side in names:
+        views = tuple(seen.views[0].model_copy(update={"name": f"{side}-{name}"}) for name in names[side])
+        seen.model_copy(update={"views": views}).save(f"{side}.obs.json")
+    cameras = [load_camera("camera.json"), load_camera("right.json")]
+    for camera, side in zip(cameras, names, strict=True):
+        record = dataclasses.replace(
+            camera.calibration.record, per_view_rms={f"{side}-{name}": rms for name, rms in names[side].items()}
+        )
+        camera.calibration = dataclasses.replace(camera.calibration, record=record)
+        save_camera(camera, f"{side}.camera.json")
+    line = "rig left.camera.json right.camera.json --pairs right.obs.json left.obs.json -o n.json"
+    text = run(line.split(), monkeypatch)
+    assert "exchanged" in text
+    assert text.endswith("kcal rig left.camera.json right.camera.json --pairs left.obs.json right.obs.json -o n.json")
