@@ -156,7 +156,9 @@ def test_the_pages_of_the_reference_are_on_the_index() -> None:
 def test_the_commands_page_has_every_option() -> None:
     page = commands_page()
     assert "## kcal rig check" in page
-    assert "@@" in page
+    assert (
+        "`--pixel-sigma` `PX` | Noise of marks along each axis; that in the rig's file, or 0.3, if not given. |" in page
+    )
     assert "`--output`, `-o` `PATH` | Rig file to write. | required |" in page
 
 

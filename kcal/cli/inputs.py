@@ -148,7 +148,7 @@ def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
         about = getattr(parameter.annotation, "__metadata__", ())
         wanted = next((part for part in about if isinstance(part, Wanted)), None)
         if wanted is not None:
-            files[name] = _label(name, about), wanted
+            files[name] = _parameter_label(name, about), wanted
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
@@ -160,7 +160,7 @@ def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
             found = [
                 _Given(label, text, wanted)
                 for name, (label, wanted) in files.items()
-                for text in _checked(wanted, given.get(name))
+                for text in _checked_inputs(wanted, given.get(name))
             ]
             # Beside a stream no files are allowed at all, which the command says.
             if not any(is_stream(one.text) for one in found if not one.label.startswith("-")):
@@ -231,9 +231,9 @@ def _candidates(wrong: _Given, kind: str) -> Iterator[str]:
             yield fitting[0]
 
 
-def _checked(wanted: Wanted, value: Any) -> list[str]:
+def _checked_inputs(wanted: Wanted, value: Any) -> list[str]:
     """The files that are checked: of a list of images, one that is none is listed by the command and stops nothing."""
-    texts = _texts(value)
+    texts = _file_texts(value)
     if wanted is not IMAGES or not isinstance(value, list):
         return texts
     kinds = {text: file_kind(text) for text in texts}
@@ -241,12 +241,12 @@ def _checked(wanted: Wanted, value: Any) -> list[str]:
     return [text for text in texts if kinds[text] == "missing"] or fine or texts
 
 
-def _texts(value: Any) -> list[str]:
+def _file_texts(value: Any) -> list[str]:
     values = value if isinstance(value, list | tuple) else [value]
     return [str(one) for one in values if one is not None]
 
 
-def _label(name: str, about: Sequence[Any]) -> str:
+def _parameter_label(name: str, about: Sequence[Any]) -> str:
     for part in about:
         if isinstance(part, OptionInfo):
             named = [text for text in (part.default, *(part.param_decls or ())) if str(text).startswith("--")]

@@ -12,7 +12,7 @@ from kcal.cli.camera_sources import single_camera
 from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.inputs import CAMERA_OR_RIG, OBSERVATIONS
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
-from kcal.cli.sides import check_views
+from kcal.cli.sides import check_views_of
 from kcal.errors import InputError
 from kcal.files import check_writable, read_bytes
 from kcal.strict_json import MOST_BYTES, read_json
@@ -174,7 +174,7 @@ def _again(camera: Camera, observations: Path) -> tuple[CameraCalibrationResult,
 
     options = stored_options(camera)
     seen = Observations.load(observations)
-    check_views([camera], [seen], [observations])
+    check_views_of([camera], [seen], [observations])
     with steps("calibrating", None) as advance:
         result = calibrate_camera(seen, options, advance)
     found = camera_difference(camera, result.camera)
@@ -201,7 +201,7 @@ def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...]
         from kcal.corners.observations import Observations
 
         left, right = (Observations.load(file) for file in observations)
-        check_views((rig.left, rig.right), (left, right), observations)
+        check_views_of((rig.left, rig.right), (left, right), observations)
         boards = paired_boards((rig.left, rig.right), (left, right), pair_by_name(left.names, right.names))
         pairs = boards.points, boards.pixels
     verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, pairs=pairs, subject=path.name.split(".")[0])

@@ -76,10 +76,10 @@ def read_settings(folder: str | Path = ".") -> dict[str, Any]:
         content = tomllib.loads(read_bytes(path, _MOST_BYTES).decode("utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise FileError(f"{NAME}: not TOML: {error}. To write a new one: kcal init --force") from error
-    return {key: _checked(key, value) for key, value in content.items()}
+    return {key: _checked_setting(key, value) for key, value in content.items()}
 
 
-def _checked(key: str, value: Any) -> Any:
+def _checked_setting(key: str, value: Any) -> Any:
     if key not in SETTINGS:
         near = difflib.get_close_matches(key, SETTINGS, 1, 0.0)[0]
         raise FileError(f"{NAME}: unknown key {key[:40]!r}; did you mean {near}? Known are {', '.join(SETTINGS)}")

@@ -33,7 +33,7 @@ def check_sides(cameras: Sequence[Camera], paths: Sequence[Path]) -> None:
         )
 
 
-def check_views(cameras: Sequence[Camera], seen: Sequence[Observations], paths: Sequence[Path]) -> None:
+def check_views_of(cameras: Sequence[Camera], seen: Sequence[Observations], paths: Sequence[Path]) -> None:
     """Refuse views of another size than their camera's, and those that the other camera was calibrated from.
 
     Raises:
@@ -41,7 +41,7 @@ def check_views(cameras: Sequence[Camera], seen: Sequence[Observations], paths: 
     """
     for camera, views, path in zip(cameras, seen, paths, strict=True):
         if camera.size != views.image_size and len(cameras) == 1:
-            raise InputError(_size_text(camera, views, path))
+            raise InputError(_other_size(camera, views, path))
     if len(cameras) != 2:
         return
     sizes = [camera.size for camera in cameras]
@@ -54,10 +54,10 @@ def check_views(cameras: Sequence[Camera], seen: Sequence[Observations], paths: 
         )
     for camera, views, path in zip(cameras, seen, paths, strict=True):
         if camera.size != views.image_size:
-            raise InputError(_size_text(camera, views, path))
+            raise InputError(_other_size(camera, views, path))
 
 
-def _size_text(camera: Camera, views: Observations, path: Path) -> str:
+def _other_size(camera: Camera, views: Observations, path: Path) -> str:
     name = camera.calibration.name if camera.calibration else ""
     return (
         f"{path}: images of {views.image_size[0]}x{views.image_size[1]} px, but the camera {name or 'given'} has "

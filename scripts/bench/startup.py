@@ -18,13 +18,15 @@ from kcal.cli.main import app
 LARGE = ("torch", "kornia", "cv2", "scipy", "matplotlib", "pyproj")
 ROOT = Path(kcal.__file__).parents[1]
 SAMPLE = ROOT / "assets" / "sample-rig.json"
-_RUN = "import sys; from kcal.cli.main import main\ntry: main()\nfinally: print(*{names} & sys.modules.keys(), file=sys.stderr)"
+_BEGIN = "import sys; from kcal.cli.main import app, main\n"
+_END = "\nprint(*{names} & sys.modules.keys(), file=sys.stderr)"
 
 
-def measure(arguments: list[str], folder: Path) -> tuple[float, int, list[str]]:
+def measure(arguments: list[str], folder: Path, code: str = "try: main()") -> tuple[float, int, list[str]]:
     """CPU seconds of a command, its exit code, and which of the large libraries it loaded."""
+    end = _END.format(names=set(LARGE))
+    code = f"{_BEGIN}{code}\nfinally:{end.replace(chr(10), ' ')}" if code.startswith("try") else _BEGIN + code + end
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    code = _RUN.format(names=set(LARGE))
     done = subprocess.run([sys.executable, "-c", code, *arguments], cwd=folder, capture_output=True, text=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

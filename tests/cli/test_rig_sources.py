@@ -258,7 +258,17 @@ def test_check_of_a_rig_that_turned_as_a_whole(
 def test_check_by_landmarks(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
     capsys.readouterr()
-    arguments = ["rig", "check", "rig.json", "--landmarks", "survey.csv", "--marks", "later.csv", "--pixel-sigma", "0.1"]
+    arguments = [
+        "rig",
+        "check",
+        "rig.json",
+        "--landmarks",
+        "survey.csv",
+        "--marks",
+        "later.csv",
+        "--pixel-sigma",
+        "0.1",
+    ]
     assert run(monkeypatch, *arguments, "--relock") == 3
     printed = capsys.readouterr()
     line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))

@@ -84,7 +84,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run(monkeypatch, "--disparity", "2", "--picture", "budget.png") == 0
+    assert run(monkeypatch, "--pixel-sigma", "1.414213562373095", "--picture", "budget.png") == 0
     printed = capsys.readouterr().out
     assert "f B 16000 px m" in printed
     line = next(line for line in printed.splitlines() if line.split()[:2] == ["5000", "disparity"])
@@ -94,14 +94,18 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert run(monkeypatch, "rig.json", "--distances", "500") == 0
     assert "rig.json: baseline 10.0" in capsys.readouterr().out
     assert run(monkeypatch, str(SAMPLE), "--distances", "1000,5000") == 0
-    table = capsys.readouterr().out.split("What the rig file knows, and 0.1 px of disparity")[1].splitlines()
+    table = (
+        capsys.readouterr()
+        .out.split("What the rig file knows, and 0.1 px of noise in each mark, in meters:")[1]
+        .splitlines()
+    )
     assert table[1].split("  ")[0] == "at m"
     distance, total, marks, lenses, pose, sideways = map(float, table[3].split())
-    assert (distance, marks) == (5000.0, pytest.approx(0.1 * 5000**2 / 16_000, rel=0.1))
+    assert (distance, marks) == (5000.0, pytest.approx(math.sqrt(2) * 0.1 * 5000**2 / 16_000, rel=0.1))
     assert total == pytest.approx(math.hypot(marks, lenses, pose), abs=1.0)
     assert min(pose, sideways) > 0
-    assert run(monkeypatch, str(SAMPLE), "--disparity", "0") == 0
-    assert "What the rig file knows" not in capsys.readouterr().out
+    assert run(monkeypatch, str(SAMPLE), "--pixel-sigma", "0") == 1
+    assert "a positive number of pixels" in capsys.readouterr().err
     assert run(monkeypatch, "--baseline", "0.08") == 0
     ranges = [line.split()[0] for line in capsys.readouterr().out.splitlines() if "disparity" in line]
     assert ranges == ["1", "2.5", "5", "10", "25", "50"]
