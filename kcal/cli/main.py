@@ -112,7 +112,7 @@ def _global_options(
 
 
 app.command("demo", cls=Command)(with_json(demo_command))
-app.command("init", cls=Command)(init_command)
+app.command("init", cls=Command)(with_json(init_command))
 app.add_typer(board, name="board")
 app.command("capture", cls=Command)(with_inputs(capture_command))
 app.command("detect", cls=Command)(with_json(with_inputs(detect_command)))

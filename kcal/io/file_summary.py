@@ -7,6 +7,7 @@ digest tells, and `kcal show` computes anew. kcal itself reads nothing else from
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Self
 
 from kcal.errors import KcalError
@@ -64,7 +65,12 @@ def sigma_over_image(camera: Camera) -> tuple[float, float] | None:
 
     spread = image_sigma(camera)
     spread = spread[spread.isfinite()]
-    return (float(spread.median()), float(spread.max())) if spread.numel() else None
+    return (_rounded(spread.median()), _rounded(spread.max())) if spread.numel() else None
+
+
+def _rounded(value: Any) -> float:
+    # Six digits: what rounding errors change shall not change the file.
+    return float(f"{float(value):.6g}")
 
 
 class RigSummary(Record):
@@ -95,8 +101,13 @@ class RigSummary(Record):
             errors = rig.covariance.matrix.diagonal()[-6:].clamp_min(0.0).sqrt().tolist()
         return cls(
             of=digest({key: value for key, value in content.items() if key not in ("left", "right")}),
-            baseline_m=float(rig.baseline),
-            rotation_vector_deg=tuple(turn),
-            sigma_m=None if errors is None else tuple(errors[3:]),
-            sigma_deg=None if errors is None else tuple(map(math.degrees, errors[:3])),
+            baseline_m=_rounded(rig.baseline),
+            rotation_vector_deg=_triple(turn),
+            sigma_m=None if errors is None else _triple(errors[3:]),
+            sigma_deg=None if errors is None else _triple(map(math.degrees, errors[:3])),
         )
+
+
+def _triple(values: Iterable[float]) -> tuple[float, float, float]:
+    x, y, z = map(_rounded, values)
+    return x, y, z
