@@ -18,6 +18,8 @@ from kcal.lens.zernike import unbind_last
 
 _DEGREE = 11
 _NODES = 96
+# An interval is split into so many parts, so many times, until it is as narrow as rounding.
+_PARTS, _SECTIONS = 64, 9
 # Largest distorted radius for a lens without a camera: 56° through a pinhole.
 _DEFAULT_REACH = 1.5
 
@@ -48,10 +50,12 @@ def fit_start(coefficients: Tensor, model: LensModel, reach: float | Tensor = _D
     # D lies a little beyond the reach, or at the fold.
     wanted = torch.as_tensor(reach, dtype=torch.float64, device=own.device)[..., None]
     low, high = torch.zeros_like(limit), limit
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        beyond = distorted(middle) > 1.1 * wanted
-        low, high = torch.where(beyond, low, middle), torch.where(beyond, middle, high)
+    fractions = torch.linspace(0.0, 1.0, _PARTS + 1, dtype=torch.float64, device=own.device)
+    for _ in range(_SECTIONS):
+        # The interval is split into parts; the first whose end lies beyond is the next.
+        ends = low + (high - low) * fractions[1:-1]
+        part = (distorted(ends) <= 1.1 * wanted).to(torch.int64).cumprod(-1).sum(-1, keepdim=True)
+        low, high = low + (high - low) * fractions[part], low + (high - low) * fractions[part + 1]
     # Evenly in angle: for a wide lens, equal steps on the plane would nearly all lie at its edge.
     steps = torch.linspace(1.0 / _NODES, 1.0, _NODES, dtype=torch.float64, device=own.device)
     radius = high * steps if model.wide else torch.tan(torch.atan(high) * steps)

@@ -25,8 +25,9 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.dispatch import may_overwrite
+from kcal.lens.dispatch import may_branch, may_overwrite
 from kcal.lens.field_modes import WeightPrior
+from kcal.lens.zernike_products import ZernikeProducts
 
 RADIAL, DECENTERED, ASTIGMATIC, OTHER, TILTED, ASPECT = range(6)
 
@@ -49,6 +50,10 @@ _FIRST_DEGREE = (5, 2, 3, 2, 2)
 _DECAY = len(_FIRST_DEGREE)
 # The coefficients of Jacobi polynomials by powers of t grow by 2.4 with each second degree: 5e7 at degree 40.
 _HIGHEST = 40
+# Up to so many places a field is evaluated by products of matrices, in few operations; of more, by Horner's rule, in
+# few multiplications (measured: twice as fast at 1,500, equal at some 5,000).
+_FEW = 4000
+_DERIVED = ("complex_modes", "real_modes", "names", "_chains", "_matrix", "_products")
 # Real and imaginary part of a complex number for each point.
 _Complex = tuple[Tensor, Tensor]
 # Where the real and the imaginary coefficients of a polynomial Q_j(t) stand; None: it is zero.
@@ -91,42 +96,16 @@ class ZernikeModes:
     names: tuple[str, ...] = dataclasses.field(init=False, repr=False, compare=False)
     _chains: tuple[tuple[_Place, ...], tuple[_Place, ...]] = dataclasses.field(init=False, repr=False, compare=False)
     _matrix: Tensor = dataclasses.field(init=False, repr=False, compare=False)
+    _products: ZernikeProducts = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("radial", "decentered", "astigmatic", "other"):
             degree = getattr(self, name)
             if not isinstance(degree, int) or isinstance(degree, bool) or not 0 <= degree <= _HIGHEST:
                 raise InputError(f"Zernike modes: {name} must be a whole number from 0 to {_HIGHEST}, got {degree!r}")
-        complex_modes = tuple(self._list_complex_modes())
-        real_modes = []
-        for part in (0, 1):
-            for i, (j, n) in enumerate(complex_modes):
-                m = abs(j - 1)
-                if (j, n) == (1, 1) or ((j, n) == (1, 3) and part == 0):
-                    continue
-                family = ASPECT if (j, n) == (-1, 1) else _family(m, n, part)
-                real_modes.append((i, part, family, n))
-        modes = ((*complex_modes[i], part) for i, part, _, _ in real_modes)
-        chains, matrix = _polynomial_layout(complex_modes, [(i, part) for i, part, _, _ in real_modes])
-        derived = {
-            "complex_modes": complex_modes,
-            "real_modes": tuple(real_modes),
-            "names": tuple(f"z{n}{j:+d}{'i' * part}" for j, n, part in modes),
-            "_chains": chains,
-            "_matrix": matrix,
-        }
-        for name, value in derived.items():
+        derived = _derived(self.radial, self.decentered, self.astigmatic, self.other)
+        for name, value in zip(_DERIVED, derived, strict=True):
             object.__setattr__(self, name, value)
-
-    def _list_complex_modes(self) -> list[tuple[int, int]]:
-        highest = (self.radial, self.decentered, self.astigmatic)
-        top = max(*highest, self.other)
-        found = []
-        for j in range(-top, top + 1):
-            m = abs(j - 1)
-            limit = highest[m] if m < len(highest) else self.other
-            found += [(j, n) for n in range(abs(j), limit + 1, 2) if n]
-        return found
 
     def __len__(self) -> int:
         """Number of real weights."""
@@ -161,25 +140,12 @@ class ZernikeModes:
 
     def columns(self, x: Tensor, y: Tensor) -> Tensor:
         """See `FieldModes`."""
-        highest: dict[int, int] = {}
-        for j, n in self.complex_modes:
-            highest[abs(j)] = max(highest.get(abs(j), 0), (n - abs(j)) // 2)
-        t = 2.0 * (x * x + y * y) - 1.0
-        powers = _powers(x, y, max(highest))
-        polynomials = {j: _jacobi(top, j, t) for j, top in highest.items()}
-        values = []
-        for j, n in self.complex_modes:
-            scaled = math.sqrt(n + 1) * polynomials[abs(j)][(n - abs(j)) // 2]
-            re, im = powers[abs(j)]
-            values.append((scaled * re, scaled * (im if j >= 0 else -im)))
-        flat: list[Tensor] = []
-        for i, part, _, _ in self.real_modes:
-            re, im = values[i]
-            flat += (-im, re) if part else (re, im)
-        return torch.stack(flat).unflatten(0, (len(self), 2))
+        return self._products.to(x.device).columns(x, y)
 
     def field(self, weights: Tensor, x: Tensor, y: Tensor, slopes: bool = True) -> tuple[Tensor, ...]:
         """See `FieldModes`."""
+        if may_branch(weights, x, y) and x.shape[-1] <= _FEW:
+            return self._products.to(x.device).field(weights, x, y, slopes)
         t = 2.0 * torch.addcmul(x * x, y, y) - 1.0
         coefficients = unbind_last(weights @ self._matrix.to(weights.device))
         reuse = may_overwrite(weights, x, y)
@@ -199,6 +165,36 @@ class ZernikeModes:
             torch.addcmul(re + re_back, x, f_t), torch.addcmul(im_back - im, y, f_t),
             torch.addcmul(im + im_back, x, g_t), torch.addcmul(re - re_back, y, g_t),
         )  # fmt: skip
+
+
+@functools.cache
+def _derived(radial: int, decentered: int, astigmatic: int, other: int) -> tuple[Any, ...]:
+    """The derived attributes, in the order of `_DERIVED`; kept, because each fit makes its modes anew."""
+    complex_modes = tuple(_complex_modes((radial, decentered, astigmatic), other))
+    real_modes = []
+    for part in (0, 1):
+        for i, (j, n) in enumerate(complex_modes):
+            m = abs(j - 1)
+            if (j, n) == (1, 1) or ((j, n) == (1, 3) and part == 0):
+                continue
+            family = ASPECT if (j, n) == (-1, 1) else _family(m, n, part)
+            real_modes.append((i, part, family, n))
+    modes = [(*complex_modes[i], part) for i, part, _, _ in real_modes]
+    chains, matrix = _polynomial_layout(complex_modes, [(i, part) for i, part, _, _ in real_modes])
+    products = ZernikeProducts.of([(j, part, _chebyshev(n, j)) for j, n, part in modes])
+    names = tuple(f"z{n}{j:+d}{'i' * part}" for j, n, part in modes)
+    return complex_modes, tuple(real_modes), names, chains, matrix, products
+
+
+def _complex_modes(highest: Sequence[int], other: int) -> list[tuple[int, int]]:
+    """(j, n) of all modes up to the highest degrees of m = 0, |m| = 1, ..., and of all other m."""
+    top = max(*highest, other)
+    found = []
+    for j in range(-top, top + 1):
+        m = abs(j - 1)
+        limit = highest[m] if m < len(highest) else other
+        found += [(j, n) for n in range(abs(j), limit + 1, 2) if n]
+    return found
 
 
 def _family(m: int, degree: int, part: int) -> int:
@@ -287,13 +283,20 @@ def _jacobi_coefficients(k: int, b: int) -> tuple[float, ...]:
     return tuple(float(value) for value in _jacobi(k, b, t)[k].coef)
 
 
-def _powers(x: Tensor, y: Tensor, highest: int) -> list[_Complex]:
-    """Real and imaginary parts of (x + i y)^j for j from 0."""
-    out = [(torch.ones_like(x), torch.zeros_like(x))]
-    for _ in range(highest):
-        re, im = out[-1]
-        out.append((re * x - im * y, re * y + im * x))
-    return out
+def _chebyshev(degree: int, j: int) -> np.ndarray:
+    """√(n+1) P_k^(0,|j|)(t) by Chebyshev polynomials of t."""
+    k = (degree - abs(j)) // 2
+    return np.asarray(math.sqrt(degree + 1) * _jacobi_by_chebyshev(abs(j))[k, : k + 1])
+
+
+@functools.cache
+def _jacobi_by_chebyshev(b: int) -> np.ndarray:
+    """(K, K) of P_k^(0,b)(t), each to be cut after k + 1: from values where Chebyshev polynomials are orthogonal."""
+    count = _HIGHEST // 2 + 1
+    angles = (np.arange(count) + 0.5) * (math.pi / count)
+    weights = np.cos(np.arange(count)[:, None] * angles) * (2.0 / count)
+    weights[0] *= 0.5
+    return np.stack(_jacobi(count - 1, b, np.cos(angles))) @ weights.T
 
 
 def _jacobi(highest: int, b: int, t: Any) -> list[Any]:

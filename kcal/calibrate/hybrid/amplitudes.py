@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from kcal.calibrate.hybrid.evidence import Maximum, evidence_loss, hyper_bounds
+from kcal.calibrate.hybrid.evidence import EvidenceLoss, Maximum, hyper_bounds
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.hybrid.quadratic import ViewData
 
@@ -45,8 +45,10 @@ def expected_maximum(
     count, log_variance = len(best.h), math.log(best.variance)
     used = families.amplitude
     which = [*used[used >= 0].unique().tolist(), *range(count, count + len(best.log_ratio))]
+    loss = EvidenceLoss(data, families, hyperprior, tempering)
     found = expected_amplitudes(
-        evidence_loss(data, families, hyperprior, tempering),
+        loss,
+        loss.value,
         np.concatenate([best.h.numpy(), best.log_ratio, [log_variance]]),
         which,
         hyper_bounds(hyperprior, len(best.log_ratio), log_variance),
@@ -55,12 +57,17 @@ def expected_maximum(
 
 
 def expected_amplitudes(
-    loss: Loss, at: np.ndarray, which: list[int], bounds: list[tuple[float, float | None]]
+    loss: Loss,
+    value: Callable[[np.ndarray], float],
+    at: np.ndarray,
+    which: list[int],
+    bounds: list[tuple[float, float | None]],
 ) -> np.ndarray:
     """½ ln <A²> of some hyperparameters, and the others as they are.
 
     Args:
         loss: -ln p and its gradient.
+        value: -ln p alone.
         at: (H,) where it is smallest.
         which: numbers of the ln A.
         bounds: of all.
@@ -68,7 +75,7 @@ def expected_amplitudes(
     Example:
         >>> def loss(v):  # ln A is normal, with a standard deviation of a half: <A²> = exp(2 · ¼)
         ...     return float(2.0 * (v @ v)), 4.0 * v
-        >>> found = expected_amplitudes(loss, np.zeros(2), [0], [(-9.0, 9.0), (-9.0, None)])
+        >>> found = expected_amplitudes(loss, lambda v: loss(v)[0], np.zeros(2), [0], [(-9.0, 9.0), (-9.0, None)])
         >>> [round(float(value), 2) for value in found]
         [0.25, 0.0]
     """
@@ -79,7 +86,7 @@ def expected_amplitudes(
         low, high = bounds[i]
         places = np.array([t for t in sigma * _PLACES if low <= at[i] + t <= (math.inf if high is None else high)])
         along = covariance[:, i] / covariance[i, i]
-        losses = np.array([loss(at + t * along)[0] for t in places])
+        losses = np.array([value(at + t * along) for t in places])
         share = np.exp(losses.min() - losses)
         found[i] += 0.5 * math.log(float(share @ np.exp(2.0 * places)) / float(share.sum()))
     return found

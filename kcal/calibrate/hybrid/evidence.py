@@ -12,7 +12,6 @@ prior on h (type-II maximum likelihood, MacKay 1992; restricted maximum likeliho
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +40,17 @@ def negative_log_evidence(data: Quadratic, families: PriorFamilies, v: np.ndarra
     return found.value, np.append(found.by_h, found.by_noise)
 
 
+class _Best(NamedTuple):
+    """-ln p, and the best lens and board: δ (S,), and in units of their priors y (S,); what derivatives need."""
+
+    value: float
+    step: np.ndarray
+    y: np.ndarray
+    deviation: np.ndarray
+    rss: float
+    root: Tensor
+
+
 class _Posterior(NamedTuple):
     """-ln p, its derivatives by h (H,) and ln σ², and the posterior: δ (S,) and F (S, S), FᵀF its covariance."""
 
@@ -51,29 +61,36 @@ class _Posterior(NamedTuple):
     factor: Tensor
 
 
-def _posterior(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Posterior | None:
+def _best(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Best | None:
     """None where priors are too wide for the precision of numbers."""
-    K, g, c, freedom = data.K.numpy(), data.g.numpy(), data.c, data.freedom
-    here = torch.from_numpy(h)
+    K, g = data.K.numpy(), data.g.numpy()
     s2 = math.exp(log_variance)
-    d = families.deviation(here).numpy()
-    A = torch.from_numpy(K * d[:, None] * d / s2)
+    d = families.deviation(torch.from_numpy(h)).numpy()
+    A = torch.from_numpy(K * d[:, None] * (d / s2))
     A.diagonal().add_(1.0)
     root, info = torch.linalg.cholesky_ex(A)
     if int(info):
         return None
-    inverse = torch.linalg.solve_triangular(root, torch.eye(len(g), dtype=A.dtype), upper=False)
-    half = inverse.numpy()
-    # The solution in units of the priors, and from there the posterior's covariance times the gradient.
+    # The solution in units of the priors.
     y = np.divide(data.at.numpy(), d, out=np.zeros_like(d), where=d > 0)
-    change = half.T @ (half @ (d * g / s2 - y))
+    change = torch.cholesky_solve(torch.from_numpy(d * g / s2 - y)[:, None], root)[:, 0].numpy()
     y, step = y + change, d * change
-    kept = (half**2).sum(0)
-    rss = c - 2 * g @ step + step @ (K @ step)
-    value = 0.5 * (freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
-    by_h = families.slopes(here).numpy() @ (0.5 * (1 - y * y - kept))
-    by_noise = 0.5 * (freedom - (len(g) - kept.sum()) - rss / s2)
-    return _Posterior(value, by_h, by_noise, step, inverse * torch.from_numpy(d))
+    rss = data.c - 2 * g @ step + step @ (K @ step)
+    value = 0.5 * (data.freedom * log_variance + rss / s2 + y @ y) + float(root.diagonal().log().sum())
+    return _Best(value, step, y, d, rss, root)
+
+
+def _posterior(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Posterior | None:
+    """None where priors are too wide for the precision of numbers."""
+    best = _best(data, families, h, log_variance)
+    if best is None:
+        return None
+    inverse = torch.linalg.solve_triangular(best.root, torch.eye(len(best.y), dtype=best.root.dtype), upper=False)
+    kept = inverse.square().sum(0)
+    y = torch.from_numpy(best.y)
+    by_h = families.pulled(torch.from_numpy(h), 0.5 * (1.0 - y * y - kept)).numpy()
+    by_noise = 0.5 * (data.freedom - (len(y) - float(kept.sum())) - best.rss * math.exp(-log_variance))
+    return _Posterior(best.value, by_h, by_noise, best.step, inverse * torch.from_numpy(best.deviation))
 
 
 class Maximum(NamedTuple):
@@ -123,7 +140,7 @@ def maximize_evidence(
     from scipy.optimize import minimize as lbfgs
 
     found = lbfgs(
-        evidence_loss(data, families, prior, tempering),
+        EvidenceLoss(data, families, prior, tempering),
         np.concatenate([h.numpy(), ratios, [log_variance]]),
         jac=True,
         method="L-BFGS-B",
@@ -144,31 +161,58 @@ def hyper_bounds(prior: Hyperprior, motions: int, log_variance: float) -> list[t
     return [*bounds, (max(log_variance - 8, 2.0 * math.log(LEAST_NOISE)), None)]
 
 
-def evidence_loss(
-    data: ViewData, families: PriorFamilies, prior: Hyperprior, tempering: float
-) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
-    """The negative logarithm of evidence and hyperprior of v = (h, logarithms of ratios, ln σ²), and its gradient."""
-    mean, sd = prior.mean.numpy(), prior.sd.numpy()
-    count = len(mean)
-    values: list[float] = []
+class EvidenceLoss:
+    """The negative logarithm of evidence and hyperprior of v = (h, logarithms of ratios of motions, ln σ²).
 
-    def objective(v: np.ndarray) -> tuple[float, np.ndarray]:
-        here, ratio, log_variance = v[:count], v[count:-1], v[-1]
-        integrated = data.integrated(ratio)
-        tempered = integrated.data.tempered(tempering)
-        found = _posterior(tempered, families, here, log_variance) if log_variance < _HIGHEST else None
+    Args:
+        data: what the views say.
+        families: the priors.
+        prior: of h.
+        tempering: by which the data count less.
+    """
+
+    def __init__(self, data: ViewData, families: PriorFamilies, prior: Hyperprior, tempering: float) -> None:
+        self._data, self._families, self._tempering = data, families, tempering
+        self._mean, self._sd = prior.mean.numpy(), prior.sd.numpy()
+        self._worst = -math.inf
+
+    def value(self, v: np.ndarray) -> float:
+        """Without the gradient, at half the cost; infinite beyond numbers."""
+        h, ratio, log_variance = self._parts(v)
+        integrated = self._data.integrated(ratio)
+        best = _best(integrated.data.tempered(self._tempering), self._families, h, log_variance)
+        return math.inf if best is None else best.value + self._beside(v, integrated.log_determinant)
+
+    def __call__(self, v: np.ndarray) -> tuple[float, np.ndarray]:
+        """The value and its gradient; large beyond numbers."""
+        h, ratio, log_variance = self._parts(v)
+        integrated = self._data.integrated(ratio)
+        tempered = integrated.data.tempered(self._tempering)
+        found = _posterior(tempered, self._families, h, log_variance) if log_variance < _HIGHEST else None
         if found is None:
             # Priors are far too wide for this precision, or a first step was far too long: worse than any trial before,
             # so that a shorter step follows.
-            return max(values, default=1e30) + 1.0, np.zeros_like(v)
-        # The prior of the motions' amplitudes is about these, not about their ratios to the noise.
-        z, w = (here - mean) / sd, (ratio + 0.5 * log_variance - math.log(MEDIAN)) / SPREAD
-        values.append(found.value + 0.5 * (float(z @ z) + integrated.log_determinant / tempering + float(w @ w)))
-        by_ratio = integrated.slopes(found.step, found.factor, math.exp(log_variance), tempering) + w / SPREAD
+            return (1e30 if math.isinf(self._worst) else self._worst + 1.0), np.zeros_like(v)
+        value = found.value + self._beside(v, integrated.log_determinant)
+        self._worst = max(self._worst, value)
+        z, w = self._scaled(v)
+        slopes = integrated.slopes(found.step, found.factor, math.exp(log_variance), self._tempering)
         by_noise = found.by_noise + 0.5 * float(w.sum()) / SPREAD
-        return values[-1], np.concatenate([found.by_h + z / sd, by_ratio, [by_noise]])
+        return value, np.concatenate([found.by_h + z / self._sd, slopes + w / SPREAD, [by_noise]])
 
-    return objective
+    def _parts(self, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        count = len(self._mean)
+        return v[:count], v[count:-1], float(v[-1])
+
+    def _scaled(self, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances from the means of the hyperprior, in its standard deviations."""
+        h, ratio, log_variance = self._parts(v)
+        # The prior of the motions' amplitudes is about these, not about their ratios to the noise.
+        return (h - self._mean) / self._sd, (ratio + 0.5 * log_variance - math.log(MEDIAN)) / SPREAD
+
+    def _beside(self, v: np.ndarray, log_determinant: float) -> float:
+        z, w = self._scaled(v)
+        return 0.5 * (float(z @ z) + log_determinant / self._tempering + float(w @ w))
 
 
 def evidence_of_motion(data: ViewData, best: Maximum, families: PriorFamilies, tempering: float) -> float:
@@ -177,6 +221,6 @@ def evidence_of_motion(data: ViewData, best: Maximum, families: PriorFamilies, t
     moving = data.integrated(best.log_ratio)
     losses = []
     for quadratic, determinant in ((data.still, 0.0), (moving.data, moving.log_determinant)):
-        found = _posterior(quadratic.tempered(tempering), families, best.h.numpy(), log_variance)
+        found = _best(quadratic.tempered(tempering), families, best.h.numpy(), log_variance)
         losses.append(math.inf if found is None else found.value + 0.5 * determinant / tempering)
     return losses[0] - losses[1]

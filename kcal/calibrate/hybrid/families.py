@@ -81,15 +81,13 @@ class PriorFamilies(NamedTuple):
         out = self.log_unit + torch.where(self.amplitude >= 0, h[self.amplitude], 0.0)
         return torch.exp(out - torch.where(self.decay >= 0, torch.exp(h[self.decay]), 0.0) * self.degree)
 
-    def slopes(self, h: Tensor) -> Tensor:
-        """(H, S) derivatives of 2 ln sd by h."""
-        out = torch.zeros(len(h), len(self.mean), dtype=h.dtype)
-        column = torch.arange(len(self.mean))
-        some = self.amplitude >= 0
-        out[self.amplitude[some], column[some]] = 2.0
-        some = self.decay >= 0
-        out[self.decay[some], column[some]] -= 2.0 * torch.exp(h[self.decay[some]]) * self.degree[some]
-        return out
+    def pulled(self, h: Tensor, by_variance: Tensor) -> Tensor:
+        """(H,) derivatives by h of what has the derivatives `by_variance` (S,) by 2 ln sd."""
+        # The last place takes what no hyperparameter sets.
+        out, count = h.new_zeros(len(h) + 1), len(h) + 1
+        decays = torch.exp(torch.cat([h, h.new_zeros(1)]))[self.decay]
+        out.index_add_(0, self.amplitude % count, 2.0 * by_variance)
+        return out.index_add_(0, self.decay % count, -2.0 * decays * self.degree * by_variance)[:-1]
 
 
 def prior_families(

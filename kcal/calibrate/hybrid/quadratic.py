@@ -40,6 +40,8 @@ class Quadratic(NamedTuple):
 
     def tempered(self, tempering: float) -> Quadratic:
         """The same data, counting less."""
+        if tempering == 1.0:
+            return self
         return Quadratic(self.K / tempering, self.g / tempering, self.c / tempering, self.freedom / tempering, self.at)
 
 
