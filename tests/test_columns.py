@@ -59,6 +59,8 @@ def test_every_name_with_a_unit_has_it_in_its_row() -> None:
                 assert cells[1] == (units[suffix[0]] if per is None else cells[1]), name
 
 
-@pytest.mark.parametrize("word", ["positive to the right", "positive downward", "clockwise from true north", "positive up"])
+@pytest.mark.parametrize(
+    "word", ["positive to the right", "positive downward", "clockwise from true north", "positive up"]
+)
 def test_signs_are_said(word: str) -> None:
     assert word in PAGE
