@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from kcal.cli.console import out, print_wrote
+from kcal.cli.console import out, print_wrote, steps
 from kcal.cli.inputs import CAMERA
 from kcal.files import check_writable
 
@@ -40,7 +40,8 @@ def bake_command(
     from kcal.io.lookup_file import save_lookup
     from kcal.lens.baking import bake
 
-    lookup = bake(calibrated_camera(camera), tolerance)
+    with steps("baking", None):
+        lookup = bake(calibrated_camera(camera), tolerance)
     save_lookup(lookup, path)
     for which, table, bound, coverage in zip(
         ("pixels to rays", "rays to pixels"),

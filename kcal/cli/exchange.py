@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from kcal.cli.camera_sources import named_source, parse_size, picked
-from kcal.cli.console import out, print_wrote, warn
+from kcal.cli.console import out, print_wrote, steps, warn
 from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN
 from kcal.errors import InputError
 from kcal.files import check_picture, check_writable
@@ -59,9 +59,9 @@ def export_command(
         check_picture(picture)
     found = import_cameras(path)
     subject = _subject(path, name)
-    done = export_cameras(
-        subject if subject is not None else picked(found, name, source), output, format=format, model=model
-    )
+    chosen = subject if subject is not None else picked(found, name, source)
+    with steps("fitting what the format holds", None):
+        done = export_cameras(chosen, output, format=format, model=model)
     for camera, model_name, misfit in zip(
         found.names if subject is not None else [name or found.names[0]], done.models, done.misfits, strict=True
     ):
