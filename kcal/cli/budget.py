@@ -61,6 +61,7 @@ def budget_command(
     from kcal.io.rig_file import load_rig
     from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
     from kcal.locate.range_sigmas import range_sigmas, usual_ranges
+    from kcal.quantities import length_text, range_text
     from kcal.report.tables import range_sigma_rows
 
     if picture is not None:
@@ -78,21 +79,22 @@ def budget_command(
     labels = {
         "disparity": f"disparity {disparity:.3g} px",
         "yaw": f"relative yaw {yaw:g}°",
-        "baseline": f"baseline {1000 * baseline_error:g} mm",
+        "baseline": f"baseline {range_text(baseline_error)}",
         "timing": f"{1000 * timing:g} ms apart at {speed:g} m/s",
     }
     found = range_errors(chosen, far, errors)
     if rig is None:
         out.print(f"planned rig: f {focal:g} px, baseline {baseline:g} m, f B {focal * baseline:g} px m")
     else:
-        out.print(f"{rig}: baseline {float(chosen.baseline):g} m", markup=False)
-    rows = [["range m", "error", "nearer m", "farther m", "first order m"]]
+        out.print(f"{rig}: baseline {length_text(float(chosen.baseline), digits=6)}", markup=False)
+    rows = [["range", "error", "nearer", "farther", "first order"]]
     for i, distance in enumerate(far):
         for name, error in found.items():
-            rows.append([f"{distance:g}", labels[name], *(_signed_meters(float(value[i])) for value in error)])
+            cells = (length_text(float(value[i]), sign=True) for value in error)
+            rows.append([range_text(distance), labels[name], *cells])
     print_table(rows, left=(1,))
     if chosen.covariance is not None:
-        out.print(f"\nWhat the rig file knows, and {noise:g} px of noise in each mark, in meters:")
+        out.print(f"\nWhat the rig file knows, and {noise:g} px of noise in each mark:")
         print_table(range_sigma_rows(range_sigmas(chosen, far, pixel_sigma=noise)))
     if picture is not None:
         from kcal.report.budget import plotted_ranges, save_budget_picture
@@ -100,9 +102,3 @@ def budget_command(
         sweep = plotted_ranges(far)
         save_budget_picture(picture, sweep, range_errors(chosen, sweep, errors), labels)
     print_wrote(picture)
-
-
-def _signed_meters(value: float) -> str:
-    if value == float("inf"):
-        return "∞"
-    return f"{value:+.3f}" if abs(value) < 1 else f"{value:+.2f}" if abs(value) < 100 else f"{value:+.1f}"

@@ -268,7 +268,7 @@ def calibrate_command(
         if place.picture is not None:
             from kcal.report.calibration import save_calibration_picture
 
-            save_calibration_picture(place.picture, result)
+            save_calibration_picture(place.picture, result, place.name)
         print_calibration(result, reject=reject, verbose=verbose or not options.hybrid)
         if result.shared_board is not None:
             others = ", ".join(places[i].name for i in result.shared_board.others)

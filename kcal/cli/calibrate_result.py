@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from kcal.cli.console import out, print_table, warn
+from kcal.quantities import measured_text, number_text
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
@@ -27,23 +28,26 @@ def print_calibration(result: CameraCalibrationResult, *, reject: bool, verbose:
     out.print(f"RMS [bold]{result.rms:.4f} px[/]{fitted}")
     brief = summarize(result)
     if brief.worst == brief.worst:
+        center, border, worst = (number_text(one, digits=2) for one in (brief.center, brief.border, brief.worst))
         out.print(
-            f"far directions: ± {brief.center:.3f} px in the middle of the image, {brief.border:.3f} px at its border, "
-            f"{brief.worst:.3f} px at worst; no board reached {100 * brief.unreached:.0f} % of it"
+            f"far directions: ± {center} px in the middle of the image, "
+            f"{border} px at its border, {worst} px at worst; no board reached {100 * brief.unreached:.0f} % of it"
         )
     if result.hybrid is not None:
         (cx, cy), (sx, sy) = result.camera.center.tolist(), (result.sigma[name] for name in ("cx", "cy"))
-        out.print(f"focal length {brief.focal}; principal point {cx:.2f} ± {sx:.2f}, {cy:.2f} ± {sy:.2f} px")
+        out.print(f"focal length {brief.focal}; principal point {measured_text(cx, sx)}, {measured_text(cy, sy, 'px')}")
     if brief.pupil is not None and brief.pupil_sigma is not None:
-        out.print(f"entrance pupil: {1e3 * brief.pupil:+z.2f} ± {1e3 * brief.pupil_sigma:.2f} mm at the image's corner")
+        pupil = measured_text(1e3 * brief.pupil, 1e3 * brief.pupil_sigma, "mm", sign=True)
+        out.print(f"entrance pupil: {pupil} at the image's corner")
     if (board := result.measured_board) is not None and bool(board.amplitudes.any()):
         (bend, bend_s), (wide, wide_s), (skew, skew_s), (rest, rest_s) = (
             board.bending, board.stretch, board.shear, board.print_error,
         )  # fmt: skip
         out.print(
-            f"board: bends by {1e3 * bend:.2f} ± {1e3 * bend_s:.2f} mm; "
-            f"stretch {100 * wide:+.3f} ± {100 * wide_s:.3f} %, shear {100 * skew:+.3f} ± {100 * skew_s:.3f} %, "
-            f"print {1e3 * rest:.3f} ± {1e3 * rest_s:.3f} mm"
+            f"board: bends by {measured_text(1e3 * bend, 1e3 * bend_s, 'mm')}; "
+            f"stretch {measured_text(100 * wide, 100 * wide_s, '%', sign=True)}, "
+            f"shear {measured_text(100 * skew, 100 * skew_s, '%', sign=True)}, "
+            f"print {measured_text(1e3 * rest, 1e3 * rest_s, 'mm')}"
         )
     if verbose:
         print_table([["parameter", "value", "± σ"], *_parameters(result)])
@@ -92,10 +96,9 @@ def _parameters(result: CameraCalibrationResult) -> list[list[str]]:
     rows = []
     values = dict(zip(result.camera.names, result.camera.params.tolist(), strict=True))
     for name, sigma in result.sigma.items():
-        digits = 3 if name in ("fx", "fy", "cx", "cy") else 6
         unknown = "fixed" if name in result.fixed else "not determined"
-        spread = unknown if sigma is None else f"{sigma:.{digits}f}"
+        spread = unknown if sigma is None else number_text(sigma, sigma)
         if name in result.led_by_prior:
             spread += " (by its prior)"
-        rows.append([name, f"{values[name]:.{digits}f}", spread])
+        rows.append([name, number_text(values[name], sigma, digits=6), spread])
     return rows

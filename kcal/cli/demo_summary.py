@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from kcal.cli.demo_steps import SIDES
 from kcal.corners.observations import Observations
 from kcal.io.rig_file import RigFile
+from kcal.quantities import length_text
 from kcal.report.judge_rig import rig_verdict
 from kcal.report.summary import Part, save_summary
 from kcal.report.verdict import Requirement
@@ -39,12 +40,14 @@ def save_site_summary(
     rig = file.rig()
     (answer,) = rig_verdict(rig, Requirement.parse(REQUIREMENT), mark_sigma=scene.mark_sigma).answers
     calibration = math.hypot(answer.parts["lenses"], answer.parts["relative pose"])
+    true = float(scene.rig.baseline)
     parts = [
         Part(
             heading="What came out",
             text=(
                 f"May this rig be used? {'Yes' if answer.ok else 'No'}: {answer.text}. Noise in the marks makes "
-                f"±{answer.parts['marks']:.0f} m of it, lenses and relative pose ±{calibration:.0f} m.",
+                f"±{length_text(answer.parts['marks'], digits=2)} of it, lenses and relative pose "
+                f"±{length_text(calibration, digits=2)}.",
                 f'{chance} "Across" is the error across the line of sight. The last column is the error that is left '
                 "when the marks have no noise: the share of the calibration.",
             ),
@@ -68,8 +71,8 @@ def save_site_summary(
             heading="2. The rig was solved",
             text=(
                 f"{len(scene.landmarks.names)} landmarks, surveyed to {100 * scene.survey_sigma:g} cm and marked in "
-                f"both images, tell where the cameras stand and look. Baseline: {float(rig.baseline):.3f} m (true "
-                f"{float(scene.rig.baseline):.3f} m).",
+                f"both images, tell where the cameras stand and look. Baseline: "
+                f"{length_text(float(rig.baseline), digits=5)} (true {length_text(true, digits=5)}).",
             ),
             pictures=((output / "rig.png", "Residuals by source"),),
         ),
@@ -113,7 +116,7 @@ def save_pairs_summary(output: Path, table: Sequence[Sequence[str]], command: st
         ),
         Part(
             heading="2. The rig was solved",
-            text=(f"From {pairs} pairs: baseline {float(file.rig().baseline):.4f} m.",),
+            text=(f"From {pairs} pairs: baseline {length_text(float(file.rig().baseline), digits=5)}.",),
         ),
         _yourself_part(command),
     ]

@@ -13,6 +13,8 @@ from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN
 from kcal.errors import InputError
 from kcal.files import check_picture, check_writable
 
+# Pixels (RMS) beyond which a lens model does not stand for a lens.
+_FAR = 0.5
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 
 
@@ -62,22 +64,30 @@ def export_command(
     chosen = subject if subject is not None else picked(found, name, source)
     with steps("fitting what the format holds", None):
         done = export_cameras(chosen, output, format=format, model=model)
-    for camera, model_name, misfit in zip(
-        found.names if subject is not None else [name or found.names[0]], done.models, done.misfits, strict=True
-    ):
+    names = found.names if subject is not None else (name or found.names[0],)
+    for camera, model_name, misfit in zip(names, done.models, done.misfits, strict=True):
         label = f"{camera or 'camera'}: {model_name}"
         if misfit is None:
             out.print(f"{label}, {'baked' if done.format == 'remap' else 'exact'}", markup=False)
         else:
             text = f"{label}, fitted: RMS {misfit.rms:.2g} px, at most {misfit.largest:.2g} px over the image"
             out.print(text, markup=False)
+            if misfit.rms > _FAR:
+                warn(
+                    f"{camera or 'camera'}: no lens model of {done.format} comes nearer; mrcal files (.cameramodel) "
+                    "hold this lens, and maps for cv2.remap (.npz) its undistorted image"
+                )
+    for note in done.notes:
+        warn(note)
     if done.lost:
         out.print(f"not in the file: {', '.join(done.lost)}")
-    misfits = [misfit for misfit in done.misfits if misfit is not None]
-    if picture is not None and misfits:
+    fitted = [(camera, misfit) for camera, misfit in zip(names, done.misfits, strict=True) if misfit is not None]
+    if picture is not None and fitted:
         from kcal.report.difference import save_difference_picture
 
-        print_wrote(save_difference_picture(picture, max(misfits, key=lambda each: each.largest), title=source))
+        camera, misfit = max(fitted, key=lambda each: each[1].largest)
+        title = f"{source}: {camera}" if len(names) > 1 else source
+        print_wrote(save_difference_picture(picture, misfit, title=title))
     elif picture is not None:
         out.print("no picture: nothing was refitted")
     print_wrote(*done.paths)

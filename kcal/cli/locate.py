@@ -10,7 +10,7 @@ import typer
 
 from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
 from kcal.cli.inputs import MARKS, RIG, SURVEY
-from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_and_source
 from kcal.cli.settings import taken
 from kcal.errors import DegenerateError, InputError
 from kcal.files import check_picture, check_writable
@@ -206,7 +206,7 @@ def locate_command(
     # Parsed before the rig is read, so that a wrong option is reported first.
     place = None if origin is None else Origin.parse(origin)
     solved = load_rig(rig)
-    noise = pixel_sigma_of(pixel_sigma, solved)
+    noise, note = pixel_sigma_and_source(pixel_sigma, solved)
     if solved.mounting is not None and {"origin", "heading"} <= taken:
         # What the rig was solved with is better known.
         place = heading = None
@@ -230,6 +230,8 @@ def locate_command(
         pixel_sigma=noise, calibration=errors.calibration, mounting=errors.mounting, link=errors.link,
         refraction=refraction, refraction_sigma=refraction_sigma,
     )  # fmt: skip
+    if note:
+        err.print(note)
     survey = None if truth is None else read_survey(truth, locate.localize.origin, measured=False)
     sample = PositionSample(frozenset(survey.names if survey else ()))
     written: list[Path] = []

@@ -25,7 +25,15 @@ PixelSigma: TypeAlias = Annotated[
 
 
 def pixel_sigma_of(given: float | None, rig: StereoRig | None = None) -> float:
-    """The noise of marks, px: as given, or as the rig's file states, or assumed; the last two are said.
+    """The noise of marks, px: as given, or as the rig's file states, or assumed; the last two are said."""
+    sigma, note = pixel_sigma_and_source(given, rig)
+    if note:
+        err.print(note)
+    return sigma
+
+
+def pixel_sigma_and_source(given: float | None, rig: StereoRig | None = None) -> tuple[float, str]:
+    """The same, and what there is to say of it.
 
     Raises:
         InputError: not a positive number.
@@ -33,10 +41,8 @@ def pixel_sigma_of(given: float | None, rig: StereoRig | None = None) -> float:
     if given is not None:
         if not 0 < given < 100:
             raise InputError(f"--pixel-sigma {given}: a positive number of pixels is needed")
-        return given
+        return given, ""
     record = None if rig is None else rig.calibration
     if record is not None and record.pixel_sigma is not None:
-        err.print(f"noise of marks: {record.pixel_sigma:g} px, from the rig's file")
-        return record.pixel_sigma
-    err.print(f"noise of marks: {ASSUMED:g} px, assumed; --pixel-sigma states it")
-    return ASSUMED
+        return record.pixel_sigma, f"noise of marks: {record.pixel_sigma:g} px, from the rig's file"
+    return ASSUMED, f"noise of marks: {ASSUMED:g} px, assumed; --pixel-sigma states it"

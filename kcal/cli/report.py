@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
 from kcal.cli.camera_sources import single_camera
-from kcal.cli.console import out, print_wrote, steps, tell, warn
+from kcal.cli.console import out, print_wrote, steps, tell
 from kcal.cli.inputs import CAMERA_OR_RIG, OBSERVATIONS
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.sides import check_views_of
@@ -18,9 +18,12 @@ from kcal.files import check_writable, read_bytes
 from kcal.strict_json import MOST_BYTES, read_json
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from kcal.calibrate.camera.options import CalibrationOptions
     from kcal.calibrate.camera.result import CameraCalibrationResult
     from kcal.lens.camera import Camera
+    from kcal.lens.rig import StereoRig
     from kcal.report.verdict import Requirement, Verdict
 
 # A verdict, how the pictures of its page are drawn, and its tables.
@@ -54,7 +57,7 @@ def report_command(
     Error bars are right if lens model and board are. With the observations kcal looks for what they do not know:
     cameras from two halves of the views that differ by more than their σ; residuals that are not noise; a bent board;
     an entrance pupil that moves; blur; views without tilt; mirrored boards; pairs that were not taken at the same
-    moment.
+    moment. A rig inherits what is found about its cameras. What could not be checked is listed as a doubt.
 
     The exit code is 3 if the answer is no, 0 if it is yes, 1 if an input cannot be used.
 
@@ -74,7 +77,7 @@ def report_command(
         else _of_camera(subject, given, needs, baseline, pixel_sigma_of(pixel_sigma))
     )
     tell(verdict=found[0].to_dict())
-    if not told_usable(*found, output):
+    if not told_usable(*found, output, warned=()):
         raise typer.Exit(NO)
 
 
@@ -97,20 +100,33 @@ def _is_rig(path: Path) -> bool:
 
 
 def told_usable(
-    verdict: Verdict, pictures: Callable[[], dict[str, bytes]], tables: list[list[list[str]]], page: Path | None
+    verdict: Verdict,
+    pictures: Callable[[], dict[str, bytes]],
+    tables: list[list[list[str]]],
+    page: Path | None,
+    *,
+    warned: tuple[str, ...] = ("calibration", "rig"),
 ) -> bool:
-    """Print a verdict and write its page; returns whether it is a yes."""
+    """Print a verdict and write its page; returns whether it is a yes.
+
+    Args:
+        verdict: what it says.
+        pictures: draws those of the page.
+        tables: of the page.
+        page: to write.
+        warned: names of findings of which the command has warned already.
+    """
     from kcal.report.verdict_page import range_rows, save_verdict_page
 
-    print_verdict(verdict)
+    print_verdict(verdict, warned)
     if page is not None:
         ranges = [range_rows(verdict)] if verdict.answers else []
         print_wrote(save_verdict_page(page, verdict, pictures(), [*ranges, *tables]))
     return verdict.usable
 
 
-def print_verdict(verdict: Verdict) -> None:
-    """Print answers, reason, next step and findings."""
+def print_verdict(verdict: Verdict, warned: tuple[str, ...] = ()) -> None:
+    """Print answers, reason, next step and findings but those that were told already."""
     # A single answer is the reason, and said once.
     single = [answer.text for answer in verdict.answers] == [verdict.reason]
     for answer in () if single else verdict.answers:
@@ -120,7 +136,7 @@ def print_verdict(verdict: Verdict) -> None:
     if not verdict.usable:
         out.print(f"next: {verdict.next_step}", markup=False)
     for finding in verdict.findings:
-        if finding.severity == "fine" or finding.name in ("calibration", "rig"):
+        if finding.severity == "fine" or finding.name in warned:
             continue
         out.print(f"  {finding.name}: {finding.text}{f'; {finding.action}' if finding.action else ''}", markup=False)
 
@@ -138,8 +154,7 @@ def _of_camera(
         return found, dict, camera_tables(camera)
     if len(observations) > 1:
         raise InputError("a camera has one observations file; give --observations once")
-    result, options = _again(camera, observations[0])
-    return judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=name)
+    return _judged_again(camera, observations[0], needs, baseline=baseline, mark_sigma=mark_sigma, name=name)
 
 
 def judged(
@@ -147,62 +162,98 @@ def judged(
     options: CalibrationOptions,
     needs: tuple[Requirement, ...],
     *,
-    baseline: float,
+    baseline: float = 10.0,
     mark_sigma: float,
     name: str,
+    stored: Camera | None = None,
 ) -> Judged:
-    """The verdict on a calibration, with the pictures and tables of its page."""
+    """The verdict on a calibration, with the pictures and tables of its page; `stored` as in `camera_verdict`."""
     from kcal.calibrate.camera.trust import examine
     from kcal.report.judge_camera import camera_verdict
     from kcal.report.verdict_page import camera_tables
     from kcal.report.verdict_pictures import camera_pictures
 
-    with steps("checking", None) as advance:
+    with steps(f"checking {name}", None) as advance:
         examination = examine(result, options, advance)
     verdict = camera_verdict(
-        result, options, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name, examination=examination
-    )
-    return verdict, lambda: camera_pictures(result, examination), camera_tables(result.camera, result)
+        result, options, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name, examination=examination,
+        stored=stored,
+    )  # fmt: skip
+    return verdict, lambda: camera_pictures(result, examination), camera_tables(result.camera, result, name)
 
 
-def _again(camera: Camera, observations: Path) -> tuple[CameraCalibrationResult, CalibrationOptions]:
-    """The calibration that the camera file is from, made again: files have no residuals and no poses."""
+def _judged_again(
+    camera: Camera, observations: Path, needs: tuple[Requirement, ...], *, baseline: float = 10.0, mark_sigma: float,
+    name: str,
+) -> Judged:  # fmt: skip
+    """The verdict on a camera of a file, calibrated again from its views: files have no residuals and no poses."""
     from kcal.calibrate.camera.calibrate import calibrate_camera
     from kcal.calibrate.camera.trust import stored_options
     from kcal.corners.observations import Observations
-    from kcal.lens.difference import camera_difference
 
-    options = stored_options(camera)
-    seen = Observations.load(observations)
+    seen, options = Observations.load(observations), stored_options(camera)
     check_views_of([camera], [seen], [observations])
-    with steps("calibrating", None) as advance:
+    with steps(f"calibrating {name}", None) as advance:
         result = calibrate_camera(seen, options, advance)
-    found = camera_difference(camera, result.camera)
-    if found.ratio is None or found.ratio > 0.5:
-        warn(
-            f"{observations}: these views give a camera that differs by {found.rms:.2g} px (RMS) from the one in the "
-            "file, which was calibrated from others or with other options; the verdict is on what these views give"
-        )
-    return result, options
+    return judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=name, stored=camera)
 
 
 def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], pixel_sigma: float | None) -> Judged:
     from kcal.io.rig_file import load_rig
-    from kcal.report.judge_rig import rig_verdict
-    from kcal.report.verdict_page import camera_tables
 
     rig = load_rig(path)
     mark_sigma = pixel_sigma_of(pixel_sigma, rig)
     if observations and len(observations) != 2:
         raise InputError("a rig needs --observations twice: left, then right")
-    pairs = None
-    if observations:
-        from kcal.calibrate.rig.pairs import pair_by_name, paired_boards
-        from kcal.corners.observations import Observations
+    return judged_rig(rig, observations, needs, mark_sigma=mark_sigma, name=path.name.split(".")[0])
 
-        left, right = (Observations.load(file) for file in observations)
-        check_views_of((rig.left, rig.right), (left, right), observations)
+
+def judged_rig(
+    rig: StereoRig, observations: Sequence[Path], needs: tuple[Requirement, ...], *, mark_sigma: float, name: str
+) -> Judged:
+    """The verdict on a rig and, with the observations of its left and right camera, on these as well."""
+    from kcal.report.judge_rig import rig_verdict
+
+    cameras = judged_sides(rig, observations, mark_sigma)
+    pairs, unpaired = _pairs(rig, observations) if observations else (None, "")
+    verdict = rig_verdict(
+        rig, needs, mark_sigma=mark_sigma, pairs=pairs, unpaired=unpaired, cameras=[found[0] for found in cameras],
+        subject=name,
+    )  # fmt: skip
+    tables = [table for found in cameras for table in found[2]]
+    return verdict, lambda: side_pictures(cameras), tables or stored_tables(rig)
+
+
+def judged_sides(rig: StereoRig, observations: Sequence[Path], mark_sigma: float) -> list[Judged]:
+    """The verdicts on both cameras of a rig, calibrated again from their observations; none without these."""
+    sides = (("left", rig.left), ("right", rig.right))
+    return [
+        _judged_again(camera, file, (), mark_sigma=mark_sigma, name=side)
+        for (side, camera), file in zip(sides, observations, strict=False)
+    ]
+
+
+def stored_tables(rig: StereoRig) -> list[list[list[str]]]:
+    """Tables of both cameras, as the rig's file has them."""
+    from kcal.report.verdict_page import camera_tables
+
+    return [*camera_tables(rig.left, name="left"), *camera_tables(rig.right, name="right")]
+
+
+def side_pictures(cameras: Sequence[Judged]) -> dict[str, bytes]:
+    """The pictures of several cameras, named as findings of a rig name them."""
+    return {f"{verdict.subject}-{name}": data for verdict, pictures, _ in cameras for name, data in pictures().items()}
+
+
+def _pairs(rig: StereoRig, observations: Sequence[Path]) -> tuple[tuple[Tensor, Tensor] | None, str]:
+    """Corners of the board and pixels of pairs of views, or why there are none."""
+    from kcal.calibrate.rig.pairs import pair_by_name, paired_boards
+    from kcal.corners.observations import Observations
+
+    left, right = (Observations.load(file) for file in observations)
+    check_views_of((rig.left, rig.right), (left, right), observations)
+    try:
         boards = paired_boards((rig.left, rig.right), (left, right), pair_by_name(left.names, right.names))
-        pairs = boards.points, boards.pixels
-    verdict = rig_verdict(rig, needs, mark_sigma=mark_sigma, pairs=pairs, subject=path.name.split(".")[0])
-    return verdict, dict, [*camera_tables(rig.left), *camera_tables(rig.right)]
+    except InputError as error:
+        return None, str(error)
+    return (boards.points, boards.pixels), ""

@@ -166,9 +166,9 @@ def solve_command(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
         refraction_sigma=refraction_sigma,
     )  # fmt: skip
-    cameras = load_camera(left), load_camera(right)
-    check_sides(cameras, (left, right))
-    data, frame, unpaired = read_sources(cameras, sources)
+    calibrated = load_camera(left), load_camera(right)
+    check_sides(calibrated, (left, right))
+    data, frame, unpaired = read_sources(calibrated, sources)
     with steps("solving the rig", 1) as advance:
         result = solve_rig(data, options)
         advance("done")
@@ -192,30 +192,53 @@ def solve_command(
         save_rig_picture(picture, result)
     print_rig(result, lines)
     try:
-        print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise)))
+        print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
     except InputError as error:
         warn(f"range errors are not split: {error}")
     print_wrote(output, picture)
     if needs or report is not None:
+        from kcal.cli.report import judged_sides, side_pictures, stored_tables
         from kcal.report.judge_rig import rig_verdict
         from kcal.report.rig import rig_figure
-        from kcal.report.verdict_page import camera_tables
         from kcal.report.verdict_pictures import png_bytes
 
-        verdict = rig_verdict(rig, needs, mark_sigma=noise, result=result, subject=output.name.split(".")[0])
-        tables = [*camera_tables(rig.left), *camera_tables(rig.right)]
+        cameras = judged_sides(rig, pairs, noise) if pairs is not None and _calibrated_from(rig, pairs) else []
+        verdict = rig_verdict(
+            rig, needs, mark_sigma=noise, result=result, cameras=[found[0] for found in cameras],
+            subject=output.name.split(".")[0],
+        )  # fmt: skip
+        tables = stored_tables(rig)
         tell(verdict=verdict.to_dict())
-        if not told_usable(verdict, lambda: {"rig": png_bytes(rig_figure(result))}, tables, report):
+
+        def drawn() -> dict[str, bytes]:
+            return {"rig": png_bytes(rig_figure(result)), **side_pictures(cameras)}
+
+        if not told_usable(verdict, drawn, tables, report):
             raise typer.Exit(NO)
+
+
+def _calibrated_from(rig: StereoRig, pairs: tuple[Path, Path]) -> bool:
+    """Whether these are the views from which both cameras were calibrated, as far as their names tell."""
+    from kcal.corners.observations import Observations
+
+    records = [camera.calibration.record if camera.calibration else None for camera in (rig.left, rig.right)]
+    return all(
+        record is not None and set(record.per_view_rms) <= set(Observations.load(file).names)
+        for record, file in zip(records, pairs, strict=True)
+    )
 
 
 def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
     """What a result says: residuals by source, the relative pose with its sigmas, the board's squares, the mounting."""
     from kcal.locate.check import triangulated_sides
+    from kcal.quantities import length_text, measured_length, measured_text, number_text
 
-    rows = [["source", "used", "left out", "RMS px", "RMS m", "sigmas"]]
+    rows = [["source", "used", "left out", "RMS px", "RMS", "sigmas"]]
     for source in result.sources:
-        cells = ["" if value is None else f"{value:.4f}" for value in (source.rms_px, source.rms_m)]
+        cells = [
+            "" if source.rms_px is None else f"{source.rms_px:.4f}",
+            "" if source.rms_m is None else length_text(source.rms_m),
+        ]
         sigmas = "" if math.isnan(source.sigmas) else f"{source.sigmas:.2f}"
         rows.append([source.source, f"{source.used}", f"{source.left_out}", *cells, sigmas])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -224,7 +247,7 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
     lines += [
         f"RMS [bold]{result.rms:.4f} px[/] (left {result.rms_px[0]:.4f}, right {result.rms_px[1]:.4f}); "
         f"{result.status.message}",
-        f"baseline [bold]{float(rig.baseline):.6f} m[/] ± {result.sigma_baseline:.6f}",
+        f"baseline [bold]{measured_length(float(rig.baseline), result.sigma_baseline)}[/]",
     ]
     if result.exact:
         lines.append(f"taken as exact, so that errors of these lenses are in no σ: {' and '.join(result.exact)}")
@@ -236,21 +259,23 @@ def rig_lines(result: RigResult, rig: StereoRig, unpaired: int) -> list[str]:
             true = float((board.points[1] - board.points[0]).norm())
             what = {"checkerboard": "squares", "aprilgrid": "tags"}.get(board.pattern, "distances of circles")
             lines.append(
-                f"triangulated {what}: {1e3 * side:.4f} mm ± {1e3 * spread:.4f} mm, the board's are {1e3 * true:.4f} mm"
+                f"triangulated {what}: {measured_length(side, spread)}, the board's are {length_text(true, digits=4)}"
             )
     if result.board_warp is not None:
         x, y = (1e3 * result.board_warp).tolist()
         lines.append(f"board warp: {x:+.3f} mm along its rows, {y:+.3f} mm along its columns")
     if mounting is not None and mounting.covariance is not None:
         sigma = mounting.covariance.diagonal().sqrt().tolist()
-        place = mounting.origin
+        place, level = mounting.origin, math.degrees(max(sigma[3:5]))
+        heading = measured_text(mounting.heading_deg, math.degrees(sigma[5]))
+        pitch, roll = number_text(mounting.pitch_deg, level), number_text(mounting.roll_deg, level)
         lines.append(
-            f"left camera at {place.lat:.7f}, {place.lon:.7f}, {place.height:.3f} m above the ellipsoid "
-            f"(± {max(sigma[:2]):.3f} m level, {sigma[2]:.3f} m up), heading {mounting.heading_deg:.4f}° ± "
-            f"{math.degrees(sigma[5]):.4f}, pitch {mounting.pitch_deg:.4f}°, roll {mounting.roll_deg:.4f}°"
+            f"left camera at {place.lat:.7f}, {place.lon:.7f}, {number_text(place.height, sigma[2])} m above the "
+            f"ellipsoid (± {length_text(max(sigma[:2]), digits=2)} level, {length_text(sigma[2], digits=2)} up), "
+            f"heading {heading}°, pitch {pitch}°, roll {roll}°"
         )
         if mounting.refraction is not None and result.data.landmarks is not None:
-            lines.append(f"refraction of light {mounting.refraction:.2f} ± {sigma[6]:.2f} of the Earth's curvature")
+            lines.append(f"refraction of light {measured_text(mounting.refraction, sigma[6])} of the Earth's curvature")
     return lines
 
 

@@ -19,6 +19,7 @@ from kcal.errors import FileError
 from kcal.file_kind import file_kind
 from kcal.files import read_bytes
 from kcal.native_file import digest
+from kcal.quantities import number_text
 from kcal.strict_json import MOST_BYTES, read_json
 
 if TYPE_CHECKING:
@@ -105,8 +106,9 @@ def _stored_facts(content: dict[str, Any]) -> tuple[list[_CameraFacts], _PoseFac
         if content["kcal"] == "camera":
             camera = _stored_camera(content)
             return None if camera is None else ([camera], None)
-        cameras = [_stored_camera(content[side]) for side in ("left", "right")]
         brief = content["summary"]
+        # The rig knows more of its cameras than each of them knew before it was solved.
+        cameras = [_stored_camera(content[side] | {"summary": brief[side]}) for side in ("left", "right")]
         rest = {key: value for key, value in content.items() if key not in ("left", "right")}
         if brief is None or brief["of"] != digest(rest) or None in cameras:
             return None
@@ -126,10 +128,8 @@ def _stored_facts(content: dict[str, Any]) -> tuple[list[_CameraFacts], _PoseFac
 
 
 def _stored_camera(content: dict[str, Any]) -> _CameraFacts | None:
-    brief, known = content["summary"], content["standard_deviations"]
+    brief = content["summary"]
     if brief is None or brief["of"] != digest(content):
-        return None
-    if known is None and (content["covariance"] or content["information"]):
         return None
     record = content["calibration"]
     return _CameraFacts(
@@ -140,7 +140,7 @@ def _stored_camera(content: dict[str, Any]) -> _CameraFacts | None:
         hybrid=content["model"].get("hybrid") is not None,
         focal_length=brief["focal_length"],
         values={name: content["intrinsics"][name] for name in _INTRINSICS} | content["coefficients"],
-        sigma=known or {},
+        sigma=brief["sigma"],
         sigma_px=brief["sigma_px"],
         record=record and record | {"board": brief["board"]},
     )
@@ -151,23 +151,19 @@ def _computed(file: Path, kind: str) -> tuple[list[_CameraFacts], _PoseFacts | N
         from kcal.io.camera_file import load_camera
 
         return [_facts_of(load_camera(file))], None
+    from kcal.io.file_summary import take_joint_errors
     from kcal.io.rig_file import load_rig
 
     rig = load_rig(file)
+    take_joint_errors(rig)
     return [_facts_of(rig.left), _facts_of(rig.right)], _pose_of(rig)
 
 
 def _facts_of(camera: Camera) -> _CameraFacts:
-    from kcal.io.file_summary import sigma_over_image
+    from kcal.io.file_summary import sigma_of, sigma_over_image
     from kcal.lens.paraxial import paraxial_focal
 
     known = camera.calibration
-    sigma: Mapping[str, float | None] = {}
-    if known is not None and known.sigma is not None:
-        sigma = known.sigma
-    elif known is not None and known.covariance is not None:
-        variances = known.covariance.diagonal().tolist()
-        sigma = {name: v**0.5 if v > 0 else None for name, v in zip(camera.names, variances, strict=True)}
     return _CameraFacts(
         name=known.name if known else "",
         size=camera.size,
@@ -176,7 +172,7 @@ def _facts_of(camera: Camera) -> _CameraFacts:
         hybrid=camera.model.hybrid is not None,
         focal_length=str(paraxial_focal(camera)),
         values=dict(zip(camera.names, camera.params.detach().tolist(), strict=True)),
-        sigma=sigma,
+        sigma=sigma_of(camera),
         sigma_px=sigma_over_image(camera),
         record=_fields(known.record) if known else None,
     )
@@ -228,14 +224,14 @@ def _show_camera(camera: _CameraFacts) -> None:
     rows = [["parameter", "value", "sigma"]]
     for name, value in list(camera.values.items())[:_SHOWN]:
         error = camera.sigma.get(name)
-        rows.append([name, f"{value:.8g}", "" if error is None else f"{error:.2g}"])
+        rows.append([name, number_text(value, error, digits=8), "" if error is None else number_text(error, error)])
     print_table(rows)
     if len(camera.values) > _SHOWN:
         out.print(f"and {len(camera.values) - _SHOWN} more weights of the field")
     if camera.sigma_px is not None:
         median, largest = camera.sigma_px
         out.print(f"sigma in the image: {median:.3g} px (median), {largest:.3g} px (largest)")
-    else:
+    elif not any(camera.sigma.values()):
         out.print("no error bars")
 
 

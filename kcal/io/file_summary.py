@@ -6,12 +6,15 @@ digest tells, and `kcal show` computes anew. kcal itself reads nothing else from
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Self
 
 from kcal.errors import KcalError
 from kcal.io.record import Record
+from kcal.lens.calibration import CameraCalibration
 from kcal.native_file import digest
 
 if TYPE_CHECKING:
@@ -28,6 +31,7 @@ class CameraSummary(Record):
         board: the board that it was calibrated with, in words.
         focal_length: on the optical axis, with its σ.
         covers_image: whether every pixel has a ray.
+        sigma: of each parameter by name; None where it was held, or nothing is known.
         sigma_px: median and largest σ of where the camera sees far things, over the image; None without error bars.
     """
 
@@ -36,6 +40,7 @@ class CameraSummary(Record):
     board: str | None
     focal_length: str
     covers_image: bool
+    sigma: dict[str, float | None]
     sigma_px: tuple[float, float] | None
 
     @classmethod
@@ -51,10 +56,35 @@ class CameraSummary(Record):
                 board=None if record is None else str(record.board),
                 focal_length=str(paraxial_focal(camera)),
                 covers_image=bool(camera.covers_image()),
+                sigma=sigma_of(camera),
                 sigma_px=sigma_over_image(camera),
             )
         except (KcalError, ValueError):
             return None
+
+
+def sigma_of(camera: Camera) -> dict[str, float | None]:
+    """σ of each parameter by name; None where it was held, or nothing is known of it."""
+    known = camera.calibration
+    if known is not None and known.sigma is not None:
+        return {name: known.sigma.get(name) for name in camera.names}
+    if known is None or known.covariance is None:
+        return dict.fromkeys(camera.names)
+    variances = known.covariance.diagonal().tolist()
+    return {name: _rounded(v**0.5) if v > 0 else None for name, v in zip(camera.names, variances, strict=True)}
+
+
+def take_joint_errors(rig: StereoRig) -> None:
+    """Give the cameras the error bars that the rig has of them: those of each alone are of before it was solved."""
+    if rig.covariance is None:
+        return
+    first = 0
+    for camera in (rig.left, rig.right):
+        size = camera.params.shape[-1]
+        half = rig.covariance.half[:, first : first + size]
+        known = camera.calibration or CameraCalibration()
+        camera.calibration = dataclasses.replace(known, sigma=None, information=None, covariance=half.T @ half)
+        first += size
 
 
 def sigma_over_image(camera: Camera) -> tuple[float, float] | None:
@@ -78,6 +108,8 @@ class RigSummary(Record):
 
     Args:
         of: digest of the rest of the file, without its cameras.
+        left: of the first camera, with the error bars that the rig has of it.
+        right: likewise of the second one.
         baseline_m: distance between the cameras.
         rotation_vector_deg: of the right camera.
         sigma_m: of the translation along x, y, z; None without error bars.
@@ -85,6 +117,8 @@ class RigSummary(Record):
     """
 
     of: str
+    left: CameraSummary | None
+    right: CameraSummary | None
     baseline_m: float
     rotation_vector_deg: tuple[float, float, float]
     sigma_m: tuple[float, float, float] | None
@@ -99,7 +133,15 @@ class RigSummary(Record):
         errors = None
         if rig.covariance is not None:
             errors = rig.covariance.matrix.diagonal()[-6:].clamp_min(0.0).sqrt().tolist()
+        both = copy.deepcopy(rig)
+        take_joint_errors(both)
+        left, right = (
+            CameraSummary.made(camera, content.get(side, {}))
+            for side, camera in (("left", both.left), ("right", both.right))
+        )
         return cls(
+            left=left,
+            right=right,
             of=digest({key: value for key, value in content.items() if key not in ("left", "right")}),
             baseline_m=_rounded(rig.baseline),
             rotation_vector_deg=_triple(turn),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -65,18 +65,54 @@ def read_kalibr(path: Path, hints: Hints) -> ImportedCameras:
     )
 
 
+class KalibrLens(NamedTuple):
+    """A lens as Kalibr writes it."""
+
+    camera_model: str
+    intrinsics: Sequence[float]
+    distortion_model: str
+    distortion_coeffs: Sequence[float]
+    resolution: tuple[int, int]
+
+
 def write_kalibr(cameras: Sequence[Camera], poses: Sequence[CameraPose], path: Path) -> list[Path]:
     """Write a chain of cameras."""
     names = {model: name for name, model in _LENSES.items()}
+    lenses = [
+        KalibrLens(
+            "pinhole",
+            camera.params[:4].tolist(),
+            "radtan" if not camera.model.size else names[str(camera.model)],
+            camera.coefficients.tolist() or [0.0] * 4,
+            camera.size,
+        )
+        for camera in cameras
+    ]
+    return write_chain(lenses, poses, path)
+
+
+def write_omni(
+    cameras: Sequence[Camera], values: Sequence[Sequence[float]], poses: Sequence[CameraPose], path: Path
+) -> list[Path]:
+    """Write a chain of cameras as omni-radtan, with the nine numbers of `kcal.io.kalibr_omni.fit_omni` for each."""
+    lenses = [
+        KalibrLens("omni", list(own[:5]), "radtan", list(own[5:]), camera.size)
+        for camera, own in zip(cameras, values, strict=True)
+    ]
+    return write_chain(lenses, poses, path)
+
+
+def write_chain(lenses: Sequence[KalibrLens], poses: Sequence[CameraPose], path: Path) -> list[Path]:
+    """Write lenses, and the pose of each from the one before, as a camchain."""
     content: dict[str, Any] = {}
-    for i, camera in enumerate(cameras):
+    for i, lens in enumerate(lenses):
         part: dict[str, Any] = {
-            "cam_overlaps": [k for k in range(len(cameras)) if k != i],
-            "camera_model": "pinhole",
-            "distortion_coeffs": camera.coefficients.tolist() or [0.0] * 4,
-            "distortion_model": "radtan" if not camera.model.size else names[str(camera.model)],
-            "intrinsics": camera.params[:4].tolist(),
-            "resolution": list(camera.size),
+            "cam_overlaps": [k for k in range(len(lenses)) if k != i],
+            "camera_model": lens.camera_model,
+            "distortion_coeffs": list(lens.distortion_coeffs),
+            "distortion_model": lens.distortion_model,
+            "intrinsics": list(lens.intrinsics),
+            "resolution": list(lens.resolution),
             "rostopic": f"/cam{i}/image_raw",
         }
         if i and poses:

@@ -99,6 +99,7 @@ class CalibrationRecord:
         tempering: by how much the corners count less because residuals repeat within views; None if not estimated.
         observations: name of the observations file, if there was one.
         temperature: of the camera when the views were taken, °C; None if nobody said.
+        warnings: what should be doubted of it, a sentence each.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
         created: when, with its time zone.
     """
@@ -117,6 +118,7 @@ class CalibrationRecord:
     tempering: float | None = None
     board_deviation: tuple[tuple[float, float, float], ...] | None = None
     temperature: float | None = None
+    warnings: tuple[str, ...] = ()
     kcal_version: str
     created: datetime.datetime
 

@@ -20,6 +20,7 @@ from torch import Tensor
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.projection import project_components
+from kcal.quantities import measured_text
 
 # Standard deviations beyond which both focal lengths are told apart, and relative rounding.
 _UNEQUAL, _ROUNDING = 3.0, 1e-9
@@ -35,7 +36,7 @@ class ParaxialFocal(NamedTuple):
 
     Example:
         >>> str(ParaxialFocal(torch.tensor([800.0, 800.0]), torch.ones(2), torch.ones(2, 2)))
-        '800.000 ± 1.000 px'
+        '800.0 ± 1.0 px'
     """
 
     value: Tensor
@@ -59,7 +60,7 @@ class ParaxialFocal(NamedTuple):
         """In words: one focal length where both are equal as far as is known."""
 
         def shown(value: float, sigma: float) -> str:
-            return f"{value:.3f}" + (f" ± {sigma:.3f}" if sigma == sigma else "")
+            return measured_text(value, sigma) if sigma == sigma else f"{value:.3f}"
 
         (aspect, error), (u, v), (s, t) = self.aspect, self.value.tolist(), self.sigma.tolist()
         if abs(aspect - 1.0) > _UNEQUAL * (error if error == error else 0.0) + _ROUNDING:

@@ -52,8 +52,3 @@ def range_interval(inverse_range: Tensor, sigma: Tensor, known: Tensor | None = 
         reach = torch.where(ahead, 1.0 / torch.where(ahead, inverse, 1.0), math.inf)
         ends.append(reach if known is None else torch.where(known, reach, unknown))
     return RangeInterval(*ends)
-
-
-def range_text(meters: float) -> str:
-    """Write a range with its unit: 250 m, 5 km."""
-    return f"{meters / 1000:g} km" if meters >= 1000 else f"{meters:g} m"

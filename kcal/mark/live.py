@@ -18,8 +18,8 @@ from kcal.locate.marks import Marks
 from kcal.locate.mounting import placed_rig
 from kcal.locate.positions import Located, locate_points
 from kcal.locate.range_sigmas import range_sigmas
-from kcal.locate.ranges import range_text
 from kcal.locate.survey import Survey, match_landmarks
+from kcal.quantities import range_text
 
 LEAST_LANDMARKS = 4
 _LEAST_SIGMA = 0.05  # px: a survey's and a lens's errors are not smaller, whatever marks say of themselves

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from kcal.calibrate.hybrid.measured_board import Measured, MeasuredBoard
+from kcal.quantities import measured_text
 from kcal.report.colors import GRAY, INK
 from kcal.report.figures import draw_arrows, new_figure, save_picture
 
@@ -21,14 +22,14 @@ _LEAST = 0.01
 def board_text(board: MeasuredBoard) -> list[str]:
     """Bending, stretch, shear and print error with their standard deviations, one line each."""
 
-    def text(found: Measured, scale: float, unit: str, digits: int) -> str:
-        return f"{scale * found.value:.{digits}f} ± {scale * found.sigma:.{digits}f} {unit}"
+    def text(found: Measured, scale: float, unit: str) -> str:
+        return measured_text(scale * found.value, scale * found.sigma, unit)
 
     return [
-        f"bending {text(board.bending, 1e3, 'mm', 3)} (height over the best plane, at most)",
-        f"stretch {text(board.stretch, 100.0, '%', 3)} (width over height)",
-        f"shear {text(board.shear, 100.0, '%', 3)}",
-        f"print error {text(board.print_error, 1e3, 'mm', 3)} RMS, beyond stretch and shear",
+        f"bending {text(board.bending, 1e3, 'mm')} (height over the best plane, at most)",
+        f"stretch {text(board.stretch, 100.0, '%')} (width over height)",
+        f"shear {text(board.shear, 100.0, '%')}",
+        f"print error {text(board.print_error, 1e3, 'mm')} RMS, beyond stretch and shear",
     ]
 
 

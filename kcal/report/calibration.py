@@ -15,17 +15,18 @@ from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.corners.observations import Observations
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.colors import ACCENT, FAINT, INK, WARN
-from kcal.report.figures import HALO, draw_arrows, frame_image, new_figure, save_picture
+from kcal.report.figures import HALO, draw_arrows, frame_image, new_figure, save_picture, shortened
 
 # Of the width of axes: their color bar and the gap before it.
 COLORBAR_SHARE = 0.055
 
 
-def calibration_figure(result: CameraCalibrationResult) -> Figure:
+def calibration_figure(result: CameraCalibrationResult, name: str = "") -> Figure:
     """Draw a calibration: coverage with magnified residuals, uncertainty over the image, residuals, RMS of each view.
 
     Args:
         result: from `calibrate_camera`.
+        name: of the camera, for the title.
 
     Returns:
         A matplotlib figure that belongs to no window and no global state; its four axes may be changed.
@@ -73,15 +74,16 @@ def calibration_figure(result: CameraCalibrationResult) -> Figure:
         drawn.set_title(drawn.get_title(loc="left") or drawn.get_title(), fontsize=12, loc="left")
         drawn.set_title("", loc="center")
     model = "" if result.hybrid is not None else f", model {result.camera.model}"
-    text = f"{len(observations.views)} views{model}: RMS {result.rms:.3f} px"
+    whose = f"{shortened(name, 60)}: " if name else ""
+    text = f"{whose}{len(observations.views)} views{model}, RMS {result.rms:.3f} px"
     place = 0.3 / size[0], 1.0 - 0.2 / size[1]
     figure.text(*place, text, ha="left", va="top", fontsize=17, fontweight="bold", color=INK)
     return figure
 
 
-def save_calibration_picture(path: str | Path, result: CameraCalibrationResult) -> Path:
+def save_calibration_picture(path: str | Path, result: CameraCalibrationResult, name: str = "") -> Path:
     """Write the picture of `calibration_figure` as PNG or SVG, atomically."""
-    return save_picture(path, calibration_figure(result))
+    return save_picture(path, calibration_figure(result, name))
 
 
 def draw_coverage(axes: Axes, observations: Observations, result: CameraCalibrationResult) -> None:
@@ -113,7 +115,7 @@ def draw_uncertainty(axes: Axes, observations: Observations, result: CameraCalib
     axes.add_patch(Rectangle((-0.5, -0.5), width, height, fill=False, edgecolor=INK, linewidth=1.2))
     known = result.camera.calibration
     if known is None or known.known(result.camera.params) is None:
-        axes.set_title("No error bars", fontsize=10, loc="left")
+        axes.set_title("No covariance: σ in the image is not known", fontsize=10, loc="left")
         return
     columns, rows = 65, max(2, round(65 * height / width))
     sigma = image_sigma(result.camera, columns, rows).numpy()

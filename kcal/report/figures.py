@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -66,6 +67,27 @@ def new_figure(width: float, height: float, dpi: int = 130) -> PlainFigure:
     figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
+
+
+def shortened(text: str, most: int) -> str:
+    """A name of at most so many characters; of a longer one its end, which tells files apart.
+
+    Example:
+        >>> shortened("a/long/path/of/left.camera.json", 18)
+        '…/left.camera.json'
+    """
+    return text if len(text) <= most else "…" + text[1 - most :]
+
+
+def wrapped(text: str, inches: float, size: float) -> list[str]:
+    """Lines of a text that fit into a width, at a font size in points; words longer than a line are divided.
+
+    Example:
+        >>> wrapped("RMS 0.19 px, largest 1.3 px, over the image", 2.0, 9.0)
+        ['RMS 0.19 px, largest 1.3', 'px, over the image']
+    """
+    # A character is about 0.6 of the font's size wide.
+    return textwrap.wrap(text, max(8, int(72.0 * inches / (0.6 * size)))) or [""]
 
 
 def plain_number(value: float, _: object = None) -> str:

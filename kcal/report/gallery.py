@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from torch import Tensor
 
+from kcal.calibrate.camera.advice import reached, unreached_share
 from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError
@@ -24,6 +24,7 @@ from kcal.report.figures import frame_image, new_figure, save_picture
 _MOST_VIEWS = 24  # views in a gallery
 _MOST_FAILED = 8  # failed images in it
 _ACROSS = 4
+_STANDS_OUT = 2.0  # predicted error of a view over the median
 _THUMB = 480  # pixels of a view's longer side
 _CELLS = 8  # of the coverage map along the image's longer side
 
@@ -47,15 +48,16 @@ class FailedImage(NamedTuple):
 def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = ()) -> Figure:
     """Draw the failed images with their reasons, then the views with their corners.
 
-    A failed image shows the corners that were found in it and rejected. Views with corners left out come first, then by
-    the corners' predicted error. Corner 0 is a ring and the first row a line, so that a board read from its other end
-    is seen at once. At most 8 failed images and 24 views are shown; other failures are listed with their reasons.
+    A failed image shows the corners that were found in it and rejected. Views that stand out come first: those with
+    corners left out, then those whose corners are predicted to be twice as uncertain as is usual here. The others
+    follow in their order. Corner 0 is a ring and the first row a line, so that a board read from its other end is seen
+    at once. At most 8 failed images and 24 views are shown; other failures are listed with their reasons.
 
     Args:
         observations: with the paths of their images; a view whose image is not there is drawn on gray.
         failed: images that gave no view, from `kcal.corners.detect.detect`.
     """
-    order = sorted(range(len(observations.views)), key=lambda i: _badness(observations.views[i]), reverse=True)
+    order, standing_out = _order(observations.views)
     shown, drawn = order[:_MOST_VIEWS], failed[:_MOST_FAILED]
     across = max(1, min(_ACROSS, len(shown) + len(drawn)))
     down = max(1, math.ceil((len(shown) + len(drawn)) / across))
@@ -75,9 +77,11 @@ def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = (
         _draw_failed(figure.add_subplot(grid[place // across, place % across]), one, observations.image_size)
     for place, i in enumerate(shown, len(drawn)):
         _draw_view(figure.add_subplot(grid[place // across, place % across]), observations, observations.views[i])
-    title = f"{len(observations.views)} views, worst first"
+    title = f"{len(observations.views)} views"
+    if standing_out:
+        title += "; the first stands out" if standing_out == 1 else f"; the first {standing_out} stand out"
     if len(order) > _MOST_VIEWS:
-        title += f" (the {_MOST_VIEWS} worst)"
+        title += f" ({_MOST_VIEWS} are shown)"
     if observations.failures:
         title += f"; without a board: {len(observations.failures)}"
     figure.text(0.02, 1 - 0.25 / tall, title, fontsize=13, color=INK, va="center")
@@ -89,7 +93,8 @@ def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = (
 def coverage_figure(observations: Observations) -> Figure:
     """Draw where corners were seen, one color per view (the paper's Fig. 1), over how many views reached each part.
 
-    Parts that no corner reached are hatched: the lens model extrapolates there.
+    Parts that no board reached are hatched: the lens model extrapolates there. Their share is the one that `kcal
+    calibrate` and its report tell (`kcal.calibrate.camera.advice.unreached_share`).
     """
     width, height = observations.image_size
     pixels = observations.pixels().numpy()
@@ -111,24 +116,19 @@ def coverage_figure(observations: Observations) -> Figure:
     axes.imshow(
         cells, cmap="Grays", vmin=0, vmax=2.5 * max(cells.max(), 1), extent=(-0.5, width - 0.5, height - 0.5, -0.5)
     )
-    for row, column in np.argwhere(cells == 0):
-        axes.add_patch(
-            Rectangle(
-                (column * width / columns - 0.5, row * height / rows - 0.5),
-                width / columns,
-                height / rows,
-                fill=False,
-                hatch="///",
-                edgecolor=WARN,
-                linewidth=0,
-                alpha=0.6,
-            )
-        )
+    outside = ~reached(observations, 4 * 65, max(2, round(4 * 65 * height / width))).numpy()
+    x, y = (
+        np.linspace(-0.5, size - 0.5, count) for size, count in zip((width, height), outside.shape[::-1], strict=True)
+    )
+    if outside.any():
+        hatched = axes.contourf(x, y, outside, levels=[0.5, 1.5], colors="none", hatches=["///"])
+        hatched.set_edgecolor((WARN, 0.5))
+        hatched.set_linewidth(0.0)
     axes.scatter(u, v, c=views, cmap="turbo", s=7, linewidths=0)
     frame_image(axes, observations.image_size)
-    reached = 100.0 * float((cells > 0).mean())
+    share = 100.0 * (1.0 - unreached_share(observations))
     axes.set_title(
-        f"{len(pixels)} views, {int(seen.sum())} corners; {reached:.0f} % of the image reached, hatched: not",
+        f"{len(pixels)} views, {int(seen.sum())} corners; boards reached {share:.0f} % of the image, hatched: not",
         fontsize=11,
         loc="left",
     )
@@ -145,8 +145,13 @@ def save_coverage(path: str | Path, observations: Observations) -> Path:
     return save_picture(path, coverage_figure(observations))
 
 
-def _badness(view: View) -> tuple[int, float]:
-    return view.pixels.count(None), _predicted_sigma(view) or 0.0
+def _order(views: Sequence[View]) -> tuple[list[int], int]:
+    """Indices of the views that stand out, the worst first, then of the others in their order; how many stand out."""
+    sigmas = [_predicted_sigma(view) or 0.0 for view in views]
+    limit = _STANDS_OUT * float(np.median(sigmas)) if sigmas else 0.0
+    out = [i for i, view in enumerate(views) if view.pixels.count(None) or sigmas[i] > limit > 0]
+    out.sort(key=lambda i: (views[i].pixels.count(None), sigmas[i]), reverse=True)
+    return [*out, *(i for i in range(len(views)) if i not in out)], len(out)
 
 
 def _predicted_sigma(view: View) -> float | None:

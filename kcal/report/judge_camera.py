@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
 from kcal.calibrate.camera.advice import what_to_photograph
 from kcal.calibrate.camera.options import CalibrationOptions, Progress
 from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.calibrate.camera.trust import Examination, examine
+from kcal.calibrate.camera.trust import Examination, examine, unexplained
 from kcal.lens.camera import Camera
+from kcal.lens.difference import camera_difference
 from kcal.lens.paraxial import paraxial_focal
 from kcal.lens.uncertainty import image_sigma
-from kcal.locate.ranges import BEARING_SIGMAS
-from kcal.report.model_findings import FAULTS, model_findings
-from kcal.report.verdict import Finding, RangeAnswer, Requirement, Verdict, sorted_findings
-from kcal.report.view_findings import view_findings
+from kcal.report.model_findings import model_findings
+from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, sorted_findings, weighed_findings
+from kcal.report.view_findings import record_findings, view_findings
 
+# Of the error bars: a camera that was calibrated again from its own views differs by less.
+_ITSELF = 0.5
 _BASIS = "in a rig of two such cameras, {:g} m apart, with marks to {:g} px, RMS over the image"
 
 
@@ -30,6 +31,7 @@ def camera_verdict(
     mark_sigma: float = 0.3,
     subject: str = "camera",
     examination: Examination | None = None,
+    stored: Camera | None = None,
     progress: Progress = lambda _: None,
 ) -> Verdict:
     """Judge a calibration against a user's own requirements.
@@ -45,6 +47,7 @@ def camera_verdict(
         mark_sigma: noise of a mark along each axis, px.
         subject: name of the camera.
         examination: from `examine`, if it was made already.
+        stored: the camera that is to be used, where the calibration was made again from what should be its views.
         progress: called after each fit.
 
     Example:
@@ -68,22 +71,25 @@ def camera_verdict(
     # Faults of the views come first: without tilts or with blur the model looks wrong too.
     reference = examination.reference or result
     found = [*view_findings(result, min(result.noise, reference.noise)), *against]
-    found += [Finding(name="calibration", severity="doubt", text=text, picture="residuals") for text in result.warnings]
-    # What another model that fits as well sees elsewhere is uncertain too, above all where no board was.
-    sigma = max(_image_rms(result.camera), 0.0 if examination.model is None else examination.model.rms)
+    found += [
+        Finding(name="calibration", severity="doubt", text=text, picture="residuals", part="lenses")
+        for text in result.warnings
+    ]
+    if stored is not None:
+        other, apart = _other_views(stored, result)
+        found, beyond = [*other, *found], max(beyond, apart)
+    # What another model that fits as well sees elsewhere is uncertain too, above all where no board was; what is known
+    # to be wrong of it counts as a fault.
+    elsewhere = 0.0 if examination.model is None else max(examination.model.rms**2 - beyond**2, 0.0)
+    sigma = max(_image_rms(result.camera), math.sqrt(elsewhere))
     answers = tuple(
         _camera_answer(result.camera, requirement, sigma, beyond, baseline, mark_sigma) for requirement in requirements
     )
-    if not all(answer.ok for answer in answers):
-        # A fault that the requirements bear is a doubt; one that breaks them is the reason.
-        found = [
-            dataclasses.replace(finding, severity="stop") if finding.name in FAULTS else finding for finding in found
-        ]
     rotation = result.cam_from_board_rotation
     return Verdict(
         subject=subject,
         answers=answers,
-        findings=sorted_findings(found),
+        findings=weighed_findings(found, answers),
         advice=result.advice or what_to_photograph(result.observations, result.camera, rotation),
         basis=_BASIS.format(baseline, mark_sigma),
         unexplained=beyond,
@@ -112,14 +118,7 @@ def stored_verdict(
         >>> stored_verdict(camera).reason
         'the camera has no error bars: nobody can say how wrong its directions are'
     """
-    found = [
-        Finding(
-            name="halves",
-            severity="doubt",
-            text="the views were not looked at: a wrong lens model or board cannot be noticed in a camera file",
-            action="give the observations too (--observations)",
-        )
-    ]
+    found = stored_findings(camera)
     sigma = _image_rms(camera)
     if math.isinf(sigma):
         found.append(
@@ -140,6 +139,45 @@ def stored_verdict(
     )
 
 
+def stored_findings(camera: Camera) -> list[Finding]:
+    """What a camera's file tells of its calibration, and that its views were not looked at."""
+    record = camera.calibration.record if camera.calibration else None
+    unseen = Finding(
+        name="halves",
+        severity="doubt",
+        text="the views were not looked at: a wrong lens model or board cannot be noticed in a camera file",
+        action="give the observations too (--observations)",
+        part="lenses",
+    )
+    return [unseen, *([] if record is None else record_findings(record))]
+
+
+def _other_views(stored: Camera, result: CameraCalibrationResult) -> tuple[list[Finding], float]:
+    """Whether these views give another camera than the one to be used, and by how many px beyond their error bars."""
+    found = camera_difference(stored, result.camera)
+    record = stored.calibration.record if stored.calibration else None
+    missing = [] if record is None else [view for view in record.per_view_rms if view not in result.observations.names]
+    # A rig refines its cameras within their error bars, and keeps no error bars of each alone.
+    alike = found.ratio is not None and (found.ratio <= _ITSELF if found.known[0] else bool(found.same))
+    if alike and not missing:
+        return [], 0.0
+    text = "these are not the views that the camera was calibrated from"
+    if record is not None and missing:
+        text += f", {record.views} with {missing[0]}"
+    text += f": they give one that differs by {found.rms:.2g} px (RMS)"
+    if found.ratio is not None:
+        text += f", {found.ratio:.1f} times what the error bars predict"
+    other = Finding(
+        name="other-views",
+        severity="doubt" if found.same else "stop",
+        text=text,
+        action="give the observations that it was calibrated from, or calibrate it again",
+        part=FAULTS,
+    )
+    told = record_findings(record) if record is not None and missing else []
+    return [other, *told], unexplained(found)
+
+
 def _image_rms(camera: Camera) -> float:
     """RMS over the image of the standard deviation of far directions, px; infinite without error bars."""
     known = camera.calibration
@@ -155,6 +193,5 @@ def _camera_answer(
 ) -> RangeAnswer:
     """The range of a target by two such cameras: Z² / (f B) for each pixel of disparity, which both cameras spoil."""
     slope = math.sqrt(2.0) * requirement.distance**2 / (paraxial_focal(camera).mean[0] * baseline)
-    parts = {"marks": slope * mark_sigma, "lenses": slope * sigma, "faults of the calibration": slope * beyond}
-    total = math.hypot(*parts.values())
-    return RangeAnswer(requirement=requirement, parts=parts, ranged=total * BEARING_SIGMAS <= requirement.distance)
+    parts = {"marks": slope * mark_sigma, "lenses": slope * sigma, FAULTS: slope * beyond}
+    return RangeAnswer(requirement=requirement, parts=parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -11,9 +12,11 @@ from torch import Tensor
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.synchrony import Synchrony, synchrony
 from kcal.errors import InputError
+from kcal.lens.calibration import RigCalibration
 from kcal.lens.rig import StereoRig
 from kcal.locate.range_sigmas import RangeSigmas, range_sigmas
-from kcal.report.verdict import Finding, RangeAnswer, Requirement, Verdict, sorted_findings
+from kcal.report.judge_camera import stored_findings
+from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, weighed_findings
 
 # Pairs disagree by this many times what noise explains: set on simulated pairs, where synchronous ones reach 1.5.
 _APART = 2.5
@@ -21,10 +24,6 @@ _LATE_SIGMAS, _LATE = 5.0, 0.02
 _MOST_LEFT_OUT = 0.2
 # Residuals of a whole rig in their sigmas: more, and something does not fit.
 _MOST_VARIANCE = 9.0
-_NEXT = {
-    "lenses": "take more views of the board with each camera, near the borders of the image, and calibrate again",
-    "relative pose": "mark more far features or surveyed landmarks in both images: they determine the relative yaw",
-}
 
 
 def rig_verdict(
@@ -34,10 +33,14 @@ def rig_verdict(
     mark_sigma: float = 0.3,
     result: RigResult | None = None,
     pairs: tuple[Tensor, Tensor] | None = None,
+    unpaired: str = "",
     cameras: Sequence[Verdict] = (),
     subject: str = "rig",
 ) -> Verdict:
     """Judge a rig against a user's own requirements.
+
+    It inherits what was found about its cameras and their boards. What a camera is wrong by beyond its error bars
+    counts in the ranges.
 
     Args:
         rig: with its covariance.
@@ -45,7 +48,9 @@ def rig_verdict(
         mark_sigma: noise of a mark along each axis, px.
         result: as it was solved, for its warnings and its pairs of boards.
         pairs: otherwise, corners of the board (N, 3) in meters, and pixels (P, 2, N, 2) of pairs of views.
-        cameras: verdicts on its cameras, whose findings count.
+        unpaired: why there are no pairs, where there should be.
+        cameras: verdicts on its left and right camera, whose findings count; what the rig's file tells of them if left
+            out.
         subject: its name.
 
     Example:
@@ -57,26 +62,56 @@ def rig_verdict(
         >>> [answer.ok for answer in verdict.answers], verdict.reason
         ([True, False], 'at 5 km the range is known to ±6.8 %; 5 % are required; most of it is from relative pose')
     """
-    findings = [finding for verdict in cameras for finding in verdict.findings if finding.severity != "fine"]
-    findings += _doubts(rig, result)
+    findings = [*_inherited(rig, cameras), *_own_findings(rig, result)]
     compared = _pairs_compared(rig, result, pairs)
     if compared is not None and compared.pairs:
         findings.append(_synchrony_finding(compared))
-    answers = tuple(_rig_answer(rig, requirement, mark_sigma) for requirement in requirements)
-    failed = [answer for answer in answers if not answer.ok]
+    elif unpaired or (result is None and rig.calibration is not None and rig.calibration.pairs):
+        findings.append(_unpaired_finding(unpaired or "no pairs of views were given"))
+    beyond = [verdict.unexplained for verdict in cameras]
+    answers = tuple(_rig_answer(rig, requirement, mark_sigma, beyond) for requirement in requirements)
     return Verdict(
         subject=subject,
         answers=answers,
-        findings=sorted_findings(findings),
-        advice=tuple(dict.fromkeys(_NEXT[a.most] for a in failed if a.most in _NEXT))
-        + tuple(text for verdict in cameras for text in verdict.advice),
+        findings=weighed_findings(findings, answers),
+        advice=tuple(f"{verdict.subject}: {text}" for verdict in cameras for text in verdict.advice),
         basis=f"from the rig's own covariance, where both cameras look, with marks to {mark_sigma:g} px",
-        unexplained=max((verdict.unexplained for verdict in cameras), default=0.0),
+        unexplained=max(beyond, default=0.0),
     )
 
 
-def _rig_answer(rig: StereoRig, requirement: Requirement, mark_sigma: float) -> RangeAnswer:
-    """The worst of several places along the middle row of the left image that both cameras see."""
+def _inherited(rig: StereoRig, cameras: Sequence[Verdict]) -> list[Finding]:
+    """Findings about the cameras, each named; what is the same of several is said once."""
+    found: dict[Finding, list[str]] = {}
+    if cameras:
+        for verdict in cameras:
+            for finding in verdict.findings:
+                found.setdefault(finding, []).append(verdict.subject)
+    else:
+        for word, camera in (("left", rig.left), ("right", rig.right)):
+            for finding in stored_findings(camera):
+                found.setdefault(finding, []).append(word)
+    return [
+        dataclasses.replace(
+            finding,
+            text=f"{' and '.join(names)}: {finding.text}",
+            action=finding.action and f"{' and '.join(names)}: {finding.action}",
+            picture=finding.picture and f"{names[0]}-{finding.picture}",
+        )
+        for finding, names in found.items()
+        if finding.severity != "fine"
+    ]
+
+
+def _rig_answer(rig: StereoRig, requirement: Requirement, mark_sigma: float, beyond: Sequence[float]) -> RangeAnswer:
+    """The worst of several places along the middle row of the left image that both cameras see.
+
+    Args:
+        rig: with its covariance.
+        requirement: what is asked.
+        mark_sigma: noise of a mark along each axis, px.
+        beyond: px by which each camera is wrong beyond its error bars.
+    """
     width, height = rig.left.size
     worst: RangeSigmas | None = None
     places = [None, *([0.5 * width + share * width, 0.5 * height] for share in (-0.3, 0.3))]
@@ -90,12 +125,29 @@ def _rig_answer(rig: StereoRig, requirement: Requirement, mark_sigma: float) -> 
         if worst is None or not float(found.total) <= float(worst.total):
             worst = found
     assert worst is not None
-    parts = {"marks": worst.marks, "lenses": worst.lenses, "relative pose": worst.pose}
-    return RangeAnswer(
-        requirement=requirement,
-        parts={name: float(part) for name, part in parts.items()},
-        ranged=bool(worst.ranged),
-    )
+    unknown = rig.covariance is None
+    parts = {
+        "marks": float(worst.marks),
+        "lenses": math.inf if unknown else float(worst.lenses),
+        "relative pose": math.inf if unknown else float(worst.pose),
+    }
+    if any(beyond):
+        # Both cameras' errors spoil the disparity as the noise of both marks does.
+        by_pixel = float(range_sigmas(rig, [requirement.distance], pixel_sigma=1.0).marks)
+        parts[FAULTS] = by_pixel * math.hypot(*beyond) / math.sqrt(2.0)
+    return RangeAnswer(requirement=requirement, parts=parts)
+
+
+def _own_findings(rig: StereoRig, result: RigResult | None) -> list[Finding]:
+    """What the rig's own solution says, and what could not be checked."""
+    found = _doubts(rig, result)
+    record = rig.calibration
+    if record is None and result is None:
+        text = "the rig's file does not tell how it was solved: residuals and what was left out could not be checked"
+        found.append(Finding(name="record", severity="doubt", text=text, part="relative pose"))
+    warnings = result.warnings if result is not None else record.warnings if record is not None else ()
+    found += [Finding(name="rig", severity="doubt", text=text, part="relative pose") for text in warnings]
+    return found
 
 
 def _doubts(rig: StereoRig, result: RigResult | None) -> list[Finding]:
@@ -121,33 +173,48 @@ def _doubts(rig: StereoRig, result: RigResult | None) -> list[Finding]:
                     text=f"{100 * share:.0f} % of what was seen contradicts the rest and was left out: with so much "
                     "of it nobody can tell which part is right",
                     action="check that both images of each pair were taken at the same moment, and the survey",
+                    part="relative pose",
                 )
             )
-    if result is None:
-        return found
-    if result.exact:
-        names = " and ".join(result.exact)
+    if exact := _exact_lenses(rig, result):
         found.append(
             Finding(
                 name="exact-lenses",
                 severity="doubt",
-                text=f"the lenses of {names} were taken as exact: their errors are in no error bar",
+                text=f"the lenses of {' and '.join(exact)} were taken as exact: their errors are in no error bar",
                 action="solve the rig from cameras with error bars, with --intrinsics prior",
+                part="lenses",
             )
         )
-    if result.variance > _MOST_VARIANCE:
+    variance = result.variance if result is not None else _stored_variance(record)
+    if variance > _MOST_VARIANCE:
         found.append(
             Finding(
                 name="misfit",
                 severity="stop",
-                text=f"residuals are {math.sqrt(result.variance):.1f} times as large as their sigmas say: cameras, "
+                text=f"residuals are {math.sqrt(variance):.1f} times as large as their sigmas say: cameras, "
                 "survey and marks do not fit each other",
                 action="look at the residuals by item, and correct what stands out",
                 picture="rig",
+                part="relative pose",
             )
         )
-    found += [Finding(name="rig", severity="doubt", text=text) for text in result.warnings]
     return found
+
+
+def _exact_lenses(rig: StereoRig, result: RigResult | None) -> tuple[str, ...]:
+    """Names of the cameras whose parameters have no error in the rig's covariance."""
+    if result is not None or rig.covariance is None:
+        return () if result is None else result.exact
+    first, second = (camera.values.shape[-1] for camera in (rig.left, rig.right))
+    parts = zip(("left", "right"), rig.covariance.half[:, : first + second].split([first, second], 1), strict=True)
+    return tuple(name for name, part in parts if not bool(part.any()))
+
+
+def _stored_variance(record: RigCalibration | None) -> float:
+    """Largest mean square of a source's residuals in their sigmas."""
+    sources = () if record is None else record.sources
+    return max((source.sigmas**2 for source in sources if source.sigmas is not None), default=0.0)
 
 
 def _pairs_compared(rig: StereoRig, result: RigResult | None, pairs: tuple[Tensor, Tensor] | None) -> Synchrony | None:
@@ -159,6 +226,16 @@ def _pairs_compared(rig: StereoRig, result: RigResult | None, pairs: tuple[Tenso
     # Turned boards are in the data as they were turned; pairs that were left out count too.
     order = torch.tensor(sorted(range(len(boards.names)), key=lambda i: boards.names[i]), dtype=torch.long)
     return synchrony(rig, boards.points, boards.pixels[order])
+
+
+def _unpaired_finding(why: str) -> Finding:
+    return Finding(
+        name="synchronization",
+        severity="doubt",
+        text=f"whether both cameras saw the board at the same moments could not be checked: {why}",
+        action="give the observations of the pairs (--observations twice: left, then right)",
+        part="relative pose",
+    )
 
 
 def _synchrony_finding(found: Synchrony) -> Finding:
@@ -173,6 +250,7 @@ def _synchrony_finding(found: Synchrony) -> Finding:
             severity="fine",
             text=f"both cameras saw the board in the same place in {found.pairs} pairs "
             f"({found.ratio:.1f} times what noise explains)",
+            part="relative pose",
         )
     how = ""
     if late and found.delay is not None and found.delay_sigma is not None:
@@ -188,4 +266,5 @@ def _synchrony_finding(found: Synchrony) -> Finding:
         f"the right camera, {found.ratio:.1f} times what noise explains{how}",
         action="trigger both cameras together, or hold the board still in each pose (a tripod), and take pairs again",
         picture="rig",
+        part="relative pose",
     )

@@ -19,14 +19,17 @@ from kcal.errors import InputError
 from kcal.files import write_atomic
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.positions import Located, Position
-from kcal.locate.ranges import range_text
 from kcal.locate.region import near, region_rings
 from kcal.locate.stereo import PositionStatus
+from kcal.quantities import Unit, length_text, number_text, range_text
 from kcal.report.backdrop import local_image, local_tiles
 from kcal.report.colors import CAMERA_COLORS
+from kcal.report.tables import interval_text, range_sigma, range_unit
 from kcal.texts import page_data, page_policy, page_text
 
+# Rings of a site and of the sea; on a bench, and where all is nearer than the first of them, round shares of the range.
 ARCS_M = (250.0, 1000.0, 5000.0)
+_ROUND = tuple(k * 10.0**e for e in range(-3, 3) for k in (1.0, 2.5, 5.0))
 _ONLINE = {
     "url": "https://tile.openstreetmap.org/{z}/{x}/{y}.png",
     "attribution": "© OpenStreetMap contributors, openstreetmap.org/copyright",
@@ -147,7 +150,8 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
         return rim + torch.tensor(foot, dtype=torch.float64)
 
     ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
-    reach = 1.15 * max([*ranges, 300.0])
+    farthest = max((one for one in ranges if math.isfinite(one)), default=0.0) or 300.0
+    reach = 1.15 * farthest
     cameras, edges = [], []
     for view, color, side in zip(located.cameras, CAMERA_COLORS, _label_sides(located), strict=False):
         outline = None
@@ -161,7 +165,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
         cameras.append({"name": view.name, "place": place, "fan": outline, "color": color, "side": side})
     low, high = (min(edges), max(edges)) if edges else (-180.0, 180.0)
     sweep = torch.linspace(low, high, 90, dtype=torch.float64) + located.heading_deg
-    arcs = [{"name": range_text(arc), "line": places(fan((0, 0, 0), sweep, arc))} for arc in ARCS_M if arc < reach]
+    arcs = [{"name": range_text(arc), "line": places(fan((0, 0, 0), sweep, arc))} for arc in arcs_within(reach)]
     bearings = [
         places(fan((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0) * ends)
         for p in located.positions
@@ -178,8 +182,9 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
             miss = torch.tensor(position.enu, dtype=torch.float64) - row.detach().cpu().double()
             azimuth = math.degrees(math.atan2(float(miss[0]), float(miss[1])))
             arrows.append({"line": [spot, (position.lat, near(position.lon, located.origin.lon))], "azimuth": azimuth})
+    unit = range_unit(located)
     points = [
-        {"name": p.name, "place": (p.lat, near(p.lon, located.origin.lon)), "rows": _popup_rows(p)}
+        {"name": p.name, "place": (p.lat, near(p.lon, located.origin.lon)), "rows": _popup_rows(p, unit)}
         for p in located.positions
         if p.lat is not None and p.lon is not None
     ]
@@ -190,25 +195,41 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def arcs_within(reach: float) -> list[float]:
+    """Ranges at which arcs are drawn, meters.
+
+    Example:
+        >>> arcs_within(2000.0), arcs_within(0.5)
+        ([250.0, 1000.0], [0.05, 0.1, 0.25])
+    """
+    known = [arc for arc in ARCS_M if arc < reach]
+    return known or [arc for arc in _ROUND if reach / 12.0 < arc < reach]
+
+
 def _label_sides(located: Located) -> tuple[str, str]:
     """Choose on which side of its dot each camera's name is written: outward, since the two are close."""
     return ("left", "right") if located.cameras[1].enu[0] >= 0 else ("right", "left")
 
 
-def _popup_rows(position: Position) -> list[tuple[str, str]]:
+def _popup_rows(position: Position, unit: Unit) -> list[tuple[str, str]]:
+    sigma = range_sigma(position)
+    up = None if position.covariance is None else math.sqrt(position.covariance[2][2])
+    height = position.height or 0.0
     rows = [
         ("latitude", f"{position.lat:.7f}°"),
         ("longitude", f"{position.lon:.7f}°"),
-        ("ellipsoidal height", f"{position.height:.2f} m"),
+        ("ellipsoidal height", f"{number_text(height, up)} m"),
     ]
-    if position.geoid_height is not None and position.height is not None:
-        rows.append(("above the geoid", f"{position.height - position.geoid_height:.2f} m"))
+    if position.geoid_height is not None:
+        rows.append(("above the geoid", f"{number_text(height - position.geoid_height, up)} m"))
+    errors = [position.cep50_m, position.cep95_m, position.meters_per_pixel, 0.01 * (position.meters_per_degree or 0.0)]
+    cep50, cep95, by_pixel, by_yaw = (length_text(error or 0.0, digits=2) for error in errors)
     rows += [
-        ("range", f"{position.range_m:.1f} m"),
-        ("95 % interval", f"{position.range_low_m:.1f} to {position.range_high_m:.1f} m"),
-        ("CEP50, CEP95", f"{position.cep50_m:.1f}, {position.cep95_m:.1f} m"),
-        ("a pixel is", f"{position.meters_per_pixel:.1f} m"),
-        ("0.01° of yaw is", f"{0.01 * (position.meters_per_degree or 0.0):.1f} m"),
+        ("range", length_text(position.range_m or 0.0, sigma, unit=unit)),
+        ("95 % interval", f"{interval_text(position, unit)} {unit.name}"),
+        ("CEP50, CEP95", f"{cep50}, {cep95}"),
+        ("a pixel is", by_pixel),
+        ("0.01° of yaw is", by_yaw),
     ]
     return [*rows, ("", position.reason)] if position.reason else rows
 

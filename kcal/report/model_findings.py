@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from kcal.calibrate.camera.options import CalibrationOptions
@@ -10,10 +11,8 @@ from kcal.calibrate.camera.summary import summarize
 from kcal.calibrate.camera.trust import Examination, HalvesDifference, unexplained
 from kcal.calibrate.camera.warnings import REPEATING
 from kcal.lens.uncertainty import image_sigma
-from kcal.report.verdict import Finding
+from kcal.report.verdict import FAULTS, Finding
 
-# Names of findings by which a camera is wrong beyond its error bars.
-FAULTS = ("model", "board", "pupil", "changed")
 # Chance by which halves may differ. Error bars from half of the views are approximate: at 1e-3, one of 30 clean
 # captures was doubted (tuning seeds of scripts/check/verdict.py), where wrong models reach 1e-7 and less.
 _CHANCE = 1e-6
@@ -25,6 +24,10 @@ _IMAGE = 2.5
 _SURE = 5.0
 # RMS of halves over that of all views, below which these are not of one camera: 0.93 and more in captures of one.
 _OWN = 0.8
+# A lens with a measured board and motions fits two cameras that are nearly alike. Their halves differ by more than
+# chance explains at the lower level, and predict each other worse than halves that are alike by this factor: 1.1 and
+# 1.2 for OpenCV's left and right images, 1.9 for both in one file.
+_LIKELY, _APART = 1e-3, 1.5
 # RMS of corners that a half did not see over that of fitted ones: 1.01 to 1.19 in clean captures of 12 to 22 views, 1.5
 # to 2.1 with 5 coefficients on a wide lens (tuning seeds of scripts/check/verdict.py).
 _PREDICTED = 1.25
@@ -40,7 +43,9 @@ def model_findings(
     structured = found.structure.neighbors > _NEIGHBORS or found.structure.image > _IMAGE
     halves = {half.label: unexplained(half.difference, _CHANCE) for half in found.halves}
     beyond = max(halves.values(), default=0.0)
-    against = _changed(result, found.halves, halves)
+    against = None
+    if (changed := _changed(result, found.halves, halves)) is not None:
+        against, beyond = _changed_finding(changed), max(beyond, unexplained(changed.difference, _LIKELY))
     if found.model is not None and found.reference is not None:
         named = _against_reference(result, options, found, found.model.rms)
         certain = named is not None and named.name in ("board", "pupil")
@@ -53,6 +58,7 @@ def model_findings(
                 f"{found.model.rms:.2g} px from one that does",
                 action="calibrate with the default lens (--model hybrid)",
                 picture="model",
+                part=FAULTS,
             )
         against = against or named
     elif structured and against is None:
@@ -69,6 +75,7 @@ def model_findings(
             + (" everywhere" if slight else ", and error bars are too small"),
             action="check that all views show one flat, stiff board, with the camera's focus and zoom unchanged",
             picture="residuals",
+            part=FAULTS,
         )
     elif beyond and against is None:
         worst = max(halves, key=lambda label: halves[label])
@@ -79,6 +86,7 @@ def model_findings(
             "bars: lens model or board do not fit",
             action="take more views, with one flat, stiff board",
             picture="halves",
+            part=FAULTS,
         )
     findings = [] if against is None else [against]
     if alike := [half for half in found.halves if half.alike]:
@@ -90,6 +98,7 @@ def model_findings(
                 severity="doubt",
                 text=f"the error bars could not be checked by halves of the views: {'; '.join(found.failures)}",
                 action="take more views",
+                part="lenses",
             )
         )
     elif against is None:
@@ -101,6 +110,7 @@ def model_findings(
                 text=f"cameras from halves of the views agree: their difference is {ratios} times what the error bars "
                 "predict",
                 picture="halves",
+                part="lenses",
             )
         )
     return findings, beyond
@@ -114,31 +124,46 @@ def _prediction_finding(half: HalvesDifference) -> Finding:
         f"{ratio:.2f} times what is left where they are fitted"
     )
     if ratio <= _PREDICTED:
-        return Finding(name="prediction", severity="fine", text=text, picture="halves")
+        return Finding(name="prediction", severity="fine", text=text, picture="halves", part="lenses")
     return Finding(
         name="prediction",
         severity="doubt",
         text=f"{text}: lens model or board do not carry over to other views",
         action="take more views, all over the image and at several distances, with one flat, stiff board",
         picture="halves",
+        part="lenses",
     )
 
 
 def _changed(
     result: CameraCalibrationResult, halves: Sequence[HalvesDifference], beyond: Mapping[str, float]
-) -> Finding | None:
-    """Whether halves in time, or by name, are not of one camera: each half alone fits, and both together do not."""
+) -> HalvesDifference | None:
+    """Halves in time, or by name, that are not of one camera: each fits alone, and both together, or one the other not.
+
+    Args:
+        result: the calibration.
+        halves: of its views.
+        beyond: label -> px by which they differ beyond their error bars.
+    """
+    alike = min((half.held_out for half in halves if half.alike), default=math.inf)
     for half in halves:
-        if not half.alike and beyond[half.label] and half.own < _OWN * result.rms:
-            return Finding(
-                name="changed",
-                severity="stop",
-                text=f"{half.label} show two different cameras, {half.difference.rms:.2g} px apart: images of two "
-                "cameras in one file, or focus, zoom or image stabilization changed in between",
-                action="calibrate from the images of one camera with fixed focus and zoom",
-                picture="halves",
-            )
+        likely = (half.difference.probability or 0.0) < _LIKELY and half.held_out > _APART * alike
+        likely = likely and result.hybrid is not None
+        if not half.alike and (likely or (beyond[half.label] and half.own < _OWN * result.rms)):
+            return half
     return None
+
+
+def _changed_finding(half: HalvesDifference) -> Finding:
+    return Finding(
+        name="changed",
+        severity="stop",
+        text=f"{half.label} show two different cameras, {half.difference.rms:.2g} px apart: images of two "
+        "cameras in one file, or focus, zoom or image stabilization changed in between",
+        action="calibrate from the images of one camera with fixed focus and zoom",
+        picture="halves",
+        part=FAULTS,
+    )
 
 
 def _against_reference(
@@ -154,6 +179,7 @@ def _against_reference(
             action="calibrate with the default lens and --board printed, which measures the board, or use a stiffer "
             "board",
             picture="board",
+            part=FAULTS,
         )
     if plain and (pupil := _pupil_fault(result, found.reference)):
         return Finding(
@@ -162,6 +188,7 @@ def _against_reference(
             text=f"{pupil}, which {result.camera.model} does not have: far directions are off by {far:.2g} px",
             action="calibrate with the default lens (--model hybrid), or show the board from farther away",
             picture="model",
+            part=FAULTS,
         )
     if (
         plain
@@ -177,6 +204,7 @@ def _against_reference(
             "most where no board was",
             action="calibrate with the default lens (--model hybrid), and show the board at the borders of the image",
             picture="model",
+            part=FAULTS,
         )
     return None
 

@@ -14,16 +14,26 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.locate.positions import Located, Position
-from kcal.locate.ranges import range_text
 from kcal.locate.stereo import PositionStatus
+from kcal.quantities import Unit, length_text, range_text
 from kcal.report.colors import CAMERA_COLORS, FAINT, GRAY, INK, WARN
 from kcal.report.figures import HALO, new_figure, save_picture
+from kcal.report.tables import range_sigma, range_unit
 
 Array = NDArray[np.float64]
 
 _UNSURE = "#8a5a00"
 # The arcs of the paper's figure first, then rounder fillers where there is room.
-_ARCS = [250, 1000, 5000, 100, 500, 2500, *(k * 10.0**e for e in (0, 1, 4, 5) for k in (1, 2.5, 5)), 10.0**6]
+_ARCS = [
+    250,
+    1000,
+    5000,
+    100,
+    500,
+    2500,
+    *(k * 10.0**e for e in (-3, -2, -1, 0, 1, 4, 5) for k in (1, 2.5, 5)),
+    10.0**6,
+]
 _PERCENT = (-1.0, -0.3, -0.1, -0.03, -0.01, -0.003, 0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 _NAMED = 40
 
@@ -278,7 +288,8 @@ def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: li
     axes.set_xticks(ticks, [f"{100 * tick:+g} %" if tick else "0" for tick in ticks], fontsize=9)
     axes.set_xticks([], minor=True)
     axes.set(xlim=(-limit, limit), ylim=(len(order) - 0.3, -0.7))
-    names = [f"{located.positions[i].name}  {_estimate(located.positions[i])}" for i in order]
+    unit = range_unit(located)
+    names = [f"{located.positions[i].name}  {_estimate(located.positions[i], unit)}" for i in order]
     axes.set_yticks(range(len(order)) if len(order) <= _NAMED else [])
     if len(order) <= _NAMED:
         axes.set_yticklabels(names, fontsize=9 if len(order) <= 20 else 7)
@@ -297,8 +308,10 @@ def _relative(position: Position, true: Array | None) -> tuple[float, float, flo
     return low / base - 1.0, high / base - 1.0, float(np.linalg.norm(true)) / base - 1.0 if known else None  # type: ignore[arg-type]
 
 
-def _estimate(position: Position) -> str:
-    return "bearing only" if position.range_m is None else f"{position.range_m:,.0f} m"
+def _estimate(position: Position, unit: Unit) -> str:
+    return (
+        "bearing only" if position.range_m is None else length_text(position.range_m, range_sigma(position), unit=unit)
+    )
 
 
 def _interval_footer(located: Located) -> str:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from kcal.calibrate.rig.result import ItemResidual, RigResult
 from kcal.lens.camera import Camera
-from kcal.locate.ranges import range_text
-from kcal.report.figures import new_figure, save_picture
+from kcal.quantities import length_text, measured_length, range_text
+from kcal.report.figures import new_figure, save_picture, wrapped
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def rig_figure(result: RigResult) -> Figure:
     _draw_items(bars, result)
     baseline = float(torch.linalg.vector_norm(result.center[1] - result.center[0]))
     figure.suptitle(
-        f"Rig of {len(result.names)} cameras, baseline {baseline:.4f} ± {result.sigma_baseline:.4f} m",
+        f"Rig of {len(result.names)} cameras, baseline {measured_length(baseline, result.sigma_baseline)}",
         x=0.015,
         ha="left",
         fontsize=14,
@@ -130,7 +130,7 @@ def _draw_plan(axes: Axes, result: RigResult) -> None:
             axes.fill(*extent[-1].T, facecolor=color, alpha=0.07, edgecolor="none", zorder=0)
             axes.plot(*extent[-1].T, color=color, alpha=0.5, linewidth=0.9, zorder=1)
     circle = np.linspace(0.0, 2.0 * math.pi, 200)
-    for radius in (step * 10.0**power for power in range(-1, 7) for step in (1.0, 5.0)):
+    for radius in (step * 10.0**power for power in range(-3, 7) for step in (1.0, 5.0)):
         if nearest / 4 <= radius <= reach:
             ring = np.log1p(radius / unit) / math.log1p(reach / unit)
             axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=_FAINT, linewidth=0.7, linestyle=":")
@@ -218,8 +218,7 @@ def _footer(result: RigResult) -> str:
     for source in result.sources:
         values = [f"{source.used} used"] + ([f"{source.left_out} left out"] if source.left_out else [])
         values += [] if source.rms_px is None else [f"{source.rms_px:.3f} px"]
-        values += [] if source.rms_m is None else [f"{source.rms_m:.3f} m"]
+        values += [] if source.rms_m is None else [length_text(source.rms_m)]
         parts.append(f"{source.source}: {', '.join(values)}, {source.sigmas:.2f} sigma")
-    lines = ["   ".join(parts)]
-    lines += [f"{item.label}: {item.reason}" for item in result.left_out[:3]]
-    return "\n".join(lines)
+    texts = ["   ".join(parts), *(f"{item.label}: {item.reason}" for item in result.left_out[:2])]
+    return "\n".join(line for text in texts for line in wrapped(text, 12.6, 9.0))

@@ -9,7 +9,9 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.locate.positions import Located, Position
 from kcal.locate.range_sigmas import RangeSigmas
+from kcal.locate.ranges import QUANTILE
 from kcal.locate.truth import position_errors
+from kcal.quantities import M, Unit, length_text, length_unit, number_text, range_text
 
 _WORDS = {1: "one", 2: "two", 3: "three", 4: "four"}
 
@@ -21,30 +23,55 @@ def position_rows(located: Located, off: list[tuple[float, float, bool] | None] 
         located: the points.
         off: from `kcal.locate.truth.position_errors`, for three more columns.
     """
-    rows = [["name", "lat °", "lon °", "height m", "range m", "interval m", "status"]]
-    rows += [_position_row(position) for position in located.positions]
+    unit = range_unit(located)
+    rows = [["name", "lat °", "lon °", "height m", f"range {unit.name}", f"interval {unit.name}", "status"]]
+    rows += [_position_row(position, unit) for position in located.positions]
     if off is not None:
-        rows[0][-1:-1] = ["off level m", "off in range m", "in interval"]
-        for row, miss in zip(rows[1:], off, strict=True):
+        rows[0][-1:-1] = [f"off level {unit.name}", f"off in range {unit.name}", "in interval"]
+        for row, position, miss in zip(rows[1:], located.positions, off, strict=True):
+            sigma = range_sigma(position)
             row[-1:-1] = (
-                ["", "", ""] if miss is None else [_meters(miss[0]), f"{miss[1]:+.1f}", "yes" if miss[2] else "no"]
+                ["", "", ""]
+                if miss is None
+                else [unit.number(miss[0], sigma), unit.number(miss[1], sigma, sign=True), "yes" if miss[2] else "no"]
             )
     return rows
 
 
-def _position_row(position: Position) -> list[str]:
+def range_unit(located: Located) -> Unit:
+    """The unit that fits the ranges of all points."""
+    return length_unit(p.range_low_m if p.range_m is None else p.range_m for p in located.positions)
+
+
+def range_sigma(position: Position) -> float | None:
+    """Standard deviation of a range as its interval tells, meters; None where it has none.
+
+    Where the interval is open, its lower half counts.
+    """
     low, high = position.range_low_m, position.range_high_m
+    if low is None or high is None:
+        return None
+    if math.isfinite(high):
+        return (high - low) / (2.0 * QUANTILE)
+    return None if position.range_m is None else (position.range_m - low) / QUANTILE
+
+
+def interval_text(position: Position, unit: Unit) -> str:
+    """The interval of a range, without the unit's name; empty where there is none."""
+    low, high, sigma = position.range_low_m, position.range_high_m, range_sigma(position)
+    return "" if low is None or high is None else f"{unit.number(low, sigma)} – {unit.number(high, sigma)}"
+
+
+def _position_row(position: Position, unit: Unit) -> list[str]:
     numbers = ["", "", "", ""]
     if position.lat is not None and position.lon is not None and position.height is not None:
-        place = [f"{position.lat:.7f}", f"{position.lon:.7f}", f"{position.height:.1f}"]
-        numbers = [*place, _meters(position.range_m or 0)]
-    interval = "" if low is None or high is None else f"{_meters(low)} – {_meters(high)}"
+        # 1e-7° are 11 mm.
+        degrees = 9 if unit.meters < M.meters else 7
+        up = None if position.covariance is None else math.sqrt(position.covariance[2][2])
+        place = [f"{position.lat:.{degrees}f}", f"{position.lon:.{degrees}f}", number_text(position.height, up)]
+        numbers = [*place, unit.number(position.range_m or 0.0, range_sigma(position))]
     status = position.status.name.lower().replace("_", " ")
-    return [position.name, *numbers, interval, f"{status} *" if position.reason else status]
-
-
-def _meters(value: float) -> str:
-    return "∞" if math.isinf(value) else f"{value:.1f}" if value < 1000 else f"{value:.0f}"
+    return [position.name, *numbers, interval_text(position, unit), f"{status} *" if position.reason else status]
 
 
 def truth_rows(located: Located, noiseless: Located, truth: Tensor) -> list[list[str]]:
@@ -56,23 +83,36 @@ def truth_rows(located: Located, noiseless: Located, truth: Tensor) -> list[list
             calibration alone has caused.
         truth: (N, 3) true east, north, up, meters.
     """
+    unit = range_unit(located)
+    lengths = (
+        f"{word} {unit.name}" for word in ("true", "estimate", "95 % interval", "error", "across", "calibration")
+    )
+    true_head, estimate_head, interval_head, error_head, across_head, calibration_head = lengths
     rows = [
-        ["target", "true m", "estimate m", "95 % interval m", "truth is", "error m", "%", "across m", "calibration m"]
+        ["target", true_head, estimate_head, interval_head, "truth is", error_head, "%", across_head, calibration_head]
     ]
     for position, exact, true, miss in zip(
         located.positions, noiseless.positions, truth, position_errors(located, truth), strict=True
     ):
-        distance = float(true.norm())
+        distance, sigma = float(true.norm()), range_sigma(position)
         if position.enu is None or position.range_m is None or miss is None:
-            rows.append([position.name, f"{distance:.1f}", "-", "-", "-", "-", "-", "-", position.reason])
+            rows.append([position.name, unit.number(distance, sigma), *["-"] * 6, position.reason])
             continue
         along, across = _along_and_across(position, true)
-        low, high = position.range_low_m or 0.0, position.range_high_m or 0.0
-        estimate, interval = f"{position.range_m:.1f}", f"{low:.1f} – {high:.1f}"
-        error = [f"{along:+.2f}", f"{100 * along / distance:+.2f}", f"{across:.2f}"]
-        share = "-" if exact.enu is None else f"{_along_and_across(exact, true)[0]:+.2f}"
-        where = "inside" if miss[2] else "outside"
-        rows.append([position.name, f"{distance:.1f}", estimate, interval, where, *error, share])
+        share = None if sigma is None else 100.0 * sigma / distance
+        rows.append(
+            [
+                position.name,
+                unit.number(distance, sigma),
+                unit.number(position.range_m, sigma),
+                interval_text(position, unit),
+                "inside" if miss[2] else "outside",
+                unit.number(along, sigma, sign=True),
+                number_text(100.0 * along / distance, share, sign=True),
+                unit.number(across, digits=2),
+                "-" if exact.enu is None else unit.number(_along_and_across(exact, true)[0], sigma, sign=True),
+            ]
+        )
     return rows
 
 
@@ -114,32 +154,40 @@ def _along_and_across(position: Position, true: Tensor) -> tuple[float, float]:
     return along, float((error - along * sight).norm())
 
 
-def range_sigma_rows(found: RangeSigmas) -> list[list[str]]:
-    """Standard deviations of ranges by their sources, meters; empty where a range cannot be told."""
-    rows = [["at m", "σ of range", "marks", "lenses", "relative pose", "mounting, sideways"]]
+def range_sigma_rows(found: RangeSigmas, known: bool = True) -> list[list[str]]:
+    """Standard deviations of ranges by their sources; where a range cannot be told, that only the bearing is known.
+
+    Args:
+        found: from `kcal.locate.range_sigmas.range_sigmas`.
+        known: whether the rig has a covariance: else nothing is known of lenses and pose, and so of the sum.
+    """
+    rows = [["at", "σ of range", "marks", "lenses", "relative pose", "mounting, sideways"]]
     for distance, marks, lenses, pose, total, ranged, sideways in zip(*(part.tolist() for part in found), strict=True):
-        parts = [total, marks, lenses, pose] if ranged else []
-        cells = [_short(part) for part in parts] or ["bearing only", "", "", ""]
-        rows.append([f"{distance:g}", *cells, _short(sideways)])
+        cells = [length_text(part, digits=2) for part in (total, marks, lenses, pose)]
+        if not known:
+            cells = ["not known", cells[1], "not known", "not known"]
+        rows.append(
+            [
+                range_text(distance),
+                *(cells if ranged else ["bearing only", "", "", ""]),
+                length_text(sideways, digits=2),
+            ]
+        )
     return rows
-
-
-def _short(value: float) -> str:
-    if value == 0:
-        return "0"
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.3f}"
 
 
 def diagonal_rows(located: Located, board: Board) -> list[list[str]]:
     """The board's diagonal, known and located, for each pair of points named "NAME first" and "NAME last"."""
     true = math.dist(board.points[0].tolist(), board.points[-1].tolist())
-    rows = [["pair", "range m", "true mm", "estimated mm", "error mm"]]
+    rows = [["pair", "range", "true", "estimated", "error"]]
     ends = {position.name: position for position in located.positions}
     for name in sorted({name.rsplit(" ", 1)[0] for name in ends}):
         first, last = ends.get(f"{name} first"), ends.get(f"{name} last")
         if first is None or last is None or first.enu is None or last.enu is None:
             continue
         length = math.dist(first.enu, last.enu)
-        error = f"{1e3 * (length - true):+.2f}"
-        rows.append([name, f"{first.range_m:.3f}", f"{1e3 * true:.2f}", f"{1e3 * length:.2f}", error])
+        far, unit = first.range_m or 0.0, length_unit([true])
+        known = length_text(true, unit=unit, digits=5)
+        estimated, error = length_text(length, unit=unit, digits=5), length_text(length - true, digits=2, sign=True)
+        rows.append([name, length_text(far, range_sigma(first)), known, estimated, error])
     return rows

@@ -9,9 +9,19 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from kcal.errors import InputError
-from kcal.locate.ranges import range_text
+from kcal.locate.ranges import BEARING_SIGMAS
+from kcal.quantities import range_text
 
 Severity = Literal["stop", "doubt", "fine"]
+# The source of what a camera is wrong by beyond its error bars.
+FAULTS = "faults of the calibration"
+# What lessens each source, where no finding tells more.
+_NEXT = {
+    "marks": "mark targets more accurately, or use a longer baseline or focal length: no calibration mends this",
+    "lenses": "take more views of the board, near the borders of the image too, and calibrate again",
+    "relative pose": "mark more far features or surveyed landmarks in both images: they determine the relative yaw",
+    FAULTS: "look at the doubts below, and calibrate again without them",
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,13 +71,11 @@ class RangeAnswer:
 
     Args:
         requirement: what was asked.
-        parts: source -> standard deviation of the range from it, meters.
-        ranged: whether a range can be told at all there: the parallax is three of its sigmas.
+        parts: source -> standard deviation of the range from it, meters; infinite where nothing is known of it.
     """
 
     requirement: Requirement
     parts: Mapping[str, float]
-    ranged: bool = True
 
     @property
     def sigma(self) -> float:
@@ -75,9 +83,19 @@ class RangeAnswer:
         return math.hypot(*self.parts.values())
 
     @property
+    def ranged(self) -> bool:
+        """Whether a range can be told at all there: the parallax is three of its sigmas."""
+        return self.sigma * BEARING_SIGMAS <= self.requirement.distance
+
+    @property
     def ok(self) -> bool:
         """Whether the requirement is met."""
         return self.ranged and self.sigma <= self.requirement.meters
+
+    def fails_by(self, source: str) -> bool:
+        """Whether the requirement is missed, and this source is most of the error or alone makes the difference."""
+        rest = {name: part for name, part in self.parts.items() if name != source}
+        return not self.ok and (self.most == source or dataclasses.replace(self, parts=rest).ok)
 
     @property
     def most(self) -> str:
@@ -107,6 +125,8 @@ class Finding:
         text: what was found, and why it matters; one sentence.
         action: what to do; empty where nothing is needed.
         picture: name of the picture on the page that shows it.
+        part: the source of range errors that it makes larger, one of `RangeAnswer.parts`; empty: with it, no error bar
+            can be believed.
     """
 
     name: str
@@ -114,6 +134,7 @@ class Finding:
     text: str
     action: str = ""
     picture: str = ""
+    part: str = ""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -154,28 +175,54 @@ class Verdict:
 
     @property
     def reason(self) -> str:
-        """The one reason for the answer."""
-        if self.stops:
-            return self.stops[0].text
-        if failed := [answer for answer in self.answers if not answer.ok]:
-            worst = max(failed, key=lambda answer: answer.sigma / answer.requirement.meters)
-            return f"{worst.text}; most of it is from {worst.most}"
+        """The one reason: the largest contribution to what misses a requirement, else what forbids the use."""
+        named, worst = self._forbidding, self._worst
+        if named is not None and (worst is None or named.part in ("", FAULTS)):
+            return named.text
+        if worst is not None:
+            return f"{worst.text}; most of it is from {worst.most}" + (f": {named.text}" if named else "")
         if self.answers:
             return max(self.answers, key=lambda answer: answer.sigma / answer.requirement.meters).text
-        return "nothing was found that forbids its use; no range was required"
+        doubts = sum(finding.severity == "doubt" for finding in self.findings)
+        but = f", but there {'are' if doubts > 1 else 'is'} {doubts} doubt{'s' if doubts > 1 else ''}" if doubts else ""
+        return f"nothing was found that forbids its use{but}; no range was required"
 
     @property
     def next_step(self) -> str:
-        """The next picture to take, or what else to do; empty where nothing is needed."""
-        for finding in self.stops:
-            if finding.action:
-                return finding.action
-        failed = [answer for answer in self.answers if not answer.ok]
-        if any(answer.most == "marks" for answer in failed):
-            return "mark targets more accurately, or use a longer baseline or focal length: no calibration mends this"
-        if self.advice and not self.usable:
+        """The next picture to take, or what else to do, against the reason; empty where nothing is needed."""
+        named, worst = self._forbidding, self._worst
+        if named is not None and named.action:
+            return named.action
+        if worst is None:
+            return "nothing is needed" if self.usable else _NEXT["lenses"]
+        return self._against(worst.most)
+
+    @property
+    def improvement(self) -> str:
+        """What would make ranges better known where they are known well enough: against most of their error."""
+        if not self.answers:
+            return self.advice[0] if self.advice else "nothing is needed"
+        return self._against(max(self.answers, key=lambda answer: answer.sigma / answer.requirement.meters).most)
+
+    def _against(self, source: str) -> str:
+        if source == "lenses" and self.advice:
             return self.advice[0]
-        return "nothing is needed" if self.usable else "take more views of the board, near the borders of the image too"
+        return _NEXT.get(source, _NEXT["lenses"])
+
+    @property
+    def _worst(self) -> RangeAnswer | None:
+        """The answer that misses its requirement by most."""
+        failed = [answer for answer in self.answers if not answer.ok]
+        return max(failed, key=lambda answer: answer.sigma / answer.requirement.meters, default=None)
+
+    @property
+    def _forbidding(self) -> Finding | None:
+        """What forbids the use: error bars that nobody can believe, else what is behind the worst answer's error."""
+        worst = self._worst
+        without_worth = [finding for finding in self.stops if not finding.part]
+        if without_worth or worst is None:
+            return next(iter([*without_worth, *self.stops]), None)
+        return next((finding for finding in self.stops if finding.part == worst.most), None)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain numbers and texts, for JSON; a range that cannot be told has no sigma."""
@@ -204,3 +251,16 @@ class Verdict:
 def sorted_findings(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     """The most severe first, otherwise in their order."""
     return tuple(sorted(findings, key=lambda finding: ("stop", "doubt", "fine").index(finding.severity)))
+
+
+def weighed_findings(findings: Sequence[Finding], answers: Sequence[RangeAnswer]) -> tuple[Finding, ...]:
+    """Sorted findings, where a fault that the requirements bear is a doubt, and one that breaks them is the reason."""
+    breaks = any(answer.fails_by(FAULTS) for answer in answers)
+    return sorted_findings(
+        [
+            dataclasses.replace(finding, severity="stop")
+            if breaks and finding.part == FAULTS and finding.severity == "doubt"
+            else finding
+            for finding in findings
+        ]
+    )

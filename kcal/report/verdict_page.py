@@ -15,7 +15,7 @@ import kcal
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.files import write_atomic
 from kcal.lens.camera import Camera
-from kcal.locate.ranges import range_text
+from kcal.quantities import length_text, number_text, range_text
 from kcal.report.verdict import RangeAnswer, Verdict
 from kcal.report.verdict_pictures import range_picture
 from kcal.texts import page_policy, visible
@@ -44,7 +44,7 @@ def verdict_page(
 
     Args:
         verdict: what it says.
-        pictures: PNG data by name, of those in `CAPTIONS`.
+        pictures: PNG data by name, of those in `CAPTIONS`; after a camera's name and a hyphen where there are several.
         tables: rows of cells, the heads first.
 
     Example:
@@ -63,7 +63,7 @@ def verdict_page(
     return environment.get_template("verdict_page.html").render(
         verdict=verdict,
         pictures={name: base64.b64encode(data).decode("ascii") for name, data in drawn.items()},
-        captions=CAPTIONS,
+        captions={name: _caption(name) for name in drawn},
         tables=tables,
         style=jinja2.filters.Markup(style),
         policy=jinja2.filters.Markup(page_policy(styles=[style])),
@@ -97,16 +97,19 @@ def range_rows(verdict: Verdict) -> list[list[str]]:
     rows = [["range", "answer", "required σ", "σ", *names]]
     for answer in verdict.answers:
         values = [answer.requirement.meters, answer.sigma, *answer.parts.values()]
-        cells = [_meters_plain(value) if math.isfinite(value) else "none" for value in values]
+        cells = [length_text(value, digits=2) if math.isfinite(value) else "not known" for value in values]
         rows.append([range_text(answer.requirement.distance), "yes" if answer.ok else "no", *cells])
     return rows
 
 
-def camera_tables(camera: Camera, result: CameraCalibrationResult | None = None) -> list[list[list[str]]]:
+def camera_tables(
+    camera: Camera, result: CameraCalibrationResult | None = None, name: str = ""
+) -> list[list[list[str]]]:
     """Tables of a camera: how it was calibrated, its parameters with σ, the strongest correlations."""
     known = camera.calibration
     record = known.record if known else None
-    facts = [["camera", ""], ["image", f"{camera.size[0]} x {camera.size[1]} px"], ["lens model", f"{camera.model}"]]
+    name = name or (known.name if known else "") or "camera"
+    facts = [[name, ""], ["image", f"{camera.size[0]} x {camera.size[1]} px"], ["lens model", f"{camera.model}"]]
     if record is not None:
         facts += [
             ["calibrated", f"{record.created:%Y-%m-%d %H:%M} UTC, kcal {record.kcal_version}"],
@@ -121,7 +124,7 @@ def camera_tables(camera: Camera, result: CameraCalibrationResult | None = None)
     rows = [["parameter", "value", "σ"]]
     for name, value in list(zip(camera.names, camera.params.detach().tolist(), strict=True))[:_MOST_PARAMETERS]:
         own = sigma.get(name)
-        rows.append([name, f"{value:.6g}", "" if own is None else f"{own:.2g}"])
+        rows.append([name, number_text(value, own, digits=6), "" if own is None else number_text(own, own)])
     tables = [facts, rows]
     if known is not None and known.covariance is not None:
         tables.append(_correlations(camera))
@@ -144,6 +147,11 @@ def _correlations(camera: Camera) -> list[list[str]]:
     return [["strongest correlations", ""], *([f"{a}, {b}", f"{value:+.3f}"] for value, a, b in found)]
 
 
+def _caption(name: str) -> str:
+    side, _, kind = name.rpartition("-")
+    return f"{side.capitalize()} camera. {CAPTIONS[kind]}" if side else CAPTIONS[kind]
+
+
 def _visible_text(value: Any) -> Any:
     return visible(value) if type(value) is str else value
 
@@ -151,11 +159,7 @@ def _visible_text(value: Any) -> Any:
 def _found(answer: RangeAnswer) -> str:
     if not answer.ranged or not math.isfinite(answer.sigma):
         return "no range can be told"
-    return f"±{_percent(100.0 * answer.sigma / answer.requirement.distance)}, {_meters_plain(answer.sigma)}"
-
-
-def _meters_plain(value: float) -> str:
-    return f"{value:.0f} m" if value >= 100 else f"{value:.2g} m"
+    return f"±{_percent(100.0 * answer.sigma / answer.requirement.distance)}, {length_text(answer.sigma, digits=2)}"
 
 
 def _percent(value: float) -> str:

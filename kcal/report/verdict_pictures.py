@@ -15,14 +15,14 @@ from kcal.calibrate.camera.advice import board_tilts
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.camera.trust import Examination
 from kcal.lens.difference import CameraDifference
-from kcal.locate.ranges import range_text
+from kcal.quantities import range_text
 from kcal.report.board import board_figure
 from kcal.report.calibration import draw_coverage, draw_residuals, draw_uncertainty, draw_view_rms
 from kcal.report.colors import ACCENT, FAINT, GRAY, INK, WARN
 from kcal.report.figures import draw_arrows, frame_image, new_figure
-from kcal.report.verdict import RangeAnswer
+from kcal.report.verdict import FAULTS, RangeAnswer
 
-_PART_COLORS = (ACCENT, "#dd7a1f", WARN)
+_PART_COLORS = {"marks": ACCENT, "lenses": "#dd7a1f", "relative pose": "#0f766e", FAULTS: WARN}
 
 
 def png_bytes(figure: Figure) -> bytes:
@@ -48,7 +48,7 @@ def camera_pictures(result: CameraCalibrationResult, examination: Examination | 
         for half in examination.halves:
             title = f"Difference of cameras from halves: {half.label}"
             found.setdefault("halves", png_bytes(_difference_figure(half.difference, title)))
-            if not half.alike and (half.difference.probability or 1.0) < 1e-6:
+            if not half.alike and (half.difference.probability or 0.0) < 1e-3:
                 found["halves"] = png_bytes(_difference_figure(half.difference, title))
         if examination.model is not None:
             found["model"] = png_bytes(_difference_figure(examination.model, "Difference from the hybrid lens"))
@@ -67,10 +67,17 @@ def range_picture(answers: Sequence[RangeAnswer]) -> bytes:
         far = answer.requirement.distance
         total = answer.sigma
         start = 0.0
-        for name, color in zip(names, _PART_COLORS, strict=False):
+        for name in names:
             # Shares of the variance, drawn as shares of the bar.
             length = 100.0 * total / far * (answer.parts[name] / total) ** 2 if 0 < total < math.inf else 0.0
-            axes.barh(row, length, left=start, color=color, height=0.5, label=name if row == 0 else None)
+            axes.barh(
+                row,
+                length,
+                left=start,
+                color=_PART_COLORS.get(name, FAINT),
+                height=0.5,
+                label=name if row == 0 else None,
+            )
             start += length
         allowed = 100.0 * answer.requirement.meters / far
         axes.plot([allowed, allowed], [row - 0.4, row + 0.4], color=INK, linewidth=2.2)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from kcal.locate.ranges import range_text
+from kcal.quantities import range_text
 from kcal.report.figures import new_figure, save_picture
 from scripts.paper.numbers import (
     DISTANCES,

@@ -48,7 +48,7 @@ def test_writes_files_and_a_table(
     printed = capsys.readouterr().out
     line = next(line for line in printed.splitlines() if line.startswith("[b]mast"))
     # 1 km west (0.0108116 degrees) and 10 m north (9.0e-5); a straight line west bends 5 cm north of the parallel.
-    assert line.split()[1:5] == ["-33.8999094", "151.1891884", "10.1", "1000"]
+    assert line.split()[1:5] == ["-33.8999094", "151.1891884", "10.07", "1000"]
     assert "lost: a mark lies outside its image" in printed
     assert "errors in calibration and mounting are not included" in printed
     features = json.loads((folder / "out.geojson").read_text())["features"]
@@ -120,7 +120,7 @@ def test_nothing_located_is_a_failure_with_its_reasons(
     [
         (["rig.json", "points.csv", "--origin", "151.2,-33.9,10", "--heading", "0"], "longitude came first"),
         (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "nan"], "heading nan"),
-        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--pixel-sigma", "0"], "pixel_sigma"),
+        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--pixel-sigma", "0"], "--pixel-sigma 0.0"),
         (["rig.json", "nothing.csv", "--origin", ORIGIN, "--heading", "0"], "nothing.csv: cannot read"),
         (
             ["points.csv", "points.csv", "--origin", ORIGIN, "--heading", "0"],

@@ -125,9 +125,9 @@ def test_without_error_bars_sigma_is_unknown() -> None:
 def test_one_number_where_both_are_equal_as_far_as_is_known() -> None:
     value, covariance = torch.tensor([500.0, 501.0]).double(), torch.tensor([[1.0, 0.9], [0.9, 1.0]]).double()
     assert ParaxialFocal(value, covariance.diagonal().sqrt(), covariance).aspect[1] == pytest.approx(9e-4, rel=0.02)
-    assert str(ParaxialFocal(value, covariance.diagonal().sqrt(), covariance)) == "500.500 ± 0.975 px"
+    assert str(ParaxialFocal(value, covariance.diagonal().sqrt(), covariance)) == "500.50 ± 0.97 px"
     sure = 0.1 * covariance
-    text = "500.000 ± 0.316 px along rows, 501.000 ± 0.316 px along columns"
+    text = "500.00 ± 0.32 px along rows, 501.00 ± 0.32 px along columns"
     assert str(ParaxialFocal(value, sure.diagonal().sqrt(), sure)) == text
 
 

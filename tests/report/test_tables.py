@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 from locate_rigs import pinhole_rig, tensor
 
 from kcal.corners.board import Board
+from kcal.lens.rig import StereoRig
 from kcal.locate.geodesy import Origin
 from kcal.locate.positions import locate_points
+from kcal.locate.range_sigmas import range_sigmas
 from kcal.locate.truth import position_errors
-from kcal.report.tables import diagonal_rows, position_rows, truth_rows
+from kcal.report.tables import diagonal_rows, position_rows, range_sigma_rows, truth_rows
 
 ORIGIN = Origin(lat=10.0, lon=20.0, height=0.0)
 
@@ -22,9 +25,9 @@ def test_positions_and_what_they_miss() -> None:
     located = locate_points(pinhole_rig(), left, right, origin=ORIGIN, heading_deg=0.0, names=["gate", "lost"])
     truth = tensor([3.0, 96.0, 0.0], [math.nan] * 3)
     heads, gate, lost = position_rows(located, position_errors(located, truth))
-    assert gate[:1] + gate[4:5] == ["gate", "100.0"]
-    assert dict(zip(heads, gate, strict=True))["off level m"] == "5.0"
-    assert dict(zip(heads, gate, strict=True))["off in range m"] == "+4.0"
+    assert gate[:1] + gate[4:5] == ["gate", "100.00"]
+    assert dict(zip(heads, gate, strict=True))["off level m"] == "5.00"
+    assert dict(zip(heads, gate, strict=True))["off in range m"] == "+3.95"
     assert lost[1:-1] == [""] * (len(heads) - 2)
     assert lost[-1].endswith("*")
 
@@ -39,8 +42,36 @@ def test_errors_along_and_across_the_line_of_sight() -> None:
         for pair in ((left, right), exact)
     )
     row = dict(zip(*truth_rows(located, noiseless, true), strict=True))
-    assert (row["error m"], row["%"], row["across m"]) == ("+1.00", "+1.00", "2.00")
-    assert row["calibration m"] in ("+0.00", "-0.00")
+    assert (row["error m"], row["%"], row["across m"]) == ("+1.00", "+1.00", "2.0")
+    assert row["calibration m"] == "+0.00"
+
+
+@pytest.mark.parametrize(
+    ("scale", "distance", "heads", "cells"),
+    [
+        (0.01, 0.4, ["range mm", "interval mm"], ["400.00", "399.17 – 400.83"]),
+        (1.0, 400.0, ["range m", "interval m"], ["400.0", "391.9 – 408.5"]),
+        (10.0, 20e3, ["range km", "interval km"], ["20.0", "18.1 – 22.3"]),
+    ],
+    ids=["bench", "site", "sea"],
+)
+def test_units_fit_the_range_and_numbers_their_sigma(
+    scale: float, distance: float, heads: list[str], cells: list[str]
+) -> None:
+    rig = pinhole_rig()
+    rig = StereoRig(rig.left, rig.right, rig.right_from_left_rotation, scale * rig.right_from_left_translation)
+    pixels = rig(tensor([0.0, 0.0, distance]))[:2]
+    located = locate_points(rig, *pixels, origin=ORIGIN, heading_deg=0.0)
+    head, row = position_rows(located)
+    assert head[4:6] == heads
+    assert row[4:6] == cells
+
+
+def test_a_sum_is_not_known_where_a_part_is_not() -> None:
+    rig = pinhole_rig()
+    head, row = range_sigma_rows(range_sigmas(rig, [1000.0]), known=rig.covariance is not None)
+    assert [row[head.index(name)] for name in ("σ of range", "lenses", "relative pose")] == ["not known"] * 3
+    assert row[head.index("marks")].endswith(" m")
 
 
 def test_diagonals_of_pairs_whose_ends_were_both_located() -> None:
@@ -52,4 +83,4 @@ def test_diagonals_of_pairs_whose_ends_were_both_located() -> None:
     )
     _, row = diagonal_rows(located, board)
     assert row[0] == "a"
-    assert row[2:] == ["5000.00", "5006.01", "+6.01"]
+    assert row[2:] == ["5.0000 m", "5.0060 m", "+6.0 mm"]

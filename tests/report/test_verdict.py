@@ -230,6 +230,50 @@ def test_real_corners_are_never_quite_independent(clean: CameraCalibrationResult
     assert severity(tempering=2.5) == "stop"
 
 
+def test_two_cameras_that_one_lens_can_fit_are_told_by_their_halves(
+    clean: CameraCalibrationResult, examination: Examination
+) -> None:
+    """Motions and a measured board fit images of two like cameras together; each half then predicts the other badly."""
+    result = calibrate_camera(clean.observations)
+    alike = next(half for half in examination.halves if half.alike)
+    other = dataclasses.replace(alike, label="images left… and right…", alike=False)
+
+    def found(held_out: float, probability: float, fit: CameraCalibrationResult = result) -> tuple[list[str], float]:
+        difference = dataclasses.replace(alike.difference, ratio=3.0, probability=probability)
+        halves = (alike, dataclasses.replace(other, difference=difference, held_out=held_out * alike.held_out))
+        given = dataclasses.replace(examination, halves=halves, reference=None, model=None)
+        findings, beyond = model_findings(fit, CalibrationOptions(), given)
+        return [one.name for one in findings if one.severity == "stop"], beyond
+
+    names, beyond = found(1.9, 1e-4)
+    assert names == ["changed"]
+    assert beyond > 0.0
+    assert found(1.2, 1e-4) == ([], 0.0)
+    assert found(1.9, 0.1) == ([], 0.0)
+    # A parametric model that does not fit its lens predicts badly too.
+    assert found(1.9, 1e-4, clean)[0] == []
+
+
+def test_a_camera_that_is_not_from_these_views_is_told(
+    clean: CameraCalibrationResult, examination: Examination
+) -> None:
+    def told(stored: Camera) -> dict[str, str]:
+        verdict = camera_verdict(clean, OPTIONS, examination=examination, stored=stored)
+        return {one.name: one.severity for one in verdict.findings if one.name == "other-views"}
+
+    assert told(clean.camera) == {}
+    values = clean.camera.params.clone()
+    values[:2] *= 1.03
+    assert told(clean.camera.with_parameters(values)) == {"other-views": "stop"}
+    assert clean.camera.calibration is not None
+    assert clean.camera.calibration.record is not None
+    record = clean.camera.calibration.record
+    more = dataclasses.replace(record, views=record.views + 1, per_view_rms={**record.per_view_rms, "far.png": 0.1})
+    other = Camera(clean.camera.params, size=clean.camera.size, model=clean.camera.model)
+    other.calibration = dataclasses.replace(clean.camera.calibration, record=more)
+    assert told(other) == {"other-views": "doubt"}
+
+
 def test_a_file_alone_is_believed_and_said_so(clean: CameraCalibrationResult) -> None:
     verdict = stored_verdict(clean.camera, Requirement.parse("100m:10%"), mark_sigma=0.1)
     assert verdict.usable

@@ -21,8 +21,11 @@ from kcal.calibrate.camera.refit import refit_camera
 from kcal.errors import DegenerateError, InputError
 from kcal.files import write_atomic
 from kcal.io.foreign import CameraPose, camera_name, paths_for, plain, rig_poses
+from kcal.io.format_kalibr import write_omni
 from kcal.io.format_mrcal import fit_spline, project_spline, write_model
 from kcal.io.formats import FORMATS, CameraFormat, format_named, held_exactly
+from kcal.io.kalibr_omni import NAME as OMNI
+from kcal.io.kalibr_omni import fit_omni, project_omni
 from kcal.lens.camera import Camera
 from kcal.lens.images import undistort_maps
 from kcal.lens.model import LensModel
@@ -33,6 +36,8 @@ from kcal.lens.rig import StereoRig
 _DENSE = (129, 97)
 _SPLINE_SAMPLES = (193, 145)
 REMAP = "remap"
+# Pixels (RMS) up to which a pinhole model of Kalibr stands for a lens.
+_NEAR = 0.2
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,6 +83,7 @@ class ExportedCameras:
         models: lens model of each camera in them, by its name there or in kcal.
         misfits: for each camera None if it was written exactly.
         lost: what the cameras have and the files do not.
+        notes: what a reader of the files should know.
     """
 
     format: str
@@ -85,6 +91,7 @@ class ExportedCameras:
     models: tuple[str, ...]
     misfits: tuple[Misfit | None, ...]
     lost: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def format_for(path: str | Path, format: str | None = None) -> str:
@@ -118,6 +125,9 @@ def export_cameras(
     The format follows from the suffix: `.yml`, `.yaml`, `.xml` OpenCV; `.cameramodel` mrcal; `.txt`, `.bin` COLMAP;
     `.json` nerfstudio; `.mat` MATLAB; `.npz` maps for `cv2.remap`. Others are named: ros, kalibr, opensfm. Formats
     with one camera per file get NAME_left and NAME_right for a rig.
+
+    Cameras of one file get one lens model, the one that is nearest to all of them. Kalibr's chains hold wide lenses as
+    omni-radtan, where its pinhole models are far off.
 
     Args:
         cameras: a single camera, a rig, or single cameras without poses.
@@ -160,10 +170,18 @@ def export_cameras(
     exact = [held_exactly(camera, [model] if model else known.models, known.skew) for camera in several]
     if name == "mrcal" and model is None and None in exact:
         return _write_splines(several, exact, poses, path, _lost(several, rig, known))
+    found = _in_one_model(several, exact, name, model)
+    if name == "kalibr" and model is None and (omni := _nearer_omni(several, found)) is not None:
+        values, omni_misfits = omni
+        return ExportedCameras(
+            format=name,
+            paths=tuple(write_omni(several, values, poses, path)),
+            models=(OMNI,) * len(several),
+            misfits=omni_misfits,
+            lost=_lost(several, rig, known),
+        )
     written, misfits = [], []
-    for camera, held in zip(several, exact, strict=True):
-        substitute, misfit = (held, None) if held is not None else _refitted(camera, name, model)
-        assert substitute is not None
+    for camera, (substitute, misfit) in zip(several, found, strict=True):
         substitute.calibration = substitute.calibration or (camera.calibration and dataclasses.replace(
             camera.calibration, sigma=None, covariance=None, information=None
         ))  # fmt: skip
@@ -175,7 +193,76 @@ def export_cameras(
         models=tuple(str(camera.model) for camera in written),
         misfits=tuple(misfits),
         lost=_lost(several, rig, known),
+        notes=_mixed(written),
     )
+
+
+def _mixed(cameras: Sequence[Camera]) -> tuple[str, ...]:
+    """A note where fisheye and other lenses are together."""
+    if len({camera.model.fisheye for camera in cameras}) < 2:
+        return ()
+    models = " and ".join(dict.fromkeys(str(camera.model) for camera in cameras))
+    return (
+        f"the cameras have lens models of different kinds, {models}: programs that expect one kind cannot use them",
+    )
+
+
+def _in_one_model(
+    cameras: Sequence[Camera], exact: Sequence[Camera | None], name: str, model: str | None
+) -> list[tuple[Camera, Misfit | None]]:
+    """Each camera in a model of the format, in one model for all unless every camera is held exactly."""
+    held = [(camera, None) for camera in exact if camera is not None]
+    if len(held) == len(cameras):
+        return list(held)
+    found: list[list[tuple[Camera, Misfit | None]]] = []
+    for kind in _richest([model] if model else FORMATS[name].models):
+        try:
+            found.append([_in_model(camera, kind, name) for camera in cameras])
+        except (InputError, DegenerateError):
+            continue
+    if found:
+        return min(found, key=_squares)
+    own = [(one, None) if one is not None else _refitted(camera, name, model)
+           for camera, one in zip(cameras, exact, strict=True)]  # fmt: skip
+    return list(own)
+
+
+def _in_model(camera: Camera, kind: LensModel, name: str) -> tuple[Camera, Misfit | None]:
+    """A camera in a lens model, exactly where it contains the lens."""
+    held = held_exactly(camera, [str(kind)], FORMATS[name].skew)
+    if held is not None:
+        return held, None
+    fitted = refit_camera(camera, kind).camera
+    return fitted, measured_misfit(camera, str(kind), fitted.project_rays)
+
+
+def _squares(found: Sequence[tuple[Camera, Misfit | None]]) -> float:
+    return sum(misfit.rms**2 for _, misfit in found if misfit is not None)
+
+
+def _nearer_omni(
+    cameras: Sequence[Camera], found: Sequence[tuple[Camera, Misfit | None]]
+) -> tuple[list[list[float]], tuple[Misfit, ...]] | None:
+    """Kalibr's omni-radtan of each camera, where its pinhole models are far off and this one is much nearer."""
+    if _squares(found) <= len(cameras) * _NEAR**2:
+        return None
+    values, misfits = [], []
+    for camera in cameras:
+        pixels = camera.grid(33, 25).reshape(-1, 2)
+        rays, valid = camera.unproject(pixels)
+        own = fit_omni(rays[valid].numpy(), pixels[valid].numpy(), float(camera.focal.mean()))
+
+        def project(rays: Tensor, own=own) -> tuple[Tensor, Tensor]:  # type: ignore[no-untyped-def]
+            seen, ahead = project_omni(own, rays.numpy())
+            return torch.from_numpy(seen), torch.from_numpy(ahead)
+
+        try:
+            misfits.append(measured_misfit(camera, OMNI, project))
+        except DegenerateError:
+            return None
+        values.append(own.tolist())
+    nearer = sum(misfit.rms**2 for misfit in misfits) < 0.25 * _squares(found)
+    return (values, tuple(misfits)) if nearer else None
 
 
 def _lost(cameras: Sequence[Camera], rig: StereoRig | None, known: CameraFormat) -> tuple[str, ...]:
@@ -215,14 +302,17 @@ def measured_misfit(camera: Camera, model: str, project: Callable[[Tensor], tupl
     return Misfit(model=model, pixels=pixels, shift=shift.reshape(pixels.shape))
 
 
+def _richest(models: Sequence[str]) -> list[LensModel]:
+    """The models that no other one of them contains."""
+    kinds = [LensModel.named(model) for model in models]
+    return [kind for kind in kinds if not any(other != kind and other.contains(kind) for other in kinds)]
+
+
 def _refitted(camera: Camera, name: str, model: str | None) -> tuple[Camera, Misfit]:
     """The model of a format that comes nearest to a camera."""
-    models = [model] if model else FORMATS[name].models
-    kinds = [LensModel.named(m) for m in models]
-    richest = [kind for kind in kinds if not any(other != kind and other.contains(kind) for other in kinds)]
     found: list[tuple[Camera, Misfit]] = []
     refused = []
-    for kind in richest:
+    for kind in _richest([model] if model else FORMATS[name].models):
         try:
             fitted = refit_camera(camera, kind).camera
             found.append((fitted, measured_misfit(camera, str(kind), fitted.project_rays)))

@@ -165,6 +165,7 @@ class CameraCalibrationResult:
             noise=self.noise,
             tempering=None if self.hybrid is None else self.hybrid.tempering,
             board_deviation=self._board_deviation(),
+            warnings=self.warnings,
             **provenance(),
         )
 

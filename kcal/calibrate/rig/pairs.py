@@ -63,6 +63,20 @@ def pair_by_name(left: Sequence[str], right: Sequence[str]) -> list[Pair]:
     )
 
 
+def names_by_side(names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Names by the camera's word in them, and by what else is in them; names without such a word are left out.
+
+    Example:
+        >>> names_by_side(["left01.jpg", "right01.jpg", "left02.jpg", "far.jpg"])
+        {'left': {'01': 'left01.jpg', '02': 'left02.jpg'}, 'right': {'01': 'right01.jpg'}}
+    """
+    found: dict[str, dict[str, str]] = {}
+    for name in names:
+        if side := _SIDE.search(Path(name).stem):
+            found.setdefault(side.group().lower(), {})[_without_side(name)] = name
+    return found
+
+
 def _by_key(names: Sequence[str], key: Callable[[str], str]) -> dict[str, list[str]]:
     table: dict[str, list[str]] = {}
     for name in names:

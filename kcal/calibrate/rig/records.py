@@ -39,7 +39,11 @@ def item_records(work: Adjustment, masks: PerKind, reasons: Reasons) -> tuple[It
         for k, kind in enumerate(KINDS):
             for i in chosen[k].nonzero()[:, 0].tolist():
                 sigmas = math.sqrt(float(squares[k][i]) / max(int(freedom[k][i]), 1))
-                why = "" if used else reasons[kind].get(i) or _contradiction(work, kind, pixels[kind][i], sigmas)
+                why = (
+                    ""
+                    if used
+                    else reasons[kind].get(i) or _contradiction(work, kind, pixels[kind][i], sigmas, float(over[k][i]))
+                )
                 items.append(
                     ItemResidual(
                         source=kind,
@@ -127,7 +131,7 @@ def _off_survey(work: Adjustment, index: int) -> float:
     return float(torch.linalg.vector_norm(work.state.points[index] - work.data.landmarks.points[index]))
 
 
-def _contradiction(work: Adjustment, kind: Kind, pixels: Sequence[float | None], sigmas: float) -> str:
+def _contradiction(work: Adjustment, kind: Kind, pixels: Sequence[float | None], sigmas: float, over: float) -> str:
     seen = [(value, name) for value, name in zip(pixels, work.data.names, strict=True) if value is not None]
     text = ", ".join(
         f"{value:.2g} px in {name}" if math.isfinite(value) else f"not seen by {name}" for value, name in seen
@@ -137,7 +141,15 @@ def _contradiction(work: Adjustment, kind: Kind, pixels: Sequence[float | None],
     if kind == "features":
         return f"its marks do not meet: off by {text} ({sigmas:.0f} sigma): not the same thing, or it moved"
     why = "it moved between the views, or a lens differs from its model"
-    return f"it does not fit the other boards: off by {text} ({sigmas:.1f} sigma): {why}"
+    # A board of many corners is wrong at few sigmas. One that is within its own limit was left out because the others
+    # fit better without it (`outliers.without_wrong`).
+    if over > 1.0:
+        most = f"{sigmas:.2f} sigma on average, where so many corners allow {sigmas / math.sqrt(over):.2f}"
+        return f"it does not fit the other boards: off by {text} ({most}): {why}"
+    return (
+        "it does not fit the other boards: with it, these fit worse than chance explains, though it is off by only "
+        f"{text} ({sigmas:.2f} sigma on average): {why}"
+    )
 
 
 def _measurement_records(work: Adjustment) -> list[ItemResidual]:

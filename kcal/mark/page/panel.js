@@ -73,7 +73,7 @@ export function drawPanel(app) {
     for (const text of ["σ of a range at", "marks", "rig", "total"]) { const th = document.createElement("th"); th.textContent = text; head.append(th); }
     for (const promise of rig.promises) {
       const row = table.insertRow();
-      for (const text of [promise.distance < 1000 ? `${promise.distance} m` : `${promise.distance / 1000} km`, meters(promise.marks), promise.rig === null ? "not known" : meters(promise.rig), meters(promise.total)]) cell(row, text);
+      for (const text of [promise.distance < 1000 ? `${promise.distance} m` : `${promise.distance / 1000} km`, meters(promise.marks), promise.rig === null ? "not known" : meters(promise.rig), (promise.rig === null ? "at least " : "") + meters(promise.total)]) cell(row, text);
     }
   }
   drawHistory(rig.history);

@@ -1,0 +1,84 @@
+"""Files that kcal writes for other programs: what is in them, for lenses that are not in the middle and for pairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from scipy.io import loadmat
+
+from kcal.io.foreign import rig_poses
+from kcal.io.format_kalibr import write_omni
+from kcal.io.format_matlab import write_matlab
+from kcal.io.format_mrcal import fit_spline, project_spline
+from kcal.io.formats import import_cameras
+from kcal.io.kalibr_omni import fit_omni, project_omni
+from kcal.lens.camera import Camera
+from kcal.lens.rig import StereoRig
+
+
+def lens(center: tuple[float, float] = (319.5, 239.5)) -> Camera:
+    return Camera.build(
+        focal=(500, 500), center=center, size=(640, 480), coefficients=[-0.2, 0.05, 0.001, -0.002], model="opencv4"
+    )
+
+
+def pair() -> StereoRig:
+    return StereoRig(lens(), lens((300.0, 250.0)), torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
+
+
+def test_a_spline_covers_the_wider_side() -> None:
+    """Whichever side of the image it is on: of a camera and its mirror image the same."""
+    grids = []
+    for center in ((500.0, 400.0), (139.0, 79.0)):
+        camera = Camera.build(focal=(500, 500), center=center, size=(640, 480), coefficients=[-0.2, 0.05])
+        pixels = camera.grid(97, 73).reshape(-1, 2)
+        rays, valid = camera.unproject(pixels)
+        grid, values = fit_spline(rays[valid].numpy(), pixels[valid].numpy(), camera.size)
+        error = project_spline(grid, values, rays[valid].numpy()) - pixels[valid].numpy()
+        assert np.abs(error).max() < 0.05
+        grids.append((grid.fov_deg, grid.rows))
+    assert grids[0] == grids[1]
+
+
+def test_matlab_has_one_camera_or_a_pair(tmp_path: Path) -> None:
+    (single,) = write_matlab([lens()], [], tmp_path / "one.mat")
+    assert "stereoParams" not in loadmat(single)
+    (read,) = import_cameras(single).cameras
+    torch.testing.assert_close(read.params, lens().params)
+    rig = pair()
+    (both,) = write_matlab([rig.left, rig.right], rig_poses(rig), tmp_path / "two.mat")
+    assert "cameraParams" not in loadmat(both)
+    found = import_cameras(both).rig()
+    torch.testing.assert_close(found.right_from_left_translation, rig.right_from_left_translation)
+    torch.testing.assert_close(found.right.params, rig.right.params)
+
+
+def test_an_omni_lens_is_written_as_kalibr_has_it(tmp_path: Path) -> None:
+    rig = pair()
+    values = [
+        [1.1, 600.0, 601.0, 320.0, 240.0, -0.1, 0.01, 0.001, 0.002],
+        [0.9, 590.0, 591.0, 321.0, 241.0, 0, 0, 0, 0],
+    ]
+    (path,) = write_omni([rig.left, rig.right], values, rig_poses(rig), tmp_path / "chain.yaml")
+    first, second = (yaml.safe_load(path.read_text())[name] for name in ("cam0", "cam1"))
+    assert (first["camera_model"], first["distortion_model"]) == ("omni", "radtan")
+    assert first["intrinsics"] + first["distortion_coeffs"] == values[0]
+    assert "T_cn_cnm1" not in first
+    assert np.array(second["T_cn_cnm1"])[:3, 3].tolist() == pytest.approx([-0.1, 0, 0])
+
+
+def test_an_omni_lens_is_found_again() -> None:
+    truth = np.array([1.2, 600.0, 601.0, 320.0, 240.0, -0.1, 0.01, 0.001, 0.002])
+    angle, turn = np.meshgrid(np.linspace(0.01, 1.4, 15), np.linspace(0.0, 6.0, 20))
+    rays = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], -1).reshape(-1, 3)
+    pixels, ahead = project_omni(truth, rays)
+    assert ahead.all()
+    # On the axis, xi only scales the focal length; lengths of rays do not matter.
+    assert project_omni(truth, np.array([[0.0, 0.0, 3.0]]))[0][0].tolist() == [320.0, 240.0]
+    assert not project_omni(np.array([0.5, *truth[1:]]), np.array([[0.0, 0.1, -2.0]]))[1].any()
+    found = fit_omni(rays, pixels, 270.0)
+    assert np.abs(project_omni(found, 2.0 * rays)[0] - pixels).max() < 1e-3

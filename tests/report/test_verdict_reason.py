@@ -1,0 +1,88 @@
+"""The one reason of a verdict, and the next step: those of the largest contribution to what misses a requirement."""
+
+from __future__ import annotations
+
+import math
+
+from kcal.report.verdict import FAULTS, Finding, RangeAnswer, Requirement, Verdict, weighed_findings
+
+MARKS = "mark targets more accurately"
+STRUCTURE = Finding(
+    name="model", severity="stop", text="residuals are not noise", action="check the board", part=FAULTS
+)
+SLIGHT = Finding(name="model", severity="doubt", text="it bends", action="measure the board", part=FAULTS)
+TILT = Finding(name="tilt", severity="stop", text="no tilted views", action="tilt the board", part="lenses")
+MIRRORED = Finding(name="mirrored", severity="stop", text="all views are mirrored", action="switch it off")
+
+
+def answer(meters: float, **parts: float) -> RangeAnswer:
+    named = {name.replace("_", " "): part for name, part in parts.items()}
+    return RangeAnswer(requirement=Requirement(distance=5000.0, meters=meters), parts=named)
+
+
+def verdict(given: RangeAnswer, *findings: Finding, advice: tuple[str, ...] = ()) -> Verdict:
+    return Verdict(subject="left", answers=(given,), findings=weighed_findings(findings, [given]), advice=advice)
+
+
+def faults(meters: float, marks: float, lenses: float, beyond: float) -> RangeAnswer:
+    parts = {"marks": marks, "lenses": lenses, FAULTS: beyond}
+    return RangeAnswer(requirement=Requirement(distance=5000.0, meters=meters), parts=parts)
+
+
+def test_marks_are_the_reason_where_they_are_most_of_the_error() -> None:
+    found = verdict(faults(500.0, 1983.0, 40.0, 0.0), STRUCTURE, advice=("show the board in the corners",))
+    assert not found.usable
+    assert found.reason.endswith("most of it is from marks")
+    assert found.next_step.startswith(MARKS)
+    # The fault is still told, and forbids the use by itself.
+    assert found.stops == (STRUCTURE,)
+    assert verdict(faults(500.0, 100.0, 40.0, 0.0), STRUCTURE).reason == STRUCTURE.text
+
+
+def test_a_fault_is_a_reason_only_where_it_breaks_the_requirement() -> None:
+    # Without it the range would be missed all the same.
+    small = verdict(faults(500.0, 1900.0, 40.0, 30.0), SLIGHT)
+    assert [finding.severity for finding in small.findings] == ["doubt"]
+    assert small.next_step.startswith(MARKS)
+    # It is most of the error.
+    large = verdict(faults(500.0, 600.0, 40.0, 900.0), SLIGHT)
+    assert (large.reason, large.next_step) == (SLIGHT.text, SLIGHT.action)
+    # It is not most of it, but without it the requirement would be met.
+    last = verdict(faults(500.0, 400.0, 40.0, 350.0), SLIGHT)
+    assert [finding.severity for finding in last.findings] == ["stop"]
+    assert verdict(faults(1000.0, 400.0, 40.0, 350.0), SLIGHT).usable
+
+
+def test_the_next_picture_belongs_to_the_reason() -> None:
+    lenses = answer(100.0, marks=30.0, lenses=400.0)
+    assert verdict(lenses, advice=("show the board at the top",)).next_step == "show the board at the top"
+    assert verdict(lenses, TILT, advice=("show the board at the top",)).next_step == TILT.action
+    assert verdict(lenses, TILT).reason.endswith(f"most of it is from lenses: {TILT.text}")
+    pose = verdict(answer(100.0, marks=30.0, relative_pose=400.0), TILT, advice=("show the board at the top",))
+    assert "most of it is from relative pose" in pose.reason
+    assert pose.next_step.startswith("mark more far features")
+
+
+def test_error_bars_that_nobody_can_believe_come_first() -> None:
+    found = verdict(faults(500.0, 1983.0, 40.0, 0.0), TILT, MIRRORED)
+    assert (found.reason, found.next_step) == (MIRRORED.text, MIRRORED.action)
+
+
+def test_a_yes_tells_of_doubts() -> None:
+    assert "nothing was found that forbids its use; no" in Verdict(subject="left").reason
+    assert "but there is 1 doubt;" in Verdict(subject="left", findings=(SLIGHT,)).reason
+    assert "but there are 2 doubts;" in Verdict(subject="left", findings=(SLIGHT, SLIGHT)).reason
+
+
+def test_what_is_not_known_is_no_yes() -> None:
+    given = answer(500.0, marks=10.0, lenses=math.inf)
+    assert not given.ranged
+    assert not given.ok
+    assert given.text == "at 5 km no range can be told; 10 % are required"
+
+
+def test_what_would_improve_a_yes_is_against_most_of_its_error() -> None:
+    advice = ("show the board at the top",)
+    assert verdict(answer(500.0, marks=100.0, lenses=20.0), advice=advice).improvement.startswith(MARKS)
+    assert verdict(answer(500.0, marks=10.0, lenses=20.0), advice=advice).improvement == advice[0]
+    assert Verdict(subject="left", advice=advice).improvement == advice[0]
