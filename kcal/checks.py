@@ -10,6 +10,9 @@ from torch import Tensor, nn
 
 from kcal.errors import InputError
 
+# Pixels: a telescope of 100 m has 1e8.
+MOST_FOCAL = 1e8
+
 
 def as_points(name: str, value: Tensor, last: int) -> Tensor:
     """Return `value` as float64 after checking that it is a real floating tensor of shape (..., last).

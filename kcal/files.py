@@ -5,36 +5,64 @@ Floats are written with Python's shortest representation, which reads back to th
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import secrets
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from kcal.errors import FileError, InputError
+from kcal.file_lock import PARTS_ARE_LOCKED, try_lock
 
 
-def read_bytes(path: str | Path, most: int = 4 * 2**30) -> bytes:
+def read_bytes(path: str | Path, most: int = 2**30) -> bytes:
     """The bytes of a regular file; a pipe or a device, which may never end, is refused.
 
     Raises:
         FileError: missing, no regular file, larger than `most` bytes, or not readable.
     """
+    with _regular_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise FileError(f"{path}: {size / 2**20:.0f} MiB; at most {most / 2**20:.0f} MiB are read")
+        return file.read(most)
+
+
+def read_text(path: str | Path, most: int) -> str:
+    """The UTF-8 text of a regular file, without a byte order mark.
+
+    Raises:
+        FileError: as `read_bytes`, or another encoding.
+    """
+    try:
+        return read_bytes(path, most).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileError(f"{path}: not UTF-8 text") from error
+
+
+def read_head(path: str | Path, count: int) -> bytes:
+    """The first bytes of a regular file, at most so many; with 0, check that it is one and can be read.
+
+    Raises:
+        FileError: missing, no regular file, or not readable.
+    """
+    with _regular_file(path) as file:
+        return file.read(count)
+
+
+@contextmanager
+def _regular_file(path: str | Path) -> Iterator[BinaryIO]:
     try:
         with open(path, "rb", opener=_open_at_once) as file:
-            about = os.fstat(file.fileno())
-            if not stat.S_ISREG(about.st_mode):
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 raise FileError(f"{path}: not a regular file; a pipe or a device cannot be read here")
-            if about.st_size > most:
-                size = about.st_size / 2**20
-                raise FileError(f"{path}: {size:.0f} MiB; at most {most / 2**20:.0f} MiB are read")
-            data = file.read(most)
+            yield file
     except (OSError, ValueError) as error:
         raise FileError(f"{path}: cannot read: {_reason(error)}") from error
-    return data
 
 
 def _open_at_once(path: str, flags: int) -> int:
@@ -120,7 +148,8 @@ def written_files() -> Iterator[list[Path]]:
 def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
     """Open a file beside `path` for writing, and move it into place when the block ends.
 
-    If the block fails or is interrupted, the new file is removed and an old one is untouched.
+    If the block fails or is interrupted, the new file is removed and an old one is untouched. What a killed process
+    left of this file is removed by the next one that writes it.
 
     If `path` is a link, the file it points at is replaced. A file that exists keeps its permissions; a new one gets
     those of the umask.
@@ -138,11 +167,12 @@ def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
     """
     path = check_writable(path)
     target = Path(os.path.realpath(path))
-    # A short name: that of the file may have all the characters that a name may have.
-    temporary = target.with_name(f".kcal-{secrets.token_hex(8)}.part")
+    _sweep(target)
     try:
         mode = stat.S_IMODE(target.stat().st_mode) if target.exists() else None
-        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else 0o600)
+        temporary, handle = _part_of(target, 0o666 if mode is None else 0o600)
+        # As long as this is open, other processes see that the part is in use.
+        held = os.dup(handle) if PARTS_ARE_LOCKED else None
         try:
             with os.fdopen(handle, "wb") as file:
                 yield file
@@ -156,8 +186,55 @@ def open_atomic(path: str | Path) -> Iterator[BinaryIO]:
         except BaseException:
             temporary.unlink()
             raise
+        finally:
+            if held is not None:
+                os.close(held)
     except OSError as error:
         raise FileError(f"{path}: cannot write: {error.strerror or error}") from error
+
+
+def _part_prefix(target: Path) -> str:
+    # A short one: the name of the file may have all the characters that a name may have.
+    return f".kcal-{hashlib.blake2s(target.name.encode(), digest_size=6).hexdigest()}-"
+
+
+def _part_of(target: Path, mode: int) -> tuple[Path, int]:
+    """A new file beside the target, open and locked."""
+    while True:
+        part = target.with_name(f"{_part_prefix(target)}{secrets.token_hex(6)}.part")
+        handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        if PARTS_ARE_LOCKED:
+            try_lock(handle)
+            if not os.fstat(handle).st_nlink:
+                # Another process took it for one of a dead process before it was locked.
+                os.close(handle)
+                continue
+        return part, handle
+
+
+# Names of parts in each folder, listed once: folders may have many files.
+_parts: dict[Path, list[str]] = {}
+
+
+def _sweep(target: Path) -> None:
+    """Remove what killed processes left of this file: parts that nobody has locked."""
+    if not PARTS_ARE_LOCKED:
+        return
+    folder = target.parent
+    if folder not in _parts:
+        _parts[folder] = []
+        with suppress(OSError), os.scandir(folder) as entries:
+            _parts[folder] = [e.name for e in entries if e.name.startswith(".kcal-") and e.name.endswith(".part")]
+    prefix = _part_prefix(target)
+    for name in [name for name in _parts[folder] if name.startswith(prefix)]:
+        _parts[folder].remove(name)
+        with suppress(OSError):
+            handle = os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW)
+            try:
+                if try_lock(handle):
+                    os.unlink(folder / name)
+            finally:
+                os.close(handle)
 
 
 def write_atomic(path: str | Path, data: str | bytes) -> Path:

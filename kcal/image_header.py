@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from kcal.errors import FileError
-from kcal.image_size import check_pixel_count
+from kcal.image_size import MOST_PIXELS, check_pixel_count
 
 Size = tuple[int, int]
 
@@ -57,7 +57,11 @@ def is_image(data: bytes) -> bool:
 
 
 def _png(data: bytes) -> Size:
-    return struct.unpack_from(">II", data, 16)
+    width, height = struct.unpack_from(">II", data, 16)
+    # Deflate makes a byte of 1032 at most: a larger image is damaged, and would be decoded for long.
+    if MOST_PIXELS >= width * height > 8 * 1032 * len(data):
+        raise ValueError("more pixels than its bytes can have")
+    return width, height
 
 
 def _jpeg(data: bytes) -> Size:

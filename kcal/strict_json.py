@@ -38,13 +38,23 @@ def read_json(data: bytes, source: str) -> Any:
     """
     if len(data) > MOST_BYTES:
         raise FileError(f"{source}: {len(data) / 2**20:.0f} MiB of JSON; at most {MOST_BYTES // 2**20} MiB are read")
-    brackets = _STRING.sub(b"", data).translate(None, _NOT_BRACKETS)
-    if max(accumulate((_STEPS[byte] for byte in brackets), initial=0)) > MOST_DEPTH:
+    if nesting(data) > MOST_DEPTH:
         raise FileError(f"{source}: nested deeper than {MOST_DEPTH} levels; this is no file of kcal")
     try:
         return json.loads(data.decode("utf-8"), parse_int=_integer, object_pairs_hook=_object)
     except ValueError as error:
         raise FileError(f"{source}: not a JSON file: {error}") from error
+
+
+def nesting(data: bytes) -> int:
+    """How deep square and curly brackets are nested, outside of texts in quotation marks.
+
+    Example:
+        >>> nesting(b'[{"a": "[["}]')
+        2
+    """
+    brackets = _STRING.sub(b"", data).translate(None, _NOT_BRACKETS)
+    return max(accumulate((_STEPS[byte] for byte in brackets), initial=0))
 
 
 def _integer(digits: str) -> int:

@@ -163,14 +163,16 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """A click on a picture shows it at its full size."""
+    """A click on a picture shows it at its full size; the empty corner of a table is no heading."""
+    html = re.sub(r"<th([^>]*)></th>", r"<td\1></td>", html)
     return re.sub(r'<img [^>]*src="([^"]+)"[^>]*>', r'<a href="\1">\g<0></a>', html)
 
 
 def on_post_build(config: MkDocsConfig) -> None:
-    """The theme takes what searches without a server from the network; the site has its own."""
+    """What the theme lacks: searching without a server and without the network, and a name for the search."""
     site = Path(config.site_dir)
     for path in site.rglob("*.html"):
         up = "../" * (len(path.relative_to(site).parts) - 1)
         text = path.read_text(encoding="utf-8").replace(NETWORK_SHIM, f"{up}offline-search.js")
+        text = text.replace('role="dialog"', 'role="dialog" aria-label="Search"')
         path.write_text(text, encoding="utf-8")

@@ -7,6 +7,8 @@ import json
 import math
 import os
 import stat
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -111,6 +113,53 @@ class TestWriteAtomic:
         monkeypatch.setattr(os, "access", lambda *_: False)
         with pytest.raises(FileError, match="no permission"):
             check_writable(tmp_path / "a.txt")
+
+
+KILLED = """
+import sys, time
+from kcal.files import open_atomic
+with open_atomic(sys.argv[1]) as one, open_atomic(sys.argv[2]) as other:
+    one.write(b"half")
+    one.flush()
+    print("ready", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="parts are locked on POSIX systems only")
+class TestParts:
+    """What a killed process leaves of a file."""
+
+    @staticmethod
+    def _start(folder: Path) -> subprocess.Popen[bytes]:
+        child = subprocess.Popen(
+            [sys.executable, "-c", KILLED, str(folder / "a.csv"), str(folder / "b.csv")], stdout=subprocess.PIPE,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        )  # fmt: skip
+        assert child.stdout is not None
+        assert child.stdout.readline() == b"ready\n"
+        return child
+
+    def test_the_next_process_removes_its_own(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("kcal.files._parts", {})
+        dead = self._start(tmp_path)
+        dead.kill()
+        dead.wait()
+        alive = self._start(tmp_path)
+        try:
+            # The one that lives was started later, and removed what the dead one had left of both files.
+            assert len(list(tmp_path.glob(".kcal-*.part"))) == 2
+            (tmp_path / ".kcal-0123456789abcdef.part").write_bytes(b"of something else")
+            write_atomic(tmp_path / "a.csv", "x")
+            assert len(list(tmp_path.glob(".kcal-*.part"))) == 3
+        finally:
+            alive.kill()
+            alive.wait()
+        monkeypatch.setattr("kcal.files._parts", {})
+        write_atomic(tmp_path / "a.csv", "y")
+        assert len(list(tmp_path.glob(".kcal-*.part"))) == 2
+        write_atomic(tmp_path / "b.csv", "y")
+        assert [path.name for path in tmp_path.glob(".kcal-*.part")] == [".kcal-0123456789abcdef.part"]
 
 
 class TestReadBytes:

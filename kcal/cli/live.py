@@ -121,7 +121,11 @@ def live_command(
     the offset between the cameras' clocks is estimated from targets that move.
 
     Stop it with Ctrl-C or SIGTERM. Started again with the same outputs, it continues where it was, after a crash too:
-    nothing is lost or written twice. Receivers of `--to` may get the last moments twice.
+    nothing is lost or written twice. Receivers of `--to` may get the last moments twice. Only one process at a time may
+    write an output.
+
+    Times are seconds. A time that the moments before and after contradict is left out; a clock that was set is
+    followed, with new tracks. Both are counted.
 
     **Examples**
 
@@ -178,19 +182,37 @@ def live_command(
         stream.shown = _progress(advance, stream.counts, page)
         if stream.ledger.place.sequence:
             err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)
-        before = {number: signal.signal(number, lambda *_: stream.stop()) for number in (signal.SIGTERM, signal.SIGINT)}
+        ending = "finished"
+
+        def stop(*_: object) -> None:
+            nonlocal ending
+            ending = "stopped"
+            stream.stop()
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
             live = pairs is not None and pairs.live
             counts = stream.follow(source, waits=not live, resumes=not live and detections != "-")
+        except BaseException:
+            ending = "ended by an error: see the terminal"
+            raise
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
             if page is not None:
-                page.close()
+                page.close(ending)
     err.print(summary(counts), markup=False)
+    if counts.jumps:
+        ahead = "ahead" if counts.last_jump_s > 0 else "back"
+        err.print(
+            f"times jumped {counts.jumps:,} times and stayed: followed, with new tracks; the last jump was "
+            f"{abs(counts.last_jump_s):,.1f} s {ahead}"
+        )
     if pairs is not None:
         err.print(str(pairs.counts), markup=False)
     if counts.malformed:
+        if not (counts.moments or counts.repeated or counts.waiting or stream.ledger.place.sequence):
+            raise InputError(f"none of {counts.malformed:,} lines could be read; the last one: {counts.last_error}")
         err.print(f"last malformed line: {counts.last_error}", markup=False)
     if clock_sigma:
         offset, sigma = stream.tracker.clock_estimate().offset(stream.tracker.time)
@@ -202,6 +224,8 @@ def summary(counts: StreamCounts) -> str:
     parts = [f"{counts.moments:,} moments, {counts.positions:,} positions"]
     for count, what in (
         (counts.repeated, "moments not after the last one, skipped"),
+        (counts.contradicted, "moments left out, whose times the ones before and after contradict"),
+        (counts.waiting, "moments left for the next run, because no later one bears out how far their times jumped"),
         (counts.malformed, "malformed lines"),
         (counts.dropped, "moments dropped for lack of time"),
         (counts.unsent, "moments that a receiver did not get"),

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from kcal.cli.console import err, out
+from kcal.cli.console import err, out, warn
 from kcal.cli.inputs import CALIBRATED, IMAGES, MARKS, RIG, SURVEY
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.errors import InputError
@@ -92,6 +92,8 @@ def mark_command(
         out.print(f"marking page: {server.address}", markup=False, soft_wrap=True)
         if session.version:
             err.print(f"continued after {session.version} actions in {session.files.log}", markup=False)
+        for note in (*session.notes, *filter(None, [session.trouble])):
+            warn(note)
         if browser:
             webbrowser.open(server.address)
         server.run()

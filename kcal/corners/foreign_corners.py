@@ -9,19 +9,20 @@ from __future__ import annotations
 import csv
 import io
 import math
-import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pydantic
 
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError, InputError
-from kcal.files import read_bytes
+from kcal.files import read_bytes, read_text
+from kcal.mat_file import read_mat
+from kcal.opencv_storage import read_storage
+from kcal.strict_json import MOST_BYTES
 
 # (u, v, weight) of a corner, or None where it was not seen.
 Corner = tuple[float, float, float] | None
@@ -69,10 +70,13 @@ def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] |
         raise InputError(f"{path}: corners are read from {', '.join(readers)} files")
     try:
         views, size = readers[path.suffix.lower()](path, board)
-    except OSError as error:
-        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError, IndexError, csv.Error, cv2.error) as error:
+    except (FileError, InputError):
+        raise
+    except (ValueError, csv.Error) as error:
         raise FileError(f"{path}: bad corners file: {error}") from error
+    except Exception as error:
+        # Whatever a parser makes of what is in a file: the file is bad.
+        raise FileError(f"{path}: bad corners file: {type(error).__name__}: {error!s:.200}") from error
     size = image_size or size
     if size is None:
         raise InputError(f"{path}: the image size is not in the file; give it (--size WIDTHxHEIGHT)")
@@ -80,10 +84,10 @@ def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] |
         if len(corners) != board.corners:
             raise FileError(f"{path}: {name} has {len(corners)} corners, the board {board.corners}")
     weighted = any(corner is not None and corner[2] != 1.0 for corners in views.values() for corner in corners)
-    found = [_view(name, corners, weighted) for name, corners in views.items() if any(corners)]
-    if not found:
-        raise FileError(f"{path}: no view with corners")
     try:
+        found = [_view(name, corners, weighted) for name, corners in views.items() if any(corners)]
+        if not found:
+            raise FileError(f"{path}: no view with corners")
         return Observations(board=board, image_size=size, refinement="none", views=tuple(found))
     except pydantic.ValidationError as error:
         raise FileError(f"{path}: bad corners file: {error.errors()[0]['msg']}") from error
@@ -110,7 +114,7 @@ def _corner_of_weight(u: str, v: str, weight: float, where: str) -> Corner:
 def _from_vnl(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
     views: dict[str, list[Corner]] = {}
     header: list[str] = []
-    for number, line in enumerate(read_bytes(path).decode("utf-8").splitlines(), 1):
+    for number, line in enumerate(read_text(path, MOST_BYTES).splitlines(), 1):
         where = f"line {number}"
         if line.startswith("##") or not line.strip():
             continue
@@ -136,7 +140,7 @@ def _from_vnl(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
 
 
 def _from_csv(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
-    table = csv.DictReader(io.StringIO(read_bytes(path).decode("utf-8-sig"), newline=""), skipinitialspace=True)
+    table = csv.DictReader(io.StringIO(read_text(path, MOST_BYTES), newline=""), skipinitialspace=True)
     names = table.fieldnames or []
     needed, allowed = {"image", "u", "v"}, {"image", "u", "v", "weight", "corner", "column", "row"}
     if not needed <= set(names) <= allowed or ("column" in names) != ("row" in names):
@@ -170,13 +174,20 @@ def _place(column: int, row: int, board: Board, where: str) -> int:
 
 
 def _from_opencv(path: Path, board: Board) -> tuple[dict[str, list[Corner]], tuple[int, int] | None]:
-    text = read_bytes(path).decode("utf-8")
-    file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    points = file.getNode("image_points").mat()
-    if points is None or points.ndim != 3 or points.shape[2] != 2:
+    stored = read_storage(read_bytes(path, MOST_BYTES), str(path))
+    points = stored.get("image_points")
+    if not isinstance(points, np.ndarray) or points.ndim != 3 or points.shape[2] != 2:
         raise ValueError("image_points of OpenCV's calibration sample, views by corners, are needed")
-    sides = [int(file.getNode(name).real()) for name in ("image_width", "image_height")]
-    return _unweighted(points), (sides[0], sides[1]) if all(sides) else None
+    sides = [stored.get(name) for name in ("image_width", "image_height")]
+    return _unweighted(points), None if None in sides else _whole_size(sides)
+
+
+def _whole_size(sides: Any) -> tuple[int, int]:
+    """Width and height, if they are whole numbers."""
+    width, height = (float(side) for side in np.asarray(sides, dtype=float).ravel()[:2])
+    if not all(1 <= side < math.inf and side == int(side) for side in (width, height)):
+        raise ValueError(f"the image size is {width:g} x {height:g}; positive whole numbers are needed")
+    return int(width), int(height)
 
 
 def _unweighted(points: np.ndarray) -> dict[str, list[Corner]]:
@@ -188,15 +199,7 @@ def _unweighted(points: np.ndarray) -> dict[str, list[Corner]]:
 
 
 def _from_matlab(path: Path, board: Board) -> tuple[dict[str, list[Corner]], tuple[int, int] | None]:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
-    try:
-        content: Mapping[str, Any] = loadmat(path)
-    except NotImplementedError:
-        raise ValueError("a file of version 7.3; save it with -v7") from None
-    except (MatReadError, zlib.error) as error:
-        raise ValueError(str(error)) from None
+    content = read_mat(read_bytes(path, MOST_BYTES), str(path))
     points = np.asarray(content["imagePoints"], dtype=float)
     points = points[..., None] if points.ndim == 2 else points
     if points.ndim != 3 or points.shape[:2] != (board.corners, 2):
@@ -217,5 +220,4 @@ def _from_matlab(path: Path, board: Board) -> tuple[dict[str, list[Corner]], tup
     sorted_views = np.empty_like(views)
     sorted_views[:, order] = views
     size = content.get("imageSize")
-    sides = None if size is None else [int(side) for side in np.ravel(size)[:2]]
-    return _unweighted(sorted_views), None if sides is None else (sides[1], sides[0])
+    return _unweighted(sorted_views), None if size is None else _whole_size(np.ravel(size)[:2][::-1])

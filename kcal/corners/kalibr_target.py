@@ -5,12 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from kcal.errors import FileError
-from kcal.files import read_bytes
-
-_MOST_BYTES = 1 << 20
+from kcal.files import read_text
+from kcal.strict_yaml import MOST_BYTES, read_yaml
 
 
 def target_fields(path: str | Path) -> dict[str, Any]:
@@ -32,12 +29,8 @@ def target_fields(path: str | Path) -> dict[str, Any]:
         ...     target_fields(path)
         {'pattern': 'aprilgrid', 'columns': 12, 'rows': 8, 'square': 0.08, 'gap': 0.02}
     """
-    data = read_bytes(Path(path), _MOST_BYTES)
-    try:
-        content = yaml.safe_load(data.decode("utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise FileError(f"{path}: no YAML file: {' '.join(str(error).split())}") from error
-    if not isinstance(content, dict) or "target_type" not in content:
+    content = read_yaml(read_text(path, MOST_BYTES), str(path))
+    if "target_type" not in content:
         raise FileError(f"{path}: not a target file of Kalibr: target_type is missing")
     kind = content["target_type"]
 

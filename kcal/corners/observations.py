@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import pydantic
@@ -83,8 +84,8 @@ class Observations(NativeFile):
     def _consistent(self) -> Observations:
         names = [view.name for view in self.views]
         if len(set(names)) != len(names):
-            twice = sorted({name for name in names if names.count(name) > 1})
-            raise ValueError(f"two views share the name {twice[0]!r}")
+            twice = min(name for name, count in Counter(names).items() if count > 1)
+            raise ValueError(f"two views share the name {twice!r}")
         for view in self.views:
             if len(view.pixels) != self.board.corners:
                 raise ValueError(f"view {view.name!r} has {len(view.pixels)} corners, the board {self.board.corners}")

@@ -9,7 +9,7 @@ from pathlib import Path
 from PIL import ExifTags
 from PIL.JpegImagePlugin import JpegImageFile
 
-from kcal.errors import FileError
+from kcal.files import read_head
 
 _HEAD = 1 << 17  # bytes: the EXIF block is among the first 64 KiB, another block may precede it
 
@@ -42,11 +42,6 @@ def turned_images(paths: Sequence[str | Path]) -> list[Path]:
     """
     found = []
     for path in map(Path, paths):
-        try:
-            with path.open("rb") as file:
-                head = file.read(_HEAD)
-        except OSError as error:
-            raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
-        if exif_orientation(head) != 1:
+        if exif_orientation(read_head(path, _HEAD)) != 1:
             found.append(path)
     return found

@@ -15,6 +15,7 @@ import pydantic
 import torch
 
 import kcal
+from kcal.checks import MOST_FOCAL
 from kcal.errors import InputError
 from kcal.image_size import ImageSize
 from kcal.io.file_summary import CameraSummary
@@ -28,13 +29,13 @@ from kcal.native_file import NativeFile
 
 
 class IntrinsicsRecord(Record):
-    """Focal lengths, principal point and skew (γ of Eq. 3), pixels."""
+    """Focal lengths, principal point and skew (γ of Eq. 3), pixels, as large as they can be."""
 
-    fx: pydantic.PositiveFloat
-    fy: pydantic.PositiveFloat
-    cx: float
-    cy: float
-    skew: float
+    fx: float = pydantic.Field(gt=0, le=MOST_FOCAL)
+    fy: float = pydantic.Field(gt=0, le=MOST_FOCAL)
+    cx: float = pydantic.Field(ge=-MOST_FOCAL, le=MOST_FOCAL)
+    cy: float = pydantic.Field(ge=-MOST_FOCAL, le=MOST_FOCAL)
+    skew: float = pydantic.Field(ge=-MOST_FOCAL, le=MOST_FOCAL)
 
 
 class ValidRegion(Record):

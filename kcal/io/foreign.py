@@ -16,15 +16,24 @@ import torch
 import yaml
 from torch import Tensor
 
-from kcal.errors import FileError, InputError
+from kcal.checks import MOST_FOCAL
+from kcal.errors import FileError, InputError, KcalError
+from kcal.files import read_text
+from kcal.image_size import check_pixel_count
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import nearest_rotation
 from kcal.lens.rig import StereoRig
+from kcal.strict_yaml import MOST_BYTES as MOST_YAML
+from kcal.strict_yaml import read_yaml
 
 # Rotations of files with six digits; beyond it they are no rotation but a mistake.
 _ROUNDED = 1e-4
+# Of a file of cameras: ten thousand frames of nerfstudio have 10 MiB.
+MOST_BYTES = 32 * 2**20
+# Meters that no rig has, and what no coefficient of a lens comes near.
+_MOST_METERS, _MOST_COEFFICIENT = 1e6, 1e15
 
 
 class Hints(NamedTuple):
@@ -108,6 +117,8 @@ def checked_pose(rotation: Any, translation: Any) -> CameraPose:
         ValueError: no rotation, or wrong shapes.
     """
     matrix = torch.tensor(rotation, dtype=torch.float64).reshape(3, 3)
+    if not all(abs(value) <= _MOST_METERS for value in translation):
+        raise ValueError(f"its translation is not finite or beyond {_MOST_METERS:g} m")
     exact = nearest_rotation(matrix)
     if not float((matrix - exact).abs().max()) <= _ROUNDED:
         raise ValueError("its rotation is no rotation matrix (R Rᵀ must be 1 and det R = +1)")
@@ -126,7 +137,15 @@ def named_camera(
 ) -> Camera:
     """A camera from fx, fy, cx, cy in kcal's convention."""
     fx, fy, cx, cy = map(float, intrinsics)
-    width, height = (int(value) for value in size)
+    width, height = check_pixel_count((int(size[0]), int(size[1])))
+    if not all(1.0 / MOST_FOCAL <= focal <= MOST_FOCAL for focal in (fx, fy)):
+        raise ValueError(f"{name}: focal lengths of {fx:g} and {fy:g} px are not finite, or no camera's")
+    if not all(abs(value) <= MOST_FOCAL for value in (cx, cy, skew)):
+        raise ValueError(
+            f"{name}: a principal point at {cx:g}, {cy:g} px, or skew {skew:g}, is not finite or no camera's"
+        )
+    if not all(abs(value) <= _MOST_COEFFICIENT for value in coefficients):
+        raise ValueError(f"{name}: a coefficient of the lens is not finite or beyond {_MOST_COEFFICIENT:g}")
     camera = Camera.build(
         focal=(fx, fy), center=(cx, cy), size=(width, height), coefficients=coefficients, model=model, skew=skew
     )
@@ -163,32 +182,34 @@ def numbers(value: Any, count: Sequence[int] | int, what: str) -> list[float]:
 def whole_size(width: Any, height: Any) -> tuple[int, int]:
     """Width and height as positive whole numbers."""
     sizes = [float(value) for value in (width, height)]
-    if not all(value > 0 and value == int(value) for value in sizes):
+    if not all(0 < value < math.inf and value == int(value) for value in sizes):
         raise ValueError(f"the image size is {width} x {height}; positive whole numbers are needed")
     return int(sizes[0]), int(sizes[1])
 
 
 @contextmanager
 def reading(path: str | Path, what: str) -> Iterator[None]:
-    """Turn whatever goes wrong while a file is read into one `FileError` that names it."""
+    """Turn whatever goes wrong while a file is read into one `FileError` that names it.
+
+    What is in a file must not end a program: parsers raise errors of a dozen kinds, and all mean that the file is bad.
+    """
     try:
         yield
     except FileError:
         raise
+    except (KcalError, ValueError, yaml.YAMLError) as error:
+        raise FileError(f"{path}: bad {what} file: {error}") from error
     except OSError as error:
         raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
     except KeyError as error:
         raise FileError(f"{path}: bad {what} file: {error.args[0]} is missing") from error
-    except (InputError, ValueError, TypeError, IndexError, AttributeError, yaml.YAMLError, RecursionError) as error:
-        raise FileError(f"{path}: bad {what} file: {error}") from error
+    except Exception as error:
+        raise FileError(f"{path}: bad {what} file: {type(error).__name__}: {error!s:.200}") from error
 
 
 def load_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file; nothing in it is executed."""
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    if not isinstance(content, dict):
-        raise ValueError("a mapping of names to values is needed")
-    return content
+    return read_yaml(read_text(path, MOST_YAML), str(path))
 
 
 def dump_yaml(content: Mapping[str, Any]) -> str:

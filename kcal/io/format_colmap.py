@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from kcal.files import write_atomic
-from kcal.io.foreign import CameraPose, Hints, ImportedCameras, named_camera, whole_size
+from kcal.files import read_bytes, read_text, write_atomic
+from kcal.io.foreign import MOST_BYTES, CameraPose, Hints, ImportedCameras, named_camera, whole_size
 from kcal.lens.camera import Camera
 
 MODELS = ("pinhole", "opencv4", "opencv8", "fisheye4")
@@ -40,7 +40,7 @@ _WRITTEN = {"pinhole": "PINHOLE", "opencv4": "OPENCV", "opencv8": "FULL_OPENCV",
 
 def read_colmap(path: Path, hints: Hints) -> ImportedCameras:
     """Read all cameras of a reconstruction; they are named by their numbers."""
-    entries = _from_binary(path.read_bytes()) if path.suffix.lower() == ".bin" else _from_text(path)
+    entries = _from_binary(read_bytes(path, MOST_BYTES)) if path.suffix.lower() == ".bin" else _from_text(path)
     if not entries:
         raise ValueError("no cameras")
     cameras = tuple(_colmap_camera(*entry) for entry in entries)
@@ -65,7 +65,7 @@ def _known(name: str) -> ColmapModel:
 
 def _from_text(path: Path) -> list[tuple[int, str, tuple[int, int], list[float]]]:
     entries = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+    for number, line in enumerate(read_text(path, MOST_BYTES).splitlines(), 1):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue

@@ -7,17 +7,26 @@ because points were rows.
 from __future__ import annotations
 
 import io
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from kcal.errors import FileError
-from kcal.files import write_atomic
-from kcal.io.foreign import CameraPose, Hints, ImportedCameras, checked_pose, named_camera, numbers, plain, whole_size
+from kcal.files import read_bytes, write_atomic
+from kcal.io.foreign import (
+    MOST_BYTES,
+    CameraPose,
+    Hints,
+    ImportedCameras,
+    checked_pose,
+    named_camera,
+    numbers,
+    plain,
+    whole_size,
+)
 from kcal.lens.camera import Camera
+from kcal.mat_file import read_mat
 
 MODELS = ("pinhole", "opencv4", "opencv5")
 _METERS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "centimeters": 1e-2, "m": 1.0, "meters": 1.0, "in": 0.0254,
@@ -26,8 +35,7 @@ _METERS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "centimeters": 1e-2, "m"
 
 def read_matlab(path: Path, hints: Hints) -> ImportedCameras:
     """Read a struct of `cameraParameters`, `cameraIntrinsics` or `stereoParameters`; objects must be made structs."""
-    content = load_mat(path)
-    structs = {name: value for name, value in content.items() if not name.startswith("__")}
+    structs = read_mat(read_bytes(path, MOST_BYTES), str(path))
     # A file may hold one struct, or its fields.
     candidates = [*structs.items(), (path.stem, structs)]
     for _, value in candidates:
@@ -37,26 +45,6 @@ def read_matlab(path: Path, hints: Hints) -> ImportedCameras:
         if isinstance(value, Mapping) and {"K", "IntrinsicMatrix", "FocalLength"} & set(value):
             return ImportedCameras(format="matlab", cameras=(_matlab_camera(value, name, hints),))
     raise ValueError("no struct of camera parameters; save one with s = toStruct(params); save('file.mat', 's')")
-
-
-def load_mat(path: Path) -> dict[str, Any]:
-    """The variables of a `.mat` file, structs as dictionaries.
-
-    Raises:
-        FileError: it cannot be read, or is of version 7.3.
-    """
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
-    try:
-        found: dict[str, Any] = loadmat(path, simplify_cells=True)
-    except NotImplementedError:
-        raise FileError(f"{path}: a .mat file of version 7.3; save it with -v7") from None
-    except OSError as error:
-        raise FileError(f"{path}: cannot read: {error.strerror or error}") from error
-    except (MatReadError, ValueError, TypeError, KeyError, IndexError, zlib.error, MemoryError) as error:
-        raise FileError(f"{path}: not a .mat file: {error}") from error
-    return found
 
 
 def _matlab_camera(value: Mapping[str, Any], name: str, hints: Hints) -> Camera:
@@ -69,9 +57,10 @@ def _matlab_camera(value: Mapping[str, Any], name: str, hints: Hints) -> Camera:
     else:
         fx, fy = numbers(value["FocalLength"], 2, "FocalLength")
         cx, cy = numbers(value["PrincipalPoint"], 2, "PrincipalPoint")
-        skew = float(value.get("Skew", 0.0))
+        (skew,) = numbers(value.get("Skew", 0.0), 1, "Skew")
     size = value.get("ImageSize")
-    size = hints.size or (None if size is None or not np.size(size) else whole_size(*np.ravel(size)[::-1]))
+    stated = None if size is None else numbers(size, (0, 2), "ImageSize")
+    size = hints.size or (whole_size(*stated[::-1]) if stated else None)
     if size is None:
         raise ValueError("ImageSize is empty; give it (--size WIDTHxHEIGHT)")
     radial = numbers(value.get("RadialDistortion", []), (0, 2, 3), "RadialDistortion")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,9 @@ import numpy as np
 import torch
 
 from kcal.errors import InputError
-from kcal.files import write_atomic
+from kcal.files import read_text, write_atomic
 from kcal.io.foreign import (
+    MOST_BYTES,
     CameraPose,
     Hints,
     ImportedCameras,
@@ -34,14 +36,21 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 
 MODELS = ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12")
+_TEXT = re.compile(r"'(?:[^'\\]|\\.)*+'|\"(?:[^\"\\]|\\.)*+\"")
+# Characters besides texts.
+_MOST_NUMBERS = 2**20
 _LENSES = {"LENSMODEL_PINHOLE": "pinhole"} | {f"LENSMODEL_OPENCV{n}": f"opencv{n}" for n in (4, 5, 8, 12)}
 
 
 def read_mrcal(path: Path, hints: Hints) -> ImportedCameras:
     """Read one camera and its pose."""
+    text = read_text(path, MOST_BYTES)
+    # What a model was made from is stored as long texts; numbers take Python a hundred times their length in memory.
+    if len(_TEXT.sub("", text)) > _MOST_NUMBERS:
+        raise ValueError(f"more than {_MOST_NUMBERS // 2**20} MiB of numbers and names")
     try:
-        content = ast.literal_eval(path.read_text(encoding="utf-8"))
-    except (SyntaxError, MemoryError):
+        content = ast.literal_eval(text)
+    except (SyntaxError, MemoryError, RecursionError):
         raise ValueError("a Python dictionary of plain values is needed") from None
     if not isinstance(content, dict):
         raise ValueError("a Python dictionary is needed")

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from kcal.errors import InputError
-from kcal.files import dump_json, write_atomic
-from kcal.io.foreign import CameraPose, Hints, ImportedCameras, named_camera, numbers, whole_size
+from kcal.files import dump_json, read_bytes, write_atomic
+from kcal.io.foreign import MOST_BYTES, CameraPose, Hints, ImportedCameras, named_camera, numbers, whole_size
 from kcal.lens.camera import Camera
+from kcal.strict_json import read_json
 
 MODELS = ("pinhole", "opencv4", "opencv5", "fisheye4")
 _HALF = 0.5
@@ -19,7 +20,7 @@ _FIELDS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", "k1", "k2", "k3
 
 def read_nerfstudio(path: Path, hints: Hints) -> ImportedCameras:
     """Read the cameras; frames with intrinsics of their own that are equal are one camera."""
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json(read_bytes(path, MOST_BYTES), str(path))
     frames = content.get("frames", [])
     shared = {key: content[key] for key in _FIELDS if key in content}
     found: dict[str, dict[str, Any]] = {}

@@ -6,7 +6,7 @@ s4 τx τy), `fisheye_model`. A pair: `M1`, `D1`, `M2`, `D2` and `R`, `T`, in on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,20 @@ import cv2
 import numpy as np
 
 from kcal.errors import InputError
-from kcal.files import write_atomic
-from kcal.io.foreign import CameraPose, Hints, ImportedCameras, checked_pose, named_camera, numbers, plain, whole_size
+from kcal.files import read_bytes, write_atomic
+from kcal.io.foreign import (
+    MOST_BYTES,
+    CameraPose,
+    Hints,
+    ImportedCameras,
+    checked_pose,
+    named_camera,
+    numbers,
+    plain,
+    whole_size,
+)
 from kcal.lens.camera import Camera
+from kcal.opencv_storage import read_storage
 
 MODELS = ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "fisheye4")
 _BY_COUNT = {0: "pinhole", 4: "opencv4", 5: "opencv5", 8: "opencv8", 12: "opencv12", 14: "opencv14"}
@@ -26,79 +37,65 @@ _COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "Distortion_Coefficien
 
 def read_opencv(path: Path, hints: Hints) -> ImportedCameras:
     """Read one camera, a pair, or the R and T of a pair whose cameras are in another file."""
-    file = _opened(path)
+    stored = read_storage(read_bytes(path, MOST_BYTES), str(path))
     notes: list[str] = []
-    size = hints.size or _stored_size(file)
+    size = hints.size or _stored_size(stored)
     pairs = [("M1", "D1", "left"), ("M2", "D2", "right")]
-    if file.getNode("M1").empty() and not file.getNode("cameraMatrix1").empty():
+    if "M1" not in stored and "cameraMatrix1" in stored:
         pairs = [("cameraMatrix1", "distCoeffs1", "left"), ("cameraMatrix2", "distCoeffs2", "right")]
     poses: tuple[CameraPose, ...] = ()
-    if not file.getNode("R").empty() and not file.getNode("T").empty():
+    if "R" in stored and "T" in stored:
         meters = hints.meters or 1.0
-        rotation, translation = _stored_numbers(file, "R", 9), [meters * t for t in _stored_numbers(file, "T", 3)]
+        rotation, translation = numbers(stored["R"], 9, "R"), [meters * t for t in numbers(stored["T"], 3, "T")]
         poses = (checked_pose(np.eye(3).tolist(), [0.0, 0.0, 0.0]), checked_pose(rotation, translation))
         if hints.meters is None:
             notes.append("the unit of T is not in the file: taken as meters (--unit mm for millimeters)")
-    if file.getNode(pairs[0][0]).empty():
-        matrix, coefficients = _present(file, _MATRICES), _present(file, _COEFFICIENTS)
+    if pairs[0][0] not in stored:
+        matrix, coefficients = _present(stored, _MATRICES), _present(stored, _COEFFICIENTS)
         pairs = [(matrix, coefficients, path.stem)] if matrix else []
         if not pairs and not poses:
             raise ValueError(f"no camera; {_MATRICES[0]}, M1 or R and T are needed")
     cameras = tuple(
-        _opencv_camera(file, matrix, coefficients, name, size, hints.fisheye, notes)
+        _opencv_camera(stored, matrix, coefficients, name, size, hints.fisheye, notes)
         for matrix, coefficients, name in pairs
     )
     return ImportedCameras(format="opencv", cameras=cameras, poses=poses, notes=tuple(dict.fromkeys(notes)))
 
 
-def _opened(path: Path) -> Any:
-    text = path.read_text(encoding="utf-8")
-    try:
-        file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        opened = file.isOpened() and file.root().isMap()
-    except cv2.error as error:
-        raise ValueError(f"OpenCV cannot parse it: {error.err or 'unknown syntax'}") from None
-    if not opened:
-        raise ValueError("OpenCV cannot parse it")
-    return file
+def _present(stored: Mapping[str, Any], names: Sequence[str]) -> str:
+    return next((name for name in names if name in stored), "")
 
 
-def _present(file: Any, names: Sequence[str]) -> str:
-    return next((name for name in names if not file.getNode(name).empty()), "")
-
-
-def _stored_size(file: Any) -> tuple[int, int] | None:
+def _stored_size(stored: Mapping[str, Any]) -> tuple[int, int] | None:
     width, height = (
-        _present(file, [f"image_{side}", f"image_{side.capitalize()}", side]) for side in ("width", "height")
+        _present(stored, [f"image_{side}", f"image_{side.capitalize()}", side]) for side in ("width", "height")
     )
     if width and height:
-        return whole_size(file.getNode(width).real(), file.getNode(height).real())
-    for name in ("image_size", "imageSize", "size"):
-        node = file.getNode(name)
-        if node.isSeq() and node.size() == 2:
-            return whole_size(node.at(0).real(), node.at(1).real())
-    return None
-
-
-def _stored_numbers(file: Any, name: str, count: int | Sequence[int]) -> list[float]:
-    node = file.getNode(name)
-    value = node.mat() if node.isMap() else [node.at(i).real() for i in range(node.size())] if node.isSeq() else None
-    return numbers([] if value is None else value.ravel() if hasattr(value, "ravel") else value, count, name)
+        return whole_size(*numbers([stored[width], stored[height]], 2, "the image size"))
+    name = _present(stored, ("image_size", "imageSize", "size"))
+    return whole_size(*numbers(stored[name], 2, name)) if name else None
 
 
 def _opencv_camera(
-    file: Any, matrix: str, coefficients: str, name: str, size: Any, fisheye: bool | None, notes: list[str]
+    stored: Mapping[str, Any],
+    matrix: str,
+    coefficients: str,
+    name: str,
+    size: Any,
+    fisheye: bool | None,
+    notes: list[str],
 ) -> Camera:
     if size is None:
         raise ValueError("the image size is not in the file; give it (--size WIDTHxHEIGHT)")
-    fx, skew, cx, zero_a, fy, cy, *last = _stored_numbers(file, matrix, 9)
+    fx, skew, cx, zero_a, fy, cy, *last = numbers(stored[matrix], 9, matrix)
     if zero_a or last != [0.0, 0.0, 1.0]:
         raise ValueError(f"{matrix} is no camera matrix")
     if skew:
         notes.append(f"{matrix} has a skew of {skew:g}, which OpenCV does not use and kcal does not take over")
-    lens = _stored_numbers(file, coefficients, tuple(_BY_COUNT)) if coefficients else []
-    node = file.getNode("fisheye_model")
-    known = fisheye if fisheye is not None else bool(node.real()) if not node.empty() else None
+    lens = numbers(stored.get(coefficients, []), tuple(_BY_COUNT), coefficients)
+    known = fisheye
+    if known is None and "fisheye_model" in stored:
+        known = bool(numbers([stored["fisheye_model"]], 1, "fisheye_model")[0])
     if known and len(lens) != 4:
         raise ValueError(f"a fisheye has 4 coefficients, {coefficients} has {len(lens)}")
     if known is None and len(lens) == 4:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from kcal.files import dump_json, write_atomic
-from kcal.io.foreign import CameraPose, Hints, ImportedCameras, camera_name, named_camera, whole_size
+from kcal.files import dump_json, read_bytes, write_atomic
+from kcal.io.foreign import MOST_BYTES, CameraPose, Hints, ImportedCameras, camera_name, named_camera, whole_size
 from kcal.lens.camera import Camera
+from kcal.strict_json import read_json
 
 MODELS = ("pinhole", "opencv4", "opencv5", "fisheye4")
 # Coefficients by projection type, in kcal's order, and kcal's model.
@@ -25,7 +25,7 @@ _LENSES = {
 
 def read_opensfm(path: Path, hints: Hints) -> ImportedCameras:
     """Read all cameras, by their names."""
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json(read_bytes(path, MOST_BYTES), str(path))
     if isinstance(content, list):
         content = content[0]
     content = content.get("cameras", content)

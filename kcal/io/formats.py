@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import torch
 
 from kcal.errors import FileError, InputError
+from kcal.files import read_head, read_text
 from kcal.io import (
     format_colmap,
     format_kalibr,
@@ -23,10 +23,12 @@ from kcal.io import (
     format_ros,
 )
 from kcal.io.camera_file import load_camera
-from kcal.io.foreign import CameraPose, Hints, ImportedCameras, reading, rig_poses
+from kcal.io.foreign import MOST_BYTES, CameraPose, Hints, ImportedCameras, reading, rig_poses
 from kcal.io.rig_file import load_rig
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
+from kcal.strict_json import MOST_BYTES as MOST_JSON
+from kcal.strict_json import read_json
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -159,10 +161,10 @@ def recognized(path: Path) -> str:
         FileError: it cannot be read, or is of no known format.
     """
     suffix = path.suffix.lower()
+    read_head(path, 0)
     if suffix in (".mat", ".cameramodel", ".bin"):
         return {".mat": "matlab", ".cameramodel": "mrcal", ".bin": "colmap"}[suffix]
-    with reading(path, "camera"):
-        text = path.read_text(encoding="utf-8")
+    text = read_text(path, MOST_BYTES)
     # mrcal's files begin with comments.
     if suffix == ".json" or re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE).lstrip()[:1] in ("{", "["):
         return _json_format(path, text)
@@ -179,12 +181,12 @@ def recognized(path: Path) -> str:
 
 def _json_format(path: Path, text: str) -> str:
     try:
-        content = json.loads(text)
-    except (ValueError, RecursionError):
+        content = read_json(text.encode(), str(path))
+    except FileError as error:
         # mrcal's files are Python, with comments and single quotes.
         if "lensmodel" in text or "distortion_model" in text:
             return "mrcal"
-        raise FileError(f"{path}: neither JSON nor another camera file that kcal knows") from None
+        raise FileError(f"{path}: neither a camera file that kcal knows nor JSON that can be read ({error})") from None
     if isinstance(content, dict) and "kcal" in content:
         return "kcal"
     if isinstance(content, dict) and ("fl_x" in content or "frames" in content):
@@ -252,7 +254,7 @@ def _imported(path: Path, name: str | None, hints: Hints) -> ImportedCameras:
         with reading(path, name):
             return FORMATS[name].read(path, hints)
     with reading(path, "kcal"):
-        kind = json.loads(path.read_text(encoding="utf-8"))["kcal"]
+        kind = read_json(read_text(path, MOST_JSON).encode(), str(path))["kcal"]
     if kind == "rig":
         rig = load_rig(path)
         return ImportedCameras(format="kcal", cameras=(rig.left, rig.right), poses=rig_poses(rig))

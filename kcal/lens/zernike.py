@@ -78,7 +78,7 @@ class ZernikeModes:
         names: of the real weights: "z5+3" is that of the mode n = 5, j = 3, and "z5+3i" that of i times this mode.
 
     Raises:
-        InputError: a degree that is not a whole number from 0 to 40, beyond which rounding would show.
+        InputError: a degree that is not a whole number from 0 to 40, beyond which rounding would show; no mode at all.
 
     Example:
         >>> ZernikeModes(radial=5, decentered=2, astigmatic=1, other=0).names
@@ -179,6 +179,8 @@ def _derived(radial: int, decentered: int, astigmatic: int, other: int) -> tuple
                 continue
             family = ASPECT if (j, n) == (-1, 1) else _family(m, n, part)
             real_modes.append((i, part, family, n))
+    if not real_modes:
+        raise InputError("Zernike modes: degrees this low leave no mode")
     modes = [(*complex_modes[i], part) for i, part, _, _ in real_modes]
     chains, matrix = _polynomial_layout(complex_modes, [(i, part) for i, part, _, _ in real_modes])
     products = ZernikeProducts.of([(j, part, _chebyshev(n, j)) for j, n, part in modes])

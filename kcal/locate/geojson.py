@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -98,6 +99,12 @@ def _json_value(cell: str) -> object:
     if not cell:
         return None
     number = _JSON_NUMBER.fullmatch(cell)
-    if number and (number[2] or number[3] or abs(int(cell)) <= _LARGEST_WHOLE):
+    # One beyond float64 is none for programs that read it.
+    if number and (_is_exact(cell) if not (number[2] or number[3]) else math.isfinite(float(cell))):
         return orjson.Fragment(cell)
     return cell
+
+
+def _is_exact(digits: str) -> bool:
+    """Of a whole number; Python refuses to read one of thousands of digits."""
+    return len(digits) <= len(str(-_LARGEST_WHOLE)) and abs(int(digits)) <= _LARGEST_WHOLE

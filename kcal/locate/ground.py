@@ -17,6 +17,7 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.errors import FileError, InputError
+from kcal.files import read_head
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, Mounting
 from kcal.locate.ellipsoid import mean_radius
@@ -33,6 +34,8 @@ _STEPS, _HALVINGS = 512, 50
 _STEP_M = 0.5
 # A place whose range is not known to a third is told as a bearing only.
 _BEARING_SIGMAS = 3.0
+# Of a raster, 1.6 GB as they are kept.
+_MOST_CELLS = 200_000_000
 
 
 class GroundPlaces(NamedTuple):
@@ -79,7 +82,7 @@ def terrain(path: str | Path, geoid_height: float = 0.0) -> Ground:
 
     Raises:
         InputError: rasterio is missing, or a height that is not finite.
-        FileError: not a raster, or one without coordinate system.
+        FileError: not a raster, one without coordinate system, or of more than 200 million cells.
     """
     try:
         import rasterio
@@ -89,8 +92,12 @@ def terrain(path: str | Path, geoid_height: float = 0.0) -> Ground:
 
     if not math.isfinite(geoid_height):
         raise InputError(f"geoid height {geoid_height}: finite meters are needed")
+    read_head(path, 0)
     try:
         with rasterio.open(path) as raster:
+            if raster.width * raster.height > _MOST_CELLS:
+                size = f"{raster.width} x {raster.height}"
+                raise FileError(f"{path}: {size} cells; at most {_MOST_CELLS:,} are read: cut out what is needed")
             heights = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
             system, to_cell = raster.crs, ~raster.transform
     except rasterio.errors.RasterioError as error:

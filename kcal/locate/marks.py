@@ -150,10 +150,12 @@ def write_marks(path: str | Path, marks: Marks) -> Path:
 
 
 def marks_text(marks: Marks) -> str:
-    """The text that `write_marks` writes."""
+    """The text that `write_marks` writes; of a pair that is marked in one image only, it has no covariance."""
     table, header = [*marks.left.T.tolist(), *marks.right.T.tolist()], ["name", *PIXELS]
     if marks.covariance is not None:
-        table += [marks.covariance[:, i, j].tolist() for i, j in _UPPER]
+        whole = marks.covariance.isfinite().all(-1).all(-1)[:, None, None]
+        covariance = torch.where(whole, marks.covariance, math.nan)
+        table += [covariance[:, i, j].tolist() for i, j in _UPPER]
         header += COVARIANCE
     lines = [csv_line(header)]
     for name, *values in zip(marks.names, *table, strict=True):

@@ -109,8 +109,13 @@ class MarkedLandmarks(NamedTuple):
     unsurveyed: tuple[str, ...]
 
 
-def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float) -> MarkedLandmarks:
+def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float | Tensor) -> MarkedLandmarks:
     """Match surveyed places and marks by name.
+
+    Args:
+        survey: the places.
+        marks: with at least one mark of each thing.
+        pixel_sigma: of a mark along an axis, px; one number, or (N, 2) for the marks in both images.
 
     Raises:
         InputError: no name is in both.
@@ -129,13 +134,14 @@ def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float) -> MarkedL
             f"no surveyed place ({', '.join(survey.names[:3])} ...) has a mark ({', '.join(marks.names[:3])} ...): "
             "the names must be the same in both files"
         )
+    rows = [index[name] for name in common]
     places = [survey.names.index(name) for name in common]
     landmarks = Landmarks(
         names=tuple(common),
         points=survey.points[places],
         sigma=survey.sigma[places],
-        pixels=marks.pixels[[index[name] for name in common]],
-        pixel_sigma=pixel_sigma,
+        pixels=marks.pixels[rows],
+        pixel_sigma=pixel_sigma[rows] if isinstance(pixel_sigma, Tensor) else pixel_sigma,
     )
     unmarked = tuple(name for name in survey.names if name not in index)
     return MarkedLandmarks(landmarks, unmarked, tuple(name for name in marks.names if name not in common))

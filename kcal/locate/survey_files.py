@@ -7,9 +7,9 @@ unless its writer says otherwise, so a geoid's height must be given.
 
 from __future__ import annotations
 
-import json
 import math
 import xml.etree.ElementTree
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 import torch
 
 from kcal.errors import FileError, InputError
-from kcal.files import read_bytes
+from kcal.files import read_text
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.survey import Survey, read_survey
-from kcal.strict_json import MOST_BYTES
+from kcal.strict_json import MOST_BYTES, read_json
+from kcal.strict_xml import read_xml
 
 
 class _Place(NamedTuple):
@@ -46,7 +47,7 @@ def import_survey(
         InputError: a GPX file without `geoid`.
 
     Example:
-        >>> import tempfile
+        >>> import json, tempfile
         >>> place = {"type": "Feature", "properties": {"name": "mast", "sigma": 0.02},
         ...          "geometry": {"type": "Point", "coordinates": [72.87, 19.07, 14.0]}}
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -65,17 +66,18 @@ def import_survey(
             f"{path}: elevations of GPX are above sea level; give the geoid's height there (0 if they are ellipsoidal)"
         )
     try:
-        text = read_bytes(path, MOST_BYTES).decode("utf-8-sig")
-        places = _from_gpx(text, geoid or 0.0) if suffix == ".gpx" else _from_geojson(text)
-    except xml.etree.ElementTree.ParseError as error:
-        raise FileError(f"{path}: not XML: {error}") from error
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, InputError) as error:
+        text = read_text(path, MOST_BYTES)
+        if suffix == ".gpx":
+            places = _from_gpx(read_xml(text, str(path)), geoid or 0.0)
+        else:
+            places = _from_geojson(read_json(text.encode(), str(path)))
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise FileError(f"{path}: bad survey: {error}") from error
     if not places:
         raise FileError(f"{path}: no places")
     names = [place.name for place in places]
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(names).items():
+        if count > 1:
             raise FileError(f"{path}: the name {name!r} occurs twice; names must differ")
     spreads = [_spread(place, sigma, path) for place in places]
     origin = origin or places[0].origin
@@ -92,8 +94,7 @@ def _spread(place: _Place, sigma: float | None, path: Path) -> tuple[float, floa
     return level, level, up
 
 
-def _from_geojson(text: str) -> list[_Place]:
-    content = json.loads(text)
+def _from_geojson(content: Any) -> list[_Place]:
     if content.get("crs"):
         raise ValueError("it has a member crs; RFC 7946 allows WGS84 longitude and latitude only")
     places = []
@@ -103,14 +104,15 @@ def _from_geojson(text: str) -> list[_Place]:
         geometry = feature["geometry"]
         if geometry["type"] != "Point":
             raise ValueError(f"{name}: a {geometry['type']}; points are needed")
-        places.append(_Place(name, _origin(name, *_position_in(geometry["coordinates"], name)), _stated(properties)))
+        position = _position_in(geometry["coordinates"], name)
+        places.append(_Place(name, _origin(name, *position), _stated(properties, name)))
     return places
 
 
 def _position_in(coordinates: Sequence[Any], name: str) -> tuple[float, float, float]:
     if len(coordinates) != 3:
         raise ValueError(f"{name}: [longitude, latitude, height] are needed, got {len(coordinates)} numbers")
-    lon, lat, height = (float(value) for value in coordinates)
+    lon, lat, height = (_stated_number(value, f"a coordinate of {name!r}") for value in coordinates)
     return lat, lon, height
 
 
@@ -121,18 +123,27 @@ def _origin(name: str, lat: float, lon: float, height: float) -> Origin:
         raise ValueError(f"{name}: {str(error).removeprefix('origin: ')}") from None
 
 
-def _stated(properties: dict[str, Any]) -> tuple[float, float] | None:
-    if properties.get("sigma") is None:
+def _stated(properties: dict[str, Any], name: str) -> tuple[float, float] | None:
+    if properties.get("sigma") in (None, ""):
         return None
-    level = float(properties["sigma"])
-    return level, float(properties.get("sigma_up") or level)
+    level = _stated_number(properties["sigma"], f"the sigma of {name!r}")
+    up = properties.get("sigma_up")
+    return level, level if up in (None, "") else _stated_number(up, f"the sigma_up of {name!r}")
 
 
-def _from_gpx(text: str, geoid: float) -> list[_Place]:
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ValueError("document types and entities are not read")
+def _stated_number(value: Any, what: str) -> float:
+    """A number, also one that a program has written as a text."""
+    try:
+        if isinstance(value, int | float | str) and not isinstance(value, bool):
+            return float(value)
+    except ValueError:
+        pass
+    raise ValueError(f"{what} is {value!r:.40}; a number is needed")
+
+
+def _from_gpx(root: xml.etree.ElementTree.Element, geoid: float) -> list[_Place]:
     places = []
-    for number, element in enumerate(xml.etree.ElementTree.fromstring(text).iter(), 1):
+    for number, element in enumerate(root.iter(), 1):
         if element.tag.rpartition("}")[2] != "wpt":
             continue
         parts = {child.tag.rpartition("}")[2]: (child.text or "").strip() for child in element}

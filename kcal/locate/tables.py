@@ -20,11 +20,13 @@ import orjson
 from numpy.typing import NDArray
 
 from kcal.errors import FileError
+from kcal.files import read_head
 from kcal.lens.dispatch import CHUNK
 
 # The pieces in which the localizer does many points: a table is located as in one call, to the last bit.
 CHUNK_ROWS = CHUNK
-
+# Characters of a line.
+_LONGEST = 1 << 20
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 # Apostrophes, and what begins a formula: see `kcal.texts.csv_line`.
@@ -168,20 +170,21 @@ def read_chunks(
     with _text_of(path) as file:
         line = 0
         names: list[str] = []
-        while not names and (text := next(file, "")):
-            rows, beyond = _split_any(path, [text], file, line)
+        texts_of = _lines_of(path, file)
+        while not names and (text := next(texts_of, "")):
+            rows, beyond = _split_any(path, [text], texts_of, line)
             line += 1 + beyond
             names = rows[0][1] if rows else []
         if not names:
             raise FileError(f"{path}: the file is empty; the first line must be {header}")
         _check_header(f"{path}: line {line}", names, header, columns, required, extras)
         read = _bytes_read(file)
-        while texts := list(itertools.islice(file, at_once)):
+        while texts := list(itertools.islice(texts_of, at_once)):
             by_column = _split_plain(texts, names)
             lines: Sequence[int] = range(line + 1, line + 1 + len(texts))
             line += len(texts)
             if by_column is None:
-                rows, beyond = _split_any(path, texts, file, lines[0] - 1)
+                rows, beyond = _split_any(path, texts, texts_of, lines[0] - 1)
                 line += beyond
                 _check_widths(path, rows, len(names))
                 by_column = {name: [cells[place] for _, cells in rows] for place, name in enumerate(names)}
@@ -205,6 +208,7 @@ def read_chunks(
 def _text_of(path: Path) -> Iterator[TextIOWrapper]:
     """Open a table; what goes wrong while the block reads it is a `FileError`."""
     try:
+        read_head(path, 0)
         with path.open(encoding="utf-8-sig", newline="") as file:
             yield file
     except OSError as error:
@@ -213,9 +217,19 @@ def _text_of(path: Path) -> Iterator[TextIOWrapper]:
         raise FileError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from error
 
 
+def _lines_of(path: Path, file: TextIOWrapper) -> Iterator[str]:
+    """The lines of a table: zeros without end, say, are none."""
+    number = 0
+    while text := file.readline(_LONGEST):
+        number += 1
+        if len(text) == _LONGEST and not text.endswith("\n"):
+            raise FileError(f"{path}: line {number}: more than {_LONGEST:,} characters; not a table")
+        yield text
+
+
 def _bytes_read(file: TextIOWrapper) -> int:
-    """How much of a file has been taken from the disk; 0 for a pipe."""
-    return os.lseek(file.fileno(), 0, os.SEEK_CUR) if file.seekable() else 0
+    """How much of a file has been taken from the disk."""
+    return os.lseek(file.fileno(), 0, os.SEEK_CUR)
 
 
 def _csv_reader(texts: Iterable[str]) -> Any:

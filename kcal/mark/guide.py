@@ -12,8 +12,9 @@ from torch import Tensor
 from kcal.corners.images import Gray
 from kcal.corners.match import MatchOptions, MatchStatus, match_points
 from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens.pose import side_axes, step_rows
+from kcal.lens.projection import project_components
+from kcal.lens.pupil import FAR
 from kcal.lens.rig import StereoRig
 from kcal.mark.items import Side
 from kcal.mark.snap import snap
@@ -70,28 +71,18 @@ class Proposal(NamedTuple):
 
 
 class RigBand:
-    """A rig and what it may be instead: one rig for each row of its covariance's root, as a batch of cameras.
+    """A rig, and how its errors move epipolar curves: to first order, from one joint covariance.
 
     Args:
         rig: with or without covariance.
     """
 
     def __init__(self, rig: StereoRig) -> None:
-        left, right = (camera.values.detach() for camera in (rig.left, rig.right))
-        half = left.new_zeros(0, len(left) + len(right) + 6) if rig.covariance is None else rig.covariance.half
-        moves = torch.cat([half.new_zeros(1, half.shape[1]), half])
-        ends = [len(left), len(left) + len(right)]
-        with torch.no_grad():
-            self._cameras = [
-                Camera(values + move, size=camera.size, model=camera.model)
-                for values, move, camera in (
-                    (left, moves[:, : ends[0]], rig.left),
-                    (right, moves[:, ends[0] : ends[1]], rig.right),
-                )
-            ]
-            self._rotation = rotation_from_vector(moves[:, -6:-3]) @ rig.right_from_left_rotation
-            self._translation = rig.right_from_left_translation + moves[:, -3:]
-        self._nearest = _NEAREST_BASELINES * float(rig.baseline)
+        self._rig = rig
+        # The curve's end at infinity is as far away as matters to an entrance pupil that moves.
+        self._inverse = torch.linspace(
+            0.0, 1.0 / (_NEAREST_BASELINES * float(rig.baseline)), _POINTS, dtype=torch.float64
+        ).clamp_min(1.0 / FAR)
 
     @torch.no_grad()
     def curve(self, side: Side, u: float, v: float) -> Curve:
@@ -100,30 +91,60 @@ class RigBand:
         Raises:
             InputError: the lens has no ray there, or nothing on the curve can be seen.
         """
-        first, second = self._cameras if side == "left" else self._cameras[::-1]
-        rotation, translation = self._rotation, self._translation
-        if side == "right":
-            rotation = rotation.mT
-            translation = -(rotation @ translation[..., None])[..., 0]
-        pixel = torch.tensor([[[u, v]]], dtype=torch.float64).expand(len(rotation), 1, 2)
-        rays, valid = first.unproject(pixel)
+        rig, of_left = self._rig, side == "left"
+        first, second = (rig.left, rig.right) if of_left else (rig.right, rig.left)
+        rays, valid = first.unproject(torch.tensor([[u, v]], dtype=torch.float64))
         if not bool(valid[0]):
             raise InputError(_REFUSALS[MatchStatus.NO_RAY])
-        near = torch.linspace(0.0, 1.0 / self._nearest, _POINTS, dtype=torch.float64)[:, None]
-        points = rays @ rotation.mT + near * ((first.ray_origins(rays) @ rotation.mT) + translation[:, None])
-        pixels, seen = second.project(points)
+        points = first.ray_origins(rays) + rays / self._inverse[:, None]
+        if not of_left:
+            points = (points - rig.right_from_left_translation) @ rig.right_from_left_rotation
+        pixels, seen = second.project(rig.right_from_left(points) if of_left else points)
         width, height = second.size
         room = 0.25 * max(width, height)
-        inside = ((pixels[0] > -room) & (pixels[0] < torch.tensor([width + room, height + room]))).all(-1)
-        kept = seen[0] & inside
+        kept = seen & ((pixels > -room) & (pixels < torch.tensor([width + room, height + room]))).all(-1)
         if int(kept.sum()) < 2:
             raise InputError(_REFUSALS[MatchStatus.OUTSIDE])
-        # Where a varied lens has no point, it says nothing.
-        moved = torch.where(seen[1:, :, None], pixels[1:] - pixels[0], 0.0)[:, kept]
-        line = pixels[0, kept]
+        line = pixels[kept]
         along = torch.nn.functional.normalize(torch.gradient(line, dim=0)[0], dim=-1)
-        across = torch.stack([-along[:, 1], along[:, 0]], -1)
-        return Curve(line, (moved * across).sum(-1).square().sum(0).sqrt())
+        across = torch.stack([-along[:, 1], along[:, 0]])
+        moved = _moved_curve(rig, points[kept].T, of_left)
+        return Curve(line, (moved * across).sum(-2).square().sum(0).sqrt())
+
+
+def _moved_curve(rig: StereoRig, points: Tensor, of_left: bool) -> Tensor:
+    """(K, 2, M) by how much each of K independent errors of a rig moves an epipolar curve.
+
+    Points of the curve go aside so that the pixel that they belong to stays, and are seen elsewhere in the other image.
+
+    Args:
+        rig: with or without covariance.
+        points: (3, M) of the curve, in the rig frame.
+        of_left: the pixel is one of the left image.
+    """
+    if rig.covariance is None:
+        return points.new_zeros(0, 2, points.shape[1])
+    rotated = rig.right_from_left_rotation @ points
+    seen = [
+        project_components(at, camera.values, camera.model, range(camera.values.shape[-1]))
+        for camera, at in ((rig.left, points), (rig.right, rotated + rig.right_from_left_translation[:, None]))
+    ]
+    by_rig = seen[0].by_camera, torch.cat([seen[1].by_camera, step_rows(seen[1].by_point, rotated)])
+    ends = len(by_rig[0])
+    moved = [
+        torch.einsum("kp,pum->kum", half, rows)
+        for half, rows in zip(rig.covariance.half.tensor_split([ends], 1), by_rig, strict=True)
+    ]
+    # Two ways aside, as long as the point is far, so that the derivatives are those of directions.
+    far = points.norm(dim=0)
+    aside = torch.stack([far * axis.T for axis in side_axes((points / far).T)])
+    by_aside = [
+        torch.einsum("xum,dxm->mud", each.by_point, way)
+        for each, way in zip(seen, (aside, rig.right_from_left_rotation @ aside), strict=True)
+    ]
+    own, other = (0, 1) if of_left else (1, 0)
+    undone = torch.linalg.solve(by_aside[own], moved[own].permute(2, 1, 0))
+    return moved[other] - (by_aside[other] @ undone).permute(2, 1, 0)
 
 
 def propose(

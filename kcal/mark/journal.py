@@ -1,21 +1,23 @@
 """The undo log: every action is one line of a file, written through to the disk before it is answered.
 
 Whatever was answered is there after a crash: the state is what the lines say, from the first to the last. A line that
-was cut off by a crash was not answered, and is removed.
+was cut off by a crash, or by a full disk, was not answered, and is removed. A line that was damaged later loses itself
+alone.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import IO
 
-import pydantic
-
 from kcal.errors import FileError, InputError
-from kcal.mark.items import ACTION, Change, MarkingState, Places, Step, applied
+from kcal.mark.items import ACTION, Add, Change, MarkingState, Places, Put, Step, applied
 
 _fcntl: ModuleType | None
 try:
@@ -32,16 +34,24 @@ class Journal:
     Args:
         path: of the log; made if it is missing.
 
+    Attributes:
+        count: how many actions there were.
+        notes: what was found damaged in the file.
+
     Raises:
-        FileError: a log that cannot be read or written, a damaged line, or one that another server has open.
+        FileError: a log that cannot be read or written, or one that another server has open.
     """
 
     def __init__(self, path: Path) -> None:
         self._states = [MarkingState()]
         self._undone: list[MarkingState] = []
+        self._earlier: list[MarkingState] = []
         self._seen: set[str] = set()
         self.count = 0
+        self.notes: list[str] = []
         self.path = path
+        # Bytes that are whole lines: what follows them was not answered.
+        self._end = 0
         self._file = self._opened()
 
     @property
@@ -49,10 +59,9 @@ class Journal:
         """The present one."""
         return self._states[-1]
 
-    @property
-    def before(self) -> MarkingState:
-        """The state before the last action that changed something."""
-        return self._undone[-1] if self._undone else self._states[max(len(self._states) - 2, 0)]
+    def earlier(self) -> Iterator[MarkingState]:
+        """States after earlier actions, latest first."""
+        return reversed(self._earlier)
 
     @property
     def can_undo(self) -> bool:
@@ -80,21 +89,37 @@ class Journal:
         states, undone = self._after(action)
         line = json.dumps({"key": key, "action": action.model_dump(mode="json", exclude_none=True)}) + "\n"
         try:
-            end = self._file.tell()
-            self._file.write(line.encode())
-            self._file.flush()
-            os.fsync(self._file.fileno())
+            self._append(line.encode())
         except OSError as error:
-            self._file.truncate(end)
-            raise FileError(f"{self.path}: cannot write: {error.strerror or error}") from error
-        self._states, self._undone = states, undone
-        self._seen.add(key)
-        self.count += 1
+            raise FileError(f"{self.path}: cannot write: {reason(error)}; this was not done") from error
+        self._take(states, undone, key)
         return True
 
     def close(self) -> None:
         """Close the file, which unlocks it."""
         self._file.close()
+
+    def _take(self, states: list[MarkingState], undone: list[MarkingState], key: str) -> None:
+        self._earlier.append(self.state)
+        self._states, self._undone = states, undone
+        self._seen.add(key)
+        self.count += 1
+
+    def _append(self, line: bytes) -> None:
+        """Write a whole line through to the disk; if that fails, nothing of it stays in the file."""
+        file = self._file.fileno()
+        # Nothing is left here unless cutting it off failed, too.
+        os.ftruncate(file, self._end)
+        try:
+            written = 0
+            while written < len(line):
+                written += os.write(file, line[written:])
+            os.fsync(file)
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(file, self._end)
+            raise
+        self._end += len(line)
 
     def _after(self, action: Change | Step) -> tuple[list[MarkingState], list[MarkingState]]:
         if isinstance(action, Places):
@@ -111,9 +136,21 @@ class Journal:
 
     def _opened(self) -> IO[bytes]:
         try:
-            file = open(self.path, "a+b")  # noqa: SIM115
+            # Without a buffer, which would keep what a full disk did not take.
+            file = open(self.path, "a+b", buffering=0)  # noqa: SIM115
         except OSError as error:
-            raise FileError(f"{self.path}: cannot open: {error.strerror or error}") from error
+            raise FileError(f"{self.path}: cannot open: {reason(error)}") from error
+        try:
+            self._read(file)
+        except OSError as error:
+            file.close()
+            raise FileError(f"{self.path}: cannot read or write: {reason(error)}") from error
+        except BaseException:
+            file.close()
+            raise
+        return file
+
+    def _read(self, file: IO[bytes]) -> None:
         if _fcntl is not None:
             try:
                 _fcntl.flock(file, _fcntl.LOCK_EX | _fcntl.LOCK_NB)
@@ -123,17 +160,15 @@ class Journal:
         whole = file.read()
         # A line without its end was being written when the server was killed.
         kept = whole[: whole.rfind(b"\n") + 1]
-        file.truncate(len(kept))
-        file.seek(0, os.SEEK_END)
-        if not kept:
-            file.write((json.dumps(_HEAD) + "\n").encode())
-            file.flush()
-            os.fsync(file.fileno())
-            return file
         self._replay(kept.split(b"\n")[:-1])
-        return file
+        self._file, self._end = file, len(kept)
+        if kept:
+            os.ftruncate(file.fileno(), self._end)
+        else:
+            self._append((json.dumps(_HEAD) + "\n").encode())
 
     def _replay(self, lines: list[bytes]) -> None:
+        damaged = []
         for number, line in enumerate(lines, start=1):
             try:
                 content = json.loads(line)
@@ -141,8 +176,30 @@ class Journal:
                     if content != _HEAD:
                         raise FileError(f"{self.path}: not a log of `kcal mark` of this version; give another -o")
                     continue
-                self._states, self._undone = self._after(ACTION.validate_python(content["action"]))
-                self._seen.add(content["key"])
-                self.count += 1
-            except (ValueError, KeyError, TypeError, pydantic.ValidationError, InputError) as error:
-                raise FileError(f"{self.path}: line {number} is damaged; delete it and what follows") from error
+                action, key = ACTION.validate_python(content["action"]), str(content["key"])
+                states, undone = self._after(self._named(action))
+            except (ValueError, KeyError, TypeError, RecursionError) as error:
+                # Also of errors of pydantic and of kcal, both of which are values that cannot be.
+                damaged.append(f"line {number} is damaged and was left out ({' '.join(str(error).split())[:60]})")
+                if number > 1:
+                    # Undoing goes back over as many actions as there were.
+                    self._states = [*self._states, self.state]
+                continue
+            self._take(states, undone, key)
+        if damaged and damaged[0].startswith("line 1 ") and not self.count:
+            raise FileError(f"{self.path}: not a log of `kcal mark`, or nothing of it can be read; give another -o")
+        self.notes += [f"{self.path}: {text}" for text in damaged]
+
+    def _named(self, action: Change | Step) -> Change | Step:
+        """The action; marks of a thing whose own line was lost bring the thing back."""
+        if isinstance(action, Put) and action.name not in self.state.items:
+            states, _ = self._after(Add(do="add", name=action.name, kind="target"))
+            self._states[-1] = states[-1]
+        return action
+
+
+def reason(error: OSError) -> str:
+    """Why a file could not be written, in words."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "the disk is full"
+    return error.strerror or str(error)

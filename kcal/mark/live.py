@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from kcal.calibrate.rig.result import ItemResidual
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
@@ -51,7 +52,7 @@ class LiveRig(NamedTuple):
         items: how well each landmark agrees with the others.
         promises: at the usual ranges; of a baseline of 10 m, 250 m, 1 km and 5 km.
         marked: landmarks marked in both images.
-        sigma: px, with which marks took part.
+        sigma: px, typical of the marks.
         text: what the operator should know, in one sentence.
         enough: whether more landmarks would still matter: errors of the rig are below those of marks at the farthest.
         warnings: of the solution.
@@ -86,7 +87,7 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
         missing = LEAST_LANDMARKS - count
         return nothing._replace(text=f"{missing} more landmark{'s' if missing > 1 else ''} in both images for a rig")
     try:
-        landmarks = match_landmarks(survey, marks, sigma).landmarks
+        landmarks = match_landmarks(survey, marks, mark_sigmas(marks, hand_sigma)).landmarks
         result = solve_rig(RigData(cameras=cameras, names=("left", "right"), landmarks=landmarks), RigOptions())
         rig = placed_rig(result, survey.origin or NOWHERE)
     except KcalError as error:
@@ -94,6 +95,8 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
     items = tuple(item for item in result.items if item.source == "landmarks")
     promises = promised(rig, sigma)
     text, enough = verdict(promises, count)
+    if result.exact:
+        text += "; errors of the lenses are not in it"
     wrong = [item.name for item in items if not item.used]
     if wrong:
         enough = False
@@ -101,12 +104,26 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
     return LiveRig(rig, survey.origin, items, promises, count, sigma, text, enough, result.warnings)
 
 
+def mark_sigmas(marks: Marks, hand_sigma: float) -> Tensor:
+    """(N, 2) standard deviation of each mark along an axis, px; NaN where an image has none.
+
+    Example:
+        >>> one = Marks(("a",), torch.tensor([[10.0, 20.0]]), torch.full((1, 2), torch.nan))
+        >>> mark_sigmas(one, 0.3).tolist()
+        [[0.3, nan]]
+    """
+    variance = torch.full((len(marks.names), 2), hand_sigma**2, dtype=torch.float64)
+    if marks.covariance is not None:
+        stated = marks.covariance.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 2)).mean(-1)
+        variance = torch.where(stated.isfinite(), stated, variance)
+    return torch.where(marks.pixels.isfinite().all(-1), variance.sqrt().clamp_min(_LEAST_SIGMA), math.nan)
+
+
 def marks_sigma(marks: Marks, hand_sigma: float) -> float:
-    """The root mean square of the marks' standard deviations along an axis, px."""
-    covariance = marks.covariance_or(hand_sigma)
-    if covariance is None or not len(covariance):
-        return hand_sigma
-    return max(math.sqrt(float(covariance.diagonal(dim1=-2, dim2=-1).mean())), _LEAST_SIGMA)
+    """The root mean square of the marks' standard deviations along an axis, px; marks that are missing do not count."""
+    sigmas = mark_sigmas(marks, hand_sigma)
+    known = sigmas[sigmas.isfinite()]
+    return float(known.square().mean().sqrt()) if len(known) else hand_sigma
 
 
 def promised(rig: StereoRig, sigma: float) -> tuple[Promise, ...]:

@@ -16,7 +16,7 @@ from kcal.locate.positions import Located, Position
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.survey import Survey, read_survey
 from kcal.mark.guide import Proposal, RigBand, at_shape, propose
-from kcal.mark.items import SIDES, Change, Item, Mark, MarkingState, Side, Step, other_side
+from kcal.mark.items import SIDES, Change, Item, Mark, MarkingState, Put, Side, Step, other_side
 from kcal.mark.live import LiveRig, located, marks_sigma, promised, solve_live
 from kcal.mark.overview import map_content
 from kcal.mark.pictures import Pictures, top_level
@@ -85,10 +85,24 @@ class Desk:
         return self._live.rig or self._given
 
     def act(self, action: Change | Step, key: str) -> Json:
-        """Apply an action, and return the state; see `Session.do`."""
+        """Apply an action, and return the state; see `Session.do`.
+
+        Raises:
+            InputError: a mark outside the picture, besides.
+        """
+        if isinstance(action, Put):
+            self._check_inside(action.side, action.mark)
         self.session.do(action, key)
         self._wake.set()
         return self.state()
+
+    def _check_inside(self, side: Side, mark: Mark) -> None:
+        height, width = self.pictures.image(side, self.pictures.number(mark.frame) or 0).shape
+        if not (-0.5 <= mark.u <= width - 0.5 and -0.5 <= mark.v <= height - 0.5):
+            raise InputError(
+                f"{mark.u:.1f}, {mark.v:.1f} is outside the {side} picture, which has {width}x{height} pixels; nothing "
+                "was marked"
+            )
 
     def about(self) -> Json:
         """What does not change: frames, sizes, files."""
@@ -105,6 +119,7 @@ class Desk:
             "columns": self.session.columns,
             "cameras": self._cameras is not None,
             "hand_sigma": self.session.hand_sigma,
+            "notes": self.session.notes,
             "reference": [] if self.reference is None else self.reference.marks.names,
         }  # fmt: skip
 
@@ -117,6 +132,7 @@ class Desk:
         return {
             "version": self.session.version,
             "pending": self._solved < self.session.version,
+            "trouble": self.session.trouble,
             "undo": undo,
             "redo": redo,
             "items": [

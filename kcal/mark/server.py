@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
@@ -16,7 +15,7 @@ from starlette.routing import Route
 from kcal.corners.point import enlarge
 from kcal.mark.items import ACTION, Mark, Side
 from kcal.mark.marking_service import Desk
-from kcal.web.gate import local_app, page_files
+from kcal.web.gate import json_body, local_app, page_files
 
 _Coordinate = Annotated[float, pydantic.Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
 _Number = Annotated[int, pydantic.Field(ge=0, le=10_000_000)]
@@ -90,8 +89,8 @@ def marking_app(desk: Desk, token: str, hosts: tuple[str, ...]) -> Starlette:
         model: type[pydantic.BaseModel], answer: Callable[[Any], Any]
     ) -> Callable[[Request], Awaitable[Response]]:
         async def endpoint(request: Request) -> Response:
-            body = await request.body()
-            query = model.model_validate(json.loads(body) if request.method == "POST" else dict(request.query_params))
+            given = await json_body(request) if request.method == "POST" else dict(request.query_params)
+            query = model.model_validate(given)
             found = await run_in_threadpool(answer, query)
             return found if isinstance(found, Response) else JSONResponse(found)
 

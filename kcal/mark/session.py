@@ -10,10 +10,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from kcal.errors import FileError
 from kcal.files import check_writable, write_atomic
 from kcal.locate.marks import Marks, marks_text, read_marks
 from kcal.mark.items import Change, Item, Kind, Load, Mark, MarkingState, Places, Side, Step
-from kcal.mark.journal import Journal
+from kcal.mark.journal import Journal, reason
 from kcal.mark.places import NO_PLACES, SurveyedPlaces, places_text, read_places
 
 _MARKED: tuple[Kind, ...] = ("landmark", "feature")
@@ -52,6 +53,10 @@ class Session:
         survey: a file of surveyed places; those are the landmarks.
         hand_sigma: of a mark that was placed by hand or read without covariance, px.
 
+    Attributes:
+        trouble: why the files are behind the log, for example a full disk; empty if they are not.
+        notes: what was found at the start: damaged lines of the log, files that were behind it.
+
     Raises:
         FileError: a file that cannot be read or written, or that another session has open.
     """
@@ -60,10 +65,12 @@ class Session:
         self.files = MarkingFiles.beside(marks)
         self.hand_sigma = hand_sigma
         self._lock = threading.Lock()
+        self.trouble = ""
         for path in (self.files.marks, self.files.points, self.files.landmarks, self.files.log):
             check_writable(path, *([survey] if survey else []))
         places = NO_PLACES if survey is None else read_places(survey)
         self._journal = Journal(self.files.log)
+        self.notes = self._journal.notes
         try:
             self.columns = self._take_over_places(places)
             self._take_over_changes()
@@ -88,15 +95,22 @@ class Session:
         return self._journal.can_undo, self._journal.can_redo
 
     def do(self, action: Change | Step, key: str) -> MarkingState:
-        """Apply an action, write the log and the files, and return the new state; see `Journal.do`."""
+        """Apply an action, write the log and the files, and return the new state; see `Journal.do`.
+
+        What is in the log is done. Files that cannot be written then are written after a later action, or at the next
+        start, and `trouble` says so.
+        """
         with self._lock:
             self._journal.do(action, key)
             self._write()
             return self.state
 
     def close(self) -> None:
-        """Release the log."""
-        self._journal.close()
+        """Write what could not be written before, and release the log."""
+        with self._lock:
+            if self.trouble:
+                self._write()
+            self._journal.close()
 
     def marks(self, *kinds: Kind, single: bool = True) -> Marks:
         """The marks of these kinds; of things marked in both images only, if not `single`."""
@@ -104,10 +118,20 @@ class Session:
 
     def _write(self) -> None:
         state = self.state
-        _write_if_new(self.files.marks, marks_text(marks_of(state, _MARKED)))
-        _write_if_new(self.files.points, marks_text(marks_of(state, ("target",), single=False)))
+        files = [
+            (self.files.marks, marks_text(marks_of(state, _MARKED))),
+            (self.files.points, marks_text(marks_of(state, ("target",), single=False))),
+        ]
         if state.survey:
-            _write_if_new(self.files.landmarks, places_text(SurveyedPlaces(self.columns, state.survey)))
+            files.append((self.files.landmarks, places_text(SurveyedPlaces(self.columns, state.survey))))
+        self.trouble = ""
+        for path, text in files:
+            try:
+                _write_if_new(path, text)
+            except FileError as error:
+                cause = error.__cause__
+                why = f"{path}: cannot write: {reason(cause)}" if isinstance(cause, OSError) else str(error)
+                self.trouble = f"{why}. Nothing is lost: all marks are in {self.files.log}"
 
     def _take_over_places(self, places: SurveyedPlaces) -> tuple[str, str, str]:
         """Log the places that are new or have changed, and return the columns of coordinates."""
@@ -120,17 +144,21 @@ class Session:
         return columns
 
     def _take_over_changes(self) -> None:
-        """Load files of marks that are neither as the log's last action left them nor as the one before did."""
+        """Load files of marks that are not as any action of the log left them."""
         groups: tuple[tuple[Path, tuple[Kind, ...], bool], ...] = (
             (self.files.marks, _MARKED, True), (self.files.points, ("target",), False),
         )  # fmt: skip
         for path, kinds, single in groups:
             if not path.exists():
                 continue
-            states = self._journal.state, self._journal.before
-            known = [marks_text(marks_of(state, kinds, single=single)) for state in states]
             text = path.read_text(encoding="utf-8-sig")
-            if text in known or len(text.splitlines()) < 2:
+            if len(text.splitlines()) < 2:
+                continue
+            before = (marks_text(marks_of(state, kinds, single=single)) for state in self._journal.earlier())
+            if text == marks_text(marks_of(self.state, kinds, single=single)):
+                continue
+            if text in before:
+                self.notes.append(f"{path}: was behind {self.files.log}, and was written again from it")
                 continue
             self._journal.do(self._load(read_marks(path, single=single), kinds), f"{_LOADED} {self.version}")
 
@@ -176,14 +204,15 @@ def marks_of(state: MarkingState, kinds: tuple[Kind, ...], *, single: bool = Tru
 
 
 def pair_covariance(item: Item) -> Tensor:
-    """(4, 4) px² of left u, v and right u, v; NaN unless both are marked.
+    """(4, 4) px² of left u, v and right u, v; NaN where it is not marked.
 
     A mark that was matched has the error of the mark that it was matched to, and that of the match besides.
     """
-    if item.left is None or item.right is None:
-        return torch.full((4, 4), math.nan, dtype=torch.float64)
     left, right = (
-        torch.tensor([[m.cov[0], m.cov[1]], [m.cov[1], m.cov[2]]], dtype=torch.float64) for m in (item.left, item.right)
+        torch.full((2, 2), math.nan, dtype=torch.float64)
+        if mark is None
+        else torch.tensor([[mark.cov[0], mark.cov[1]], [mark.cov[1], mark.cov[2]]], dtype=torch.float64)
+        for mark in (item.left, item.right)
     )
     zero = torch.zeros_like(left)
     if item.cross is None:

@@ -126,7 +126,7 @@ def assigned(
             i for i in rows
             if track[i] not in done and ends[pair[i]][0] not in left and ends[pair[i]][1] not in right
         ]:  # fmt: skip
-            chosen = _best(rows, track, pair, density)
+            chosen = _best_rows(rows, track, pair, density)
             for i in sorted(chosen, key=lambda i: -(evidence[track[i]] + density[i])):
                 first, second = ends[pair[i]]
                 if first not in left and second not in right:
@@ -137,7 +137,7 @@ def assigned(
     return accepted
 
 
-def _best(rows: list[int], track: list[int], pair: list[int], density: list[float]) -> list[int]:
+def _best_rows(rows: list[int], track: list[int], pair: list[int], density: list[float]) -> list[int]:
     """The rows of the best assignment, each track and pair once."""
     if len({track[i] for i in rows}) == len({pair[i] for i in rows}) == len(rows):
         return rows

@@ -2,8 +2,7 @@
 
 Pairs near one epipolar line (`kcal.pipeline.epipolar_band`) get their most likely point, at once on tensors. What no
 point explains is the epipolar error; it is judged by the noise of the boxes and by what is not known of the rig. The
-assignment with the least sum of costs is exact (Crouse, "On implementing 2D rectangular assignment algorithms", 2016,
-by SciPy); a detection may stay alone.
+assignment with the least sum of costs is exact (`kcal.pipeline.one_to_one`); a detection may stay alone.
 """
 
 from __future__ import annotations
@@ -13,9 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse.csgraph
 import torch
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from kcal.corners.filters import as_gray
@@ -26,12 +23,16 @@ from kcal.locate.stereo import PairFit, PositionStatus, fit_pairs, inverse_range
 from kcal.pipeline.appearance import appearance
 from kcal.pipeline.detections import Anchor, Detections
 from kcal.pipeline.epipolar_band import near_epipolar_lines
+from kcal.pipeline.one_to_one import assign_groups
 
 # Spread of the logarithm of an object's size between two views, besides what boxes err: it is seen from two sides.
 _SIZE_SPREAD = 0.15
 # Spread of 1 - correlation between two views of one object; of two objects it is 0.5 to 1.
 _LOOKS_SPREAD = 0.25
-_FORBIDDEN = 1e9
+# Of one image: more are a detector's fault, and their pairs grow with the square.
+MOST_BOXES = 2000
+# Numbers that are held at once while pairs are compared, some 100 MB with what is derived from them.
+_AT_ONCE = 1 << 19
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +104,8 @@ def associate(
         images: gray levels (H, W) of both, if looks shall count.
 
     Raises:
-        InputError: detections or images that are not of the cameras' size, or a missing keypoint.
+        InputError: detections or images that are not of the cameras' size, more than 2,000 boxes in an image, or a
+            missing keypoint.
 
     Example:
         >>> from kcal.rig import planned_rig
@@ -119,21 +121,27 @@ def associate(
     for word, camera, seen in (("left", rig.left, left), ("right", rig.right, right)):
         if seen.size != camera.size:
             raise InputError(f"the {word} detections are of an image {seen.size}, the camera has {camera.size}")
+        if len(seen) > MOST_BOXES:
+            raise InputError(f"{len(seen):,} {word} detections in one image; at most {MOST_BOXES:,} can be paired")
     near = torch.ones(len(left), len(right), dtype=torch.bool)
     if options.same_category:
         names = {name: number for number, name in enumerate({*left.category, *right.category})}
         kinds = [torch.tensor([names[name] for name in seen.category]).reshape(-1) for seen in (left, right)]
         near = kinds[0][:, None] == kinds[1]
     anchors = left.anchors(options.anchor), right.anchors(options.anchor)
-    near &= near_epipolar_lines(rig, *anchors, options.box_sigma, options.gate)
+    ranges = _nearest(rig, options), options.farthest
+    near &= near_epipolar_lines(rig, *anchors, options.box_sigma, options.gate, ranges)
     cost = pair_costs(rig, left, right, options, near)
     if images is not None:
         gray = [as_gray(f"{word} image", image) for word, image in zip(("left", "right"), images, strict=True)]
         if [image.shape[::-1] for image in gray] != [rig.left.size, rig.right.size]:
             raise InputError("association: images of the cameras' sizes are needed")
-        cost = cost + ((1.0 - appearance(gray[0], left.boxes, gray[1], right.boxes)) / _LOOKS_SPREAD).square()
+        parts = right.boxes.split(64)
+        looks = torch.cat([appearance(gray[0], left.boxes, gray[1], some) for some in parts], 1)
+        cost = cost + ((1.0 - looks) / _LOOKS_SPREAD).square()
     possible = cost < options.gate**2
-    chosen, ambiguous = _assigned(torch.where(possible, cost, _FORBIDDEN).numpy(), options)
+    costs = torch.where(possible, cost, torch.inf).numpy()
+    chosen, ambiguous = assign_groups(costs, options.gate**2, 2.0 * math.log(options.odds))
     rows = torch.from_numpy(np.flatnonzero(chosen >= 0))
     columns = torch.from_numpy(chosen[chosen >= 0])
     return Association(rows, columns, cost[rows, columns], torch.from_numpy(ambiguous)[rows], possible)
@@ -148,8 +156,22 @@ def pair_costs(
     """
     cost = torch.full((len(left), len(right)), torch.inf, dtype=torch.float64)
     rows, columns = (torch.ones_like(cost, dtype=torch.bool) if among is None else among).nonzero(as_tuple=True)
-    if not len(rows):
-        return cost
+    errors = 0 if rig.covariance is None else rig.covariance.half.shape[0]
+    size = _AT_ONCE // (16 + 8 * errors) + 1
+    for some, others in zip(rows.split(size), columns.split(size), strict=True):
+        if len(some):
+            cost[some, others] = _some_costs(rig, left, right, options, some, others)
+    return cost
+
+
+def _nearest(rig: StereoRig, options: AssociationOptions) -> float:
+    return options.nearest if options.nearest is not None else 10.0 * float(rig.baseline)
+
+
+def _some_costs(
+    rig: StereoRig, left: Detections, right: Detections, options: AssociationOptions, rows: Tensor, columns: Tensor
+) -> Tensor:
+    """(L,) of the pairs of these numbers."""
     variance = options.box_sigma**2
     first, second = left.anchors(options.anchor)[rows], right.anchors(options.anchor)[columns]
     # Every coordinate has the same noise: the point does not depend on how large it is.
@@ -159,13 +181,11 @@ def pair_costs(
         moved = calibration_effect(found.fit, found.scale, rig.covariance.half.T)[2]
         spread = spread + moved.square().sum(0)
     reach = inverse_range(found, spread, PositionStatus.BEARING_ONLY)
-    nearest = options.nearest if options.nearest is not None else 10.0 * float(rig.baseline)
     beyond = (1.0 / options.farthest - reach.value).clamp_min(0.0)
-    before = (reach.value - 1.0 / nearest).clamp_min(0.0)
+    before = (reach.value - 1.0 / _nearest(rig, options)).clamp_min(0.0)
     total = epipolar_cost(found, variance, rig.covariance) + (torch.maximum(beyond, before) / reach.sigma).square()
     total = total + _size_cost(found, left.boxes[rows], right.boxes[columns], options.box_sigma)
-    cost[rows, columns] = torch.where(found.usable & (reach.sigma > 0), total, torch.inf)
-    return cost
+    return torch.where(found.usable & (reach.sigma > 0), total, torch.inf)
 
 
 def epipolar_cost(found: PairFit, variance: float, covariance: RigCovariance | None) -> Tensor:
@@ -190,46 +210,3 @@ def _size_cost(found: PairFit, left: Tensor, right: Tensor, box_sigma: float) ->
     # Middles of boxes err by box_sigma, so edges by √2 and sizes by twice as much.
     spread = sum((2.0 * box_sigma / size).square() for size in sizes) + _SIZE_SPREAD**2
     return (ratio.square() / spread).sum(-1)
-
-
-def _assigned(cost: np.ndarray, options: AssociationOptions) -> tuple[np.ndarray, np.ndarray]:
-    """For each row its column or -1, and whether another pairing of the two is nearly as good.
-
-    Detections that no chain of possible pairs connects do not bear on each other, so each group is solved on its own.
-    """
-    chosen, ambiguous = np.full(len(cost), -1), np.zeros(len(cost), dtype=bool)
-    ends = np.nonzero(cost < _FORBIDDEN)
-    graph = scipy.sparse.coo_array(
-        (np.ones(len(ends[0])), (ends[0], len(cost) + ends[1])), shape=(sum(cost.shape),) * 2
-    )
-    _, groups = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    for group in np.unique(groups[ends[0]]):
-        rows = np.flatnonzero(groups[: len(cost)] == group)
-        columns = np.flatnonzero(groups[len(cost) :] == group)
-        if len(rows) == len(columns) == 1:
-            # Cheaper than two that stay alone, and without a rival.
-            chosen[rows] = columns
-            continue
-        part = cost[np.ix_(rows, columns)]
-        best, least = _best_assignment(part, options.gate**2)
-        chosen[rows] = np.where(best >= 0, columns[best], -1)
-        for i in np.flatnonzero(best >= 0):
-            without = part.copy()
-            without[i, best[i]] = _FORBIDDEN
-            other, more = _best_assignment(without, options.gate**2)
-            elsewhere = other[i] >= 0 or best[i] in other
-            ambiguous[rows[i]] = elsewhere and more - least < 2.0 * math.log(options.odds)
-    return chosen, ambiguous
-
-
-def _best_assignment(cost: np.ndarray, alone: float) -> tuple[np.ndarray, float]:
-    """Columns of the rows, or -1, and the sum of costs, where two detections that stay alone cost `alone` together."""
-    rows, columns = cost.shape
-    whole = np.full((rows + columns, rows + columns), _FORBIDDEN)
-    whole[:rows, :columns] = cost
-    whole[rows:, columns:] = 0.0
-    whole[np.arange(rows), columns + np.arange(rows)] = 0.5 * alone
-    whole[rows + np.arange(columns), np.arange(columns)] = 0.5 * alone
-    at = linear_sum_assignment(whole)[1]
-    chosen = np.where(at[:rows] < columns, at[:rows], -1)
-    return chosen, float(whole[np.arange(len(at)), at].sum())

@@ -77,6 +77,8 @@ def _as_numbers(name: str, values: Any) -> Tensor:
 
 def _boxes(values: Any) -> Tensor:
     boxes = _as_numbers("boxes", values)
+    if not boxes.ndim:
+        raise InputError(f"boxes: rows of x1, y1, x2, y2 are needed, got {float(boxes):g}")
     return boxes.reshape(0, 4) if boxes.numel() == 0 else boxes
 
 

@@ -7,6 +7,8 @@ a few products. Far from the line, the fit of a point may also stop at a false o
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -18,7 +20,37 @@ from kcal.lens.uncertainty import pixel_slopes
 _SLACK = 1.5
 
 
-def near_epipolar_lines(rig: StereoRig, left: Tensor, right: Tensor, sigma: float, gate: float) -> Tensor:
+# Ranges from the left camera and from the rig's middle differ by this ratio at most, from 2 baselines on.
+_MIDDLE = 1.25
+# Numbers that are held at once.
+_AT_ONCE = 1 << 20
+
+
+class _Rays(NamedTuple):
+    """N rays of a camera, in the frame of the right one.
+
+    Attributes:
+        ray: (N, 3).
+        by_pixel: (N, 3, 2) turns of it by a pixel.
+        by_error: (N, 3, K) turns of it by the errors of the rig.
+    """
+
+    ray: Tensor
+    by_pixel: Tensor
+    by_error: Tensor
+
+    def at(self, which: Tensor) -> _Rays:
+        return _Rays(*(value[which] for value in self))
+
+
+def near_epipolar_lines(
+    rig: StereoRig,
+    left: Tensor,
+    right: Tensor,
+    sigma: float,
+    gate: float,
+    ranges: tuple[float, float] | None = None,
+) -> Tensor:
     """(N, M) bool: False only where the epipolar error is beyond `gate` standard deviations for certain.
 
     Args:
@@ -27,6 +59,7 @@ def near_epipolar_lines(rig: StereoRig, left: Tensor, right: Tensor, sigma: floa
         right: (M, 2).
         sigma: standard deviation of every pixel along each axis.
         gate: standard deviations.
+        ranges: nearest and farthest, meters: pairs beyond them by as many standard deviations are left out, too.
 
     Example:
         >>> from kcal.rig import planned_rig
@@ -39,24 +72,82 @@ def near_epipolar_lines(rig: StereoRig, left: Tensor, right: Tensor, sigma: floa
     sizes = (rig.left.values.shape[-1], rig.right.values.shape[-1], 3, 3)
     known = shift.new_zeros(0, sum(sizes)) if rig.covariance is None else rig.covariance.half
     own = known.T.split(sizes)
-    rays_left, by_left, effect_left = _turns(rig.left, left, own[0])
-    rays_right, by_right, effect_right = _turns(rig.right, right, own[1])
-    turned = (rays_left @ rotation.T)[:, None]
-    across = torch.linalg.cross(rays_right, shift.expand_as(rays_right))[None]
+    ray, by_pixel, by_error = _turns(rig.left, left, own[0])
+    first = _Rays(ray @ rotation.T, rotation @ by_pixel, own[2] - rotation @ by_error)
+    other = _Rays(*_turns(rig.right, right, own[1]))
+    shifts = shift, own[3]
+    near = torch.zeros(len(left), len(right), dtype=torch.bool, device=left.device)
+    errors = max(1, own[3].shape[1])
+    for rows in torch.arange(len(left), device=left.device).split(_AT_ONCE // (32 * max(1, len(right))) + 1):
+        part = first.at(rows)
+        block = _possible(part, other, shifts, sigma, _SLACK * gate, ranges)
+        if len(known):
+            # Exact where the bound on what the errors of the rig do leaves it open.
+            for some, columns in (which.T for which in block.nonzero().split(_AT_ONCE // (8 * errors) + 1)):
+                block[some, columns] = _certain(part.at(some), other.at(columns), shifts, sigma, _SLACK * gate)
+        near[rows] = block
+    return near
+
+
+def _possible(
+    first: _Rays,
+    other: _Rays,
+    shifts: tuple[Tensor, Tensor],
+    sigma: float,
+    gate: float,
+    ranges: tuple[float, float] | None,
+) -> Tensor:
+    """(N, M) bool: each error of the rig as large as it can be beside the others."""
+    shift, by_shift = shifts
+    turned, rays = first.ray[:, None], other.ray[None]
+    across = torch.linalg.cross(rays, shift.expand_as(rays))
+    shifted = torch.linalg.cross(*torch.broadcast_tensors(turned, rays))
     error = (turned * across).sum(-1)
     # Derivatives of the error (N, M, 3) by turns of the left rays about the right camera's axes, and of the right rays.
     by_turn = torch.linalg.cross(*torch.broadcast_tensors(turned, across))
-    normal = torch.linalg.cross(shift.expand_as(turned), turned)
-    by_other = torch.linalg.cross(*torch.broadcast_tensors(rays_right[None], normal))
-    shifted = torch.linalg.cross(*torch.broadcast_tensors(turned, rays_right[None]))
-    by_left, by_other = rotation @ by_left, by_other.movedim(1, 0)
-    marks = torch.cat([by_turn @ by_left, (by_other @ by_right).movedim(0, 1)], -1)
-    moved = by_turn @ (own[2] - rotation @ effect_left) - (by_other @ effect_right).movedim(0, 1) + shifted @ own[3]
-    variance = sigma**2 * marks.square().sum(-1) + moved.square().sum(-1)
+    by_other = torch.linalg.cross(*torch.broadcast_tensors(rays, torch.linalg.cross(shift.expand_as(turned), turned)))
+    marks = (by_turn @ first.by_pixel).square().sum(-1)
+    marks = marks + (by_other.movedim(1, 0) @ other.by_pixel).movedim(0, 1).square().sum(-1)
+    moved = _length(by_turn, first.by_error) + _length(by_other.movedim(1, 0), other.by_error).T
+    moved = moved + _length(shifted, by_shift)
     # What products of two turns add at most.
-    reach = (_SLACK * gate * sigma) ** 2
-    second = by_left.square().sum((1, 2))[:, None] + by_right.square().sum((1, 2))
-    return ~(error.abs() > _SLACK * gate * variance.sqrt() + reach * rig.baseline * second)
+    turns = [ray.by_pixel.square().sum((1, 2)) for ray in (first, other)]
+    second = (gate * sigma) ** 2 * (turns[0][:, None] + turns[1])
+    baseline = torch.linalg.vector_norm(shift)
+    near = error.abs() <= gate * ((sigma**2 * marks).sqrt() + moved) + second * baseline
+    if ranges is None:
+        return near
+    # A point at the inverse distance q is seen where the cross product of its rays is q times that with the baseline.
+    length = torch.linalg.vector_norm(across, dim=-1).clamp_min(1e-12)
+    inverse = (shifted * across).sum(-1) / length.square()
+    own = [(sigma**2 * turn).sqrt() + ray.by_error.square().sum((1, 2)).sqrt()
+           for turn, ray in zip(turns, (first, other), strict=True)]  # fmt: skip
+    stretch = (own[1] * baseline + by_shift.square().sum().sqrt()) / length
+    reach = gate * ((own[0][:, None] + own[1]) / length + inverse.abs() * stretch) + second / length
+    beyond = inverse + reach < 1.0 / (_MIDDLE * ranges[1])
+    before = inverse - reach > _MIDDLE / ranges[0]
+    # Near the baseline's own direction nothing is said of the distance.
+    return near & ~((beyond | before) & (gate * stretch < 0.3))
+
+
+def _length(by: Tensor, errors: Tensor) -> Tensor:
+    """Of by (..., M, 3) times errors (..., 3, K), by the products of the errors with each other: no K for each pair."""
+    return ((by @ (errors @ errors.mT)) * by).sum(-1).clamp_min(0.0).sqrt()
+
+
+def _certain(first: _Rays, other: _Rays, shifts: tuple[Tensor, Tensor], sigma: float, gate: float) -> Tensor:
+    """(L,) bool: the same of L pairs, with the errors of the rig together."""
+    shift, by_shift = shifts
+    across = torch.linalg.cross(other.ray, shift.expand_as(other.ray))
+    by_turn = torch.linalg.cross(first.ray, across)[:, None]
+    by_other = torch.linalg.cross(other.ray, torch.linalg.cross(shift.expand_as(first.ray), first.ray))[:, None]
+    shifted = torch.linalg.cross(first.ray, other.ray)[:, None]
+    marks = torch.cat([by_turn @ first.by_pixel, by_other @ other.by_pixel], -1)
+    moved = by_turn @ first.by_error - by_other @ other.by_error + shifted @ by_shift
+    variance = sigma**2 * marks.square().sum((1, 2)) + moved.square().sum((1, 2))
+    turns = sum(ray.by_pixel.square().sum((1, 2)) for ray in (first, other))
+    second = (gate * sigma) ** 2 * turns * torch.linalg.vector_norm(shift)
+    return (first.ray * across).sum(-1).abs() <= gate * variance.sqrt() + second
 
 
 def _turns(camera: Camera, pixels: Tensor, half: Tensor) -> tuple[Tensor, Tensor, Tensor]:

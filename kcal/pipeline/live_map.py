@@ -1,33 +1,41 @@
 """The map of a stream in the browser: served to this machine only, and it loads nothing from elsewhere.
 
-A page gets the newest tracks as server-sent events. A page that is slow misses moments; nothing waits for it.
+A page gets the newest tracks as server-sent events. A page that is slow misses moments; nothing waits for it, except
+that the end is told to each page before the server stops.
 """
 
 from __future__ import annotations
 
 import asyncio
-import math
+import itertools
 import secrets
 import threading
+import time
 from collections.abc import AsyncIterator
 
+import numpy as np
 import orjson
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from kcal.lens.mounting import Origin
 from kcal.locate.columns import PositionColumns
+from kcal.locate.map_places import camera_place, field_of_view
 from kcal.locate.positions import Located
+from kcal.locate.region import CORNER_DECIMALS, near, ring_blocks
 from kcal.web.gate import local_app, page_files
 from kcal.web.serving import LocalServer
 
-# Seconds between looks for news, and between signs of life while there is none.
-_POLL, _ALIVE = 0.1, 10.0
+# Seconds between looks for news, between signs of life while there is none, and for which the end waits for pages.
+_POLL, _ALIVE, _FAREWELL = 0.1, 10.0, 3.0
+# Meters to which fields of view are drawn: farther than any target, so that they fill the map at every zoom.
+_FIELD_REACH_M = 100_000.0
 
 
 class LiveMap:
-    """The server; `address` is what to open.
+    """The server; `address` is what to open, `readers` the number of pages that are open.
 
     Args:
         run: where the cameras stand.
@@ -38,11 +46,20 @@ class LiveMap:
     """
 
     def __init__(self, run: Located, port: int) -> None:
-        self._site = orjson.dumps(
-            {"cameras": [{"name": f"{camera.name} camera", "place": camera.geodetic[:2]} for camera in run.cameras]}
-        )
-        self._news = (0, b"")
-        self._ended = threading.Event()
+        cameras = [
+            {
+                "name": f"{camera.name} camera",
+                "place": camera_place(camera, run.origin),
+                "field": field_of_view(camera, run.origin, _FIELD_REACH_M),
+            }
+            for camera in run.cameras
+        ]
+        self.run, self.readers = run, 0
+        self._site = orjson.dumps({"cameras": cameras})
+        # Number of the news, its columns and its moment; the last that was written for pages.
+        self._news: tuple[int, PositionColumns | None, int] = (0, None, 0)
+        self._written = (0, b"")
+        self._ending = b""
         self._server = LocalServer(self._app, port, fallback=False)
         self.address = self._server.address
         # Signals are those of the stream.
@@ -50,25 +67,15 @@ class LiveMap:
         self._thread.start()
 
     def show(self, columns: PositionColumns, sequence: int) -> None:
-        """Show the tracks of a moment."""
-        radius, range_m = columns.column("cep95_m").tolist(), columns.column("range_m").tolist()
-        tracks = [
-            {
-                "name": name,
-                "place": [lat, lon],
-                "radius": around if math.isfinite(around) else 0.0,
-                "text": f"{columns.extras['category'][i]}, {distance:,.0f} m",
-            }
-            for i, (name, (lat, lon), around, distance) in enumerate(
-                zip(columns.names, columns.numbers[:, :2].tolist(), radius, range_m, strict=True)
-            )
-            if math.isfinite(lat)
-        ]
-        self._news = (self._news[0] + 1, orjson.dumps({"sequence": sequence, "tracks": tracks}))
+        """Show the tracks of a moment. It is written out only if a page asks for it."""
+        self._news = (self._news[0] + 1, columns, sequence)
 
-    def close(self) -> None:
-        """End the server."""
-        self._ended.set()
+    def close(self, words: str = "finished") -> None:
+        """Tell each page how it ended, and end the server."""
+        self._ending = orjson.dumps({"words": words})
+        until = time.monotonic() + _FAREWELL
+        while self.readers and time.monotonic() < until:
+            time.sleep(_POLL / 2)
         self._server.stop()
         self._thread.join(5.0)
 
@@ -79,19 +86,53 @@ class LiveMap:
                 return PlainTextResponse("open the address that kcal live printed", 403)
             return StreamingResponse(self._told(request), media_type="text/event-stream")
 
-        pages = page_files(("kcal.pipeline", "page"), ("kcal.report", "leaflet"))
+        pages = page_files(("kcal.pipeline", "page"), ("kcal.report", "leaflet"), ("kcal.web", "map"))
         return local_app([Route("/events", events)], pages, token, hosts)
 
     async def _told(self, request: Request) -> AsyncIterator[bytes]:
-        yield b"event: site\ndata: " + self._site + b"\n\n"
-        seen, quiet = 0, 0.0
-        while not self._ended.is_set() and not await request.is_disconnected():
-            number, text = self._news
-            if number != seen:
-                seen, quiet = number, 0.0
-                yield b"event: tracks\ndata: " + text + b"\n\n"
-            elif quiet >= _ALIVE:
-                quiet = 0.0
-                yield b": alive\n\n"
-            await asyncio.sleep(_POLL)
-            quiet += _POLL
+        self.readers += 1
+        try:
+            yield b"event: site\ndata: " + self._site + b"\n\n"
+            seen, quiet = 0, 0.0
+            while not await request.is_disconnected():
+                # Looked at before the news: what came before the end is shown before it.
+                ending, (number, columns, sequence) = self._ending, self._news
+                if number != seen and columns is not None:
+                    seen, quiet = number, 0.0
+                    yield b"event: tracks\ndata: " + self._text(number, columns, sequence) + b"\n\n"
+                elif quiet >= _ALIVE:
+                    quiet = 0.0
+                    yield b": alive\n\n"
+                if ending:
+                    yield b"event: end\ndata: " + ending + b"\n\n"
+                    return
+                await asyncio.sleep(_POLL)
+                quiet += _POLL
+        finally:
+            self.readers -= 1
+
+    def _text(self, number: int, columns: PositionColumns, sequence: int) -> bytes:
+        """News as JSON, written once for all pages."""
+        if self._written[0] != number:
+            self._written = number, _tracks_text(columns, sequence, self.run.origin)
+        return self._written[1]
+
+
+def _tracks_text(columns: PositionColumns, sequence: int, origin: Origin) -> bytes:
+    """The tracks with a position: name, place, 95 % region, and what is said of each."""
+    located = np.flatnonzero(columns.located)
+    rings = itertools.chain.from_iterable(ring_blocks(columns, origin))
+    tracks = []
+    for i, ring in zip(located.tolist(), rings, strict=True):
+        lat, lon = columns.numbers[i, :2].tolist()
+        # As `near` does for one: the whole ring lies on the origin's side of the antimeridian.
+        turn = near(lon, origin.lon) - lon
+        tracks.append(
+            {
+                "name": columns.names[i],
+                "place": [lat, lon + turn],
+                "region": np.round(ring + np.array([0.0, turn]), CORNER_DECIMALS).tolist(),
+                "text": f"{columns.extras['category'][i]}, {columns.column('range_m')[i]:,.0f} m",
+            }
+        )
+    return orjson.dumps({"sequence": sequence, "tracks": tracks})

@@ -22,6 +22,7 @@ from kcal.locate.export import APPENDED, appended
 from kcal.locate.positions import Located
 from kcal.pipeline.handover import Handover
 from kcal.pipeline.lines import Moment
+from kcal.pipeline.moment_order import MOST_SECONDS, MomentOrder, Released
 from kcal.pipeline.senders import Sender
 from kcal.pipeline.snapshots import restore, snapshot
 from kcal.pipeline.stream_journal import Ledger
@@ -50,6 +51,10 @@ class StreamCounts:
     Attributes:
         moments: written to the outputs in this run.
         repeated: skipped, because their time is not after that of the last one.
+        contradicted: left out, because the moments before and after agree that their time is wrong.
+        waiting: at the end, moments whose time jumped and that no later one bears out; the next run reads them again.
+        jumps: how often the clock was set, or nothing came for a while, and what came was followed.
+        last_jump_s: by how many seconds the clock was set last.
         malformed: lines that could not be read.
         dropped: moments of a camera for which there was no time.
         positions: written.
@@ -59,6 +64,10 @@ class StreamCounts:
 
     moments: int = 0
     repeated: int = 0
+    contradicted: int = 0
+    waiting: int = 0
+    jumps: int = 0
+    last_jump_s: float = 0.0
     malformed: int = 0
     dropped: int = 0
     positions: int = 0
@@ -102,8 +111,13 @@ class Stream:
         self.counts = StreamCounts()
         self._stop = threading.Event()
         self.ledger = Ledger(journal, outputs)
+        self._behind, self._order = False, MomentOrder[SourceItem]()
         if self.ledger.state is not None:
-            restore(tracker, self.ledger.state)
+            try:
+                restore(tracker, self.ledger.state)
+            except BaseException:
+                self.ledger.close()
+                raise
 
     def stop(self) -> None:
         """End after the present moment; may be called from another thread or a signal's handler."""
@@ -111,6 +125,9 @@ class Stream:
 
     def follow(self, source: Callable[[int], Iterator[SourceItem]], *, waits: bool, resumes: bool) -> StreamCounts:
         """Follow a source until it ends or `stop` is called.
+
+        A time that jumps is followed once two later moments go on from it (`kcal.pipeline.moment_order`); tracks then
+        begin anew.
 
         Args:
             source: gives items from an offset on; if it can be closed, it is closed at the end.
@@ -120,39 +137,31 @@ class Stream:
         place, checkpoint = self.ledger.place, self.ledger.checkpoint_at
         begin = checkpoint.offset if resumes else 0
         # Moments after the checkpoint that are in the outputs already bring only the tracker to where it was.
-        behind = resumes and self.ledger.state is not None and checkpoint.sequence < place.sequence
-        if not behind:
-            self.ledger.checkpoint(snapshot(self.tracker))
-        latest = place.time if place.time is not None and not resumes else -math.inf
+        self._behind = resumes and self.ledger.state is not None and checkpoint.sequence < place.sequence
+        self._order = self._new_order(waits=waits, resumes=resumes)
+        if not self._behind:
+            self._checkpoint()
         items = Handover(source(begin), _WAITING, waits=waits, stop=self._stop)
         try:
             for item in items:
                 self.counts.dropped = items.dropped
-                if isinstance(item.moment, InputError):
-                    # Of lines that are read again after a restart, each was counted in the run before.
-                    if item.offset > place.offset or not resumes:
+                # Of lines that are read again after a restart, each was counted in the run before.
+                new = item.offset > place.offset or not resumes
+                wrong = item.moment if isinstance(item.moment, InputError) else self._wrong_time(item.moment)
+                if wrong is not None:
+                    if new:
                         self.counts.malformed += 1
-                        self.counts.last_error = str(item.moment)
+                        self.counts.last_error = str(wrong)
                     continue
-                if item.moment.time <= max(self.tracker.time, latest):
-                    self.counts.repeated += not behind
-                    continue
-                if behind:
-                    written, behind = item.offset <= place.offset, item.offset < place.offset
-                    if written:
-                        self.tracker(item.moment.pairs, item.moment.time)
-                    if not behind:
-                        self.ledger.checkpoint(snapshot(self.tracker))
-                    if written:
-                        continue
-                sequence = self.ledger.place.sequence + 1
-                self._write(item.moment, item.offset, sequence)
-                if sequence % _CHECKPOINT == 0:
-                    self.ledger.checkpoint(snapshot(self.tracker))
+                assert isinstance(item.moment, Moment)
+                self._take_in(self._order.put(item, item.moment.time), new)
+            if not self._stop.is_set():
+                self._take_in(self._order.end(), True)
+            self.counts.waiting = self._order.waiting
         finally:
             self._stop.set()
-            if not behind:
-                self.ledger.checkpoint(snapshot(self.tracker))
+            if not self._behind:
+                self._checkpoint()
             self.ledger.close()
             for sender in self.senders:
                 sender.close()
@@ -162,6 +171,57 @@ class Stream:
                 close()
             items.close(0.5 if close is None else 10.0)
         return self.counts
+
+    def _new_order(self, *, waits: bool, resumes: bool) -> MomentOrder[SourceItem]:
+        latest, state = self.ledger.place.time, self.ledger.state
+        step = float(state.get("step_s", 0.0)) if state is not None else 0.0
+        if resumes or latest is None:
+            return MomentOrder(self.tracker.time, step)
+        if self.tracker.time > latest:
+            self.tracker.set_clock(latest)
+        # A pipe's writer may begin somewhat earlier again; a camera cannot.
+        return MomentOrder(latest, step, until=latest if waits else -math.inf)
+
+    def _checkpoint(self) -> None:
+        self.ledger.checkpoint(snapshot(self.tracker) | {"step_s": self._order.step})
+
+    def _take_in(self, released: Released[SourceItem], new: bool) -> None:
+        """Take in the moments that are in order now; `new`: they are counted."""
+        if new:
+            self.counts.repeated += released.repeated
+            self.counts.contradicted += released.contradicted
+        for number, item in enumerate(released.moments):
+            assert isinstance(item.moment, Moment)
+            if released.jump_s and number == 0:
+                self.tracker.set_clock(item.moment.time)
+                if item.offset > self.ledger.place.offset or not self._behind:
+                    self.counts.jumps += 1
+                    self.counts.last_jump_s = released.jump_s
+            if self._behind:
+                place = self.ledger.place
+                written, self._behind = item.offset <= place.offset, item.offset < place.offset
+                if written:
+                    self.tracker(item.moment.pairs, item.moment.time)
+                if not self._behind:
+                    self._checkpoint()
+                if written:
+                    continue
+            sequence = self.ledger.place.sequence + 1
+            self._write(item.moment, item.offset, sequence)
+            if sequence % _CHECKPOINT == 0:
+                self._checkpoint()
+
+    def _wrong_time(self, moment: Moment) -> InputError | None:
+        """Why a time cannot be one in seconds, or None."""
+        largest = max([abs(moment.time), *moment.pairs.time.abs().flatten().tolist()])
+        if largest >= MOST_SECONDS:
+            return InputError(f"time {largest:.6g}: seconds are needed; this may be in milliseconds or smaller units")
+        if self.start is not None:
+            try:
+                self.start + datetime.timedelta(seconds=moment.time)
+            except OverflowError:
+                return InputError(f"time {moment.time:.6g}: no date so many seconds after the start")
+        return None
 
     def _write(self, moment: Moment, offset: int, sequence: int) -> None:
         when = self._calendar(moment.time)
@@ -174,11 +234,12 @@ class Stream:
         self.ledger.append(parts, moment.time, offset)
         for sender in self.senders:
             sender.send(columns, self.run, when)
-        if self.shown is not None:
-            self.shown(columns, tracks)
         self.counts.moments += 1
         self.counts.positions += len(columns.names)
         self.counts.unsent = sum(sender.failed for sender in self.senders)
+        # Last: what is told counts this moment, too.
+        if self.shown is not None:
+            self.shown(columns, tracks)
 
     def _calendar(self, time: float) -> datetime.datetime:
         if self.start is not None:

@@ -15,7 +15,8 @@ from typing import Any, BinaryIO, NamedTuple
 import orjson
 
 from kcal.errors import FileError
-from kcal.files import write_atomic
+from kcal.file_lock import FileLock
+from kcal.files import read_bytes, write_atomic
 
 _HEAD = {"kcal": "live journal", "version": 1}
 
@@ -44,18 +45,25 @@ class Ledger:
         outputs: files; they are made, or cut to what the journal says.
 
     Raises:
-        FileError: a file that cannot be opened, a damaged journal, one of other outputs, or an output that has lost
-            what the journal says it has.
+        FileError: a file that another process writes or that cannot be opened, a damaged journal, one of other outputs,
+            or an output that has lost what the journal says it has.
     """
 
     def __init__(self, path: Path, outputs: Sequence[Path]) -> None:
         self.path, self.outputs = path, tuple(outputs)
         self.state: dict[str, Any] | None = None
         self.checkpoint_at = self.place = StreamPlace(0, None, 0, (0,) * len(self.outputs))
-        if path.exists():
-            self._read()
-        self._files = [self._opened(file, size) for file, size in zip(self.outputs, self.place.sizes, strict=True)]
+        self._files: list[BinaryIO] = []
         self._log: BinaryIO | None = None
+        self._lock = FileLock((*self.outputs, path), "kcal live")
+        try:
+            if path.exists():
+                self._read()
+            for file, size in zip(self.outputs, self.place.sizes, strict=True):
+                self._files.append(self._opened(file, size))
+        except BaseException:
+            self.close()
+            raise
 
     def append(self, parts: Sequence[bytes], time: float, offset: int) -> None:
         """Write a moment's bytes to the outputs, and then to the journal."""
@@ -82,12 +90,13 @@ class Ledger:
         self.state, self.checkpoint_at = state, self.place
 
     def close(self) -> None:
-        """Close all files."""
+        """Close all files, and let other processes write them."""
         for file in (*self._files, *([self._log] if self._log else [])):
             file.close()
+        self._lock.release()
 
     def _read(self) -> None:
-        lines = self.path.read_bytes().split(b"\n")[:-1]  # what is cut off was not complete
+        lines = read_bytes(self.path).split(b"\n")[:-1]  # what is cut off was not complete
         try:
             head = orjson.loads(lines[0])
             places = [StreamPlace(*head["place"]), *(StreamPlace(*orjson.loads(line)) for line in lines[1:])]
@@ -96,6 +105,8 @@ class Ledger:
             if head["outputs"] != [str(path.resolve()) for path in self.outputs]:
                 raise FileError(f"{self.path}: a journal of other outputs, {head['outputs']}; delete it to begin anew")
             self.state = head["state"]
+            if any(len(place.sizes) != len(self.outputs) for place in places) or not isinstance(self.state, dict):
+                raise TypeError("a place does not fit its outputs")
         except (orjson.JSONDecodeError, KeyError, TypeError, IndexError) as error:
             raise FileError(f"{self.path}: the journal is damaged ({error}); delete it to begin anew") from error
         self.checkpoint_at, self.place = places[0], places[-1]._replace(sizes=tuple(places[-1].sizes))

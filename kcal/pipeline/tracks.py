@@ -209,6 +209,20 @@ class Tracker:
             self.history.filtered(time, keys, self.frame.movedim(-1, 0), self.beliefs.summary(), self.shared.values)
         return self.tracks()
 
+    def set_clock(self, time: float) -> None:
+        """Go on at another time, also an earlier one: the clock was set, or nothing came for long.
+
+        Tracks end, because nobody knows how much time has passed; numbers go on, and so does what is known of the
+        offset between the cameras' clocks.
+        """
+        if self.shared.start is not None and time < self.time:
+            # The drift counts from there.
+            self.shared.start += time - self.time
+        self.time = -math.inf
+        self.records = []
+        self.frame = self.frame[..., :0]
+        self.beliefs = no_beliefs(self.calibration, len(self.options.motions), self.frame.device)
+
     def tracks(self) -> Tracks:
         """The confirmed tracks as they are now."""
         told = [i for i, track in enumerate(self.records) if self._is_told(track)]

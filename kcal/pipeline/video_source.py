@@ -164,12 +164,16 @@ class VideoPairs:
     def _count(self, name: str) -> None:
         setattr(self.counts, name, getattr(self.counts, name) + 1)
 
-    def _moment(self, one: TimedFrame, other: TimedFrame) -> Moment:
+    def _moment(self, one: TimedFrame, other: TimedFrame) -> Moment | InputError:
         left, right = (
             detect_in(self._detector, frame.colors(), frame.time, f"{word} image")
             for word, frame in (("left", one), ("right", other))
         )
         images = one.gray(), other.gray()
-        pairs = pair_objects(self._rig, left, right, images, options=self._options, disparity=self._match)
+        try:
+            pairs = pair_objects(self._rig, left, right, images, options=self._options, disparity=self._match)
+        except InputError as error:
+            # Too many boxes: one frame, and not the end.
+            return error
         self._count("paired")
         return Moment(one.time, dataclasses.replace(pairs, covariance=pairs.covariance + self._compression))

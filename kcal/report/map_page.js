@@ -28,12 +28,7 @@
   };
   const overlays = {};
   const layer = (name) => overlays[name] || (overlays[name] = L.layerGroup().addTo(map));
-  const named = [];
-  const label = (shape, name, side) => {
-    named.push(shape);
-    return shape.bindTooltip(() => { const s = document.createElement("span"); s.append(text(name)); return s; },
-      {permanent: true, direction: side || "right", className: "name", offset: side ? [0, 0] : [6, 0]});
-  };
+  const labels = mapLabels(map);
 
   if (data.image) {
     L.imageOverlay(data.image.uri, data.image.bounds, {attribution: attribution(data.image.name)}).addTo(map);
@@ -61,34 +56,12 @@
       if (tip && tip.getElement()) tip.getElement().style.display = far ? "" : "none";
     }
   };
-  // A name that would cover another one goes to the other side of its point, or waits until the map is zoomed in.
-  const spread = () => {
-    const placed = [];
-    for (const shape of named.slice(0, 300)) {
-      const tip = shape.getTooltip(), element = tip.getElement();
-      if (!element || !map.hasLayer(shape) || element.style.display === "none") continue;
-      const fits = (direction) => {
-        tip.options.direction = direction;
-        tip.options.offset = L.point(direction === "right" ? 6 : -6, 0);
-        tip.update();
-        const box = element.getBoundingClientRect();
-        const free = placed.every((b) => box.right < b.left || b.right < box.left || box.bottom - 2 < b.top || b.bottom - 2 < box.top);
-        if (free) placed.push(box);
-        return free;
-      };
-      const first = tip.options.first || (tip.options.first = tip.options.direction);
-      element.style.visibility = fits(first) || fits(first === "right" ? "left" : "right") ? "" : "hidden";
-    }
-  };
-  for (const view of data.cameras) {
-    if (view.fan) L.polygon(view.fan, {color: view.color, weight: 1, opacity: 0.7, fillOpacity: 0.06, smoothFactor: 0.2, interactive: false}).addTo(layer("fields of view"));
-    label(L.circleMarker(view.place, {radius: 6, color: "#fff", weight: 1.5, fillColor: view.color, fillOpacity: 1})
-      .addTo(layer("cameras")), view.name, view.side);
-  }
+  drawCameras(data.cameras, labels, layer("fields of view"), layer("cameras"));
   for (const arc of data.arcs) {
     L.polyline(arc.line, {color: "#4b5563", weight: 1, dashArray: "5 4", smoothFactor: 0.2, interactive: false}).addTo(layer("range arcs"));
-    const end = L.circleMarker(arc.line[arc.line.length - 1], {radius: 0, opacity: 0, interactive: false});
-    small.push([label(end.addTo(layer("range arcs")), arc.name), data.cameras[0].place, end.getLatLng(), 50]);
+    const end = L.circleMarker(arc.line[arc.line.length - 1], {radius: 0, weight: 0, opacity: 0, interactive: false});
+    labels.add(end, arc.name, 2);
+    small.push([end.addTo(layer("range arcs")), data.cameras[0].place, end.getLatLng(), 50]);
   }
   for (const ring of data.regions) {
     L.polygon(ring, {color: "#111827", weight: 1.5, fillOpacity: 0.2, interactive: false}).addTo(layer("95 % regions"));
@@ -98,16 +71,15 @@
   }
   for (const arrow of data.arrows) {
     L.polyline(arrow.line, {color: "#c02a6b", weight: 1.6, interactive: false}).addTo(layer("true positions"));
-    const tip = L.marker(arrow.line[1], {interactive: false,
+    const tip = L.marker(arrow.line[1], {interactive: false, keyboard: false,
       icon: L.divIcon({className: "head", iconSize: [12, 12], html: head(arrow.azimuth)})});
     small.push([tip.addTo(layer("true positions")), arrow.line[0], arrow.line[1], 16]);
   }
   for (const spot of data.truth) {
-    L.circleMarker(spot, {radius: 5, color: "#fff", weight: 1, fillColor: "#c02a6b", fillOpacity: 1, interactive: false}).addTo(layer("true positions"));
+    labels.avoid(L.circleMarker(spot, {radius: 5, color: "#fff", weight: 1, fillColor: "#c02a6b", fillOpacity: 1, interactive: false})).addTo(layer("true positions"));
   }
   for (const spot of data.points) {
-    const shape = L.circleMarker(spot.place, {radius: 6, color: "#111827", weight: 2, fillColor: "#fff", fillOpacity: 1}).addTo(layer("estimated positions"));
-    label(shape, spot.name);
+    const shape = L.circleMarker(spot.place, {radius: 6, color: "#111827", weight: 2, fillColor: "#fff", fillOpacity: 1});
     const rows = document.createElement("table");
     for (const [name, value] of spot.rows) {
       const row = rows.insertRow();
@@ -115,11 +87,12 @@
       row.insertCell().append(text(value));
     }
     shape.bindPopup(rows);
+    // Targets keep their names, those of cameras and arcs give way.
+    labels.add(shape, spot.name, 0);
+    shape.addTo(layer("estimated positions"));
   }
-  // Targets keep their names, those of cameras and arcs give way.
-  named.sort((a, b) => Number(Boolean(b.getPopup())) - Number(Boolean(a.getPopup())));
   L.control.layers(null, overlays, {collapsed: map.getSize().x < 600}).addTo(map);
-  map.on("zoomend moveend overlayadd", () => { tidy(); spread(); });
+  map.on("zoomend moveend overlayadd", tidy);
   map.fitBounds(data.bounds, {padding: [30, 30]});
-  map.whenReady(() => { tidy(); spread(); document.documentElement.dataset.drawn = data.points.length + "/" + document.querySelectorAll("#map path").length; });
+  map.whenReady(() => { tidy(); labels.place(); document.documentElement.dataset.drawn = data.points.length + "/" + document.querySelectorAll("#map path").length; });
 })();

@@ -1,7 +1,7 @@
 """Write an interactive map as one HTML file that needs no network, no server and no other file.
 
 Leaflet (BSD-2-Clause, in the folder `leaflet`) draws. All geometry is computed here, on the ellipsoid, and written into
-the page. The page's content policy allows its own two scripts only and, without online tiles, forbids it to load
+the page. The page's content policy allows its own scripts only and, without online tiles, forbids it to load
 anything.
 """
 
@@ -17,13 +17,12 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.files import write_atomic
-from kcal.locate.geodesy import enu_to_geodetic
+from kcal.locate.map_places import camera_place, field_azimuths, field_of_view, level_rim, map_places
 from kcal.locate.positions import Located, Position
 from kcal.locate.region import near, region_rings
 from kcal.locate.stereo import PositionStatus
 from kcal.quantities import Unit, length_text, number_text, range_text
 from kcal.report.backdrop import local_image, local_tiles
-from kcal.report.colors import CAMERA_COLORS
 from kcal.report.tables import interval_text, range_sigma, range_unit
 from kcal.texts import page_data, page_policy, page_text
 
@@ -38,16 +37,13 @@ _MAP_STYLE = """
 html, body { margin: 0; height: 100%; font: 14px/1.4 system-ui, sans-serif; color: #111827; }
 body { display: flex; flex-direction: column; }
 header { padding: 8px 14px; border-bottom: 1px solid #d1d5db; }
-header b { font-size: 16px; }
+header h1 { font-size: 16px; margin: 0; }
 header p { margin: 2px 0 0; color: #4b5563; font-size: 12px; }
 #map { flex: 1; background: #f3f1ea; }
 .north { pointer-events: none; font: 700 14px system-ui, sans-serif; margin-left: 17px !important; }
 .leaflet-control-layers-toggle::after { content: "\\2630"; display: block; text-align: center; line-height: 36px;
   color: #374151; font-size: 20px; }
 .leaflet-control-layers-toggle { text-decoration: none; }
-.leaflet-tooltip.name { background: none; border: 0; box-shadow: none; padding: 0; font: 600 12px system-ui, sans-serif;
-  color: #111827; text-shadow: 0 0 3px #fff, 0 0 3px #fff, 0 0 3px #fff, 0 0 3px #fff; }
-.leaflet-tooltip.name::before { display: none; }
 .leaflet-popup-content td { padding: 1px 8px 1px 0; white-space: nowrap; }
 .head, .head svg { overflow: visible; }
 """
@@ -90,8 +86,10 @@ def map_page(
     # This page does not show the controls of these pictures.
     for picture in ("images/layers.png", "images/layers-2x.png", "images/marker-icon.png"):
         style = style.replace(f"url({picture})", "none")
-    own = (resources.files("kcal.report") / "map_page.js").read_text(encoding="utf-8")
-    scripts = ((library / "leaflet.js").read_text(encoding="utf-8"), own)
+    shared = resources.files("kcal.web") / "map"
+    style += (shared / "map.css").read_text(encoding="utf-8")
+    sources = (library / "leaflet.js", shared / "map.js", resources.files("kcal.report") / "map_page.js")
+    scripts = [source.read_text(encoding="utf-8") for source in sources]
     allowed = "data: https://tile.openstreetmap.org" if online else "data:"
     title = located.count_note
     note = (
@@ -100,6 +98,7 @@ def map_page(
     )
     key = "White dots: estimated; click one for its numbers. Black outlines: 95 % regions."
     key += " Red dots: true, with an arrow to the estimate." if truth is not None else ""
+    elements = "\n".join(f"<script>{script}</script>" for script in scripts)
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -112,11 +111,10 @@ def map_page(
 <style>{_MAP_STYLE}</style>
 </head>
 <body>
-<header><b>{page_text(title)}</b><p>{page_text(note)}<br>{page_text(key)}</p></header>
-<div id="map"></div>
+<header><h1>{page_text(title)}</h1><p>{page_text(note)}<br>{page_text(key)}</p></header>
+<main id="map" aria-label="Map"></main>
 <script type="application/json" id="data">{page_data(content)}</script>
-<script>{scripts[0]}</script>
-<script>{scripts[1]}</script>
+{elements}
 </body>
 </html>
 """
@@ -140,34 +138,26 @@ def check_map_format(path: str | Path) -> None:
 
 
 def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
-    def places(enu: Tensor) -> list[LatLon]:
-        geodetic = enu_to_geodetic(enu.detach().cpu().double(), located.origin).tolist()
-        return [(lat, near(lon, located.origin.lon)) for lat, lon, _ in geodetic]
-
-    def fan(foot: tuple[float, float, float], azimuths: Tensor, reach: float) -> Tensor:
-        angle = torch.deg2rad(azimuths)
-        rim = torch.stack([angle.sin(), angle.cos(), torch.zeros_like(angle)], -1) * reach
-        return rim + torch.tensor(foot, dtype=torch.float64)
-
     ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
     farthest = max((one for one in ranges if math.isfinite(one)), default=0.0) or 300.0
     reach = 1.15 * farthest
     cameras, edges = [], []
-    for view, color, side in zip(located.cameras, CAMERA_COLORS, _label_sides(located), strict=False):
-        outline = None
-        if view.azimuths_deg is not None:
-            first, last = view.azimuths_deg
-            sweep = torch.linspace(first, first + (last - first) % 360, 60, dtype=torch.float64)
-            foot = torch.tensor([view.enu], dtype=torch.float64)
-            outline = places(torch.cat([foot, fan(view.enu, sweep, reach)]))
+    for view in located.cameras:
+        sweep = field_azimuths(view)
+        if sweep is not None:
             edges += [(float(a) - located.heading_deg + 180) % 360 - 180 for a in sweep[[0, -1]]]
-        place = (view.geodetic[0], near(view.geodetic[1], located.origin.lon))
-        cameras.append({"name": view.name, "place": place, "fan": outline, "color": color, "side": side})
+        outline, place = field_of_view(view, located.origin, reach), camera_place(view, located.origin)
+        cameras.append({"name": view.name, "place": place, "field": outline})
     low, high = (min(edges), max(edges)) if edges else (-180.0, 180.0)
     sweep = torch.linspace(low, high, 90, dtype=torch.float64) + located.heading_deg
-    arcs = [{"name": range_text(arc), "line": places(fan((0, 0, 0), sweep, arc))} for arc in arcs_within(reach)]
+    arcs = [
+        {"name": range_text(arc), "line": map_places(level_rim((0, 0, 0), sweep, arc), located.origin)}
+        for arc in arcs_within(reach)
+    ]
     bearings = [
-        places(fan((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0) * ends)
+        map_places(
+            level_rim((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0) * ends, located.origin
+        )
         for p in located.positions
         if p.azimuth_deg is not None and p.status != PositionStatus.OK
         for ends in [torch.tensor([[min(p.range_low_m or 0.0, reach)], [reach]], dtype=torch.float64)]
@@ -176,7 +166,7 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
     for position, row in zip(located.positions, [] if truth is None else truth, strict=truth is not None):
         if not bool(torch.isfinite(row).all()):
             continue
-        (spot,) = places(row[None])
+        (spot,) = map_places(row[None], located.origin)
         true.append(spot)
         if position.enu is not None and position.lat is not None and position.lon is not None:
             miss = torch.tensor(position.enu, dtype=torch.float64) - row.detach().cpu().double()
@@ -204,11 +194,6 @@ def arcs_within(reach: float) -> list[float]:
     """
     known = [arc for arc in ARCS_M if arc < reach]
     return known or [arc for arc in _ROUND if reach / 12.0 < arc < reach]
-
-
-def _label_sides(located: Located) -> tuple[str, str]:
-    """Choose on which side of its dot each camera's name is written: outward, since the two are close."""
-    return ("left", "right") if located.cameras[1].enu[0] >= 0 else ("right", "left")
 
 
 def _popup_rows(position: Position, unit: Unit) -> list[tuple[str, str]]:

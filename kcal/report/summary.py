@@ -109,9 +109,9 @@ def _html_table(part: Part) -> str:
     if len({len(row) for row in part.table}) > 1:
         raise InputError(f"the table of {part.heading!r}: rows of different lengths")
     head, *rows = part.table
-    lines = ["<tr>" + "".join(f"<th>{page_text(cell)}</th>" for cell in head) + "</tr>"]
+    lines = ["<tr>" + "".join(f'<th scope="col">{page_text(cell)}</th>' for cell in head) + "</tr>"]
     lines += ["<tr>" + "".join(f"<td>{page_text(cell)}</td>" for cell in row) + "</tr>" for row in rows]
-    return '<div class="scroll"><table>\n' + "\n".join(lines) + "\n</table></div>"
+    return '<div class="scroll" tabindex="0"><table>\n' + "\n".join(lines) + "\n</table></div>"
 
 
 def _figure(path: str | Path, caption: str) -> str:
@@ -122,4 +122,4 @@ def _figure(path: str | Path, caption: str) -> str:
         raise InputError(f"{path}: neither a PNG nor a JPEG picture")
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
     text = page_text(caption)
-    return f'<figure><img src="{source}" alt="{text}"><figcaption>{text}</figcaption></figure>'
+    return f'<figure tabindex="0"><img src="{source}" alt="{text}"><figcaption>{text}</figcaption></figure>'

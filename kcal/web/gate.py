@@ -7,9 +7,11 @@ its own: DNS rebinding) and, beyond the page's own files, only those with the to
 from __future__ import annotations
 
 import json
+import re
 import secrets
 from collections.abc import Awaitable, Callable, Mapping
 from importlib import resources
+from typing import Any
 
 import pydantic
 from starlette.applications import Starlette
@@ -20,9 +22,11 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from kcal.errors import KcalError
+from kcal.errors import FileError, InputError, KcalError
 
 _LARGEST_BODY = 1 << 20
+_DEEPEST = 32
+_DIGITS = re.compile("[0-9]{1,12}")
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -53,10 +57,33 @@ def local_app(
         exception_handlers={
             KcalError: _refuse,
             pydantic.ValidationError: _refuse,
-            json.JSONDecodeError: _refuse,
-            UnicodeDecodeError: _refuse,
         },
     )
+
+
+async def json_body(request: Request) -> Any:
+    """The content of a request's body.
+
+    Raises:
+        InputError: no JSON, or JSON that cannot be read: nested too deeply, or a number of thousands of digits.
+    """
+    body = await request.body()
+    try:
+        content = json.loads(body)
+        _check_depth(content)
+    except RecursionError as error:
+        raise InputError("the request is nested too deeply") from error
+    except ValueError as error:
+        raise InputError(f"the request cannot be read: {error}") from error
+    return content
+
+
+def _check_depth(content: Any, depth: int = _DEEPEST) -> None:
+    """Raise `RecursionError` beyond `_DEEPEST` levels: whoever walks through the content must not fail."""
+    if not depth:
+        raise RecursionError
+    for part in content.values() if isinstance(content, dict) else content if isinstance(content, list) else ():
+        _check_depth(part, depth - 1)
 
 
 def page_files(*folders: tuple[str, str]) -> dict[str, tuple[bytes, str]]:
@@ -90,7 +117,7 @@ class _Gate(BaseHTTPMiddleware):
         if request.url.path.startswith("/api/") and not secrets.compare_digest(given, self._token):
             return _secured(JSONResponse({"error": "the token is wrong: open the address that kcal printed"}, 401))
         length = request.headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > _LARGEST_BODY or "transfer-encoding" in request.headers:
+        if not _DIGITS.fullmatch(length) or int(length) > _LARGEST_BODY or "transfer-encoding" in request.headers:
             return _secured(JSONResponse({"error": "the request is too large"}, 413))
         return _secured(await call_next(request))
 
@@ -116,4 +143,6 @@ async def _refuse(_: Request, error: Exception) -> Response:
         first = error.errors()[0]
         text = ": ".join(filter(None, [".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")]))
         return JSONResponse({"error": text}, 422)
-    return JSONResponse({"error": " ".join(str(error).split())}, 400)
+    # What this machine could not write may be possible later, and is then worth asking for again.
+    failed = isinstance(error, FileError) and isinstance(error.__cause__, OSError)
+    return JSONResponse({"error": " ".join(str(error).split())}, 503 if failed else 400)

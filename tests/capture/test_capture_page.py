@@ -5,16 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from browser import chromium_page, needs_browser
 from capture_frames import BOARD, images
-from marking_browser import CHROMIUM, Server, chromium_page, free_port
+from marking_browser import Server, free_port
 
 from kcal.corners.observations import Observations
 from kcal.io.images import write_png
 
-for library in ("starlette", "uvicorn", "playwright"):
-    pytest.importorskip(library, reason="the extras `mark` and `dev` are not installed")
-if CHROMIUM is None:
-    pytest.skip("Chromium is not installed (Debian: apt-get install chromium)", allow_module_level=True)
+for library in ("starlette", "uvicorn"):
+    pytest.importorskip(library, reason="the extra `mark` is not installed")
+pytestmark = needs_browser
 
 
 def test_frames_are_shown_and_the_page_ends_it(tmp_path: Path) -> None:

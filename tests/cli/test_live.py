@@ -82,6 +82,36 @@ def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: p
     assert (folder / "tracks.csv").read_bytes() == whole
 
 
+@pytest.mark.parametrize("how", ["finished", "stopped", "ended by an error: see the terminal"])
+def test_the_map_is_told_how_it_ended(folder: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("uvicorn")
+    from kcal.pipeline.live_map import LiveMap
+
+    close, write, told, shown = LiveMap.close, Stream._write, [], []
+
+    def ended(page: LiveMap, words: str) -> None:
+        told.append(words)
+        close(page, words)
+
+    def disturbed(self: Stream, *what: object) -> None:
+        write(self, *what)  # type: ignore[arg-type]
+        if self.counts.moments == 7 and how == "stopped":
+            os.kill(os.getpid(), signal.SIGTERM)
+        if self.counts.moments == 7 and how.startswith("ended"):
+            raise FileError("the disk is full")
+
+    monkeypatch.setattr(LiveMap, "close", ended)
+    monkeypatch.setattr(LiveMap, "show", lambda page, columns, sequence: shown.append(sequence))
+    monkeypatch.setattr(Stream, "_write", disturbed)
+    if how.startswith("ended"):
+        with pytest.raises(FileError, match="disk is full"):
+            live(folder, "--map", "0")
+    else:
+        live(folder, "--map", "0")
+    assert told == [how]
+    assert shown == list(range(1, 21 if how == "finished" else 8))
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
@@ -99,6 +129,30 @@ def test_what_is_wrong(
     monkeypatch.chdir(folder)
     with pytest.raises(error, match=message):
         live(folder, *options)
+
+
+def test_wrong_times_are_told(folder: Path) -> None:
+    """One moment a day ahead and one in milliseconds leave all others as they are; a clock that is set is said."""
+    lines = (folder / "lines.jsonl").read_text().splitlines()
+    stamped = [json.loads(line) for line in lines[:20]]
+    texts = [json.dumps(line) for line in stamped]
+    texts[10:10] = [json.dumps(stamped[10] | {"time": stamped[10]["time"] + 86400.0})]
+    texts[5:5] = [json.dumps(stamped[5] | {"time": 1e13})]
+    texts += [json.dumps(line | {"time": line["time"] + 3600.0}) for line in stamped]
+    (folder / "lines.jsonl").write_text("\n".join(texts) + "\n")
+    told = " ".join(live(folder, "--clock-sigma", "0.1").split())
+    assert "40 moments, 68 positions; 1 moments left out, whose times the ones before and after contradict" in told
+    assert "times jumped 1 times and stayed: followed, with new tracks; the last jump was 3,598.1 s ahead" in told
+    assert "last malformed line: time 1e+13: seconds are needed" in told
+
+
+def test_nothing_that_can_be_read_is_an_error(folder: Path) -> None:
+    lines = [json.loads(line) for line in (folder / "lines.jsonl").read_text().splitlines()[:20]]
+    texts = [json.dumps(line | {"time": 1e3 * line["time"]}) for line in lines]
+    (folder / "lines.jsonl").write_text("\n".join(texts) + "\n")
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"none of 20 lines could be read; the last one: time 1\.7e\+12: seconds"):
+            live(folder)
 
 
 def test_a_rig_that_does_not_say_where_it_stands(folder: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from browser import chromium_page, needs_browser
 from calibrate_scenes import BOARD, camera, motions
 from locate_rigs import pinhole_rig
 from typer.testing import CliRunner
@@ -21,8 +21,6 @@ from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
 from kcal.io.rig_file import save_rig
 from kcal.lens.rig import RigCovariance
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 def kcal(*words: object) -> tuple[int, str]:
@@ -145,22 +143,12 @@ def test_completion_installs(shell: str, tmp_path: Path) -> None:
     assert "report" in subprocess.run(script, env=asked, capture_output=True, text=True).stdout
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+@needs_browser
 @pytest.mark.parametrize(("width", "height"), [(1400, 900), (390, 844)])
 def test_a_browser_shows_the_page_without_errors_and_requests(folder: Path, width: int, height: int) -> None:
-    sync_api = pytest.importorskip("playwright.sync_api")
     page_file = folder / "page.html"
     kcal("report", folder / "left.camera.json", "--require", "100m:10%,1km:5%,5km:10%", "-o", page_file)
-    complaints: list[str] = []
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": width, "height": height})
-        page.on("console", lambda message: complaints.append(message.text))
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on(
-            "request",
-            lambda request: complaints.append(request.url) if not request.url.startswith(("file:", "data:")) else None,
-        )
+    with chromium_page(width, height) as page:
         page.goto(page_file.as_uri())
         # The answer, why, and what to do fit one screen; nothing is wider than it.
         header = page.locator("header").bounding_box()
@@ -169,5 +157,4 @@ def test_a_browser_shows_the_page_without_errors_and_requests(folder: Path, widt
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert page.locator(".answer").inner_text() == "NO"
         assert page.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
-        browser.close()
-    assert complaints == []
+        assert page.complaints == []

@@ -89,7 +89,7 @@ def test_matlab_goes_down_the_columns_from_pixel_one(tmp_path: Path, world: bool
         ("a.csv", "image,corner,u,v\na,1,1,2\na,1,1,2\n", "occurs twice"),
         ("a.csv", "image,corner,u,v\na,1,inf,2\n", "no finite numbers"),
         ("a.csv", "image,corner,u,v\na,1,,2\n", "no view with corners"),
-        ("a.mat", "nothing", "bad corners file"),
+        ("a.mat", "nothing", r"not a \.mat file"),
     ],
 )
 def test_bad_files(tmp_path: Path, name: str, text: str, what: str) -> None:

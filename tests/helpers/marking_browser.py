@@ -5,18 +5,13 @@ from __future__ import annotations
 import os
 import re
 import select
-import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 class Server:
@@ -65,27 +60,6 @@ def free_port() -> int:
         return port
 
 
-@contextmanager
-def chromium_page(width: int = 1366, height: int = 768) -> Iterator[Any]:
-    """A page of headless Chromium; requests beyond this machine and errors of scripts are collected on it."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": width, "height": height})
-        page.complaints = []
-        page.on("pageerror", lambda error: page.complaints.append(str(error)))
-        page.on("console", lambda m: page.complaints.append(m.text) if "Content Security" in m.text else None)
-        page.on(
-            "request",
-            lambda r: (
-                page.complaints.append(r.url) if not r.url.startswith(("http://127.0.0.1", "data:", "blob:")) else None
-            ),
-        )
-        yield page
-        browser.close()
-
-
 def settled(page: Any, timeout: float = 60_000) -> None:
     """Wait until all actions are answered and the rig is solved."""
     page.wait_for_function(
@@ -95,14 +69,19 @@ def settled(page: Any, timeout: float = 60_000) -> None:
     )
 
 
-def click_at(page: Any, side: str, u: float, v: float) -> None:
-    """Click where the view of one side shows an image position."""
+def on_screen(page: Any, side: str, u: float, v: float) -> tuple[float, float]:
+    """Where on the screen the view of one side shows an image position."""
     x, y = page.evaluate(
         "([side, u, v]) => { const view = kcal.views[side], box = view.canvas.getBoundingClientRect();"
         " const [x, y] = view.screen(u, v); return [box.left + x / view.ratio, box.top + y / view.ratio]; }",
-        [side, u, v],
+        [side, float(u), float(v)],
     )
-    page.mouse.click(x, y)
+    return x, y
+
+
+def click_at(page: Any, side: str, u: float, v: float) -> None:
+    """Click where the view of one side shows an image position."""
+    page.mouse.click(*on_screen(page, side, u, v))
 
 
 def look_at(page: Any, side: str, u: float, v: float, scale: float = 6.0) -> None:

@@ -121,3 +121,26 @@ def test_inputs_and_weights_are_not_overwritten() -> None:
 def test_impossible_degrees(degree: int) -> None:
     with pytest.raises(InputError, match="astigmatic must be a whole number from 0 to 40"):
         ZernikeModes(astigmatic=degree)
+
+
+def test_degrees_without_a_mode() -> None:
+    for radial in (0, 1):
+        with pytest.raises(InputError, match="no mode"):
+            ZernikeModes(radial=radial, decentered=0, astigmatic=0, other=0)
+
+
+@pytest.mark.parametrize("modes", [ZernikeModes(), ZernikeModes(radial=9, decentered=0, astigmatic=1, other=3)])
+@pytest.mark.parametrize("slopes", [True, False])
+def test_few_places_and_many(modes: ZernikeModes, slopes: bool) -> None:
+    """Products of matrices, for few places, and Horner's rule, for many, are the same field; batches too."""
+    generator = torch.Generator().manual_seed(6)
+    weights = torch.randn(2, len(modes), generator=generator, dtype=torch.float64)
+    x, y = 1.4 * torch.rand(2, 2, 5000, generator=generator, dtype=torch.float64) - 0.7
+    few = modes.field(weights, x[:, :300], y[:, :300], slopes)
+    many = modes.field(weights, x, y, slopes)
+    assert len(few) == len(many) == (6 if slopes else 2)
+    for one, other in zip(few, many, strict=True):
+        # Powers of t lose six digits at degree 33.
+        torch.testing.assert_close(one, other[:, :300], rtol=0, atol=1e-10 * float(other.abs().max()))
+    by_columns = torch.einsum("bm,mkbn->kbn", weights, modes.columns(x[:, :300], y[:, :300]))
+    torch.testing.assert_close(torch.stack(few[:2]), by_columns, rtol=1e-11, atol=1e-11)

@@ -181,7 +181,16 @@ def test_further_columns_are_carried(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("cell", "value"),
-    [("", None), ("-1.50e3", -1500.0), ("9007199254740993", "9007199254740993"), ("nan", "nan"), ("+1", "+1")],
+    [
+        ("", None),
+        ("-1.50e3", -1500.0),
+        ("9007199254740993", "9007199254740993"),
+        ("nan", "nan"),
+        ("+1", "+1"),
+        ("9" * 5000, "9" * 5000),
+        ("1e999", "1e999"),
+        ("-9007199254740992", -9007199254740992),
+    ],
 )
 def test_cells_of_further_columns_in_json(tmp_path: Path, cell: str, value: object) -> None:
     path = tmp_path / "points.csv"

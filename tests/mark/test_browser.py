@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from marking_browser import CHROMIUM, Server, choose, chromium_page, click_at, free_port, look_at, settled
+from browser import chromium_page, needs_browser
+from marking_browser import Server, choose, click_at, free_port, look_at, settled
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
@@ -20,10 +21,9 @@ from kcal.io.rig_file import load_rig, save_rig
 from kcal.locate.marks import read_marks
 from scripts.shared.marking_scene import LANDMARKS, TARGETS, MarkingSite, marking_site
 
-for library in ("starlette", "uvicorn", "playwright"):
-    pytest.importorskip(library, reason="the extras `mark` and `dev` are not installed")
-if CHROMIUM is None:
-    pytest.skip("Chromium is not installed (Debian: apt-get install chromium)", allow_module_level=True)
+for library in ("starlette", "uvicorn"):
+    pytest.importorskip(library, reason="the extra `mark` is not installed")
+pytestmark = needs_browser
 
 # Each start of the server takes seconds; `test_session.py` kills sessions at ten moments, without a browser.
 KILLS = int(os.environ.get("KCAL_KILLS", "3"))

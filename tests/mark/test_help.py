@@ -7,8 +7,9 @@ from typing import cast
 import numpy as np
 import pytest
 import torch
+from lenses import FEW_MODES, hybrid_camera
 
-from kcal.corners.match import MatchStatus
+from kcal.corners.match import Matches, MatchStatus
 from kcal.corners.refind import find_again
 from kcal.errors import InputError
 from kcal.io.images import write_png
@@ -21,7 +22,7 @@ from kcal.locate.relock import check_rig, seen_again
 from kcal.locate.survey import Survey
 from kcal.mark.guide import RigBand, at_shape, propose
 from kcal.mark.items import Add, Mark, Place, Put, Side, SurveyPlace
-from kcal.mark.live import Promise, solve_live, verdict
+from kcal.mark.live import Promise, mark_sigmas, marks_sigma, solve_live, verdict
 from kcal.mark.marking_service import Desk
 from kcal.mark.overview import map_content
 from kcal.mark.pictures import open_pictures
@@ -118,6 +119,50 @@ class TestCurve:
         # 400 draws: 3.5 % of a standard deviation.
         assert float(across.std()) == pytest.approx(float(curve.sigma[0]), rel=0.12)
 
+    @pytest.mark.parametrize("side", ["left", "right"])
+    def test_the_band_of_a_default_lens_is_that_of_moved_rigs(self, side: Side) -> None:
+        """Errors of lenses, entrance pupils and pose, moved one by one by a thousandth of a sigma of each."""
+        lenses = hybrid_camera("webcam", 1, FEW_MODES), hybrid_camera("wide", 2, FEW_MODES)
+        values = [lens.params + torch.tensor([0.02 * (name == "pupil1") for name in lens.names]) for lens in lenses]
+        cameras = [lens.with_parameters(value) for lens, value in zip(lenses, values, strict=True)]
+        turn = rotation_from_vector(torch.tensor([0.01, -0.03, 0.02]).double())
+        shift = torch.tensor([-10.0, 0.1, 0.3]).double()
+        rig = StereoRig(cameras[0], cameras[1], turn, shift)
+        ends = [len(value) for value in values]
+        size = torch.cat([*(1e-3 * value.abs() + 1e-5 for value in values), torch.full((6,), 1e-3).double()])
+        generator = torch.Generator().manual_seed(0)
+        half = size * torch.randn(4, len(size), generator=generator, dtype=torch.float64)
+        rig.covariance = RigCovariance(half=half)
+        curve = RigBand(rig).curve(side, 700.0, 400.0)
+        along = torch.nn.functional.normalize(torch.gradient(curve.pixels, dim=0)[0], dim=-1)
+        across, squares = torch.stack([-along[:, 1], along[:, 0]], -1), torch.zeros(len(along)).double()
+        for move in 1e-3 * half:
+            left, right, pose = move.tensor_split([ends[0], sum(ends)])
+            moved = StereoRig(
+                cameras[0].with_parameters(values[0] + left), cameras[1].with_parameters(values[1] + right),
+                rotation_from_vector(pose[:3]) @ turn, shift + pose[3:],
+            )  # fmt: skip
+            # Far things move along the curve besides, and not across it.
+            there = RigBand(moved).curve(side, 700.0, 400.0).pixels
+            squares += (((there - curve.pixels) * across).sum(-1) / 1e-3).square()
+        assert len(along) > 90
+        torch.testing.assert_close(curve.sigma, squares.sqrt(), rtol=0.01, atol=0)
+
+    def test_it_begins_where_infinity_is_seen(self) -> None:
+        """With an entrance pupil that wanders by centimeters: as far as anything is away, they do not matter."""
+        camera = hybrid_camera("wide", 2, FEW_MODES)
+        moved = camera.with_parameters(
+            camera.params + torch.tensor([0.05 * (name == "pupil1") for name in camera.names])
+        )
+        rig = StereoRig(moved, moved, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+        pixel = torch.tensor([[200.0, 300.0]]).double()
+        curve = RigBand(rig).curve("left", *pixel[0].tolist())
+        torch.testing.assert_close(curve.pixels[0], pixel[0], rtol=0, atol=1e-6)
+        # Its end, at three baselines, is where a thing there is seen.
+        rays, _ = moved.unproject(pixel)
+        near, _ = moved.project(rig.right_from_left(moved.ray_origins(rays) + 30.0 * rays))
+        torch.testing.assert_close(curve.pixels[-1], near[0], rtol=0, atol=1e-6)
+
 
 class TestProposal:
     def test_a_cross_before_hills(self, site: MarkingSite) -> None:
@@ -152,6 +197,24 @@ class TestProposal:
         assert "repeated" in propose(rig, fence, "left", *seen(rig, point, 0)[0]).refusal
 
 
+class TestWayBack:
+    """A match is believed if the way back ends within half a pixel and four sigmas of where it began."""
+
+    @pytest.mark.parametrize(("miss", "refused"), [(0.0, False), (0.85, False), (0.95, True)])
+    def test_its_limit(self, site: MarkingSite, monkeypatch: pytest.MonkeyPatch, miss: float, refused: bool) -> None:
+        def found(u: float) -> Matches:
+            return Matches(
+                torch.tensor([[u, 200.0]]).double(), torch.eye(2).double()[None] * 0.1**2, torch.tensor([0]),
+                torch.ones(1).double(), torch.zeros(1).double(),
+            )  # fmt: skip
+
+        answers = iter([found(280.0), found(300.0 + miss)])
+        monkeypatch.setattr("kcal.mark.guide.match_points", lambda *_: next(answers))
+        proposal = propose(site.rig, site.images, "left", 300.0, 200.0)
+        assert (proposal.u, proposal.v) == (280.0, 200.0)
+        assert ("the way back ends" in proposal.refusal) == refused
+
+
 def survey_of(site: MarkingSite, names: list[str]) -> Survey:
     points = torch.stack([site.points[name] for name in names])
     return Survey(tuple(names), points, torch.full_like(points, 0.02), None)
@@ -177,6 +240,37 @@ class TestLiveRig:
         assert parts[1] < parts[0]
         assert found[1].rig is not None
         assert float(found[1].rig.baseline) == pytest.approx(10.0, abs=0.2)
+
+    def test_a_mark_in_one_image_worsens_nothing(self, site: MarkingSite) -> None:
+        """Neither does one placed by hand: each counts with its own sigma."""
+        names = [point.name for point in LANDMARKS]
+        whole, survey = marks_at(site, names[:8]), survey_of(site, names)
+        assert whole.covariance is not None
+        cameras = site.rig.left, site.rig.right
+
+        def total(marks: Marks) -> list[float]:
+            found = solve_live(cameras, survey, marks, 0.3)
+            return [promise.rig or math.nan for promise in found.promises]
+
+        before = total(Marks(whole.names[:7], whole.left[:7], whole.right[:7], whole.covariance[:7]))
+        one, missing = whole.covariance.clone(), whole.right.clone()
+        one[7, 2:], one[7, :, 2:], missing[7] = math.nan, math.nan, math.nan
+        half = Marks(whole.names, whole.left, missing, one)
+        assert marks_sigma(half, 0.3) == pytest.approx(0.05)
+        by_hand = Marks(whole.names, whole.left, whole.right, whole.covariance.clone())
+        assert by_hand.covariance is not None
+        by_hand.covariance[7] = 0.3**2 * torch.eye(4)
+        # The residuals of seven landmarks are not those of eight.
+        for after in (total(half), total(by_hand)):
+            assert max(b / a for a, b in zip(before, after, strict=True)) < 1.01
+
+    def test_marks_have_their_own_sigmas(self) -> None:
+        right = torch.tensor([[1.0, 1.0], [math.nan, math.nan]])
+        variances = torch.tensor([[0.04, 0.02, 0.25, 0.25], [0.01, 0.01, math.nan, math.nan]]).double()
+        found = mark_sigmas(Marks(("a", "b"), torch.zeros(2, 2), right, torch.diag_embed(variances)), 0.3)
+        torch.testing.assert_close(found[0], torch.tensor([math.sqrt(0.03), 0.5]).double())
+        assert float(found[1, 0]) == pytest.approx(0.1)
+        assert math.isnan(float(found[1, 1]))
 
     def test_a_wrong_landmark_is_named(self, site: MarkingSite) -> None:
         names = [point.name for point in LANDMARKS]

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import errno
 import json
+import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +15,9 @@ pytest.importorskip("starlette", reason="the extra `mark` is not installed")
 pytest.importorskip("httpx", reason="starlette's test client needs httpx")
 from starlette.testclient import TestClient
 
+from kcal.errors import FileError
 from kcal.io.images import write_png
+from kcal.mark.journal import Journal
 from kcal.mark.marking_service import Desk
 from kcal.mark.pictures import open_pictures
 from kcal.mark.server import marking_app, marking_files
@@ -90,6 +95,10 @@ def test_other_hosts_are_refused(client: TestClient) -> None:
                                                    "mark": {**MARK, "cov": [1, 2, 1]}}}).encode(), 422,
          "the covariance is not positive definite"),
         (b" " * (1 << 21), 413, "too large"),
+        (b"[" * 100_000, 400, "nested too deeply"),
+        (b'{"key": "12345678", "action": ' + b'{"do":' * 400 + b"1" + b"}" * 401, 400, "nested too deeply"),
+        (b'{"key": "12345678", "action": ' + b"[" * 900 + b"]" * 900 + b"}", 400, "nested too deeply"),
+        (b'{"key": "12345678", "action": {"do": "undo", "n": ' + b"9" * 5000 + b"}}", 400, "cannot be read"),
     ],
 )  # fmt: skip
 def test_bad_requests(client: TestClient, body: bytes, status: int, message: str) -> None:
@@ -97,6 +106,70 @@ def test_bad_requests(client: TestClient, body: bytes, status: int, message: str
     assert answer.status_code == status
     assert message in answer.json()["error"]
     assert client.get("/api/state").json()["version"] == 0
+
+
+def test_a_click_outside_the_picture_is_no_mark(client: TestClient) -> None:
+    do(client, {"do": "add", "name": "a", "kind": "target"})
+    for number, (u, v) in enumerate(((-0.6, 5), (5, -3), (99.6, 5), (5, 1e5))):
+        action = {"do": "put", "name": "a", "side": "left", "mark": {**MARK, "u": u, "v": v}}
+        answer = do(client, action, f"outside-{number}")
+        assert answer.status_code == 400
+        assert "outside the left picture, which has 100x100 pixels" in answer.json()["error"]
+    state = client.get("/api/state").json()
+    assert state["items"][0]["left"] is None
+    for number, (u, v) in enumerate(((-0.5, 5), (99.5, 99.5))):
+        action = {"do": "put", "name": "a", "side": "left", "mark": {**MARK, "u": u, "v": v}}
+        assert do(client, action, f"border-{number}").status_code == 200
+
+
+def test_a_full_disk_is_told_and_what_was_answered_stays(
+    client: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Room for 37 more bytes at a time: answers are whole or refusals, never failures of the server."""
+    do(client, {"do": "add", "name": "a", "kind": "target"})
+    random, left, wrote = np.random.default_rng(0), [0], os.write
+
+    def write(file: int, data: bytes) -> int:
+        count = min(left[0], len(data))
+        left[0] -= count
+        if not count:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return wrote(file, data[:count])
+
+    answers = []
+    with monkeypatch.context() as patched:
+        patched.setattr("kcal.mark.journal.os.write", write)
+        for number in range(60):
+            left[0] = int(random.integers(0, 400))
+            action = {"do": "put", "name": "a", "side": "left", "mark": {**MARK, "u": float(number)}}
+            answer = do(client, action, f"put-number-{number}")
+            answers.append(answer.status_code)
+            if answer.status_code == 503:
+                assert "the disk is full; this was not done" in answer.json()["error"]
+            else:
+                last = float(number)
+    assert {200, 503} == set(answers)
+    assert client.get("/api/state").json()["items"][0]["left"]["u"] == last
+    assert client.get("/api/state").json()["version"] == 1 + answers.count(200)
+    again = Journal(Path(shutil.copy(tmp_path / "marks.log", tmp_path / "copy.log")))
+    assert (again.count, again.notes) == (1 + answers.count(200), [])
+    mark = again.state.items["a"].left
+    assert mark is not None
+    assert mark.u == last
+
+
+def test_tables_that_cannot_be_written_are_told(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, text: str) -> None:
+        raise FileError(f"{path}: cannot write") from OSError(errno.ENOSPC, "no space")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("kcal.mark.session.write_atomic", full)
+        do(client, {"do": "add", "name": "a", "kind": "feature"})
+        answer = do(client, {"do": "put", "name": "a", "side": "left", "mark": MARK}, "some-key-2")
+    assert answer.status_code == 200
+    assert "the disk is full. Nothing is lost" in answer.json()["trouble"]
+    answer = do(client, {"do": "put", "name": "a", "side": "right", "mark": MARK}, "some-key-3")
+    assert answer.json()["trouble"] == ""
 
 
 def test_tiles_are_the_gray_levels(client: TestClient, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import contextlib
-import json
+import errno
 import os
 import random
 import signal
@@ -134,15 +134,173 @@ def test_marks_that_were_changed_outside_are_taken_over(tmp_path: Path, survey: 
     assert left.u == 10.1
 
 
-def test_a_damaged_log_is_named(tmp_path: Path) -> None:
-    session = Session(tmp_path / "marks.csv")
-    work_on = Add(do="add", name="a", kind="target")
-    session.do(work_on, "key-0001")
+@pytest.mark.parametrize(
+    "damaged", [b"nonsense", b"\0" * 40, b"[1, 2]", b"[" * 100_000, b'{"key": "k", "action": ' + b"9" * 5000 + b"}"]
+)
+def test_a_damaged_line_loses_itself_alone(tmp_path: Path, survey: Path, damaged: bytes) -> None:
+    """Whatever stands in its place: noise, zeros, JSON of another kind, a nest, a number of 5,000 digits."""
+    session = Session(tmp_path / "marks.csv", survey)
+    work(session)
+    state = session.state
     session.close()
-    log = session.files.log
-    log.write_text(log.read_text() + "nonsense\n" + json.dumps({"key": "k", "action": {"do": "undo"}}) + "\n")
-    with pytest.raises(FileError, match="line 3 is damaged"):
+    lines = session.files.log.read_bytes().splitlines(keepends=True)
+    added = next(i for i, line in enumerate(lines) if b'"truck"' in line)
+    # Even where a thing was added: its marks bring it back.
+    session.files.log.write_bytes(b"".join([*lines[:added], damaged + b"\n", *lines[added + 1 :]]))
+    again = Session(tmp_path / "marks.csv", survey)
+    assert again.state == state
+    assert f"line {added + 1} is damaged and was left out" in again.notes[0]
+    again.do(put("post", "left", mark(99.0, 1.0)), "key-later")
+    again.close()
+    kept = Session(tmp_path / "marks.csv", survey)
+    assert kept.state.items["post"].left == mark(99.0, 1.0)
+    kept.close()
+
+
+def test_the_only_line_may_be_the_damaged_one(tmp_path: Path) -> None:
+    session = Session(tmp_path / "marks.csv")
+    session.close()
+    with session.files.log.open("ab") as log:
+        log.write(b"nonsense\n")
+    again = Session(tmp_path / "marks.csv")
+    again.do(Add(do="add", name="a", kind="target"), "key-0001")
+    again.close()
+    # A head that was damaged loses nothing either.
+    lines = session.files.log.read_bytes().splitlines(keepends=True)
+    session.files.log.write_bytes(b"".join([b"nonsense\n", *lines[1:]]))
+    assert list(Session(tmp_path / "marks.csv").state.items) == ["a"]
+
+
+def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "marks.log").write_text("something else\nand more\n")
+    with pytest.raises(FileError, match="give another -o"):
         Session(tmp_path / "marks.csv")
+    assert (tmp_path / "marks.log").read_text() == "something else\nand more\n"
+
+
+class FullDisk:
+    """Takes so many more bytes of the log, and then none: `os.write` writes a part first, as it may."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, left: int) -> None:
+        self.left, self._write, self._sync = left, os.write, os.fsync
+        monkeypatch.setattr("kcal.mark.journal.os.write", self.write)
+
+    def write(self, file: int, data: bytes) -> int:
+        if not self.left:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written = self._write(file, data[: self.left])
+        self.left -= written
+        return written
+
+
+@pytest.mark.parametrize("left", [0, 1, 50, 10**9])
+def test_a_full_disk_loses_nothing_that_was_acknowledged(
+    tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch, left: int
+) -> None:
+    session = Session(tmp_path / "marks.csv", survey)
+    work(session)
+    before, log, version = session.state, session.files.log.read_bytes(), session.version
+    with monkeypatch.context() as patched:
+        FullDisk(patched, left)
+        if left == 10**9:
+
+            def unsynced(_: int) -> None:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+            patched.setattr("kcal.mark.journal.os.fsync", unsynced)
+        for number in range(3):
+            with pytest.raises(FileError, match="the disk is full; this was not done"):
+                session.do(put("post", "left", mark(77.0, 1.0)), f"key-full{number}")
+    assert (session.state, session.files.log.read_bytes(), session.version) == (before, log, version)
+    # Ten marks afterwards, of which the first is one that was refused.
+    for number in range(10):
+        session.do(put("post", "left", mark(float(number), 1.0)), f"key-full{number}")
+    after = session.state
+    session.close()
+    again = Session(tmp_path / "marks.csv", survey)
+    assert again.state == after
+    assert again.notes == []
+
+
+def test_nothing_is_left_where_even_cutting_off_fails(
+    tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Session(tmp_path / "marks.csv", survey)
+    work(session)
+
+    def failing(*_: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    whole = os.ftruncate
+    with monkeypatch.context() as patched:
+        FullDisk(patched, 30)
+        calls: list[int] = []
+
+        def once(file: int, length: int) -> None:
+            calls.append(length)
+            (whole if len(calls) == 1 else failing)(file, length)
+
+        patched.setattr("kcal.mark.journal.os.ftruncate", once)
+        for number in range(2):
+            with pytest.raises(FileError, match="cannot write"):
+                session.do(put("post", "left", mark(77.0, 1.0)), f"key-full{number}")
+    session.do(put("post", "left", mark(88.0, 1.0)), "key-good")
+    after = session.state
+    session.close()
+    again = Session(tmp_path / "marks.csv", survey)
+    assert again.state == after
+    assert again.notes == []
+
+
+def test_tables_that_a_full_disk_did_not_take_are_written_later(
+    tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Session(tmp_path / "marks.csv", survey)
+    work(session)
+    old = session.files.marks.read_text()
+
+    def full(path: Path, text: str) -> None:
+        error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        raise FileError(f"{path}: cannot write: {error.strerror}") from error
+
+    with monkeypatch.context() as patched:
+        patched.setattr("kcal.mark.session.write_atomic", full)
+        for number in range(3):
+            session.do(put("post", "left", mark(float(number), 1.0)), f"key-later{number}")
+        assert "the disk is full" in session.trouble
+        assert str(session.files.log) in session.trouble
+        after = session.state
+        session.close()
+    assert session.files.marks.read_text() == old
+    # Tables that are three actions behind are no work of somebody else.
+    again = Session(tmp_path / "marks.csv", survey)
+    assert again.state == after
+    assert again.trouble == ""
+    assert "was behind" in again.notes[0]
+    assert read_marks(session.files.marks, single=True).left[0].tolist() == [2.0, 1.0]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the limit is one of POSIX")
+def test_a_limit_of_the_system_is_a_full_disk(tmp_path: Path, survey: Path) -> None:
+    """As with `ulimit -f`: the kernel writes a part of a line and refuses the rest."""
+    import resource
+
+    session = Session(tmp_path / "marks.csv", survey)
+    work(session)
+    before = session.state
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (session.files.log.stat().st_size + 20, limits[1]))
+    try:
+        for number in range(20):
+            with pytest.raises(FileError, match="the disk is full"):
+                session.do(put("post", "left", mark(5.0, 1.0)), f"key-full{number}")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert session.state == before
+    session.do(put("post", "left", mark(5.0, 1.0)), "key-full0")
+    after = session.state
+    session.close()
+    assert Session(tmp_path / "marks.csv", survey).state == after
 
 
 def test_marks_of_a_target_are_of_one_moment(tmp_path: Path, survey: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 
 import numpy as np
 import pytest
@@ -13,17 +14,15 @@ from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.locate.stereo import fit_pairs
 from kcal.pipeline.association import (
-    _FORBIDDEN,
     Association,
     AssociationOptions,
-    _assigned,
-    _best_assignment,
     associate,
     epipolar_cost,
     pair_costs,
 )
 from kcal.pipeline.detections import Detections
 from kcal.pipeline.epipolar_band import near_epipolar_lines
+from kcal.pipeline.one_to_one import assign_groups, best_assignment
 
 SIZE = (1920, 1080)
 
@@ -119,7 +118,8 @@ def test_the_band_leaves_out_no_pair_that_is_possible(kind: str, share: float) -
     options = AssociationOptions(box_sigma=2.0, nearest=5.0)
     size = torch.tensor(SIZE, dtype=torch.float64)
     left, right = (seen(torch.rand(120, 2, generator=random, dtype=torch.float64) * size) for _ in range(2))
-    near = near_epipolar_lines(rig, left.anchors(), right.anchors(), options.box_sigma, options.gate)
+    anchors, ranges = (left.anchors(), right.anchors()), (5.0, options.farthest)
+    near = near_epipolar_lines(rig, *anchors, options.box_sigma, options.gate, ranges)
     every = pair_costs(rig, left, right, options)
     possible = every < options.gate**2
     for i, j in (possible & ~near).nonzero().tolist():
@@ -139,21 +139,67 @@ def test_the_band_leaves_out_no_pair_that_is_possible(kind: str, share: float) -
 def test_groups_are_assigned_as_the_whole_is() -> None:
     """Costs of three groups in one matrix: columns, ambiguity and sum are those of one large problem."""
     random = np.random.default_rng(0)
-    options = AssociationOptions()
     for _ in range(20):
-        cost = np.full((9, 8), _FORBIDDEN)
+        cost = np.full((9, 8), np.inf)
         for rows, columns in ((slice(0, 4), slice(0, 3)), (slice(4, 7), slice(3, 7)), (slice(8, 9), slice(7, 8))):
             part = random.uniform(0.0, 16.0, cost[rows, columns].shape)
-            cost[rows, columns] = np.where(random.random(part.shape) < 0.7, part, _FORBIDDEN)
-        chosen, ambiguous = _assigned(cost, options)
-        whole, least = _best_assignment(cost, 16.0)
+            cost[rows, columns] = np.where(random.random(part.shape) < 0.7, part, np.inf)
+        chosen, ambiguous = assign_groups(cost, 16.0, 2.0 * np.log(20.0))
+        whole, least = best_assignment(cost, 16.0)
         assert chosen.tolist() == whole.tolist()
         for i in np.flatnonzero(chosen >= 0):
             without = cost.copy()
-            without[i, chosen[i]] = _FORBIDDEN
-            other, more = _best_assignment(without, 16.0)
+            without[i, chosen[i]] = np.inf
+            other, more = best_assignment(without, 16.0)
             rival = other[i] >= 0 or chosen[i] in other
             assert ambiguous[i] == (rival and more - least < 2.0 * np.log(20.0))
+
+
+def test_one_that_stays_alone_costs_half_of_what_two_do() -> None:
+    """Where some pairs cost more than staying alone, the columns and the sum are those of trying everything."""
+    random = np.random.default_rng(1)
+    for shape in ((3, 3), (4, 2), (2, 4), (4, 3)):
+        for _ in range(10):
+            cost = random.uniform(0.0, 9.0, shape)
+            chosen, least = best_assignment(cost, 4.0)
+            pairs = [(i, j) for i, j in enumerate(chosen.tolist()) if j >= 0]
+            assert least == pytest.approx(brute(torch.from_numpy(cost), 4.0))
+            assert least == pytest.approx(sum(cost[pair] for pair in pairs) + 2.0 * (sum(shape) - 2 * len(pairs)))
+            assert all(cost[pair] < 4.0 for pair in pairs)
+
+
+def test_a_pair_has_no_rival_where_staying_alone_is_likelier_than_another_partner() -> None:
+    """A second left detection is near the right one's: a rival if it costs little more than the first, alone or not."""
+    for second, rival in ((5.0, True), (9.0, False)):
+        assert assign_groups(np.array([[1.0], [second]]), 16.0, 6.0)[1].tolist() == [rival, False]
+    # Both alone, at 4 more, is likelier than the exchange, at 5 more; where neither is likely, the exchange counts.
+    costs = np.array([[12.0, 14.6], [14.6, 12.2]])
+    assert assign_groups(costs, 16.0, 6.0)[1].tolist() == [False, False]
+    assert assign_groups(costs - 2.0, 16.0, 6.0)[1].tolist() == [True, True]
+
+
+def test_a_crowd_takes_bounded_time_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """400 boxes in one row, of which most could be most: 6.8 CPU seconds when every rival was an assignment."""
+    random = torch.Generator().manual_seed(0)
+    rows = [torch.rand(400, 2, generator=random).double() * torch.tensor([1800.0, 20.0]) + 500.0 for _ in range(2)]
+    left, right = (seen(row - torch.tensor([440.0, 0.0])) for row in rows)
+    sizes = []
+
+    def counted(rig: StereoRig, *pixels: Tensor, **options: bool) -> object:
+        sizes.append(len(pixels[0]))
+        return fit_pairs(rig, *pixels, **options)
+
+    monkeypatch.setattr("kcal.pipeline.association.fit_pairs", counted)
+    begin = time.process_time()
+    found = associate(rig_of(), left, right)
+    assert time.process_time() - begin < 3.0
+    assert len(found.left) > 300
+    assert found.ambiguous.double().mean() > 0.8
+    # Pairs that diverge or are too near are not fitted, and others some at a time.
+    assert sum(sizes) < 0.3 * 400**2
+    assert max(sizes) < 40_000
+    with pytest.raises(InputError, match="2,100 left detections in one image"):
+        associate(rig_of(), seen(torch.full((2100, 2), 500.0).double()), right)
 
 
 def test_two_that_could_be_swapped_are_ambiguous() -> None:

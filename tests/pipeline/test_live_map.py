@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import itertools
+import multiprocessing
+import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
 import orjson
 import pytest
 import torch
-from marking_browser import CHROMIUM
-from track_scenes import pairs_of, tracked_site
+from browser import chromium_page, needs_browser
+from track_scenes import ORIGIN, pairs_of, tracked_site
 
 pytest.importorskip("uvicorn")
+from pages import crowded_map
+
+from kcal.lens.mounting import Origin
+from kcal.locate.columns import PositionColumns
+from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.positions import located_by
 from kcal.locate.tabulate import Locator
 from kcal.pipeline.live_map import LiveMap
@@ -30,15 +41,22 @@ def page() -> Iterator[LiveMap]:
     live.close()
 
 
-def show(page: LiveMap, category: str = "car") -> None:
+def show(page: LiveMap, category: str = "car") -> PositionColumns:
     tracker = Tracker(SITE, TrackOptions(confirm_hits=1))
     left, right, _ = SITE.rig(torch.tensor([[0.0, 0.0, 500.0], [30.0, 0.0, 90_000.0]]).double())
     columns = track_columns(tracker(pairs_of(left, right, 1.0)), 1)
     columns.extras["category"][0] = category
     page.show(columns, 7)
+    return columns
 
 
-def events(page: LiveMap, count: int) -> dict[str, object]:
+def level(places: list[list[float]], origin: Origin = ORIGIN) -> np.ndarray:
+    """East and north in meters of places on the map."""
+    geodetic = torch.tensor([[*place, origin.height] for place in places], dtype=torch.float64)
+    return geodetic_to_enu(geodetic, origin)[:, :2].numpy()
+
+
+def events(page: LiveMap, count: int) -> dict[str, Any]:
     parts = urlsplit(page.address)
     found = {}
     with urllib.request.urlopen(f"http://{parts.netloc}/events?token={parts.fragment}", timeout=5) as answer:
@@ -58,7 +76,53 @@ def test_site_and_tracks_are_told(page: LiveMap) -> None:
     assert track["name"] == "track 1"
     assert track["place"] == pytest.approx([SITE.origin.lat + 500 / 110_700, SITE.origin.lon], abs=1e-4)
     assert track["text"] == "car, 500 m"
-    assert 0 < track["radius"] < 50
+
+
+def test_regions_are_those_of_the_covariance(page: LiveMap) -> None:
+    columns = show(page)
+    (track,) = events(page, 2)["tracks"]["tracks"]
+    ring = level(track["region"])
+    east, north = (columns.column(f"cov_{axes}_m2")[0] ** 0.5 for axes in ("ee", "nn"))
+    # 95 % of two Gaussian coordinates lie within 2.45 sigma; the target is north, and its range is the worst known.
+    assert np.ptp(ring[:, 1]) / 2 == pytest.approx(2.4477 * north, rel=0.01)
+    assert np.ptp(ring[:, 0]) / 2 == pytest.approx(2.4477 * east, rel=0.01)
+    assert np.ptp(ring[:, 1]) > 20 * np.ptp(ring[:, 0])
+
+
+def test_fields_of_view_are_those_of_the_cameras(page: LiveMap) -> None:
+    for camera, seen in zip(events(page, 1)["site"]["cameras"], page.run.cameras, strict=True):
+        foot, first, *_, last = level([*camera["field"]])
+        assert foot == pytest.approx(level([camera["place"]])[0], abs=1e-3)
+        for rim, azimuth in zip((first, last), seen.azimuths_deg, strict=True):
+            east, north = rim - foot
+            assert np.degrees(np.arctan2(east, north)) % 360 == pytest.approx(azimuth % 360, abs=1e-3)
+
+
+def test_nothing_jumps_at_the_antimeridian() -> None:
+    site = tracked_site(origin=Origin(lat=10.0, lon=179.9999, height=0.0), heading_deg=90.0)
+    live = LiveMap(located_by(Locator(site.rig, origin=site.origin, heading_deg=90.0)), 0)
+    left, right, _ = site.rig(torch.tensor([[0.0, 0.0, 500.0]]).double())
+    live.show(track_columns(Tracker(site, TrackOptions(confirm_hits=1))(pairs_of(left, right, 1.0)), 1), 1)
+    told = events(live, 2)
+    live.close()
+    (track,) = told["tracks"]["tracks"]
+    lons = [
+        lon for _, lon in [track["place"], *track["region"], *(p for c in told["site"]["cameras"] for p in c["field"])]
+    ]
+    assert 179 < min(lons) < 180 < max(lons) < 182
+
+
+def test_the_last_tracks_and_the_end_are_told(page: LiveMap) -> None:
+    found: dict[str, Any] = {}
+    reader = threading.Thread(target=lambda: found.update(events(page, 3)))
+    reader.start()
+    while not page.readers:
+        time.sleep(0.01)
+    show(page)
+    page.close("stopped")
+    reader.join(5.0)
+    assert list(found) == ["site", "tracks", "end"]
+    assert found["end"] == {"words": "stopped"}
 
 
 @pytest.mark.parametrize(("path", "host"), [("/events?token=wrong", None), ("/events", None), ("/", "evil.example")])
@@ -70,21 +134,76 @@ def test_others_are_refused(page: LiveMap, path: str, host: str | None) -> None:
         )
 
 
+def status(page: Any, words: str) -> None:
+    page.wait_for_function(
+        "words => document.getElementById('status').textContent === words", arg=words, timeout=60_000
+    )
+
+
+@needs_browser
 def test_the_page_in_a_browser(page: LiveMap) -> None:
-    playwright = pytest.importorskip("playwright.sync_api")
-    if CHROMIUM is None:
-        pytest.skip("no browser")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        tab = browser.new_page()
-        errors: list[str] = []
-        tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        tab.on("pageerror", lambda error: errors.append(str(error)))
+    with chromium_page() as tab:
         tab.goto(page.address)
         show(page, "<img src=x onerror=alert(1)>")
         tab.wait_for_function("() => document.documentElement.dataset.sequence === '7'", timeout=60_000)
-        assert tab.locator("#status").inner_text() == "1 track, moment 7"
-        assert "<img src=x onerror=alert(1)>, 500 m" in tab.locator(".leaflet-tooltip").first.inner_text()
+        status(tab, "running")
+        assert tab.inner_text("#count") == "1 track, moment 7"
+        names = tab.locator(".leaflet-tooltip").all_inner_texts()
+        assert names == ["left camera", "right camera", "track 1, <img src=x onerror=alert(1)>, 500 m"]
         assert tab.locator("#map img").count() == 0
-        assert errors == []
-        browser.close()
+        # A field of view for each camera, two cameras, a region, a trail, a target.
+        assert tab.locator("#map path").count() == 2 + 2 + 1 + 1 + 1
+        page.close()
+        status(tab, "finished")
+        tab.wait_for_timeout(500)
+        status(tab, "finished")
+        assert tab.complaints == []
+
+
+@needs_browser
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+def test_names_cover_neither_each_other_nor_dots(width: int, height: int) -> None:
+    with crowded_map(40) as live, chromium_page(width, height) as tab:
+        tab.goto(live.address)
+        tab.wait_for_function("() => document.documentElement.dataset.sequence === '1'", timeout=60_000)
+        boxes = tab.evaluate(
+            "() => ['.leaflet-tooltip', 'path.leaflet-interactive', '.leaflet-control'].map((kind) =>"
+            " [...document.querySelectorAll(kind)].filter((e) => getComputedStyle(e).visibility === 'visible')"
+            " .map((e) => e.getBoundingClientRect()).map((b) => [b.left, b.top, b.right, b.bottom]))"
+        )
+        names, dots, controls = boxes
+        assert len(dots) == 42
+        assert len(names) >= 15  # the others wait until there is room
+        covered = [
+            (a, b)
+            for a, b in [*itertools.combinations(names, 2), *itertools.product(names, [*dots, *controls])]
+            if min(a[2], b[2]) - max(a[0], b[0]) > 0.5 and min(a[3], b[3]) - max(a[1], b[1]) > 0.5
+        ]
+        assert covered == []
+        # With the keyboard every target can be reached, and then its name is there.
+        hidden = tab.evaluate(
+            "() => { const e = [...document.querySelectorAll('.leaflet-tooltip')]"
+            ".find((e) => e.style.visibility === 'hidden'); return e.textContent; }"
+        )
+        tab.locator(f'path[aria-label="{hidden}"]').focus()
+        assert tab.locator(".leaflet-tooltip.asked").inner_text() == hidden
+        assert tab.locator(".leaflet-tooltip.asked").is_visible()
+
+
+def serve(answer: Any) -> None:
+    page = LiveMap(located_by(Locator(SITE.rig, origin=SITE.origin, heading_deg=0.0)), 0)
+    answer.send(page.address)
+    time.sleep(120)
+
+
+@needs_browser
+def test_a_lost_connection_is_not_an_end() -> None:
+    here, there = multiprocessing.Pipe()
+    process = multiprocessing.get_context("fork").Process(target=serve, args=(there,), daemon=True)
+    process.start()
+    with chromium_page() as tab:
+        tab.goto(here.recv())
+        status(tab, "running")
+        process.kill()
+        status(tab, "connection lost; trying again")
+    process.join()

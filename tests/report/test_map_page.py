@@ -6,13 +6,12 @@ import html
 import json
 import math
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from browser import chromium_page, needs_browser
 from locate_rigs import pinhole_rig, tensor
 from PIL import Image, TiffImagePlugin
 
@@ -25,13 +24,6 @@ from kcal.report.map_page import map_page, save_map
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])
-BROWSER = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
-
-needs_browser = pytest.mark.skipif(
-    BROWSER is None, reason="no Chromium on this machine: the map was not opened in a browser"
-)
 
 
 def scene(origin: Origin = ORIGIN) -> tuple[Located, torch.Tensor]:
@@ -79,16 +71,13 @@ def test_it_may_load_nothing_unless_asked() -> None:
     assert "img-src data: https://tile.openstreetmap.org" in map_page(scene()[0], online=True)
 
 
-def dom(page: Path) -> str:
+def dom(file: Path) -> str:
     """What a browser makes of a page; it must not complain."""
-    assert BROWSER is not None
-    done = subprocess.run(
-        [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
-         f"--user-data-dir={page.parent / 'profile'}", "--virtual-time-budget=2000", "--dump-dom", page.as_uri()],
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
-    assert "CONSOLE" not in done.stderr, done.stderr
-    return done.stdout
+    with chromium_page() as page:
+        page.goto(file.as_uri())
+        page.wait_for_function("() => document.documentElement.dataset.drawn", timeout=60_000)
+        assert page.complaints == []
+        return page.content()
 
 
 @needs_browser
@@ -134,18 +123,19 @@ def test_nothing_else_runs_in_the_page(tmp_path: Path) -> None:
     page = map_page(scene()[0])
     planted = (
         "<img src=x onerror=document.documentElement.dataset.ran=1><script>document.documentElement.dataset.ran=2"
-        '</script><b onclick="" style="color:red">b</b><iframe src="data:text/html,x"></iframe><div id="map">'
+        '</script><b onclick="" style="color:red">b</b><iframe src="data:text/html,x"></iframe><main id="map"'
     )
     path = tmp_path / "planted.html"
-    path.write_text(page.replace('<div id="map">', planted))
-    done = subprocess.run(
-        [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
-         f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=2000", "--dump-dom", path.as_uri()],
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
-    assert "data-ran" not in done.stdout
-    assert 'data-drawn="3/' in done.stdout
-    assert done.stderr.count("Content Security Policy") >= 4
+    path.write_text(page.replace('<main id="map"', planted))
+    with chromium_page() as tab:
+        tab.goto(path.as_uri())
+        tab.wait_for_function("() => document.documentElement.dataset.drawn", timeout=60_000)
+        tab.wait_for_timeout(500)
+        drawn = tab.content()
+        refused = [text for text in tab.complaints if "Content Security Policy" in text]
+    assert "data-ran" not in drawn
+    assert 'data-drawn="3/' in drawn
+    assert len(refused) >= 4
 
 
 def geotiff(path: Path) -> Path:
@@ -244,3 +234,17 @@ def test_bad_arguments(tmp_path: Path) -> None:
     (tmp_path / "text.tif").write_text("no image")
     with pytest.raises(FileError, match="cannot read this image"):
         map_page(located, image=tmp_path / "text.tif")
+
+
+@needs_browser
+def test_numbers_are_within_the_keyboards_reach(tmp_path: Path) -> None:
+    located, truth = scene()
+    with chromium_page() as page:
+        page.goto(save_map(tmp_path / "map.html", located, truth).as_uri())
+        page.wait_for_function("() => document.documentElement.dataset.drawn", timeout=60_000)
+        for _ in range(40):
+            page.keyboard.press("Tab")
+            if page.evaluate("document.activeElement.getAttribute('aria-label')") == "ship":
+                break
+        page.keyboard.press("Enter")
+        assert page.locator(".leaflet-popup-content").inner_text().startswith("latitude")

@@ -228,8 +228,9 @@ def _masks_of_fields(masks: PerKind) -> RigState:
 
 def _weighted(source: Landmarks | Features, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels and whitening of marks whose noise is the same along both axes."""
-    pixels = source.pixels[mask]
-    return pixels, (torch.eye(2, dtype=torch.float64) / source.pixel_sigma).expand(*pixels.shape, 2)
+    pixels, sigma = source.pixels[mask], source.pixel_sigma
+    each = sigma[mask] if isinstance(sigma, Tensor) else torch.tensor(sigma, dtype=torch.float64)
+    return pixels, (torch.eye(2, dtype=torch.float64) / each[..., None, None]).expand(*pixels.shape, 2)
 
 
 def _of_all(masks: PerKind, problem: RigProblem, values: Sequence[Tensor]) -> PerKind:

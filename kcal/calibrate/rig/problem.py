@@ -78,7 +78,6 @@ class RigProblem:
     """
 
     batch: tuple[int, ...] = ()
-    joint = False
 
     def __init__(
         self,
@@ -92,6 +91,8 @@ class RigProblem:
     ) -> None:
         self.cameras, self.blocks, self.unknowns, self.loss = tuple(cameras), tuple(blocks), unknowns, loss
         self._terms = tuple(terms)
+        # Of some marks, derivatives cost little more than the pixels themselves.
+        self.joint = all(block.kind != "boards" for block in self.blocks)
         self.turn: list[slice | None] = []
         self.shift: list[slice | None] = []
         end = len(unknowns)
@@ -129,13 +130,17 @@ class RigProblem:
     def cost(self, state: State) -> Tensor:
         """See `Problem.cost`."""
         state = RigState(*state)
-        total = self.term_rows(state)[-1].square().sum()
-        for block, squares in zip(self.blocks, self.item_squares(state), strict=True):
+        return self._cost_of(self.term_rows(state)[-1], self.item_squares(state))
+
+    def _cost_of(self, terms: Tensor, squares: Sequence[Tensor]) -> Tensor:
+        """Half the sum of squared terms (Q,) and of items' squares, as the loss counts these."""
+        total = terms.square().sum()
+        for block, own in zip(self.blocks, squares, strict=True):
             if self.loss is None:
-                total = total + squares.sum()
+                total = total + own.sum()
             else:
                 count = block.counts.clamp_min(1)
-                total = total + (count * self.loss.value(squares / count)).sum()
+                total = total + (count * self.loss.value(own / count)).sum()
         return 0.5 * total
 
     def deletions(self, state: RigState) -> list[Tensor]:
@@ -146,7 +151,7 @@ class RigProblem:
         g_iᵀ (N - N_i)⁻¹ g_i of the others'; for a single residual that is its squared external Studentized value
         (Baarda 1968; Cook and Weisberg 1982).
         """
-        gram, L = self._gram(state), LOCAL_SIZE
+        (gram, _), L = self._gram(state), LOCAL_SIZE
         scale = gram[:, :L, :L].diagonal(dim1=-2, dim2=-1).rsqrt()
         factor, _ = torch.linalg.cholesky_ex(gram[:, :L, :L] * scale[:, :, None] * scale[:, None, :])
         coupling = gram[:, :L, L:] * scale[:, :, None]
@@ -160,30 +165,33 @@ class RigProblem:
         others = torch.where(info == 0, pull.square().sum((-2, -1)), 0.0)
         return list((gram[:, -1, -1] + others).split([len(block) for block in self.blocks]))
 
-    def _gram(self, state: RigState) -> Tensor:
-        """(V, L + S + 1, L + S + 1) products of the rows of all items, with the loss's weights."""
+    def _gram(self, state: RigState) -> tuple[Tensor, list[Tensor]]:
+        """(V, L + S + 1, L + S + 1) products of the rows of all items, with the loss's weights; and `item_squares`."""
         size = LOCAL_SIZE + self.shared_size + 1
         posed, grams = self.posed(state), [state.center.new_zeros(0, size, size)]
+        squares = []
         for block in self.blocks:
             rows = block.rows(posed, state, self.shared_size)
+            squares.append(rows[:, -1].square().sum(-1))
             if self.loss is not None:
                 count = block.counts.clamp_min(1)
-                rows = rows * self.loss.weight(rows[:, -1].square().sum(-1) / count).sqrt()[:, None, None]
+                rows = rows * self.loss.weight(squares[-1] / count).sqrt()[:, None, None]
             missing = LOCAL_SIZE - block.size
             gram = rows.new_zeros((len(block), size, size))
             # Unknowns that smaller items do not have: with a one on the diagonal they change nothing.
             gram[:, range(missing), range(missing)] = 1.0
             gram[:, missing:, missing:] = rows @ rows.transpose(-1, -2)
             grams.append(gram)
-        return torch.cat(grams)
+        return torch.cat(grams), squares
 
     def linearize(self, state: State) -> SchurLinearization:
         """See `Problem.linearize`."""
         state = RigState(*state)
         terms = self.term_rows(state)
-        linear = SchurLinearization.of_gram(self._gram(state), LOCAL_SIZE, terms @ terms.T)
+        gram, squares = self._gram(state)
+        linear = SchurLinearization.of_gram(gram, LOCAL_SIZE, terms @ terms.T)
         if self.loss is not None:
-            linear.cost = self.cost(state)
+            linear.cost = self._cost_of(terms[-1], squares)
         return linear
 
     def select(self, elements: Tensor) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import math
 from typing import Literal
 
@@ -29,6 +30,7 @@ from kcal.errors import DegenerateError, InputError
 from kcal.io.camera_file import provenance
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
+from kcal.lens.information import CameraInformation
 from kcal.lens.mounting import REFRACTION, REFRACTION_SIGMA, check_refraction
 from kcal.solve.lm import LMOptions
 from kcal.solve.result import Result, SolverStatus
@@ -37,6 +39,8 @@ from kcal.solve.result import Result, SolverStatus
 _CORNER_SIGMA = 0.2
 # Enough steps to tell which of several starts is best.
 _SCREENING = LMOptions(max_iterations=25, tolerance=1e-6, residual_floor=1e-8)
+# λ of a solve that begins at the robust solution.
+_NEAR_DAMPING = 1e-9
 # Of fewer boards alone, a wrong one cannot be told from a good one.
 _FEW_BOARDS = 3
 # px: a higher RMS is not noise.
@@ -133,13 +137,16 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
         warnings += doubts
     if options.motion:
         work.fit_motion(kept)
+    # The robust solution is near, so that the first step may be the undamped one.
+    near = dataclasses.replace(options.solver, initial_damping=_NEAR_DAMPING)
+    _, found = work.solve(masks, near)
     for _ in range(3):
-        work.solve(masks, options.solver)
         before = work.sigma_corner
         work.fit_corners(masks)
+        if work.sigma_corner != before:
+            _, found = work.solve(masks, near)
         if abs(work.sigma_corner / before - 1.0) < 1e-3:
             break
-    _, found = work.solve(masks, options.solver)
     return _rig_result(work, found, masks, reasons, initial, warnings, refuse=options.reject)
 
 
@@ -205,11 +212,14 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
             if own is not None and boards is not None:
                 own = without_repeated(own, camera, boards, number, options.solver)
             known.append(own)
-        board, measured = (None, False) if boards is None else (boards.board, boards.deviation is not None)
-        knowledge = gathered(data.cameras, known, board)
-        unknowns, deviation = joint_unknowns(data.cameras, knowledge, board, measured=measured)
-        if boards is not None and deviation is not None:
-            data = dataclasses.replace(data, boards=dataclasses.replace(boards, deviation=deviation))
+        if boards is None:
+            unknowns = _lens_unknowns(data.cameras, tuple(camera.fingerprint for camera in data.cameras), tuple(known))
+        else:
+            knowledge = gathered(data.cameras, known, boards.board)
+            measured = boards.deviation is not None
+            unknowns, deviation = joint_unknowns(data.cameras, knowledge, boards.board, measured=measured)
+            if deviation is not None:
+                data = dataclasses.replace(data, boards=dataclasses.replace(boards, deviation=deviation))
     else:
         unknowns = held(data.cameras) if options.intrinsics == "fixed" else free(data.cameras, data.names)
     if options.board_warp and boards is not None and not len(unknowns.shapes):
@@ -217,6 +227,14 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
     if data.absolute:
         unknowns = unknowns.and_refraction(options.refraction, options.refraction_sigma)
     return data, unknowns
+
+
+@functools.lru_cache(maxsize=2)
+def _lens_unknowns(
+    cameras: tuple[Camera, ...], fingerprints: tuple[str, ...], known: tuple[CameraInformation | None, ...]
+) -> SharedUnknowns:
+    """Unknowns of cameras without boards. Whoever marks landmarks solves the same rig again and again."""
+    return joint_unknowns(cameras, gathered(cameras, known, None), None)[0]
 
 
 def _robust(initial: InitialPoses, masks: PerKind, unknowns: SharedUnknowns) -> Adjustment:

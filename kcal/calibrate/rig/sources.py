@@ -105,14 +105,14 @@ class Landmarks:
         points: (L, 3) meters in the local frame.
         sigma: (L, 3) meters along the frame's axes, of the survey; independent from point to point.
         pixels: (L, C, 2) marks.
-        pixel_sigma: of a mark along an axis, px.
+        pixel_sigma: of a mark along an axis, px; one number for all, or (L, C) for each mark.
     """
 
     names: tuple[str, ...]
     points: Tensor
     sigma: Tensor
     pixels: Tensor
-    pixel_sigma: float = 0.3
+    pixel_sigma: float | Tensor = 0.3
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -125,7 +125,14 @@ class Landmarks:
         require_finite("landmarks: points", as_points("landmarks: points", self.points, 3))
         if not bool((torch.isfinite(self.sigma) & (self.sigma > 0)).all()):
             raise InputError("landmarks: every sigma must be a positive number of meters; nothing is surveyed exactly")
-        _positive("landmarks: pixel_sigma", self.pixel_sigma)
+        if not isinstance(self.pixel_sigma, Tensor):
+            _positive("landmarks: pixel_sigma", self.pixel_sigma)
+            return
+        if self.pixel_sigma.shape != self.pixels.shape[:2]:
+            raise InputError(f"landmarks: pixel_sigma {tuple(self.pixels.shape[:2])} is needed, one for each mark")
+        sigma = self.pixel_sigma[torch.isfinite(self.pixels).all(-1)]
+        if not bool((torch.isfinite(sigma) & (sigma > 0)).all()):
+            raise InputError("landmarks: pixel_sigma must be a positive number of pixels wherever there is a mark")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

@@ -171,14 +171,31 @@ def open_place(
 
     # Turns and lenses, which trade with each other by far more than both together are off, count to first order.
     found, seen = seen_from(steps @ places)
-    one = torch.ones((), dtype=torch.float64)
-    by_place = torch.func.jvp(lambda share: seen_from(share * (steps @ places))[0], (0.0 * one,), (one,))[1]
+    by_place = _first_order(targets.rays, true, center, steps @ places)
     found = found - by_place - (targets.at(true.expand_as(found)) @ steps[:, :, None])[..., 0]
     variance = targets.own + targets.at(found).square().sum(-1)
     errors = (found - true).square() / variance
     common = _common(problem, second, seen @ rotation.T)
     mean = torch.where(common, errors.nan_to_num(math.inf), 0.0).sum(-1) / common.sum(-1).clamp_min(1)
     return OpenPlace(float(share.median()), math.sqrt(float(mean.max())) / _SIGMAS, axes[:, 0], float(sigmas[0]))
+
+
+def _first_order(rays: Tensor, true: Tensor, center: Tensor, moved: Tensor) -> Tensor:
+    """(D, W, T) change of the inverse ranges of targets by W moves (W, 3) of the second center, to first order.
+
+    With s the unit vector from that center c to a target and r the ray, the inverse range is found as
+    (c r - (s c)(s r)) / (c c - (s c)²), where c is not known to have moved.
+    """
+    there = rays - true[..., None] * center
+    length = there.norm(dim=-1, keepdim=True)
+    sight = there / length
+    turned = -true[..., None] * moved[:, None] / length
+    turned = turned - (turned * sight).sum(-1, keepdim=True) * sight
+    p, q = sight @ center, (sight * rays).sum(-1)
+    dp, dq = turned @ center, (turned * rays).sum(-1)
+    square = center @ center - p * p
+    found = (rays @ center - p * q) / square
+    return (2.0 * found * p * dp - dp * q - p * dq) / square
 
 
 def _common(problem: RigProblem, second: int, points: Tensor) -> Tensor:

@@ -93,6 +93,7 @@ function show(state, frame) {
     more.textContent = "Match the orange outline; the dot is the board's first corner." + (state.next.sigma ? ` Expected then: ± ${state.next.sigma.toFixed(3)} px.` : "");
     words.append(more);
   }
+  document.querySelector("#next h2").textContent = state.finished ? "Finished" : "Photograph next";
   document.body.classList.toggle("done", Boolean(state.finished));
   const last = state.history[state.history.length - 1];
   byId("sigma").textContent = last ? `± ${last[1].toFixed(3)} px, goal ± ${state.until} px` : "known after four views";

@@ -7,6 +7,7 @@ if (location.hash.length > 1) {
 }
 
 export class Refused extends Error {}
+export const AWAY = "the server does not answer: start kcal mark again with the same -o, and open its address";
 
 async function checked(response) {
   if (response.ok) return response;
@@ -30,10 +31,17 @@ export async function post(name, body) {
 // Actions are sent one after the other, again and again until they are answered. The key makes doing them twice harmless.
 export class Actions {
   constructor(place, answered, failed) {
-    this.place = "kcal-unsent:" + place;
+    // Each window has a place of its own; a new one takes over what closed ones left.
+    const shared = "kcal-unsent:" + place;
+    this.place = shared + ":" + crypto.randomUUID();
     this.answered = answered;
     this.failed = failed;
-    this.waiting = JSON.parse(localStorage.getItem(this.place) || "[]");
+    this.waiting = [];
+    for (const name of Object.keys(localStorage).filter((each) => each === shared || each.startsWith(shared + ":"))) {
+      this.waiting.push(...JSON.parse(localStorage.getItem(name)));
+      localStorage.removeItem(name);
+    }
+    if (this.waiting.length) this.keep();
     this.sending = false;
     this.ends = new Map();
     if (this.waiting.length) this.send();
@@ -53,7 +61,10 @@ export class Actions {
     this.keep();
     return () => { const done = this.ends.get(key); this.ends.delete(key); if (done) done(); };
   }
-  keep() { localStorage.setItem(this.place, JSON.stringify(this.waiting)); }
+  keep() {
+    if (this.waiting.length) localStorage.setItem(this.place, JSON.stringify(this.waiting));
+    else localStorage.removeItem(this.place);
+  }
   async send() {
     if (this.sending) return;
     this.sending = true;
@@ -64,14 +75,15 @@ export class Actions {
         this.answered(state, this.waiting.length);
         ended();
       } catch (error) {
-        if (error instanceof Refused && error.status !== 401) {
+        // What the server cannot do now, for example because the disk is full, it may do later.
+        if (error instanceof Refused && error.status !== 401 && error.status < 500) {
           const ended = this.shift();
-          this.failed(error.message);
+          this.failed(error.message, false);
           ended();
           continue;
         }
-        const what = error instanceof Refused ? error.message : "the server does not answer: start kcal mark again with the same -o, and open its address";
-        this.failed(what + " (" + this.waiting.length + " unsent, kept here)");
+        const what = error instanceof Refused ? error.message : AWAY;
+        this.failed(what + " (" + this.waiting.length + " unsent, kept here)", true);
         await new Promise((done) => setTimeout(done, 1000));
       }
     }

@@ -1,4 +1,6 @@
 // The keyboard and the buttons.
+import {stretchContrast} from "/page/tiles.js";
+
 const KEYS = [
   ["N", "new target"], ["F", "new static feature"], ["[ ]", "previous, next thing"], ["Space", "mark at the middle of the image in focus"],
   ["Arrows", "move the mark by 0.1 px"], ["Shift+arrows", "move it by 1 px"], ["Alt+arrows", "move the image"],
@@ -20,7 +22,7 @@ export function listen(app) {
     n: () => app.add("target"), f: () => app.add("feature"), "[": () => app.next(-1), "]": () => app.next(1),
     s: () => app.snapAgain(), Enter: () => app.accept(), r: () => app.reject(), Delete: remove, Backspace: remove,
     x: () => app.views[app.side === "left" ? "right" : "left"].canvas.focus(), "+": () => app.zoom(view(), 1.5), "=": () => app.zoom(view(), 1.5),
-    "-": () => app.zoom(view(), 1 / 1.5), 0: fit, z: () => app.closer(), i: () => app.toggle("interpolated"), c: () => app.contrast(),
+    "-": () => app.zoom(view(), 1 / 1.5), 0: fit, z: () => app.closer(), i: () => app.toggle("interpolated"), c: () => stretchContrast(app),
     k: () => app.toggle("linked"), u: () => app.act({do: "undo"}), ",": () => app.show(app.frame - 1), ".": () => app.show(app.frame + 1),
     a: again, "?": () => byId("keys").showModal(), " ": () => app.place(app.side, ...view().center),
   };
@@ -40,7 +42,7 @@ export function listen(app) {
     run();
   });
   document.addEventListener("pointerdown", () => { app.byKeyboard = false; });
-  const press = {"new-target": commands.n, "new-feature": commands.f, undo: commands.u, redo: () => app.act({do: "redo"}), fit, interpolate: commands.i,
+  const press = {"new-target": commands.n, "new-feature": commands.f, undo: commands.u, redo: () => app.act({do: "redo"}), fit, nearer: commands["+"], farther: commands["-"], accept: commands.Enter, reject: commands.r, interpolate: commands.i,
     contrast: commands.c, link: commands.k, again, "show-keys": commands["?"], drop: () => app.selected && app.act({do: "drop", name: app.selected})};
   for (const [id, run] of Object.entries(press)) byId(id).addEventListener("click", run);
   byId("frame").addEventListener("input", (event) => app.show(Number(event.target.value)));

@@ -1,5 +1,6 @@
 // The page: what is selected, what a click, a drag and a key do. The server knows everything that lasts.
 import {Actions, get, latest, post} from "/page/api.js";
+import {followOthers} from "/page/windows.js";
 import {View} from "/page/view.js";
 import {listen} from "/page/keys.js";
 import {drawPanel, drawTable} from "/page/panel.js";
@@ -27,12 +28,13 @@ class App {
     this.version = -1;
     this.views = {};
     for (const side of SIDES) this.views[side] = new View(side, about.images[side], this);
-    this.actions = new Actions(about.files.log, (state) => this.take(state), (text) => this.say(text, true));
+    followOthers(this);
+    this.actions = new Actions(about.files.log, (state) => this.answered(state), (text, kept) => this.failed(text, kept));
     this.askCurve = latest(async (side, u, v, key) => {
       const found = await post("curve", {side, frame: this.frame, u, v});
       if (key !== this.key()) return;
       this.curves = found.refusal ? {} : {[other(side)]: found};
-      if (found.refusal) this.say(found.refusal);
+      if (found.refusal) this.refuse(found.refusal);
       this.draw();
     });
     this.askPosition = latest(async (left, right, matched) => {
@@ -53,26 +55,56 @@ class App {
   }
 
   say(text, bad = false) {
+    this.said = bad ? "bad" : "";
     byId("status").textContent = text;
     byId("status").classList.toggle("bad", bad);
+  }
+  // Why something cannot be had now, which may change with the next landmark.
+  refuse(text) { this.say(text); this.said = "refusal"; }
+  // What was said of an earlier thing or rig no longer holds.
+  settle(...kinds) { if (kinds.includes(this.said)) this.say(""); }
+
+  answered(state) {
+    this.settle("bad");
+    this.take(state);
+    this.others.postMessage(state.version);
+  }
+  failed(text, kept) {
+    this.say(text, true);
+    // The page shows what was asked for; the server knows what there is.
+    if (!kept) this.refresh();
+  }
+  inside(side, u, v) {
+    const [width, height] = this.about.images[side].size;
+    if (u >= -0.5 && v >= -0.5 && u <= width - 0.5 && v <= height - 0.5) return true;
+    this.say("that is outside the picture: nothing was marked", true);
+    return false;
   }
 
   // A new state from the server.
   take(state) {
+    const text = JSON.stringify(state);
     if (state.version < this.version) return;
-    const rigChanged = JSON.stringify(state.rig.promises) !== JSON.stringify(this.rig.promises);
+    if (text === this.last && !this.moved) return;
+    this.last = text;
+    this.moved = false;
+    const rigChanged = state.rig.known !== this.rig.known || JSON.stringify(state.rig.promises) !== JSON.stringify(this.rig.promises);
     this.version = state.version;
     this.items = state.items;
     this.survey = state.survey;
     this.rig = state.rig;
     if (!this.item()) this.selected = null;
+    byId("trouble").textContent = state.trouble;
+    byId("trouble").hidden = !state.trouble;
     byId("undo").disabled = !state.undo;
     byId("redo").disabled = !state.redo;
     document.documentElement.dataset.version = state.version;
     document.documentElement.dataset.pending = state.pending;
+    this.pending = state.pending;
     this.draw();
     drawPanel(this);
     drawTable(this);
+    if (rigChanged) this.settle("refusal");
     if (state.pending) this.poll();
     else { drawMap(this); if (rigChanged) this.guide(); }
   }
@@ -82,10 +114,15 @@ class App {
       try { this.take(await get("state")); } catch (error) { this.poll(); }
     }, 250);
   }
-  draw() { for (const side of SIDES) this.views[side].draw(); }
+  draw() {
+    const proposed = SIDES.some((side) => this.proposals[side] && !this.proposals[side].refusal);
+    for (const id of ["accept", "reject"]) byId(id).hidden = !proposed;
+    for (const side of SIDES) this.views[side].draw();
+  }
   act(action) { return this.actions.push(action); }
 
   select(name, look = true) {
+    if (name !== this.selected) this.settle("refusal", "bad");
     this.selected = name;
     this.curves = {};
     this.proposals = {};
@@ -134,7 +171,7 @@ class App {
   proposed(side, found) {
     this.proposals[side] = found;
     document.documentElement.dataset.proposal = found.refusal ? "refused" : "there";
-    if (found.refusal) this.say(`${side}: ${found.refusal}`);
+    if (found.refusal) this.refuse(`${side}: ${found.refusal}`);
     else {
       this.say(`${side}: proposal (${found.how}) with σ ${found.sigma.toFixed(3)} px, correlation ${found.score.toFixed(2)}. Enter accepts it, R rejects it.`);
       const view = this.views[side];
@@ -193,6 +230,7 @@ class App {
 
   // Place the selected thing's mark: at the shape that is there, or exactly where it was said.
   async place(side, u, v, snapping = true) {
+    if (!this.inside(side, u, v)) return;
     if (!this.item()) await this.add("target");
     const item = this.item();
     if (!item) return;
@@ -216,6 +254,8 @@ class App {
     if (!item || !mark) { this.say("nothing is marked in this image to be moved"); return; }
     const hand = this.about.hand_sigma ** 2;
     const moved = {u: mark.u + du, v: mark.v + dv, cov: [hand, 0, hand], how: "hand", frame: mark.frame};
+    if (!this.inside(this.side, moved.u, moved.v)) return;
+    this.moved = true;
     item[this.side] = {...moved, sigma: this.about.hand_sigma};
     this.act({do: "put", name: item.name, side: this.side, mark: moved});
     this.askCurve(this.side, moved.u, moved.v, this.key());
@@ -317,26 +357,14 @@ class App {
   }
   drop() {
     const {side, item, mark} = this.dragged;
-    item[side] = mark;
     this.dragged = null;
+    if (!this.inside(side, mark.u, mark.v)) { this.draw(); drawPanel(this); return; }
+    item[side] = mark;
+    this.moved = true;
     this.act({do: "put", name: item.name, side, mark: {u: mark.u, v: mark.v, cov: mark.cov, how: "hand", frame: this.frameName()}});
     this.guide();
   }
 
-  contrast() {
-    const pressed = byId("contrast").getAttribute("aria-pressed") !== "true";
-    byId("contrast").setAttribute("aria-pressed", pressed);
-    for (const side of SIDES) {
-      const view = this.views[side], level = view.level();
-      const [left, top] = view.image(0, 0), [right, bottom] = view.image(view.canvas.width, view.canvas.height);
-      let span = pressed ? view.tiles.span(this.frame, level, left, top, right, bottom) : null;
-      const image = this.about.images[side];
-      if (span && image.deep) { const step = (image.span[1] - image.span[0]) / 255; span = span.map((v) => image.span[0] + v * step); }
-      view.tiles.stretch(span);
-      view.enlarged = null;
-      view.draw();
-    }
-  }
   toggle(name) {
     this[name] = !this[name];
     byId(name === "linked" ? "link" : "interpolate").setAttribute("aria-pressed", this[name]);
@@ -355,7 +383,8 @@ async function start() {
   byId("frame-name").textContent = about.frames[0];
   app.take(await get("state"));
   if (!app.selected && app.items.length) app.select((app.items.find((item) => !item.left || !item.right) || app.items[0]).name);
-  if (app.actions.waiting.length === 0) app.say(about.cameras ? "Choose a thing in the list, or press N for a new target; click it in one image. The key ? lists all keys." : "No cameras were given: marks are snapped and saved, but no geometry helps. Start with --rig or --cameras for it.");
+  if (about.notes.length) app.say(about.notes.join("; "), true);
+  else if (app.actions.waiting.length === 0) app.say(about.cameras ? "Choose a thing in the list, or press N for a new target; click it in one image. The key ? lists all keys." : "No cameras were given: marks are snapped and saved, but no geometry helps. Start with --rig or --cameras for it.");
 }
 start().catch((error) => {
   byId("status").textContent = error.message;

@@ -42,6 +42,8 @@ export const drawMap = latest(async (app) => {
     if (item.ring) L.polygon(item.ring, {color: "#111827", weight: 1, fillOpacity: 0.15, interactive: false}).addTo(layer);
     if (item.place) dot(item.name, item.place, "#e69f00", "● ");
   }
+  // The list selects by keyboard what the map selects by pointer.
+  layer.eachLayer((shape) => shape.getElement()?.setAttribute("tabindex", "-1"));
   const key = spots.map((spot) => spot.map((v) => v.toFixed(4)).join()).join(" ");
   if (spots.length > 2 && key !== fitted) {
     fitted = key;

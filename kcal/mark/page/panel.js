@@ -64,7 +64,8 @@ export function drawPanel(app) {
   }
   const rig = app.rig, box = byId("rig");
   box.classList.toggle("enough", rig.enough);
-  byId("rig-text").textContent = rig.text || (rig.known ? "the given rig is used" : "");
+  const known = rig.text || (rig.known ? "the given rig is used" : "");
+  byId("rig-text").textContent = app.pending ? `solving the rig … ${known}` : known;
   byId("rig-text").title = rig.warnings.join("; ");
   const table = byId("promises");
   table.textContent = "";

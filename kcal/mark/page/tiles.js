@@ -81,3 +81,18 @@ export class Tiles {
     return high > low ? [low, high] : [low - 1, low + 1];
   }
 }
+
+// Stretch both images to the gray levels that they show now, or show them as they are again.
+export function stretchContrast(app) {
+  const button = document.getElementById("contrast"), pressed = button.getAttribute("aria-pressed") !== "true";
+  button.setAttribute("aria-pressed", pressed);
+  for (const [side, view] of Object.entries(app.views)) {
+    const level = view.level(), image = app.about.images[side];
+    const [left, top] = view.image(0, 0), [right, bottom] = view.image(view.canvas.width, view.canvas.height);
+    let span = pressed ? view.tiles.span(app.frame, level, left, top, right, bottom) : null;
+    if (span && image.deep) { const step = (image.span[1] - image.span[0]) / 255; span = span.map((v) => image.span[0] + v * step); }
+    view.tiles.stretch(span);
+    view.enlarged = null;
+    view.draw();
+  }
+}

@@ -3,21 +3,43 @@
   const map = L.map("map", {maxZoom: 22, zoomSnap: 0.25});
   map.attributionControl.setPrefix("kcal, Leaflet");
   L.control.scale({imperial: false, maxWidth: 200}).addTo(map);
-  const status = document.getElementById("status");
+  const [fields, cameras, regions, trails] = [0, 1, 2, 3].map(() => L.layerGroup().addTo(map));
+  const labels = mapLabels(map);
+  const status = document.getElementById("status"), count = document.getElementById("count");
   const shown = new Map();
   const MOST = 300; // points of a trail
-  let placed = false;
-  // Leaflet takes texts as HTML; a node with a text is shown as it is.
-  const text = (value) => { const s = document.createElement("span"); s.textContent = value; return s; };
+  let places = [], own = true, touched = false;
+
+  const say = (words, lost) => {
+    status.textContent = words;
+    document.documentElement.classList.toggle("lost", lost);
+  };
+  const counted = (number, word) => number + " " + word + (number === 1 ? "" : "s");
+  // Until the reader moves the map, it keeps all targets in view.
+  map.on("movestart", () => { touched = touched || !own; });
+  const look = (spots) => {
+    own = true;
+    map.fitBounds(L.latLngBounds(spots).pad(0.1), {maxZoom: 18, animate: false});
+    own = false;
+  };
+
   const source = new EventSource("/events" + location.hash.replace("#", "?token="));
-  source.onerror = () => { status.textContent = "connection lost; trying again"; };
+  source.onopen = () => say("running", false);
+  source.onerror = () => {
+    say(source.readyState === EventSource.CLOSED ? "not connected: open the address that kcal live printed last" : "connection lost; trying again", true);
+  };
+  source.addEventListener("end", (event) => {
+    // Otherwise the browser would ask again, and take the end for a failure.
+    source.close();
+    say(JSON.parse(event.data).words, false);
+  });
   source.addEventListener("site", (event) => {
-    for (const camera of JSON.parse(event.data).cameras) {
-      L.circleMarker(camera.place, {radius: 6, color: "#fff", weight: 1.5, fillColor: "#1d4ed8", fillOpacity: 1})
-        .bindTooltip(() => text(camera.name)).addTo(map);
-      if (!placed) map.setView(camera.place, 14);
-      placed = true;
-    }
+    const site = JSON.parse(event.data);
+    // After a lost connection it comes again.
+    if (places.length) return;
+    places = site.cameras.map((camera) => camera.place);
+    look(places.concat(L.latLng(places[0]).toBounds(600).getNorthEast(), L.latLng(places[0]).toBounds(600).getSouthWest()));
+    drawCameras(site.cameras, labels, fields, cameras);
   });
   source.addEventListener("tracks", (event) => {
     const told = JSON.parse(event.data);
@@ -27,27 +49,31 @@
       let one = shown.get(track.name);
       if (!one) {
         one = {
+          region: L.polygon(track.region, {color: "#111827", weight: 1.5, fillOpacity: 0.15, smoothFactor: 0.2, interactive: false}).addTo(regions),
+          trail: L.polyline([], {color: "#c02a6b", weight: 1.5, interactive: false}).addTo(trails),
           dot: L.circleMarker(track.place, {radius: 5, color: "#111827", weight: 2, fillColor: "#fff", fillOpacity: 1}),
-          circle: L.circle(track.place, {radius: 0, color: "#111827", weight: 1, fillOpacity: 0.1, interactive: false}),
-          trail: L.polyline([], {color: "#c02a6b", weight: 1.5, interactive: false}),
         };
-        Object.values(one).forEach((shape) => shape.addTo(map));
-        one.dot.bindTooltip(text(track.name), {permanent: true, direction: "right"});
+        one.label = labels.add(one.dot, track.name, 0);
+        one.dot.addTo(map);
         shown.set(track.name, one);
       }
       one.dot.setLatLng(track.place);
-      one.circle.setLatLng(track.place);
-      one.circle.setRadius(track.radius);
+      one.region.setLatLngs(track.region);
       one.trail.addLatLng(track.place);
       if (one.trail.getLatLngs().length > MOST) one.trail.setLatLngs(one.trail.getLatLngs().slice(-MOST));
-      one.dot.setTooltipContent(text(track.name + ", " + track.text));
+      labels.rename(one.label, track.name + ", " + track.text);
     }
     for (const [name, one] of shown) {
       if (now.has(name)) continue;
-      Object.values(one).forEach((shape) => shape.remove());
+      labels.remove(one.label);
+      one.region.remove();
+      one.trail.remove();
       shown.delete(name);
     }
-    status.textContent = told.tracks.length + (told.tracks.length === 1 ? " track" : " tracks") + ", moment " + told.sequence;
+    const spots = told.tracks.map((track) => track.place);
+    if (!touched && spots.some((spot) => !map.getBounds().contains(spot))) look(places.concat(spots));
+    labels.place();
+    count.textContent = counted(told.tracks.length, "track") + ", moment " + told.sequence;
     document.documentElement.dataset.sequence = told.sequence;
   });
 })();

@@ -11,13 +11,13 @@ from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 from lenses import FEW_MODES, hybrid_camera
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import roll_warnings, what_to_photograph
+from kcal.calibrate.camera.advice import reached, roll_warnings, what_to_photograph
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.pupil_check import corner_pupil, pupil_warnings
 from kcal.calibrate.camera.warnings import general_warnings
 from kcal.corners.board import Board
 from kcal.corners.detect import detect
-from kcal.corners.observations import Observations
+from kcal.corners.observations import Observations, View
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.solve.result import SolverStatus
@@ -144,3 +144,17 @@ def test_advice_names_three_parts_of_the_image_or_all_of_them() -> None:
     assert place.startswith("show the board in the corners and along the sides of the image")
     assert len(BOARD.points) == 42
     assert translation.shape == (3, 3)
+
+
+def test_parts_of_the_image_are_reached_by_their_middles() -> None:
+    """To a quarter of a pixel on either side, on pixels and on parts of two pixels."""
+    corners = ((2.75, 2.75), (6.25, 2.75), (2.75, 6.25), (6.25, 6.25))
+    view = View(name="a", pixels=corners)
+    seen = Observations(board=Board(columns=2, rows=2, square=0.1), image_size=(10, 9), views=(view,))
+    pixels = torch.zeros(9, 10, dtype=torch.bool)
+    pixels[3:7, 3:7] = True
+    assert torch.equal(reached(seen, 10, 9), pixels)
+    # Middles at 0.5, 2.5, 4.5, 6.5, 8.5, and at 1, 4, 7.
+    parts = torch.zeros(3, 5, dtype=torch.bool)
+    parts[1, 2] = True
+    assert torch.equal(reached(seen, 5, 3), parts)

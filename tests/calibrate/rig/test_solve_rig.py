@@ -26,8 +26,9 @@ from rig_scenes import (
 )
 from torch import Tensor
 
-from kcal.calibrate.rig import limits
+from kcal.calibrate.rig import limits, solve
 from kcal.calibrate.rig.blocks import BoardBlock, FeatureBlock, LandmarkBlock, PosedCamera, RigState
+from kcal.calibrate.rig.prior_information import joint_unknowns
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem
 from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
 from kcal.calibrate.rig.result import RigResult
@@ -37,6 +38,7 @@ from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
+from kcal.lens.information import CameraInformation
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.solve.result import SolverStatus
 
@@ -365,6 +367,51 @@ class TestIntrinsics:
         # Uncertain lenses are an uncertain yaw.
         yaw = [float(found.relative_covariance()[1, 1]) for found in (held, prior, free)]
         assert yaw[0] / held.variance < yaw[1] / prior.variance < yaw[2] / free.variance
+
+    def test_lenses_are_prepared_once_for_the_same_calibrations(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Whoever marks landmarks solves one rig again and again."""
+        prepared: list[int] = []
+
+        def counted(*arguments: object, **options: object) -> object:
+            prepared.append(1)
+            return joint_unknowns(*arguments, **options)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(solve, "joint_unknowns", counted)
+        spread = torch.diag(torch.cat([torch.full((4,), 0.3), torch.zeros(6)]).double() ** 2)
+        cameras = [camera.with_parameters(camera.params) for camera in CAMERAS[:2]]
+        for camera in cameras:
+            camera.calibration = CameraCalibration(information=CameraInformation.from_covariance(camera.params, spread))
+        sources = dataclasses.replace(data(landmarks=landmarks(count=20, noise=0.1)), cameras=tuple(cameras))
+        first = solve_rig(sources)
+        again = solve_rig(sources)
+        assert len(prepared) == 1
+        assert again.chi2 == first.chi2
+        torch.testing.assert_close(again.joint_covariance(), first.joint_covariance(), rtol=0, atol=0)
+        # Another calibration of the same camera is another rig.
+        doubled = CameraInformation.from_covariance(cameras[0].params, 4.0 * spread)
+        cameras[0].calibration = CameraCalibration(information=doubled)
+        wider = solve_rig(sources)
+        assert len(prepared) == 2
+        assert float(wider.joint_covariance()[0, 0]) > 1.1 * float(first.joint_covariance()[0, 0])
+
+    def test_marks_with_sigmas_of_their_own(self) -> None:
+        """A bad mark that says so does no harm, and equal sigmas are one number."""
+        known = landmarks(count=12, noise=0.1)
+        one = solve_rig(data(landmarks=dataclasses.replace(known, pixel_sigma=0.1)))
+        each = torch.full(known.pixels.shape[:2], 0.1, dtype=torch.float64)
+        same = solve_rig(data(landmarks=dataclasses.replace(known, pixel_sigma=each)))
+        torch.testing.assert_close(same.relative_covariance(), one.relative_covariance(), rtol=1e-9, atol=0)
+        pixels = known.pixels.clone()
+        pixels[3, 1] += 3.0
+        each[3, 1] = 3.0
+        found = solve_rig(data(landmarks=dataclasses.replace(known, pixels=pixels, pixel_sigma=each)))
+        assert found.left_out == ()
+        assert off(found) < 4
+        with pytest.raises(InputError, match="one for each mark"):
+            dataclasses.replace(known, pixel_sigma=each[:3])
+        each[2, 0] = 0.0
+        with pytest.raises(InputError, match="wherever there is a mark"):
+            dataclasses.replace(known, pixel_sigma=each)
 
     def test_a_camera_of_which_nothing_is_known_is_held_and_named(self) -> None:
         found = solve_rig(data(landmarks=landmarks()))

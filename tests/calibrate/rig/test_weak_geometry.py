@@ -13,7 +13,7 @@ from torch import Tensor
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.sources import Landmarks, MeasuredPosition, RigData
-from kcal.calibrate.rig.weak_geometry import OpenPlace, _targets, open_place
+from kcal.calibrate.rig.weak_geometry import OpenPlace, _first_order, _targets, open_place
 from kcal.errors import DegenerateError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
@@ -155,3 +155,20 @@ class TestOrdinary:
             # The variance by the marks is that at infinity.
             torch.testing.assert_close((targets.own + by_rig).sqrt()[good], wanted, rtol=0.03, atol=0.0)
             assert math.isfinite(float(wanted.max()))
+
+
+def test_first_order_is_the_slope() -> None:
+    """Of the inverse range at which a target is found from a place that is not known to have moved."""
+    random = generator(1)
+    rays = torch.nn.functional.normalize(torch.randn(5, 3, generator=random, dtype=torch.float64) + tensor(0, 0, 3))
+    true, center = torch.tensor([0.1, 0.01]).double()[:, None, None], tensor(-10.0, 0.3, 0.5)
+    moved = 0.1 * torch.randn(4, 3, generator=random, dtype=torch.float64)
+
+    def seen_from(moved: Tensor) -> Tensor:
+        sight = torch.nn.functional.normalize(rays - true[..., None] * (center + moved)[:, None], dim=-1)
+        base = center - (sight @ center)[..., None] * sight
+        return (base * rays).sum(-1) / base.square().sum(-1)
+
+    step = 1e-5
+    slope = (seen_from(step * moved) - seen_from(-step * moved)) / (2 * step)
+    torch.testing.assert_close(_first_order(rays, true, center, moved), slope, rtol=1e-6, atol=1e-12)

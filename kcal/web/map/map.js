@@ -1,0 +1,144 @@
+"use strict";
+// What every map draws alike: names of dots, and cameras with their fields of view.
+
+// Names beside the dots of a Leaflet map: none covers another name, a dot or a control. A name that finds no room waits
+// until the map is zoomed in, or until its dot is pointed at or reached with the Tab key.
+function mapLabels(map) {
+  const CELL = 4, MOST = 300; // px of a cell of what is taken; names at once
+  const dots = new Set(), labels = [];
+  let cells = new Uint8Array(0), columns = 0, rows = 0;
+
+  const each = (box, told) => {
+    for (let y = Math.max(0, Math.floor(box[1] / CELL)); y <= Math.min(rows - 1, Math.floor(box[3] / CELL)); y++) {
+      for (let x = Math.max(0, Math.floor(box[0] / CELL)); x <= Math.min(columns - 1, Math.floor(box[2] / CELL)); x++) {
+        if (told(y * columns + x)) return false;
+      }
+    }
+    return true;
+  };
+  const take = (box) => each(box, (cell) => { cells[cell] = 1; });
+  const free = (box, size) =>
+    box[0] >= 0 && box[1] >= 0 && box[2] <= size.x && box[3] <= size.y && each(box, (cell) => cells[cell]);
+
+  // The places around a dot in order, as offsets of the name's middle: right, left, above, below, and between.
+  const around = (reach, width, height) => {
+    const x = reach + width / 2, y = reach + height / 2, half = width / 2;
+    return [[x, 0], [-x, 0], [0, -y], [0, y], [half, -y], [half, y], [-half, -y], [-half, y]];
+  };
+  const radius = (shape) => shape.getRadius() + (shape.options.weight || 0) / 2;
+
+  const reachable = (label) => {
+    const element = label.shape.getElement();
+    if (!element || !label.shape.options.interactive) return;
+    element.setAttribute("tabindex", "0");
+    element.setAttribute("role", label.shape.getPopup() ? "button" : "img");
+    element.setAttribute("aria-label", label.text);
+  };
+  const asked = (label, on) => {
+    label.asked = on;
+    const element = label.shape.getTooltip() && label.shape.getTooltip().getElement();
+    if (!element) return;
+    element.classList.toggle("asked", on);
+    element.style.visibility = on || label.room ? "" : "hidden";
+  };
+
+  // A dot that names stay clear of.
+  function avoid(shape) { dots.add(shape); return shape; }
+
+  // A dot with its name. Names of lower rank are placed first; `at` is the place around the dot that is tried first.
+  function add(shape, text, rank, at = 0) {
+    const label = {shape, text: null, rank, at, room: true, asked: false, words: document.createElement("span")};
+    if (shape.getRadius() > 0) avoid(shape);
+    shape.bindTooltip(label.words, {permanent: true, direction: "center", className: "name", opacity: 1});
+    shape.on("add", () => reachable(label));
+    shape.on("mouseover", () => asked(label, true)).on("mouseout", () => asked(label, false));
+    const focus = (event) => asked(label, event.type === "focus");
+    shape.on("add", () => {
+      const element = shape.getElement();
+      if (!element) return;
+      element.addEventListener("focus", focus);
+      element.addEventListener("blur", focus);
+    });
+    let before = labels.length;
+    while (before > 0 && labels[before - 1].rank > rank) before--;
+    labels.splice(before, 0, label);
+    rename(label, text);
+    return label;
+  }
+
+  function rename(label, text) {
+    if (label.text === text) return;
+    label.text = text;
+    label.words.textContent = text;
+    label.size = null;
+    reachable(label);
+  }
+
+  function remove(label) {
+    dots.delete(label.shape);
+    labels.splice(labels.indexOf(label), 1);
+    label.shape.remove();
+  }
+
+  function place() {
+    const size = map.getSize(), ground = map.getContainer().getBoundingClientRect();
+    columns = Math.ceil(size.x / CELL) + 1;
+    rows = Math.ceil(size.y / CELL) + 1;
+    cells = new Uint8Array(columns * rows);
+    for (const control of map.getContainer().querySelectorAll(".leaflet-control")) {
+      const box = control.getBoundingClientRect();
+      take([box.left - ground.left, box.top - ground.top, box.right - ground.left, box.bottom - ground.top]);
+    }
+    for (const shape of dots) {
+      if (!map.hasLayer(shape)) continue;
+      const {x, y} = map.latLngToContainerPoint(shape.getLatLng()), r = radius(shape);
+      take([x - r, y - r, x + r, y + r]);
+    }
+    const elements = labels.map((label) => (map.hasLayer(label.shape) ? label.shape.getTooltip().getElement() : null));
+    // All that is read first, then all that is written: the browser lays the page out once.
+    labels.forEach((label, i) => {
+      const element = elements[i];
+      if (element && !label.size && element.style.display !== "none") label.size = [element.offsetWidth, element.offsetHeight];
+    });
+    let named = 0;
+    labels.forEach((label, i) => {
+      const element = elements[i];
+      if (!element || element.style.display === "none") return;
+      const spot = map.latLngToContainerPoint(label.shape.getLatLng()), [width, height] = label.size;
+      const offsets = around(radius(label.shape) + CELL + 1, width, height);
+      const box = ([x, y]) => [spot.x + x - width / 2, spot.y + y - height / 2, spot.x + x + width / 2, spot.y + y + height / 2];
+      // Where it was before, if there still is room: names do not jump.
+      const order = [label.at, ...offsets.keys()];
+      const found = named < MOST ? order.find((k) => free(box(offsets[k]), size)) : undefined;
+      label.room = found !== undefined;
+      if (label.room) { named++; label.at = found; take(box(offsets[found])); }
+      const tooltip = label.shape.getTooltip(), [x, y] = offsets[label.at];
+      tooltip.options.offset = L.point(x, y);
+      tooltip.update();
+      element.style.visibility = label.room || label.asked ? "" : "hidden";
+    });
+  }
+
+  let waiting = false;
+  map.on("zoomend moveend resize layeradd layerremove", () => {
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(() => { waiting = false; place(); });
+  });
+  return {add, avoid, rename, remove, place};
+}
+
+// The cameras, and the part of the ground that each sees, where that is known.
+function drawCameras(cameras, labels, fields, dots) {
+  const colors = ["#2b6cb0", "#dd7a1f"]; // those of kcal.report.figures
+  cameras.forEach((camera, i) => {
+    const color = colors[i % colors.length], others = cameras.filter((other) => other !== camera);
+    if (camera.field) {
+      L.polygon(camera.field, {color, weight: 1, opacity: 0.7, fillOpacity: 0.06, smoothFactor: 0.2, interactive: false}).addTo(fields);
+    }
+    const dot = L.circleMarker(camera.place, {radius: 6, color: "#fff", weight: 1.5, fillColor: color, fillOpacity: 1});
+    // Cameras are close to each other: their names go outward.
+    labels.add(dot, camera.name, 1, others.some((other) => other.place[1] > camera.place[1]) ? 1 : 0);
+    dot.addTo(dots);
+  });
+}

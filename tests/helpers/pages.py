@@ -1,0 +1,189 @@
+"""Every page that kcal serves or writes, with something on it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from calibrate_scenes import BOARD, camera, motions
+from capture_frames import BOARD as PHOTOGRAPHED
+from capture_frames import images
+from locate_rigs import pinhole_rig
+from starlette.applications import Starlette
+from track_scenes import pairs_of, tracked_site
+from typer.testing import CliRunner
+
+from kcal.capture.server import capture_app
+from kcal.capture.session import CaptureSession
+from kcal.cli.main import app
+from kcal.corners.observations import Observations, View
+from kcal.io.images import write_png
+from kcal.lens.mounting import Origin
+from kcal.locate.positions import locate_points, located_by
+from kcal.locate.tabulate import Locator
+from kcal.mark.items import Add, Mark, Put
+from kcal.mark.marking_service import Desk
+from kcal.mark.pictures import open_pictures
+from kcal.mark.server import marking_app
+from kcal.mark.session import Session
+from kcal.pipeline.live_map import LiveMap
+from kcal.pipeline.track_columns import track_columns
+from kcal.pipeline.tracks import Tracker, TrackOptions
+from kcal.report.map_page import save_map
+from kcal.report.summary import Part, save_summary
+from kcal.web.serving import LocalServer
+from scripts.shared.marking_scene import LANDMARKS, TARGETS, MarkingSite, marking_site
+
+ROOT = Path(__file__).parents[2]
+ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
+# What opens a page: the place to go to, and what must be true of the page before it is looked at.
+Opened = tuple[str, str]
+DRAWN = "() => document.documentElement.dataset.drawn"
+
+
+@contextmanager
+def served(make_app: Callable[[str, tuple[str, ...]], Starlette]) -> Iterator[str]:
+    """The address of an application while it is served by this process."""
+    server = LocalServer(make_app, 0, fallback=False)
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    yield server.address
+    server.stop()
+    thread.join(10.0)
+
+
+def write_site(folder: Path) -> tuple[MarkingSite, Path]:
+    """Both pictures of a site and its survey."""
+    site = marking_site(seed=0)
+    for side, image in zip(("left", "right"), site.images, strict=True):
+        write_png(folder / f"{side}.png", image)
+    survey = folder / "survey.csv"
+    survey.write_text(site.survey(0.02, np.random.default_rng(1)))
+    return site, survey
+
+
+@contextmanager
+def desk_of(folder: Path) -> Iterator[tuple[Desk, MarkingSite]]:
+    """A site to be marked, with its cameras and its survey."""
+    site, survey = write_site(folder)
+    pictures = open_pictures(folder / "left.png", folder / "right.png")
+    desk = Desk(pictures, Session(folder / "marks.csv", survey), (site.rig.left, site.rig.right))
+    yield desk, site
+    desk.close()
+
+
+@contextmanager
+def marking(folder: Path) -> Iterator[Opened]:
+    """The marking page after eight landmarks and two targets."""
+    with desk_of(folder) as (desk, site):
+        for point in (*LANDMARKS[:8], *TARGETS[:2]):
+            if point in TARGETS:
+                desk.session.do(Add(do="add", name=point.name, kind="target"), f"add {point.name}")
+            for side, (u, v) in zip(("left", "right"), site.pixels[point.name], strict=True):
+                mark = Mark(u=u, v=v, cov=(0.01, 0.0, 0.01), frame=desk.pictures.names[0])
+                put = Put(do="put", name=point.name, side=side, mark=mark)
+                desk.session.do(put, f"mark {point.name} {side}")
+        desk._wake.set()
+        with served(lambda token, hosts: marking_app(desk, token, hosts)) as address:
+            yield address, "() => window.kcal && document.documentElement.dataset.pending === 'false'"
+
+
+@contextmanager
+def capturing(folder: Path) -> Iterator[Opened]:
+    """The capture page after six views."""
+    session = CaptureSession(folder / "x.obs.json", PHOTOGRAPHED)
+    for i, image in enumerate(images()):
+        session.offer(image, f"{i}.png", moving=False)
+    session.think()
+    stop = threading.Event()
+    with served(lambda token, hosts: capture_app(session, stop, token, hosts)) as address:
+        yield address, f"() => document.documentElement.dataset.views === '{session.views}'"
+
+
+@contextmanager
+def crowded_map(targets: int) -> Iterator[LiveMap]:
+    """A live map of targets at 100 m to 3 km, many of them side by side."""
+    site = tracked_site(0.01)
+    page = LiveMap(located_by(Locator(site.rig, origin=site.origin, heading_deg=0.0)), 0)
+    reach = 100.0 * 30.0 ** torch.linspace(0, 1, targets).double()
+    side = 0.3 * reach * torch.sin(2.4 * torch.arange(targets).double())
+    left, right, _ = site.rig(torch.stack([side, 0 * side, reach], -1))
+    page.show(track_columns(Tracker(site, TrackOptions(confirm_hits=1))(pairs_of(left, right, 1.0, 0.05)), 1), 1)
+    yield page
+    page.close()
+
+
+@contextmanager
+def live(folder: Path) -> Iterator[Opened]:
+    """The live map with 20 targets."""
+    with crowded_map(20) as page:
+        yield page.address, "() => document.documentElement.dataset.sequence === '1'"
+
+
+@contextmanager
+def verdict(folder: Path) -> Iterator[Opened]:
+    """`kcal report` on a camera with its views."""
+    truth = camera("opencv5")
+    rotation, translation = motions(truth, 14, 3)
+    pixels, _ = truth.project(BOARD.points @ rotation.transpose(-1, -2) + translation[:, None])
+    pixels = pixels + 0.05 * torch.randn(pixels.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    views = [View(name=f"{i:02}", pixels=[tuple(p) for p in view]) for i, view in enumerate(pixels.tolist())]
+    Observations(board=BOARD, image_size=(640, 480), views=tuple(views)).save(folder / "left.obs.json")
+    known, seen = folder / "left.camera.json", folder / "left.obs.json"
+    run = CliRunner().invoke
+    run(app, ["calibrate", str(seen), "-o", str(known), "--model", "opencv5"], catch_exceptions=False)
+    asked = ["--require", "50m:10%,1km:5%", "-o", str(folder / "page.html")]
+    run(app, ["report", str(known), "--observations", str(seen), *asked], catch_exceptions=False)
+    yield (folder / "page.html").as_uri(), "() => true"
+
+
+@contextmanager
+def written_map(folder: Path) -> Iterator[Opened]:
+    """The map of `kcal locate`, with true positions."""
+    truth = torch.tensor([[20, 0, 100], [26, 0, 104], [-300, 5, 1000], [900, 0, 5000]]).double()
+    rig = pinhole_rig()
+    left, right, _ = rig(truth)
+    located = locate_points(
+        rig, left, right + torch.tensor([0.6, 0.0]), origin=ORIGIN, heading_deg=0.0,
+        names=["gate", "a second gate beside it", "mast", "ship"],
+    )  # fmt: skip
+    yield save_map(folder / "map.html", located, truth[:, [0, 2, 1]] * torch.tensor([1, 1, -1])).as_uri(), DRAWN
+
+
+@contextmanager
+def summary(folder: Path) -> Iterator[Opened]:
+    """The page of `kcal demo`: a part of every kind."""
+    picture = write_png(folder / "a.png", np.full((400, 600), 128, np.uint8))
+    table = (("name", *(f"column {i}" for i in range(9))), *((f"row {i}", *("12.3 m",) * 9) for i in range(3)))
+    parts = [
+        Part(heading="Calibration", text=("What was done.",), table=table, pictures=((picture, "Coverage"),)),
+        Part(heading="Again", code="kcal locate rig.json points.csv -o again.geojson --picture map.png " * 3),
+    ]
+    yield save_summary(folder / "s.html", "kcal demo", "A simulated site.", parts).as_uri(), "() => true"
+
+
+PAGES: dict[str, Callable[[Path], AbstractContextManager[Opened]]] = {
+    "mark": marking, "capture": capturing, "live": live, "verdict": verdict, "map": written_map, "summary": summary,
+}  # fmt: skip
+
+
+def build_site(folder: Path) -> Path:
+    """The documentation's site, as `make docs` does it."""
+    words = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "-d", str(folder)]
+    subprocess.run(words, cwd=ROOT, check=True, capture_output=True)
+    return folder
+
+
+def wait_for(true: Callable[[], bool], seconds: float = 20.0) -> None:
+    """Wait until something is true."""
+    until = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < until, "waited in vain"
+        time.sleep(0.05)

@@ -1,0 +1,142 @@
+"""The marking page in a real browser: windows on the same marks, clicks beside the picture, what is said and when."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from browser import chromium_page, needs_browser, violations
+
+pytest.importorskip("uvicorn", reason="the extra `mark` is not installed")
+from marking_browser import choose, click_at, look_at, settled
+from pages import desk_of, served
+
+from kcal.errors import FileError
+from kcal.mark.items import Mark, Put
+from kcal.mark.marking_service import Desk
+from kcal.mark.server import marking_app
+from scripts.shared.marking_scene import LANDMARKS, MarkingSite
+
+pytestmark = needs_browser
+STATUS = "document.getElementById('status').textContent"
+NO_POSE = "no relative pose yet"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Desk, MarkingSite, str]]:
+    folder = tmp_path_factory.mktemp("site")
+    with desk_of(folder) as (desk, scene), served(lambda token, hosts: marking_app(desk, token, hosts)) as address:
+        yield desk, scene, address
+
+
+def opened(page: Any, address: str) -> None:
+    page.goto(address)
+    settled(page)
+
+
+def mark(page: Any, scene: MarkingSite, name: str, *sides: int) -> None:
+    choose(page, name)
+    for number in sides:
+        side = ("left", "right")[number]
+        u, v = map(float, scene.pixels[name][number])
+        look_at(page, side, u, v)
+        click_at(page, side, u, v)
+        page.wait_for_function("([name, side]) => kcal.item(name)[side]", arg=[name, side])
+
+
+def test_windows_on_the_same_marks_follow_each_other(site: tuple[Desk, MarkingSite, str]) -> None:
+    _, scene, address = site
+    with chromium_page() as first:
+        opened(first, address)
+        second = first.context.new_page()
+        opened(second, address)
+        mark(first, scene, "post 1", 0)
+        second.wait_for_function("() => kcal.item('post 1').left", timeout=5_000)
+        assert second.evaluate(STATUS) == "another window changed the marks"
+        second.evaluate("kcal.act({do: 'undo'})")
+        first.wait_for_function("() => !kcal.item('post 1').left", timeout=5_000)
+        # Neither takes from the other what it has not sent yet.
+        first.evaluate("kcal.actions.sending = true; kcal.act({do: 'add', name: 'one', kind: 'target'}); 0")
+        second.evaluate("kcal.actions.sending = true; kcal.act({do: 'add', name: 'two', kind: 'target'}); 0")
+        first.close()
+        second.reload()
+        settled(second)
+        second.wait_for_function("() => kcal.item('one') && kcal.item('two')", timeout=5_000)
+        for name in ("one", "two"):
+            second.evaluate("name => kcal.act({do: 'drop', name})", name)
+        settled(second)
+
+
+def test_a_click_beside_the_picture_marks_nothing(site: tuple[Desk, MarkingSite, str]) -> None:
+    desk, _, address = site
+    with chromium_page() as page:
+        opened(page, address)
+        choose(page, "post 2")
+        look_at(page, "left", 0, 0, 6.0)
+        before = desk.session.version
+        click_at(page, "left", -8.0, 5.0)
+        page.wait_for_function(f"() => {STATUS}.includes('outside the picture')")
+        page.wait_for_timeout(300)
+        assert desk.session.version == before
+        # A drag beyond the border springs back.
+        page.evaluate("kcal.place('left', 2, 2, false)")
+        page.wait_for_function("() => kcal.item('post 2').left")
+        page.evaluate("kcal.drag('left', kcal.item().left, -30, 0); kcal.drop()")
+        settled(page)
+        assert page.evaluate("kcal.item('post 2').left.u") == 2
+        page.evaluate("kcal.act({do: 'take', name: 'post 2', side: 'left'})")
+        settled(page)
+
+
+def test_a_refusal_ends_with_its_reason(site: tuple[Desk, MarkingSite, str]) -> None:
+    """Without a rig there is no proposal; the fourth landmark gives one, and the fifth begins without that sentence."""
+    _, scene, address = site
+    with chromium_page() as page:
+        opened(page, address)
+        for point in LANDMARKS[:3]:
+            mark(page, scene, point.name, 0, 1)
+        choose(page, LANDMARKS[3].name)
+        mark(page, scene, LANDMARKS[3].name, 0)
+        page.wait_for_function(f"() => {STATUS}.includes('{NO_POSE}')")
+        mark(page, scene, LANDMARKS[3].name, 1)
+        page.wait_for_function("() => kcal.rig.known", timeout=30_000)
+        settled(page)
+        assert NO_POSE not in page.evaluate(STATUS)
+        choose(page, LANDMARKS[4].name)
+        assert NO_POSE not in page.evaluate(STATUS)
+        mark(page, scene, LANDMARKS[4].name, 0)
+        page.wait_for_function("() => document.documentElement.dataset.proposal === 'there'")
+        assert page.is_visible("#accept")
+        page.click("#accept")
+        page.wait_for_function("name => kcal.item(name).right", arg=LANDMARKS[4].name)
+        assert not page.is_visible("#accept")
+
+
+def test_a_full_disk_is_on_the_page(site: tuple[Desk, MarkingSite, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mark waits on the page and is sent again; tables that could not be written are told in words."""
+    desk, _, address = site
+
+    def full(*_: object) -> None:
+        raise FileError("marks.log: cannot write: the disk is full; this was not done") from OSError(28, "no space")
+
+    with chromium_page() as page:
+        opened(page, address)
+        choose(page, "post 9")
+        with monkeypatch.context() as patched:
+            patched.setattr(desk.session._journal, "do", full)
+            page.evaluate("kcal.place('left', 100, 100, false); 0")
+            page.wait_for_function(f"() => {STATUS}.includes('the disk is full') && {STATUS}.includes('1 unsent')")
+            assert page.evaluate("kcal.item('post 9').left") is None
+        page.wait_for_function("() => kcal.item('post 9').left", timeout=10_000)
+        assert page.evaluate(STATUS) == ""
+        with monkeypatch.context() as patched:
+            patched.setattr("kcal.mark.session.write_atomic", full)
+            page.evaluate("kcal.place('right', 100, 100, false); 0")
+            page.wait_for_function("() => !document.getElementById('trouble').hidden")
+            assert "Nothing is lost" in page.inner_text("#trouble")
+            assert violations(page) == []
+        page.evaluate("kcal.act({do: 'undo'})")
+        page.wait_for_function("() => document.getElementById('trouble').hidden")
+    mark = Mark(u=1.0, v=1.0, cov=(0.01, 0.0, 0.01), frame=desk.pictures.names[0])
+    desk.act(Put(do="put", name="post 9", side="left", mark=mark), "key-at-the-end")
