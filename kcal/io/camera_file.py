@@ -108,15 +108,6 @@ class CameraFile(NativeFile):
     calibration: CalibrationRecord | None = None
     summary: CameraSummary | None = None
 
-    @pydantic.field_validator("summary", mode="wrap")
-    @classmethod
-    def _summary_or_none(cls, value: Any, handler: pydantic.ValidatorFunctionWrapHandler) -> Any:
-        """What is derived stops nothing: the summary of another version is left out."""
-        try:
-            return handler(value)
-        except pydantic.ValidationError:
-            return None
-
     @pydantic.field_validator("coefficients", "standard_deviations")
     @classmethod
     def _named(cls, value: dict[str, Any] | None, info: pydantic.ValidationInfo) -> dict[str, Any] | None:

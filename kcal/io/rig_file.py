@@ -11,7 +11,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import pydantic
 import torch
@@ -166,15 +166,6 @@ class RigFile(NativeFile):
     mounting: RigMounting | None = None
     calibration: RigCalibration | None = None
     summary: RigSummary | None = None
-
-    @pydantic.field_validator("summary", mode="wrap")
-    @classmethod
-    def _rig_summary_or_none(cls, value: Any, handler: pydantic.ValidatorFunctionWrapHandler) -> Any:
-        """What is derived stops nothing: the summary of another version is left out."""
-        try:
-            return handler(value)
-        except pydantic.ValidationError:
-            return None
 
     @pydantic.model_validator(mode="after")
     def _measured(self) -> RigFile:
