@@ -41,6 +41,8 @@ def main() -> None:
         kcal("demo", "-o", folder)
         for source, target in FROM_DEMO.items():
             shutil.copyfile(Path(folder, source), ASSETS / target)
+        kcal("demo", "--practice", str(Path(folder, "practice")))
+        shutil.copyfile(Path(folder, "practice", "site", "sketch.png"), ASSETS / "practice-site.png")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from kcal.cli.demo_pairs import real_pairs
+from kcal.cli.demo_practice import practice_site
+from kcal.cli.demo_score import practice_score
 from kcal.cli.demo_site import simulated_site
 from kcal.files import make_folder
 
@@ -18,6 +20,14 @@ def demo_command(
     ] = Path("kcal-demo"),
     # The draw in which the noise of the targets' marks is nearest to what is said of it, by its RMS.
     seed: Annotated[int, typer.Option(help="Seed of the simulated site's poses, noise and marks.", min=0)] = 1,
+    practice: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Render a site to practise on into a folder; results are then yours."),
+    ] = None,
+    score: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Compare your results on a practice site with its truth, in meters."),
+    ] = None,
     images: Annotated[
         Path | None, typer.Option(help="Folder of real pairs: left01.jpg with right01.jpg, or left/ and right/.")
     ] = None,
@@ -45,12 +55,29 @@ def demo_command(
     `kcal calibrate`, `kcal rig`, `kcal locate` and `kcal report` as yours would; the truth is used for the comparison
     only. `summary.html` says what was done and what came out.
 
+    With `--practice` the pictures of another site are left to you: two masts' cameras with landmarks to mark, targets
+    out to 5 km, boards, and a film with ships. `README.txt` there has the commands. `--score` reads your
+    `left.camera.json`, `right.camera.json`, `rig.json`, `positions.geojson` (or `.csv`) and `tracks.csv` (or
+    `.geojsonl`) in that folder, and says how far each is from the truth. Files that are there are never written over.
+
     **Examples**
 
     `kcal demo`
 
+    `kcal demo --practice practice`
+
+    `kcal demo --score practice`
+
     `kcal demo --images calibration/ --board 9x6 --square 25mm -o results`
     """
+    if sum(each is not None for each in (practice, score, images)) > 1:
+        raise typer.BadParameter("--practice, --score and --images exclude each other")
+    if practice is not None:
+        practice_site(practice, seed)
+        return
+    if score is not None:
+        practice_score(score)
+        return
     make_folder(output)
     if images is None:
         simulated_site(output, seed)

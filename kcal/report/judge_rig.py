@@ -176,6 +176,17 @@ def _doubts(rig: StereoRig, result: RigResult | None) -> list[Finding]:
                     part="relative pose",
                 )
             )
+        found += [
+            Finding(
+                name="contradiction",
+                severity="stop",
+                text=text,
+                action="measure again what contradicts, correct it or its sigma, and solve the rig again",
+                picture="rig",
+                part="relative pose",
+            )
+            for text in record.contradictions
+        ]
     if exact := _exact_lenses(rig, result):
         found.append(
             Finding(

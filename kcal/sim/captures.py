@@ -47,6 +47,7 @@ def drawn_lens(
     focal: float | None = None,
     focal_mm: float = 2.8,
     wander: float = 0.1,
+    scale: float = 1.0,
 ) -> TruthLens:
     """Draw a ray-traced lens with errors of assembly: a strength of 1 is ordinary, 3 poor, 0 perfect.
 
@@ -61,6 +62,7 @@ def drawn_lens(
         focal: in pixels; the prescription's own if left out.
         focal_mm: see `TruthLens`.
         wander: see `TruthLens`.
+        scale: of the image of 1920 x 1080 px, with the same lens and field of view; smaller for quick tests.
 
     Example:
         >>> lens = drawn_lens("machine-vision", 1.0, 7)
@@ -72,11 +74,13 @@ def drawn_lens(
     generator = torch.Generator().manual_seed(seed)
     misalignment = Misalignment.draw(PRESCRIPTIONS[name], strength, generator)
     tilt, shift = (strength * torch.randn((2, 2), dtype=torch.float64, generator=generator)).tolist()
+    size = round(1920 * scale), round(1080 * scale)
     return TruthLens(
         name,
-        focal=focal,
+        focal=scale * (PRESCRIPTIONS[name].focal if focal is None else focal),
+        size=size,
         focal_mm=focal_mm,
-        center=(959.5 + _AXIS * shift[0], 539.5 + _AXIS * shift[1]),
+        center=(0.5 * (size[0] - 1) + scale * _AXIS * shift[0], 0.5 * (size[1] - 1) + scale * _AXIS * shift[1]),
         misalignment=misalignment,
         sensor_tilt=(_SENSOR_TILT * tilt[0], _SENSOR_TILT * tilt[1]),
         wander=wander,

@@ -44,7 +44,9 @@ class TrueRig:
         return pixels_left, pixels_right, valid_left & valid_right
 
 
-def drawn_rig(lens: str, strength: float, seed: int, *, focal_mm: float = 2.8, wander: float = 0.1) -> TrueRig:
+def drawn_rig(
+    lens: str, strength: float, seed: int, *, focal_mm: float = 2.8, wander: float = 0.1, scale: float = 1.0
+) -> TrueRig:
     """Draw two cameras 10 m apart whose lenses have one design and separate errors of assembly.
 
     The right camera is toed in by 0.34 degrees, and turned by 0.17 degrees in pitch and 0.46 in roll.
@@ -55,6 +57,7 @@ def drawn_rig(lens: str, strength: float, seed: int, *, focal_mm: float = 2.8, w
         seed: of both draws.
         focal_mm: see `TruthLens`.
         wander: see `TruthLens`.
+        scale: of the image, see `kcal.sim.captures.drawn_lens`.
 
     Example:
         >>> rig = drawn_rig("surveillance", 1.0, 3)
@@ -63,7 +66,9 @@ def drawn_rig(lens: str, strength: float, seed: int, *, focal_mm: float = 2.8, w
     """
     rotation = rotation_from_vector(torch.tensor([0.003, 0.006, -0.008], dtype=torch.float64))
     center = torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64)
-    left, right = (drawn_lens(lens, strength, 2 * seed + side, focal_mm=focal_mm, wander=wander) for side in (0, 1))
+    left, right = (
+        drawn_lens(lens, strength, 2 * seed + side, focal_mm=focal_mm, wander=wander, scale=scale) for side in (0, 1)
+    )
     return TrueRig(
         left=left,
         right=right,

@@ -12,7 +12,7 @@ from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turn
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import StereoRig
-from kcal.locate.stereo import PositionStatus
+from kcal.locate.stereo import PositionStatus, fit_pairs
 from kcal.locate.triangulate import Triangulate
 
 RIG = real_rig()
@@ -240,3 +240,15 @@ def test_compiles_as_one_graph() -> None:
     compiled = torch.compile(triangulate, fullgraph=True, backend="eager")
     for a, b in zip(triangulate(left, right), compiled(left, right), strict=True):
         assert torch.allclose(a, b, rtol=1e-9)
+
+
+def test_ranges_do_not_hang_on_the_length_of_the_direction() -> None:
+    """A direction need not have length one: twice as long with twice the inverse it is the same point."""
+    points = spread_points(torch.logspace(1.8, 3.5, 12, dtype=torch.float64))
+    left, right, _ = RIG(points)
+    found = fit_pairs(RIG, left, right)
+    torch.testing.assert_close(1.0 / (found.fit.inverse / (found.scale * found.length)), points.norm(dim=-1))
+    longer = found._replace(
+        fit=found.fit._replace(direction=2.0 * found.fit.direction, inverse=2.0 * found.fit.inverse)
+    )
+    torch.testing.assert_close(longer.length, 2.0 * found.length, rtol=1e-14, atol=0)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import DegenerateError
-from kcal.solve.hessian import HessianSolve
+from kcal.solve.hessian import HessianSolve, implicit_step
 from kcal.solve.schur import SchurLinearization
 
 
@@ -74,3 +74,26 @@ def test_rows_of_the_shared_parameters_alone_count_once() -> None:
     lam = torch.full((), 0.1, dtype=torch.float64)
     for own, other in zip(found.step(lam)[0], expected.step(lam)[0], strict=True):
         torch.testing.assert_close(own, other, rtol=1e-11, atol=1e-12)
+
+
+def test_a_minimum_follows_its_data() -> None:
+    """Of dᵀx + ½ xᵀ M x, the minimum is -M⁻¹ d: so are its derivatives, sign and scale included."""
+    shared, views, local = 3, 2, 2
+    matrix, slope = quadratic(shared, views, local)
+
+    def cost(s: Tensor, own: Tensor, data: Tensor) -> Tensor:
+        x = torch.cat([s, own.flatten()])
+        return data @ x + 0.5 * x @ matrix @ x
+
+    zero = torch.zeros(shared, dtype=torch.float64), torch.zeros(views, local, dtype=torch.float64)
+    gram = torch.zeros(views, local + shared + 1, local + shared + 1, dtype=torch.float64)
+    for v in range(views):
+        which = torch.tensor([*range(shared + v * local, shared + (v + 1) * local), *range(shared)])
+        gram[v, :-1, :-1] = matrix[which[:, None], which]
+        gram[v, local:-1, local:-1] /= views
+    found = HessianSolve(lambda s, own: cost(s, own, slope), SchurLinearization.of_gram(gram, local), zero)
+    data = slope.clone().requires_grad_(True)
+    step = torch.cat([part.flatten() for part in implicit_step(cost, found, (data,))])
+    weight = torch.arange(1.0, len(slope) + 1, dtype=torch.float64)
+    (by_data,) = torch.autograd.grad(weight @ step, data)
+    torch.testing.assert_close(by_data, -torch.linalg.solve(matrix, weight), rtol=1e-9, atol=1e-9)

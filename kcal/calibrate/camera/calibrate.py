@@ -14,6 +14,7 @@ from kcal.calibrate.camera.parametric import calibrate_parametric
 from kcal.calibrate.camera.repeats import copied_views, copy_warnings, pose_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedView
 from kcal.calibrate.camera.sharing import ALONE, sharing
+from kcal.calibrate.camera.two_cameras import refuse_two_cameras
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError
 
@@ -51,7 +52,7 @@ def calibrate_camera(
     Raises:
         DegenerateError: fewer than three views or poses of the board, too few corners for the model, or views that do
             not determine the focal length (all parallel to the image, for example).
-        InputError: the data and the model do not fit at all.
+        InputError: the data and the model do not fit at all; views that are not of one camera, which are named.
 
     Example:
         >>> from kcal import Board, Camera, View
@@ -89,6 +90,7 @@ def calibrate_camera(
         progress(f"{len(nearly)} views are copies of others; again without them")
         copied = nearly
         result = _calibrate(_without_copies(observations, copied), options, progress)
+    refuse_two_cameras(result, options, progress)
     return _complete(result, observations, copied)
 
 

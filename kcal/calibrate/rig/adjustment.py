@@ -65,8 +65,10 @@ class Adjustment:
         loose = [data.absolute or c > 0 for c in range(len(data.cameras))]
         self._turning, self._moving = turning or loose, moving or loose
         self.anchor = start.center.mean(0)
-        self._terms: list[SharedTerm] = [DistanceTerm(b.first, b.second, b.length, b.sigma) for b in data.baselines]
-        self._terms += [PlaceTerm(p.camera, p.point, p.sigma) for p in data.positions]
+        self.terms: list[SharedTerm] = [DistanceTerm(b.first, b.second, b.length, b.sigma) for b in data.baselines]
+        self.terms += [PlaceTerm(p.camera, p.point, p.sigma) for p in data.positions]
+        # Of `terms`, those that are left out, by their indices.
+        self.without: frozenset[int] = frozenset()
         self.motion: list[BoardMotion | None] = [None] * len(data.cameras)
         direction, inverse_range = _feature_start(data, start, self.anchor)
         self.state = RigState(
@@ -89,7 +91,8 @@ class Adjustment:
         unknowns = nothing(cameras) if held else self.unknowns
         turning, moving = ([not held and one for one in each] for each in (self._turning, self._moving))
         blocks = self._blocks(masks, unknowns)
-        return RigProblem(cameras, blocks, () if held else self._terms, unknowns, turning, moving, loss)
+        terms = [] if held else [term for i, term in enumerate(self.terms) if i not in self.without]
+        return RigProblem(cameras, blocks, terms, unknowns, turning, moving, loss)
 
     def _blocks(self, masks: PerKind, unknowns: SharedUnknowns) -> list[Block]:
         """A block of each kind that has items in the masks."""
@@ -107,6 +110,14 @@ class Adjustment:
             known = data.features.inverse_range[masks.features], data.features.inverse_range_sigma[masks.features]
             found.append(FeatureBlock(*_weighted(data.features, masks.features), *known, self.anchor))
         return found
+
+    @property
+    def term_labels(self) -> list[str]:
+        """A name for each of `terms`."""
+        data = self.data
+        return [f"the baseline {data.names[b.first]} to {data.names[b.second]}" for b in data.baselines] + [
+            f"the position of {data.names[p.camera]}" for p in data.positions
+        ]
 
     def names(self, kind: Kind) -> tuple[str, ...]:
         """Names of all items of a kind."""
@@ -213,7 +224,7 @@ class Adjustment:
         else:
             problem = self.problem(masks)
             # Where there is nothing but boards, they determine the shared unknowns too.
-            alone = len(problem.blocks) == 1 and not self._terms
+            alone = len(problem.blocks) == 1 and not self.terms
             free = problem.shared_size - int(self.unknowns.known.sum())
             ratio = float(squares.sum()) / max(dof - alone * free, 1)
         if 0 < ratio < math.inf:

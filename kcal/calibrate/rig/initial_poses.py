@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcal.calibrate.problem.closed_form import spread_out
 from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS, Poses, check_cameras, consensus, half_turn, pose_alone
-from kcal.calibrate.rig.resection import consensus_pose, consensus_rotation, rotation_between
+from kcal.calibrate.rig.resection import consensus_pose, consensus_rotation, distinct_poses, rotation_between
 from kcal.calibrate.rig.sources import Boards, RigData
 from kcal.errors import DegenerateError
 from kcal.solve.lm import LMOptions
@@ -21,6 +21,8 @@ _FOREIGN_PX, _FOREIGN_TIMES = 10.0, 10.0
 # Weight of "cameras are held upright" where measured positions leave a turn open: enough to decide, without effect on
 # what the positions tell.
 _LEVEL = 1e-3
+# Landmarks that place a camera in up to four ways.
+_AMBIGUOUS = 3
 
 
 @dataclasses.dataclass(kw_only=True, eq=False)
@@ -89,10 +91,10 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
             if not any(_from_features(data, c, known, tried, placed=placed) for c in waiting):
                 raise DegenerateError(
                     f"nothing tells where {', '.join(data.names[c] for c in waiting)} stands: it needs boards seen "
-                    "together with another camera, three or better four landmarks, or features together with its "
+                    "together with another camera, four or better six landmarks, or features together with its "
                     "position or the baseline"
                 )
-        starts = _starts(known, tried)
+        starts = _in_all_places(data, _starts(known, tried))
         if data.absolute and not placed:
             for start in starts:
                 _into_frame(data, start)
@@ -197,6 +199,22 @@ def _starts(known: _Known, tried: list[int]) -> list[Start]:
             for start in starts
             for place in start.center[other] + length * axes
         ]
+    return starts
+
+
+def _in_all_places(data: RigData, starts: list[Start]) -> list[Start]:
+    """The starts, also with cameras that see three landmarks in all the places that these allow."""
+    marks = data.landmarks
+    for c, camera in enumerate(data.cameras if marks is not None else ()):
+        assert marks is not None
+        rays, valid = camera.unproject(marks.pixels[:, c])
+        if int(valid.sum()) != _AMBIGUOUS or _position(data, c) is not None:
+            continue
+        for start in list(starts):
+            for rotation, center in distinct_poses(rays[valid], marks.points[valid], start.center[c], _AMBIGUOUS):
+                turned, moved = start.rotation.clone(), start.center.clone()
+                turned[c], moved[c] = rotation, center
+                starts.append(dataclasses.replace(start, rotation=turned, center=moved))
     return starts
 
 

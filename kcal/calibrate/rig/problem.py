@@ -22,17 +22,35 @@ from kcal.solve.schur import SchurLinearization
 
 
 class SharedTerm(ABC):
-    """Residuals of the cameras alone, in units of their standard deviations."""
+    """Residuals of the cameras alone, in units of their standard deviations.
+
+    Attributes:
+        cameras: the indices of those that it is about.
+        count: of residuals.
+    """
+
+    cameras: tuple[int, ...]
+    count: int
 
     @abstractmethod
     def rows(self, cameras: Sequence[PosedCamera], shared_size: int) -> Tensor:
         """(S + 1, Q): derivatives of Q residuals by the shared unknowns, and last these."""
+
+    @abstractmethod
+    def against(self, off: Tensor, sigma: Tensor) -> str:
+        """What was stated, and what a solution without it says, in words.
+
+        Args:
+            off: (Q,) its residuals in that solution.
+            sigma: (Q,) their standard deviations there; both in units of the stated ones.
+        """
 
 
 class DistanceTerm(SharedTerm):
     """A measured distance between two centers."""
 
     def __init__(self, first: int, second: int, length: float, sigma: float) -> None:
+        self.cameras, self.count = (first, second), 1
         self._pair, self._length, self._sigma = (first, second), length, sigma
 
     def rows(self, cameras: Sequence[PosedCamera], shared_size: int) -> Tensor:
@@ -47,11 +65,20 @@ class DistanceTerm(SharedTerm):
         out[-1, 0] = (length - self._length) / self._sigma
         return out
 
+    def against(self, off: Tensor, sigma: Tensor) -> str:
+        """See `SharedTerm.against`."""
+        found, spread = self._length + self._sigma * float(off[0]), self._sigma * float(sigma[0])
+        return (
+            f"{self._length:.6g} ± {self._sigma:.2g} m was stated, and without it the cameras are {found:.6g} ± "
+            f"{spread:.2g} m apart"
+        )
+
 
 class PlaceTerm(SharedTerm):
     """A measured center, with a (3,) sigma along the axes."""
 
     def __init__(self, camera: int, point: Tensor, sigma: Tensor) -> None:
+        self.cameras, self.count = (camera,), 3
         self._camera, self._point, self._sigma = camera, point, sigma
 
     def rows(self, cameras: Sequence[PosedCamera], shared_size: int) -> Tensor:
@@ -62,6 +89,15 @@ class PlaceTerm(SharedTerm):
             out[posed.shift] = torch.diag(1.0 / self._sigma)
         out[-1] = (posed.center - self._point) / self._sigma
         return out
+
+    def against(self, off: Tensor, sigma: Tensor) -> str:
+        """See `SharedTerm.against`."""
+        away, spread = off * self._sigma, float((sigma * self._sigma).norm())
+        east, north, up = away.tolist()
+        return (
+            f"without it the camera stands {float(away.norm()):.3g} ± {spread:.2g} m from where it was measured "
+            f"({east:+.3g} m east, {north:+.3g} m north, {up:+.3g} m up)"
+        )
 
 
 class RigProblem:
@@ -90,7 +126,7 @@ class RigProblem:
         loss: RobustLoss | None = None,
     ) -> None:
         self.cameras, self.blocks, self.unknowns, self.loss = tuple(cameras), tuple(blocks), unknowns, loss
-        self._terms = tuple(terms)
+        self.terms = tuple(terms)
         # Of some marks, derivatives cost little more than the pixels themselves.
         self.joint = all(block.kind != "boards" for block in self.blocks)
         self.turn: list[slice | None] = []
@@ -118,14 +154,17 @@ class RigProblem:
         return [block.residuals(posed, state).square().sum(-1) for block in self.blocks]
 
     def term_rows(self, state: RigState) -> Tensor:
-        """(S + 1, Q) of what was measured of the cameras besides."""
+        """(S + 1, Q) of what was measured of the cameras besides, and of what is known of lenses, board and air."""
         posed = self.posed(state)
-        rows = [term.rows(posed, self.shared_size) for term in self._terms]
+        return torch.cat([self.prior_rows(state), *(term.rows(posed, self.shared_size) for term in self.terms)], -1)
+
+    def prior_rows(self, state: RigState) -> Tensor:
+        """(S + 1, Q) of what is known beforehand of lenses, board and air."""
         known = self.unknowns.known.nonzero()[:, 0]
         prior = state.center.new_zeros((self.shared_size + 1, len(known)))
         prior[known, range(len(known))] = 1.0
         prior[-1] = state.unknown[known] if len(known) else 0.0
-        return torch.cat([prior, *rows], -1)
+        return prior
 
     def cost(self, state: State) -> Tensor:
         """See `Problem.cost`."""
@@ -151,12 +190,8 @@ class RigProblem:
         g_iᵀ (N - N_i)⁻¹ g_i of the others'; for a single residual that is its squared external Studentized value
         (Baarda 1968; Cook and Weisberg 1982).
         """
-        (gram, _), L = self._gram(state), LOCAL_SIZE
-        scale = gram[:, :L, :L].diagonal(dim1=-2, dim2=-1).rsqrt()
-        factor, _ = torch.linalg.cholesky_ex(gram[:, :L, :L] * scale[:, :, None] * scale[:, None, :])
-        coupling = gram[:, :L, L:] * scale[:, :, None]
-        reduced = gram[:, L:, L:] - coupling.mT @ torch.cholesky_solve(coupling, factor)
-        terms = self.term_rows(state)
+        gram, _ = self._gram(state)
+        reduced, terms = _reduced(gram), self.term_rows(state)
         rest = (reduced.sum(0) + terms @ terms.T - reduced)[:, :-1, :-1]
         unit = rest.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
         roots, info = torch.linalg.cholesky_ex(rest * unit[:, :, None] * unit[:, None, :])
@@ -164,6 +199,11 @@ class RigProblem:
         # An item without which the rest would determine nothing cannot be tested.
         others = torch.where(info == 0, pull.square().sum((-2, -1)), 0.0)
         return list((gram[:, -1, -1] + others).split([len(block) for block in self.blocks]))
+
+    def block_grams(self, state: RigState) -> list[Tensor]:
+        """For each block (S + 1, S + 1) products of the rows of all its items, their own unknowns eliminated."""
+        gram, _ = self._gram(state)
+        return [part.sum(0) for part in _reduced(gram).split([len(block) for block in self.blocks])]
 
     def _gram(self, state: RigState) -> tuple[Tensor, list[Tensor]]:
         """(V, L + S + 1, L + S + 1) products of the rows of all items, with the loss's weights; and `item_squares`."""
@@ -230,3 +270,12 @@ class RigProblem:
         """The state with its cameras' rotations made orthonormal again after many small steps."""
         found = RigState(*state)
         return found._replace(rotation=nearest_rotation(found.rotation))
+
+
+def _reduced(gram: Tensor) -> Tensor:
+    """(V, S + 1, S + 1) products of rows (V, L + S + 1, L + S + 1) off what each item's own unknowns can do."""
+    L = LOCAL_SIZE
+    scale = gram[:, :L, :L].diagonal(dim1=-2, dim2=-1).rsqrt()
+    factor, _ = torch.linalg.cholesky_ex(gram[:, :L, :L] * scale[:, :, None] * scale[:, None, :])
+    coupling = gram[:, :L, L:] * scale[:, :, None]
+    return gram[:, L:, L:] - coupling.mT @ torch.cholesky_solve(coupling, factor)

@@ -18,6 +18,8 @@ from kcal.lens.pose import nearest_rotation
 _SAMPLES = 400
 # Radians: all rays that are farther off than this count alike.
 _GROSS = 5e-3
+# Centers that are farther apart, in distances of the points, are other places.
+_ELSEWHERE = 0.01
 
 
 def rotation_between(rays: Tensor, directions: Tensor) -> Tensor:
@@ -142,3 +144,31 @@ def consensus_pose(rays: Tensor, points: Tensor, near: Tensor | None = None) -> 
         if math.isfinite(float(scores[best])):
             found.append((rotations[best], centers[best], float(scores[best])))
     return min(found, key=lambda pose: pose[2]) if found else None
+
+
+def distinct_poses(
+    rays: Tensor, points: Tensor, known: Tensor, most: int, awry: float = math.inf
+) -> list[tuple[Tensor, Tensor]]:
+    """Poses, other than at a known center (3,), that three of the rays (M, 3) to points (M, 3) allow; the best first.
+
+    Args:
+        rays: unit, in the camera's frame.
+        points: meters.
+        known: (3,) center of the pose that is not wanted.
+        most: how many at most.
+        awry: radians that the others may be off at most, all together.
+    """
+    chosen = _samples(len(rays), 3)
+    rotations, centers = (value.flatten(0, 1) for value in poses_from_three(rays[chosen], points[chosen]))
+    scores = _score(rays, rotations, points - centers[:, None])
+    distance = float((points.mean(0) - known).norm())
+    found: list[tuple[Tensor, Tensor]] = []
+    for i in scores.argsort().tolist():
+        others = torch.stack([known, *(center for _, center in found)])
+        if not float(scores[i]) < awry**2 or math.isinf(float(scores[i])):
+            break
+        if float((others - centers[i]).norm(dim=-1).min()) > _ELSEWHERE * distance:
+            found.append((rotations[i], centers[i]))
+        if len(found) == most:
+            break
+    return found

@@ -104,6 +104,8 @@ class RigResult:
             ranges are not linear in errors of the baseline (`kcal.calibrate.rig.weak_geometry`); 1 if neither.
         sigma_corner: of a board's corner along an axis, px, as used; None without boards.
         undetermined: what the data leave open, in words; none of it concerns the cameras' relative poses.
+        contradictions: which source contradicts the others beyond reasonable doubt
+            (`kcal.calibrate.rig.contradictions`), a sentence each; such a rig should not be used.
         status: why the solver stopped.
         warnings: one sentence for each thing that the user should doubt.
     """
@@ -123,6 +125,7 @@ class RigResult:
     variance: float
     sigma_corner: float | None
     undetermined: tuple[str, ...]
+    contradictions: tuple[str, ...]
     status: SolverStatus
     warnings: tuple[str, ...]
     _problem: RigProblem
@@ -229,6 +232,7 @@ class RigResult:
                 for source in self.sources
             ),
             warnings=self.warnings,
+            contradictions=self.contradictions,
             baseline_m=float(rig.baseline),
             **self._provenance,
         )

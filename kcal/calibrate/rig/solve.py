@@ -14,12 +14,16 @@ from torch import Tensor
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.blocks import KINDS, PerKind
 from kcal.calibrate.rig.board_consensus import MINIMUM_CORNERS
+from kcal.calibrate.rig.contradictions import CERTAIN, contradictions
+from kcal.calibrate.rig.explanations import explained
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
 from kcal.calibrate.rig.mixups import cost_of_features_behind, refuse_same_camera, swap_warnings
 from kcal.calibrate.rig.motion import moved_warnings
-from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible, without_wrong
+from kcal.calibrate.rig.other_places import refuse_several
+from kcal.calibrate.rig.outliers import LOSS, ROUGHLY, possible
 from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
 from kcal.calibrate.rig.records import Reasons, item_records, places, source_records
+from kcal.calibrate.rig.redundancy import refuse_exact
 from kcal.calibrate.rig.repeated_views import without_repeated
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import RigData
@@ -94,9 +98,11 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
         options: see `RigOptions`.
 
     Raises:
-        InputError: data that contradict each other as a whole; cameras that are swapped or given twice.
+        InputError: data that contradict each other as a whole, or that have several explanations; a measured baseline
+            or position that contradicts the rest; cameras that are swapped or given twice.
         DegenerateError: a camera that nothing connects with the others, or relative poses that the data do not
-            determine; what could be anything is named.
+            determine, or determine exactly, so that nothing is left over to check them with, or that may as well be
+            others; what could be anything, and what is missing, is named.
 
     Example:
         >>> from kcal import Camera, Landmarks
@@ -130,7 +136,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
     # With lenses among the unknowns digits are dear, and what is wrong shows without them.
     looking = ROUGHLY if unknowns.refine_lenses else options.solver
     if options.reject:
-        masks = kept = without_wrong(work, masks, looking)
+        masks = kept = explained(work, masks, looking)
     else:
         masks = possible(work, masks)
         kept, doubts = _suspicions(work, masks, reasons, looking)
@@ -266,7 +272,7 @@ def _suspicions(work: Adjustment, masks: PerKind, reasons: Reasons, solver: LMOp
     """What agrees, and warnings that name what would be left out, were it not to be kept."""
     trial = copy.copy(work)
     try:
-        kept = without_wrong(trial, masks, solver)
+        kept = explained(trial, masks, solver)
     except InputError as error:
         return masks, [str(error)]
     named = {(kind, work.names(kind)[i]) for kind in KINDS for i in reasons[kind]}
@@ -311,6 +317,12 @@ def _rig_result(
                 "anything; add boards seen by both, surveyed landmarks, far features of known range, a measured "
                 "baseline or measured positions"
             )
+    refuse_exact(problem, data.names, fit.freedom)
+    refuse_several(work, masks)
+    against = contradictions(work, problem, state)
+    certain = [one for one in against if one.sigmas > CERTAIN]
+    if refuse and certain and certain[0].stated:
+        raise InputError(certain[0].text)
     widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
     if widen > 1.0:
         covariance = SharedCovariance(problem, state, widen**2 * fit.variance)
@@ -322,8 +334,7 @@ def _rig_result(
     if fit.variance > 1.0:
         times = math.sqrt(fit.variance)
         warnings.append(f"residuals are {times:.1f} times as large as their sigmas say; the covariance was widened")
-    if fit.freedom <= 0:
-        warnings.append("nothing is left over to check the solution with: a wrong measurement could not be noticed")
+    warnings += [one.text for one in against]
     only_boards = len(problem.blocks) == 1 and problem.blocks[0].kind == "boards"
     if only_boards and (count := int(masks.boards.sum())) < _FEW_BOARDS:
         warnings.append(f"{count} pair(s) only: a wrong one could not be noticed; 5 or more are good")
@@ -365,6 +376,7 @@ def _rig_result(
         variance=widen**2 * fit.variance,
         sigma_corner=None if data.boards is None else work.sigma_corner,
         undetermined=undetermined,
+        contradictions=tuple(one.text for one in certain),
         status=status,
         warnings=tuple(warnings),
         _problem=problem,

@@ -20,6 +20,7 @@ from kcal.calibrate.camera.calibrate import (
     calibrate_cameras,
 )
 from kcal.calibrate.camera.options import OutlierRejection
+from kcal.calibrate.camera.sharing import sharing
 from kcal.calibrate.hybrid.board_orders import turned_corners
 from kcal.calibrate.rig.prior_information import gathered, joint_unknowns
 from kcal.cli.main import app
@@ -198,6 +199,26 @@ def test_one_type_is_refused_before_anything_is_calibrated(monkeypatch: pytest.M
     other = seen_by(2).model_copy(update={"image_size": (1280, 961)})
     with pytest.raises(InputError, match="images of one size"):
         calibrate_cameras([seen_by(1), other], one_type=True)
+
+
+def test_cameras_of_one_size_may_be_of_one_type() -> None:
+    bad = [seen_by(number).subset(["v00", "v01"]) for number in (1, 2)]
+    assert all(isinstance(one, DegenerateError) for one in calibrate_cameras(bad, one_type=True))
+
+
+def test_cameras_that_saw_other_boards_are_not_fitted_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is common to them: each stays as it is alone, and no time is spent."""
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("fitted together")
+
+    monkeypatch.setattr("kcal.calibrate.camera.sharing.fit_cameras", never)
+    found = [calibrate_camera(seen_by(number)) for number in (1, 2)]
+    other = Board(columns=BOARD.columns, rows=BOARD.rows, square=0.031)
+    found[1] = dataclasses.replace(found[1], observations=found[1].observations.model_copy(update={"board": other}))
+    assert sharing(found, CalibrationOptions()) == found
+    with pytest.raises(AssertionError, match="fitted together"):
+        sharing([found[0], found[0]], CalibrationOptions())
 
 
 def test_cameras_that_cannot_be_fitted_together_stay_as_they_are_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,8 +26,9 @@ from rig_scenes import (
 )
 from torch import Tensor
 
-from kcal.calibrate.rig import limits, solve
+from kcal.calibrate.rig import initial_poses, limits, solve
 from kcal.calibrate.rig.blocks import BoardBlock, FeatureBlock, LandmarkBlock, PosedCamera, RigState
+from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.prior_information import joint_unknowns
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem
 from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
@@ -310,9 +311,21 @@ class TestFrame:
         with pytest.raises(DegenerateError, match=r"how right stands from left: a mixture of .* and more could"):
             solve_rig(data(landmarks=landmarks(count=4, noise=0.1)), RigOptions(intrinsics="free"))
 
-    def test_three_landmarks_leave_nothing_to_check_with(self) -> None:
-        found = solve_rig(data(landmarks=landmarks(count=3, noise=0.1)))
-        assert any("nothing is left over to check" in text for text in found.warnings)
+    def test_cameras_in_measured_places_are_held_upright_alike_at_any_scale(self) -> None:
+        """Where measured positions do not quite fit, the level counts as much, however large a rig is."""
+        turns = []
+        for scale in (1.0, 1000.0):
+            known = scale * torch.tensor([[0.0, 0, 0], [9, 0, 1], [4, 3, 0]], dtype=torch.float64)
+            places = tuple(
+                MeasuredPosition(
+                    camera=c, point=known[c] @ ROTATION[0] + scale * normal((3,), c), sigma=torch.ones(3).double()
+                )
+                for c in range(3)
+            )
+            start = Start(rotation=rotation_from_vector(0.3 * normal((3, 3), 7)), center=known)
+            initial_poses._into_frame(data(3, positions=places), start)
+            turns.append(start.rotation)
+        torch.testing.assert_close(turns[0], turns[1], rtol=0, atol=1e-12)
 
 
 class TestHybrid:

@@ -1,0 +1,251 @@
+"""Find views that another camera took, or the same one at another zoom or with another crop, and refuse them.
+
+Two such groups differ in scale and principal point. Poses, and motions during the readout, hide most of that: the RMS
+of one camera for both is hardly larger than of two. So it is told by the evidence. Near the solution each view is a
+quadratic form in scale and principal point, its pose and motion eliminated; two groups are fitted to these as by
+k-means. Where they would explain a lot, the corners are moved by what parts the groups, so that one camera shows all
+of them, and this camera is fitted again: the groups are real if the logarithm of the evidence rises by more than the
+choice of a group for each view, and of three numbers, can bring by chance.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal.calibrate.camera.options import CalibrationOptions, Progress
+from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
+from kcal.calibrate.problem.board_problem import BoardProblem
+from kcal.calibrate.problem.state import BoardState
+from kcal.errors import DegenerateError, InputError
+from kcal.solve.schur import without_local
+
+# Views of the smaller group: two views of any camera find a scale and principal point that suit them.
+_FEWEST = 3
+# fx, fy, cx, cy among the parameters; groups differ in their common scale, and in cx and cy.
+_INDICES, _SIZE = (0, 1, 2, 3), 3
+# Standard deviations of ln scale and, in shares of the image's diagonal, of the principal point, by which the estimates
+# of single views are held together before they are grouped.
+_SPREAD, _SPREAD_CENTER = 0.1, 0.02
+# Nats beyond chance. Measured (scripts/check/faults.py): what groups of good captures bring stays 5 below chance.
+_BEYOND = 5.0
+# Share of the image's diagonal that corners must be apart: a lens that was touched moves by less.
+_APART = 0.002
+# Before the camera is fitted again the quadratic forms must promise this share: motions take up the rest.
+_PROMISED = 0.4
+# How far motions are held back where groups are looked for: with them as wide as found, they hide the groups.
+_HELD = 10.0
+_ROUNDS, _STEPS = 3, 30
+# Nats by which a view belongs to its group.
+_CLEAR = 3.0
+_FAILED = (InputError, DegenerateError, ArithmeticError, torch.linalg.LinAlgError)
+
+
+class _ByView(NamedTuple):
+    """χ² of each view by scale and principal point: c + 2 gᵀθ + θᵀNθ.
+
+    Attributes:
+        N: (V, 3, 3).
+        g: (V, 3).
+    """
+
+    N: Tensor
+    g: Tensor
+
+    def change(self, theta: Tensor) -> Tensor:
+        """(V,) of χ² by θ (3,), or by one for each view (V, 3)."""
+        each = theta.expand_as(self.g)
+        return (each * (2.0 * self.g + (self.N @ each[..., None])[..., 0])).sum(-1)
+
+    def best(self, second: Tensor) -> Tensor:
+        """(2, 3) the best θ of both groups; `second` (V,) tells which views are in the second one."""
+        groups = [(self.N[one].sum(0), self.g[one].sum(0)) for one in (~second, second)]
+        return torch.stack([-torch.linalg.lstsq(N, g[:, None]).solution[:, 0] for N, g in groups])
+
+    def fall(self, second: Tensor) -> float:
+        """By how much χ² falls with the best of both groups."""
+        return -float(self.change(self.best(second)[second.long()]).sum())
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TwoCameras:
+    """Views that are not of one camera.
+
+    Args:
+        second: (V,) which views are in the smaller group.
+        clear: (V,) nats by which each view belongs to its own group.
+        log_scale: of the second group's images from the first's.
+        shift: (2,) px of its principal point.
+        nats: by which two cameras are more likely than one, the choice of the groups paid for.
+    """
+
+    second: Tensor
+    clear: Tensor
+    log_scale: float
+    shift: Tensor
+    nats: float
+
+    def text(self, names: Sequence[str]) -> str:
+        """One sentence that names the views of the smaller group."""
+        own = [names[i] for i in self.second.nonzero()[:, 0].tolist()]
+        unclear = [names[i] for i in (self.clear < _CLEAR).nonzero()[:, 0].tolist()]
+        u, v = self.shift.tolist()
+        return (
+            f"the views are not of one camera, zoom and crop: {len(own)} of {len(names)} ({', '.join(own)}) show "
+            f"everything {100.0 * math.expm1(self.log_scale):+.1f} % larger than the others, with the principal point "
+            f"({u:+.0f}, {v:+.0f}) px from theirs (two cameras are likelier than one by {self.nats:.0f} nats"
+            + (f"; not clear for {', '.join(unclear)}" if unclear else "")
+            + "). Calibrate both groups separately, from images as the camera gives them"
+        )
+
+
+def refuse_two_cameras(result: CameraCalibrationResult, options: CalibrationOptions, progress: Progress) -> None:
+    """Raise `InputError` if the views of a result are not of one camera; the message names the smaller group."""
+    used = result.per_view_rms.isfinite().nonzero()[:, 0].tolist()
+    if len(used) < 2 * _FEWEST:
+        return
+    seen = result.observations
+    pixels = torch.where(result.residuals.isfinite(), seen.pixels(), torch.nan)[used]
+    if result.hybrid is not None:
+        fit = result.hybrid.only(used)
+    else:
+        # Views of a parametric lens have no motion: the reference lens tells whether it is that.
+        state = BoardState.flat(
+            result.camera.params.detach(),
+            result.cam_from_board_rotation[used],
+            result.cam_from_board_translation[used],
+        )
+        problem = BoardProblem(result.board_points, pixels, result.camera.model, _INDICES)
+        if _promising(_by_view(problem, state, result.noise**2), pixels, seen.image_size) is None:
+            return
+        try:
+            fit = fit_hybrid(seen.board.points, pixels, seen.image_size, board=options.board, motion=options.motion)
+        except _FAILED:
+            return
+    found = two_cameras(fit, seen.board.points, pixels, options, progress)
+    if found is not None:
+        raise InputError(found.text([seen.names[i] for i in used]))
+
+
+def two_cameras(
+    fit: HybridFit, points: Tensor, pixels: Tensor, options: CalibrationOptions, progress: Progress = lambda _: None
+) -> TwoCameras | None:
+    """Tell whether views are of two cameras; None if they are of one, or where nothing tells.
+
+    Args:
+        fit: of all of them as one camera.
+        points: (N, 3) the board as ordered, meters.
+        pixels: (V, N, 2), NaN where not seen.
+        options: with which it was fitted.
+        progress: called after each further fit.
+    """
+    found = _promising(_of_fit(fit, pixels), pixels, fit.size)
+    if found is None and fit.readout is not None:
+        return None
+    second = found if fit.readout is None else _grouped(_of_fit(fit, pixels, _HELD), fit.size)
+    if second is None:
+        return None
+    current, theta, needed = fit, _of_fit(fit, pixels).best(second), _chance(pixels) + _BEYOND
+    best: TwoCameras | None = None
+    for _ in range(_ROUNDS):
+        if not _FEWEST <= int(second.sum()) <= len(second) - _FEWEST:
+            break
+        undone = _undone(pixels, second, theta, fit.state.parameters[2:4])
+        try:
+            current = fit_hybrid(points, undone, fit.size, fit.weights, board=options.board, start=current)
+        except _FAILED:
+            break
+        progress("views as of two cameras")
+        views = _of_fit(current, undone)
+        change = theta[1] - theta[0]
+        # What a view would gain in the other group.
+        clear = 0.5 * views.change(torch.where(second[:, None], -change, change))
+        gain = current.log_evidence - fit.log_evidence - needed
+        if best is None or gain > best.nats:
+            best = TwoCameras(second=second, clear=clear, log_scale=float(change[0]), shift=change[1:], nats=gain)
+        theta = theta + views.best(second)
+        second = second ^ (clear < 0.0)
+    if best is None or best.nats <= 0.0 or not _far_apart(best.log_scale, best.shift, fit.size):
+        return None
+    if 2 * int(best.second.sum()) > len(second):
+        return dataclasses.replace(best, second=~best.second, log_scale=-best.log_scale, shift=-best.shift)
+    return best
+
+
+def _of_fit(fit: HybridFit, pixels: Tensor, held: float = 1.0) -> _ByView:
+    """Of a fit's views, motions held back so many times as much as it found."""
+    still = None if fit.readout is None else held * fit.stillness
+    problem = BoardProblem(
+        fit.board_points, pixels, fit.model, _INDICES, weights=fit.weights, readout=fit.readout, stillness=still
+    )
+    state = fit.state._replace(board=fit.state.board.new_zeros(len(problem.shapes)))
+    return _by_view(problem, state, fit.sigma**2 / fit.tempering)
+
+
+def _by_view(problem: BoardProblem, state: BoardState, variance: float) -> _ByView:
+    rows, local = problem.rows(state), problem.local_size
+    fx, fy = state.parameters[0], state.parameters[1]
+    scale = fx * rows[:, local] + fy * rows[:, local + 1]
+    off = without_local(torch.cat([rows[:, :local], scale[:, None], rows[:, local + 2 :]], 1), local)
+    gram = off @ off.transpose(1, 2) / variance
+    return _ByView(gram[:, :_SIZE, :_SIZE], gram[:, :_SIZE, _SIZE])
+
+
+def _promising(views: _ByView, pixels: Tensor, size: tuple[int, int]) -> Tensor | None:
+    """The second group (V,) if two groups might be real, else None."""
+    second = _grouped(views, size)
+    if second is None or 0.5 * views.fall(second) < _PROMISED * (_chance(pixels) + _BEYOND):
+        return None
+    change = views.best(second)[1] - views.best(second)[0]
+    return second if _far_apart(2.0 * float(change[0]), 2.0 * change[1:], size) else None
+
+
+def _grouped(views: _ByView, size: tuple[int, int]) -> Tensor | None:
+    """(V,) the second of the two groups with which χ² falls most, from several starts; None where nothing is known."""
+    if not bool(views.N.isfinite().all() and views.g.isfinite().all()):
+        return None
+    center = _SPREAD_CENTER * math.hypot(*size)
+    prior = torch.diag(torch.tensor([_SPREAD, center, center], dtype=torch.float64) ** -2)
+    each = -torch.linalg.solve(views.N + prior, views.g[..., None])[..., 0]
+    white = each @ torch.linalg.cholesky(views.N.mean(0) + prior)
+    _, axes = torch.linalg.eigh(torch.cov(white.T))
+    order = torch.arange(len(each), dtype=torch.float64)
+    lines = [order, order % 2, *(white @ axes).T, *each.T]
+    best: tuple[float, Tensor] | None = None
+    for line in lines:
+        second = line > 0.5 * (line.min() + line.max()) if line is lines[1] else line > line.median()
+        for _ in range(_STEPS):
+            theta = views.best(second)
+            moved = views.change(theta[1]) < views.change(theta[0])
+            if bool((moved == second).all()):
+                break
+            second = moved
+        if _FEWEST <= int(second.sum()) <= len(second) - _FEWEST and (best is None or views.fall(second) > best[0]):
+            best = views.fall(second), second
+    return None if best is None else best[1]
+
+
+def _chance(pixels: Tensor) -> float:
+    """Nats that the choice of a group for each view and three numbers bring by chance, at most."""
+    residuals = 2.0 * float(pixels.isfinite().all(-1).sum())
+    return len(pixels) * math.log(2.0) + 0.5 * _SIZE * math.log(residuals)
+
+
+def _far_apart(log_scale: float, shift: Tensor, size: tuple[int, int]) -> bool:
+    # Half of the diagonal's half is a typical distance from the middle.
+    diagonal = math.hypot(*size)
+    return math.hypot(0.25 * diagonal * log_scale, float(shift.norm())) > _APART * diagonal
+
+
+def _undone(pixels: Tensor, second: Tensor, theta: Tensor, center: Tensor) -> Tensor:
+    """Pixels as one camera between both groups shows them; areas stay the same altogether, and so does the noise."""
+    share = float(second.double().mean())
+    apart = theta - (1.0 - share) * theta[0] - share * theta[1]
+    each = apart[second.long()][:, None]
+    return (pixels - center - each[..., 1:]) * torch.exp(-each[..., :1]) + center

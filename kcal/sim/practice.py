@@ -1,0 +1,337 @@
+"""A coast to practise on: two cameras on masts, surveyed landmarks, targets out to 5 km, and moving ships.
+
+All of it is made of flat pieces whose geometry is exact (`kcal.sim.facets`), behind the ray-traced lenses of
+`kcal.sim.scene`. Light is bent as in life.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kcal.sim.backdrop import Coast, backdrop, exposed, rotation_of
+from kcal.sim.board import PrintedBoard
+from kcal.sim.coast_objects import (
+    BLACK,
+    GRASS,
+    RED,
+    ROCK,
+    WHITE,
+    box_outline,
+    building,
+    facing,
+    ground,
+    panel,
+    pole,
+    ridge,
+    ship,
+)
+from kcal.sim.facets import Color, Eye, Facet, cut, eye, facet_windows, paint
+from kcal.sim.scene import FOCAL_MM, DemoScene
+from kcal.sim.true_rig import drawn_rig
+
+Floats = NDArray[np.float64]
+Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
+# Sigma of the optics' blur in pixels, and of the sensor's noise in gray levels.
+BLUR, NOISE = 0.7, 1.5
+_QUAY = -15.0  # height of the quay, meters from the left camera
+
+
+class Thing(NamedTuple):
+    """Something to mark: name, distance in meters, degrees to the right of the heading, height in meters, and words.
+
+    Heights are those above the left camera. `where` says which point of it is meant.
+    """
+
+    name: str
+    distance: float
+    bearing: float
+    up: float
+    where: str
+
+
+LANDMARKS = (
+    Thing("panel 1", 120.0, 20.0, -12.5, "middle of the black and white panel"),
+    Thing("panel 2", 180.0, -29.0, -11.5, "middle of the black and white panel"),
+    Thing("panel 3", 150.0, 8.0, -12.7, "middle of the black and white panel"),
+    Thing("hut", 260.0, -4.0, -9.0, "upper left corner of its front"),
+    Thing("barn", 340.0, -18.0, -8.0, "upper left corner of its front"),
+    Thing("chimney", 420.0, 28.0, 20.0, "middle of its top"),
+    Thing("depot", 650.0, -13.0, 8.0, "upper left corner of its front"),
+    Thing("silo", 900.0, 13.5, 6.0, "upper left corner of its front"),
+    Thing("beacon", 1150.0, -8.5, 8.0, "top of the pole on the mole"),
+    Thing("antenna", 1500.0, -23.0, 95.0, "top of the mast on the left headland"),
+    Thing("hill mast", 2100.0, 19.0, 150.0, "top of the mast on the right hill"),
+    Thing("lighthouse", 2600.0, 3.5, 26.0, "middle of its top"),
+)
+TARGETS = (
+    Thing("gate", 100.0, -9.0, -12.6, "top of the white post"),
+    Thing("yawl", 250.0, 14.5, -9.5, "top of the mast of the moored boat"),
+    Thing("buoy", 500.0, -23.5, -11.0, "top of the yellow spar buoy"),
+    Thing("ferry", 1000.0, 6.0, 12.0, "upper left corner of its blue deckhouse"),
+    Thing("tower", 2000.0, -31.5, 72.0, "upper left corner of the tower on the left headland"),
+    Thing("turbine", 3500.0, 30.5, 185.0, "tip of the blade that points up"),
+    Thing("freighter", 5000.0, 0.4, 40.0, "upper left corner of its dark deckhouse"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Passage:
+    """A ship's way in the film.
+
+    Args:
+        name: of the ship.
+        style: see `kcal.sim.coast_objects.ship`.
+        length: meters.
+        start: distance and bearing of its middle at the start, meters and degrees.
+        end: at the end.
+        bow: meters to the side by which the way curves in its middle.
+    """
+
+    name: str
+    style: int
+    length: float
+    start: tuple[float, float]
+    end: tuple[float, float]
+    bow: float = 0.0
+
+
+PASSAGES = (
+    Passage(name="sailing boat", style=3, length=11.0, start=(520.0, -3.0), end=(640.0, 21.0), bow=25.0),
+    Passage(name="trawler", style=1, length=24.0, start=(690.0, 25.0), end=(700.0, -6.0), bow=-30.0),
+    Passage(name="patrol boat", style=0, length=32.0, start=(930.0, 12.6), end=(970.0, -9.3), bow=-30.0),
+    Passage(name="coaster", style=2, length=140.0, start=(3260.0, -7.0), end=(3140.0, 4.6)),
+)
+
+
+def practice_scene(seed: int = 1, views: int = 12, scale: float = 1.0) -> DemoScene:
+    """The site of a seed: its cameras, boards, landmarks and targets.
+
+    Args:
+        seed: of lenses, poses, noise and survey.
+        views: of the board by each camera.
+        scale: of the images, see `kcal.sim.captures.drawn_lens`.
+
+    Example:
+        >>> scene = practice_scene()
+        >>> scene.landmarks.names[:2], len(scene.targets.names)
+        (('panel 1', 'panel 2'), 7)
+    """
+    return DemoScene(
+        seed=seed,
+        rig=drawn_rig("surveillance", 1.0, 10 + seed, focal_mm=FOCAL_MM, wander=1.0, scale=scale),
+        lat=58.094, lon=6.571, height=61.0, heading_deg=236.0, pitch_deg=2.2, roll_deg=0.3,
+        near_board=PrintedBoard(9, 6, 0.06, seed=10 + seed), near_views=views,
+        targets_at=tuple(thing[:4] for thing in TARGETS), landmarks_at=tuple(thing[:4] for thing in LANDMARKS),
+    )  # fmt: skip
+
+
+class PracticeSite:
+    """The coast as both cameras see it.
+
+    Args:
+        scene: cameras and places.
+        coast: sky, sea and air.
+    """
+
+    def __init__(self, scene: DemoScene, coast: Coast | None = None) -> None:
+        self.scene = scene
+        self.coast = coast or Coast()
+        self.facets = sorted(self._facets(), key=lambda facet: -facet.distance)
+
+    @functools.cached_property
+    def eyes(self) -> dict[Side, Eye]:
+        """Both cameras, with the lines of sight of all pixels."""
+        rig, into_enu = self.scene.rig, self.scene.enu_from_rig
+        turn, shift = rig.right_from_left_rotation, rig.right_from_left_translation
+        center = rotation_of(into_enu) @ rotation_of(-turn.T @ shift)
+        return {
+            "left": eye(rig.left, rotation_of(into_enu.T), np.zeros(3)),
+            "right": eye(rig.right, rotation_of(turn @ into_enu.T), center),
+        }
+
+    def true_pixels(self, side: Side, enu: torch.Tensor | Floats) -> Floats:
+        """Pixels (N, 2) at which a camera sees points (N, 3) east, north, up, through bent light."""
+        pixels, valid = self.eyes[side].project(self.coast.apparent(np.asarray(enu, dtype=np.float64)))
+        assert valid.all()
+        return pixels
+
+    @functools.cache  # noqa: B019  the site lives as long as its pictures are needed
+    def light(self, side: Side) -> Floats:
+        """The site without ships as light on a sensor, before blur and noise: (H, W, 3) gray levels."""
+        camera = self.eyes[side]
+        image = backdrop(camera, self.coast)
+        for facet, window in zip(self.facets, facet_windows(camera, self.facets), strict=True):
+            if window is not None:
+                paint(image[window], facet, cut(camera, facet, window), self.coast.haze)
+        return image
+
+    def picture(self, side: Side, noise: float = NOISE) -> NDArray[np.uint8]:
+        """The site in color, (H, W, 3), with blur and noise."""
+        random = np.random.default_rng([self.scene.seed, SIDES.index(side), 1])
+        return exposed(self.light(side), BLUR, noise, random)
+
+    def at(self, distance: float, bearing: float, up: float) -> Floats:
+        """East, north, up of a place, as it seems to be."""
+        angle = math.radians(self.scene.heading_deg + bearing)
+        return self.coast.apparent(np.array([distance * math.sin(angle), distance * math.cos(angle), up]))
+
+    def sea_at(self, distance: float, bearing: float) -> Floats:
+        """A place on the sea, as it seems to be."""
+        return self.at(distance, bearing, self.coast.surface(distance))
+
+    def _facets(self) -> list[Facet]:
+        place = {thing.name: self.at(*thing[1:4]) for thing in (*LANDMARKS, *TARGETS)}
+        return [*self._land(), *self._landmarks(place), *self._targets(place)]
+
+    def _land(self) -> list[Facet]:
+        heading, sea = self.scene.heading_deg, -self.coast.sea
+        concrete, gravel = (150.0, 146.0, 138.0), (128.0, 120.0, 106.0)
+        return [
+            ridge((-60.0, 75.0), 14000.0, ((0.0, 330.0), (0.2, 180.0), (0.3, -60.0), (0.56, -60.0), (0.68, 120.0),
+                  (1.0, 420.0)), -34.0,
+                  (74.0, 84.0, 92.0), heading=heading, rough=50.0, grain=260.0, seed=3.0),
+            ridge((22.0, 70.0), 3500.0, ((0.0, -25.0), (0.12, 30.0), (0.25, 75.0), (1.0, 160.0)), -25.0,
+                  (82.0, 96.0, 74.0), heading=heading, rough=14.0, grain=60.0, seed=8.0),
+            ridge((8.0, 70.0), 2100.0, ((0.0, -22.0), (0.06, 30.0), (0.18, 112.0), (0.3, 80.0), (0.45, 30.0),
+                  (1.0, 60.0)), -22.0, GRASS, heading=heading, rough=12.0, grain=40.0, seed=5.0),
+            ridge((-75.0, -12.0), 2000.0, ((0.0, 120.0), (0.62, 48.0), (0.9, 12.0), (1.0, -24.0)), -22.0,
+                  (88.0, 100.0, 76.0), heading=heading, rough=9.0, grain=35.0, seed=1.0),
+            ridge((-75.0, -17.0), 1500.0, ((0.0, 100.0), (0.7, 35.0), (0.93, 16.0), (1.0, -22.0)), -20.0, GRASS,
+                  heading=heading, rough=6.0, grain=25.0, seed=2.0),
+            ridge((1.9, 5.3), 2600.0, ((0.0, -22.0), (0.3, -12.0), (0.6, -10.0), (1.0, -22.0)), -22.0, ROCK,
+                  heading=heading, rough=3.0, grain=18.0, seed=6.0),
+            ridge((-16.0, -7.6), 1160.0, ((0.0, -14.0), (0.95, -14.5), (1.0, -19.0)), sea - 1, ROCK, heading=heading,
+                  rough=1.2, grain=4.0, seed=9.0),
+            ridge((10.5, 18.5), 905.0, ((0.0, -19.0), (0.15, -14.0), (0.85, -13.0), (1.0, -19.0)), sea - 1, ROCK,
+                  heading=heading, rough=1.5, grain=5.0, seed=4.0),
+            ridge((-16.0, -9.5), 655.0, ((0.0, -19.0), (0.2, -15.0), (0.8, -14.0), (1.0, -19.0)), sea - 1, ROCK,
+                  heading=heading, rough=1.2, grain=4.0, seed=7.0),
+            *ground((-420.0, 150.0, -10.0, 385.0), _QUAY, gravel, heading=heading),
+            *ground((130.0, 190.0, 420.0, 450.0), _QUAY, gravel, heading=heading),
+            *ground((-300.0, 15.0, 300.0, 205.0), _QUAY, concrete, heading=heading),
+            *self._harbor(),
+            *self._houses(),
+        ]  # fmt: skip
+
+    def _harbor(self) -> list[Facet]:
+        """What stands on the quay."""
+        heading, mark, dark = self.scene.heading_deg, (206.0, 204.0, 196.0), (72.0, 76.0, 80.0)
+        found = [
+            *ground((-300.0, 203.0, 300.0, 204.2), _QUAY, mark, heading=heading),
+            *ground((-300.0, 15.0, 300.0, 64.0), _QUAY, (86.0, 104.0, 58.0), heading=heading, grain=0.7),
+            *ground((-300.0, 64.0, 300.0, 65.0), _QUAY, (176.0, 172.0, 162.0), heading=heading),
+            *ground((-300.0, 65.0, 300.0, 74.0), _QUAY, (84.0, 86.0, 90.0), heading=heading, grain=0.5),
+        ]
+        found += [
+            part for x in range(-90, 90, 9) for part in ground((x, 69.3, x + 3.0, 69.6), _QUAY, mark, heading=heading)
+        ]
+        found += [
+            part for x in range(-60, 60, 6) for part in ground((x, 78.0, x + 0.2, 83.0), _QUAY, mark, heading=heading)
+        ]
+        for bearing in (-35.0, -23.0, -15.2, -2.4, 14.6, 24.6, 33.5):
+            lamp = self.at(76.0 / math.cos(math.radians(bearing)), bearing, -6.5)
+            arm = np.array([[-0.08, -0.1], [1.6, 0.05], [1.6, 0.25], [-0.08, 0.1]])
+            found += [*pole(lamp, 0.16, _QUAY, dark), facing(lamp, arm, dark)]
+        for bearing, color in ((-31.0, RED), (-22.0, WHITE), (-19.5, (44.0, 62.0, 96.0)), (10.6, (60.0, 64.0, 70.0)),
+                               (28.5, WHITE), (1.2, (150.0, 132.0, 60.0))):  # fmt: skip
+            found += _car(self.at(80.0 / math.cos(math.radians(bearing)), bearing, _QUAY), color)
+        # A crane at the edge of the quay.
+        steel = (198.0, 152.0, 44.0)
+        foot = self.at(198.0, -34.5, _QUAY)
+        for shape in (
+            [(-5.0, 0.0), (-4.0, 0.0), (-4.0, 22.0), (-5.0, 22.0)], [(4.0, 0.0), (5.0, 0.0), (5.0, 22.0), (4.0, 22.0)],
+            [(-5.0, 20.5), (5.0, 20.5), (5.0, 22.0), (-5.0, 22.0)],
+            [(-1.6, 22.0), (2.4, 22.0), (2.4, 25.5), (-1.6, 25.5)],
+            [(-1.0, 24.6), (-18.0, 37.6), (-18.4, 36.8), (-1.4, 23.2)],
+        ):  # fmt: skip
+            found.append(facing(foot, np.array(shape), steel))
+        return found
+
+    def _houses(self) -> list[Facet]:
+        """Houses that are no landmarks: so that it looks like a place."""
+        random = np.random.default_rng(20)
+        found: list[Facet] = []
+        paints = ((206.0, 198.0, 184.0), (170.0, 84.0, 66.0), (196.0, 168.0, 110.0), (222.0, 222.0, 216.0))
+        for bearing, distance, up in (
+            (-33.0, 1480.0, 22.0), (-31.0, 1490.0, 16.0), (-29.5, 1470.0, 20.0), (-27.8, 1485.0, 10.0),
+            (-26.0, 1478.0, 12.0), (-20.6, 1480.0, 4.0), (24.5, 2080.0, 24.0), (26.2, 2075.0, 14.0),
+            (27.9, 2085.0, 20.0), (30.2, 2078.0, 10.0), (32.4, 2080.0, 16.0),
+        ):  # fmt: skip
+            size = (float(random.uniform(16, 34)), float(random.uniform(10, 18)))
+            paint_ = paints[int(random.integers(len(paints)))]
+            found += building(self.at(distance, bearing, up + size[1] / 2), size, paint_, windows=(4.0, 3.4))
+        rust, green, blue = (158.0, 70.0, 48.0), (92.0, 110.0, 84.0), (58.0, 92.0, 124.0)
+        for bearing, distance, color in (
+            (-34.0, 150.0, rust), (-32.4, 150.0, green), (-36.5, 160.0, blue),
+            (-14.5, 170.0, blue), (-19.5, 165.0, rust), (25.0, 160.0, green), (-24.0, 300.0, blue),
+            (-21.9, 300.0, rust),
+            (-11.5, 280.0, green), (24.5, 250.0, rust), (26.0, 252.0, blue), (31.5, 330.0, (188.0, 184.0, 172.0)),
+        ):  # fmt: skip
+            found += building(self.at(distance, bearing, _QUAY + 2.8), (9.0, 2.8), color)
+        return found
+
+    def _landmarks(self, place: dict[str, Floats]) -> list[Facet]:
+        return [
+            *panel(place["panel 1"], 2.4, _QUAY),
+            *panel(place["panel 2"], 3.0, _QUAY),
+            *panel(place["panel 3"], 3.2, _QUAY),
+            *building(place["hut"], (11.0, 6.0), (228.0, 222.0, 208.0), windows=(3.6, 4.4)),
+            *building(place["barn"], (18.0, 7.0), (196.0, 170.0, 120.0), windows=(4.5, 5.0)),
+            *pole(place["chimney"], 1.6, _QUAY, (128.0, 70.0, 56.0)),
+            *building(self.at(424.0, 28.6, -6.0), (24.0, 9.0), (170.0, 160.0, 146.0), windows=(4.0, 4.4)),
+            *building(place["depot"], (26.0, 22.0), (176.0, 88.0, 66.0), windows=(5.0, 5.4)),
+            *building(place["silo"], (30.0, 19.0), (226.0, 224.0, 218.0), side=0.5),
+            *pole(place["beacon"], 2.6, -18.0, BLACK),
+            *pole(place["antenna"], 3.0, 10.0, (110.0, 44.0, 40.0)),
+            *pole(place["hill mast"], 4.0, 90.0, (70.0, 66.0, 70.0)),
+            *pole(place["lighthouse"], 7.0, -16.0, RED),
+        ]
+
+    def _targets(self, place: dict[str, Floats]) -> list[Facet]:
+        hull = (44.0, 40.0, 46.0)
+        ferry, freighter = place["ferry"], place["freighter"]
+        turbine, yawl = place["turbine"], place["yawl"]
+        blade = box_outline((-2.6, -56.0, 2.6, 0.0))
+        hub = turbine - np.array([0.0, 0.0, 58.0])
+        white = (206.0, 208.0, 210.0)
+        others = [
+            facing(hub, np.array([[0.0, -2.6], [s * 49.0, -30.9], [s * 47.0, -34.0], [0.0, 2.6]]), white)
+            for s in (-1.0, 1.0)
+        ]
+        return [
+            *pole(place["gate"], 0.36, _QUAY, WHITE),
+            *ship(self.sea_at(250.0, 14.5), 10.0, 3, 1.0)[:1],
+            facing(yawl, box_outline((-0.25, -8.0, 0.25, 0.0)), (214.0, 206.0, 190.0)),
+            *pole(place["buoy"], 1.3, -18.4, (226.0, 206.0, 70.0)),
+            facing(ferry, np.array([[-16.0, -30.4], [62.0, -30.4], [68.0, -20.0], [-18.0, -20.0]]), (36.0, 52.0, 88.0)),
+            facing(ferry, box_outline((0.0, -20.5, 52.0, 0.0)), (58.0, 84.0, 136.0)),
+            facing(ferry, box_outline((14.0, -19.0, 50.0, -9.0)), WHITE, windows=(5.0, 5.0)),
+            facing(ferry, box_outline((-12.0, -20.0, -1.0, -15.0)), WHITE),
+            facing(ferry, box_outline((34.0, 0.0, 41.0, 8.0)), RED),
+            *building(place["tower"], (16.0, 50.0), (72.0, 66.0, 62.0), side=0.4),
+            facing(turbine, box_outline((-3.0, -160.0, 3.0, -56.0)), (96.0, 98.0, 102.0)),
+            *others,
+            facing(turbine, blade, (88.0, 90.0, 96.0)),
+            facing(freighter, np.array([[-60.0, -60.5], [220.0, -60.5], [236.0, -36.0], [-66.0, -36.0]]), hull),
+            facing(freighter, box_outline((0.0, -37.0, 48.0, 0.0)), BLACK),
+            facing(freighter, box_outline((70.0, -36.0, 150.0, -14.0)), (150.0, 66.0, 48.0)),
+            facing(freighter, box_outline((158.0, -36.0, 214.0, -18.0)), (60.0, 98.0, 128.0)),
+        ]  # fmt: skip
+
+
+def _car(foot: Floats, color: Color) -> list[Facet]:
+    cabin = np.array([[-1.2, 0.8], [1.5, 0.8], [1.0, 1.45], [-0.7, 1.45]])
+    tires = [facing(foot, box_outline((x - 0.32, 0.0, x + 0.32, 0.6)), BLACK) for x in (-1.35, 1.35)]
+    return [
+        facing(foot, box_outline((-2.1, 0.28, 2.1, 0.85)), color),
+        facing(foot, cabin, (64.0, 76.0, 88.0)),
+        *tires,
+    ]

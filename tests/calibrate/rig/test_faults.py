@@ -1,0 +1,235 @@
+"""Faults that no residual shows: nothing left over, several solutions or explanations, a source that contradicts."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from rig_scenes import CAMERAS, CENTER, NAMES, boards, features, landmarks, normal, tensor
+from torch import Tensor
+
+from kcal.calibrate.rig import other_places
+from kcal.calibrate.rig.adjustment import Adjustment
+from kcal.calibrate.rig.blocks import PerKind
+from kcal.calibrate.rig.contradictions import contradictions
+from kcal.calibrate.rig.initial_poses import first_poses
+from kcal.calibrate.rig.redundancy import redundancy
+from kcal.calibrate.rig.resection import distinct_poses, poses_from_three
+from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.calibrate.rig.sources import Baseline, Landmarks, MeasuredPosition, RigData
+from kcal.calibrate.rig.unknowns import held
+from kcal.errors import DegenerateError, InputError
+from kcal.lens.pose import rotation_from_vector
+from kcal.report.judge_rig import rig_verdict
+from kcal.solve.lm import LMOptions
+
+APART = float((CENTER[0] - CENTER[1]).norm())
+STRAIGHT = RigOptions(refraction=0.0, refraction_sigma=0.0)
+KEPT = dataclasses.replace(STRAIGHT, reject=False)
+
+
+def data(**sources: object) -> RigData:
+    return RigData(cameras=CAMERAS[:2], names=NAMES[:2], **sources)  # type: ignore[arg-type]
+
+
+def marked(*, seed: int = 0, **options: int) -> Landmarks:
+    return landmarks(noise=0.1, error=0.02, seed=seed, **options)
+
+
+def baseline(length: float = APART, sigma: float = 0.005) -> tuple[Baseline, ...]:
+    return (Baseline(first=0, second=1, length=length, sigma=sigma),)
+
+
+def positions(off: Tensor | None = None, sigma: float = 0.02) -> tuple[MeasuredPosition, ...]:
+    """Of both cameras with noise; `off` (2, 3) meters from where they are."""
+    places = CENTER[:2] + sigma * normal((2, 3), 77) + (0.0 if off is None else off)
+    spread = torch.full((3,), sigma, dtype=torch.float64)
+    return tuple(MeasuredPosition(camera=c, point=places[c], sigma=spread) for c in (0, 1))
+
+
+def adjusted(sources: RigData) -> tuple[Adjustment, PerKind]:
+    """A plain solution of everything."""
+    start = first_poses(sources, LMOptions()).starts[0]
+    work = Adjustment(sources, start, held(sources.cameras), 0.1)
+    masks = PerKind(*(torch.ones(len(mask), dtype=torch.bool) for mask in work.none()))
+    work.solve(masks, LMOptions(residual_floor=1e-8))
+    return work, masks
+
+
+class TestRedundancy:
+    def test_is_what_each_camera_adds(self) -> None:
+        def count(**sources: object) -> list[int | None]:
+            work, masks = adjusted(data(**sources))
+            return redundancy(work.problem(masks))
+
+        four = landmarks(count=4)
+        assert count(landmarks=four) == [2, 2]
+        four.pixels[0, 1] = math.nan
+        assert count(landmarks=four) == [2, 0]
+        assert count(landmarks=four, baselines=baseline()) == [3, 1]
+        assert count(landmarks=four, positions=positions()) == [5, 3]
+        # Of a board the pose is to be found, in the frame of the first camera; a feature is a ray from the other one.
+        assert count(boards=boards(count=1)) == [None, 2 * 42 - 6]
+        assert count(features=features(count=9), baselines=baseline()) == [None, 9 + 1 - 6]
+        assert count(features=features(count=9, known=0.1), baselines=baseline()) == [None, 18 + 1 - 6]
+
+    def test_three_landmarks_are_refused_and_what_is_missing_is_told(self) -> None:
+        with pytest.raises(
+            DegenerateError, match=r"left and right stand exactly \(3 landmarks.*at least one more survey"
+        ):
+            solve_rig(data(landmarks=marked(count=3)), STRAIGHT)
+
+    def test_three_marks_in_one_camera_are_refused_by_its_name(self) -> None:
+        marks = marked()
+        marks.pixels[3:, 1] = math.nan
+        with pytest.raises(DegenerateError, match=r"determine where right stands exactly \(3 landmarks;"):
+            solve_rig(data(landmarks=marks), STRAIGHT)
+
+    def test_boards_are_redundancy_enough(self) -> None:
+        found = solve_rig(data(landmarks=marked(count=3), boards=boards(noise=0.1)), STRAIGHT)
+        assert found.left_out == ()
+        assert float((found.center[1] - found.center[0]).norm()) == pytest.approx(APART, abs=0.05)
+
+
+class TestSeveralSolutions:
+    def test_three_landmarks_and_a_baseline_begin_everywhere(self) -> None:
+        """Of up to four places of each camera, the baseline tells which ones belong together."""
+        for seed in range(2):
+            found = solve_rig(data(landmarks=marked(count=3, seed=seed), baselines=baseline()), STRAIGHT)
+            assert float((found.center - CENTER[:2]).norm(dim=-1).max()) < 1.0
+
+    def test_other_places_that_fit_alike_are_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Three landmarks in each camera fit in several places; that nothing checks them is taken out here."""
+        monkeypatch.setattr("kcal.calibrate.rig.solve.refuse_exact", lambda *_: None)
+        monkeypatch.setattr("kcal.calibrate.rig.solve.check_places", lambda *_, **__: (1.0, []))
+        # On a circle around the cameras' axis, so that the other places are real ones.
+        around = tensor([30.0, 0, 0], [-14, 24, 2], [-16, -25, -3])
+        marks = landmarks(count=3)
+        look = solve_rig(data(landmarks=landmarks()), STRAIGHT).rotation[0]
+        points = CENTER[:2].mean(0) + (around + tensor(0.0, 0.0, 150.0)) @ look
+        pixels = torch.stack([_seen(points, c) for c in (0, 1)], 1)
+        with pytest.raises(
+            DegenerateError, match=r"do not tell where the cameras stand: right may be .* m or .* m from"
+        ):
+            solve_rig(data(landmarks=dataclasses.replace(marks, points=points, pixels=pixels)), STRAIGHT)
+
+    def test_poses_of_three_points_without_the_known_one(self) -> None:
+        points = tensor([1.0, 0, 8], [-0.5, 0.9, 8.2], [-0.5, -0.8, 7.9])
+        turn, center = rotation_from_vector(tensor(0.1, -0.2, 0.3)), tensor(0.2, -0.1, 0.3)
+        rays = torch.nn.functional.normalize((points - center) @ turn.T, dim=-1)
+        every = poses_from_three(rays, points)[1]
+        places = [place for place in every if bool(place.isfinite().all())]
+        found = distinct_poses(rays, points, center, 4)
+        assert 1 <= len(found) <= len(places)
+        seen = [torch.nn.functional.normalize((points - place) @ rotation.T, dim=-1) for rotation, place in found]
+        assert all(float((place - center).norm()) > 0.05 for _, place in found)
+        # The best first, and exact.
+        torch.testing.assert_close(seen[0], rays, rtol=0, atol=1e-6)
+        off = [float((one - rays).norm()) for one in seen]
+        assert off == sorted(off)
+
+    def test_nothing_is_tried_where_boards_tie_the_cameras(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(other_places, "_other_places", None)
+        assert solve_rig(data(landmarks=marked(count=5), boards=boards(noise=0.1)), STRAIGHT).left_out == ()
+
+
+class TestExplanations:
+    @pytest.mark.parametrize("wrong", [0, 3])
+    def test_of_five_landmarks_the_wrong_one_alone_is_left_out(self, wrong: int) -> None:
+        marks = marked(count=5)
+        marks.points[wrong] += tensor(0.6, 0.8, 0.0)
+        assert [item.name for item in solve_rig(data(landmarks=marks), STRAIGHT).left_out] == [f"post {wrong}"]
+
+    def test_explanations_of_equal_worth_are_all_named(self) -> None:
+        """The farthest of five: without another one the rest agrees as well."""
+        marks = marked(count=5)
+        marks.points[4] += tensor(0.6, 0.8, 0.0)
+        told = r"the data do not tell what: all the rest agrees without landmark post 4 \(χ² .*\); or landmark post 0"
+        with pytest.raises(InputError, match=told):
+            solve_rig(data(landmarks=marks), STRAIGHT)
+
+    def test_of_four_landmarks_none_is_left_out(self) -> None:
+        """Three fit anything."""
+        marks = marked(count=4)
+        marks.points[3] += tensor(0.6, 0.8, 0.0)
+        with pytest.raises(
+            InputError, match=r"too few are left to check it with \(4 landmarks; worst: landmark post 3\)"
+        ):
+            solve_rig(data(landmarks=marks), STRAIGHT)
+
+    def test_a_wrong_baseline_does_not_make_a_landmark_wrong(self) -> None:
+        """Either it is named, or both explanations are."""
+        for seed in range(3):
+            sources = data(landmarks=marked(seed=seed), baselines=baseline(1.01 * APART, 0.001))
+            with pytest.raises(InputError, match="the baseline left to right"):
+                solve_rig(sources, STRAIGHT)
+
+    def test_a_wrong_landmark_does_not_make_a_baseline_wrong(self) -> None:
+        marks = marked()
+        marks.points[4] += tensor(0.0, 0.0, 2.0)
+        found = solve_rig(data(landmarks=marks, baselines=baseline()), STRAIGHT)
+        assert [item.name for item in found.left_out] == ["post 4"]
+        assert found.contradictions == ()
+
+
+class TestContradictions:
+    def test_a_baseline_is_named_with_numbers(self) -> None:
+        sources = data(landmarks=marked(), boards=boards(noise=0.1), baselines=baseline(1.01 * APART, 0.001))
+        told = (
+            r"baseline left to right contradicts the boards and the landmarks: 10\.1\d* ± 0\.001 m was stated, and wit"
+        )
+        with pytest.raises(InputError, match=told):
+            solve_rig(sources, STRAIGHT)
+
+    def test_a_position_and_all_positions(self) -> None:
+        marks = {"landmarks": marked(), "baselines": baseline()}
+        with pytest.raises(InputError, match=r"the position of left contradicts .* the camera stands 0\.\d+ ± 0\.0"):
+            solve_rig(data(**marks, positions=positions(tensor([0.3, 0.2, 0.1], [0.0, 0, 0]))), STRAIGHT)
+        with pytest.raises(InputError, match="the measured positions contradict the landmarks and the baseline"):
+            solve_rig(data(**marks, positions=positions(tensor([0.3, 0.2, 0.1], [0.3, 0.2, 0.1]))), STRAIGHT)
+
+    def test_sources_that_support_themselves_are_both_doubted_and_the_verdict_is_no(self) -> None:
+        """A board whose squares are one percent larger than stated makes the baseline shorter."""
+        shown = boards(noise=0.05)
+        small = dataclasses.replace(shown, board=shown.board.model_copy(update={"square": 0.396}))
+        found = solve_rig(data(landmarks=marked(), boards=small), STRAIGHT)
+        (text,) = found.contradictions
+        assert "contradict" in text
+        assert "it may as well be the" in text
+        assert text in found.warnings
+        rig = found.stereo()
+        assert rig.calibration is not None
+        assert rig.calibration.contradictions == found.contradictions
+        assert not rig_verdict(rig).usable
+        assert text in {finding.text for finding in rig_verdict(rig).stops}
+
+    def test_what_is_kept_is_told_all_the_same(self) -> None:
+        found = solve_rig(data(landmarks=marked(), baselines=baseline(1.01 * APART, 0.001)), KEPT)
+        assert any("the baseline left to right contradicts" in text for text in found.contradictions)
+
+    def test_good_sources_agree(self) -> None:
+        for seed in range(2):
+            sources = {
+                "landmarks": marked(seed=seed),
+                "boards": boards(noise=0.1, seed=seed),
+                "features": features(noise=0.1, known=0.1, seed=seed),
+            }
+            found = solve_rig(data(**sources, baselines=baseline(), positions=positions()), STRAIGHT)
+            assert found.contradictions == ()
+            assert found.warnings == ()
+
+    def test_the_difference_is_that_of_solving_without(self) -> None:
+        """To first order: χ² with the baseline, without it, and how far off it then is."""
+        sources = data(landmarks=marked(), baselines=baseline(1.01 * APART, 0.005))
+        whole, without = adjusted(sources), adjusted(dataclasses.replace(sources, baselines=()))
+        problem, state = (whole[0].problem(whole[1]), whole[0].part(whole[1]))
+        (found,) = contradictions(whole[0], problem, state)
+        chi2 = [2.0 * float(work.problem(masks).cost(work.part(masks))) for work, masks in (whole, without)]
+        assert found.sigmas == pytest.approx(math.sqrt(chi2[0] - chi2[1]), rel=0.02)
+
+
+def _seen(points: Tensor, camera: int) -> Tensor:
+    rotation = solve_rig(data(landmarks=landmarks()), STRAIGHT).rotation[camera]
+    return CAMERAS[camera].project((points - CENTER[camera]) @ rotation.T)[0]

@@ -1,0 +1,210 @@
+"""`kcal demo --practice` and `--score`: a folder that is filled, continued, never written over; a stranger's walk."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from practice_marks import mark_practice
+from typer.testing import CliRunner
+
+import kcal.io.images
+import kcal.io.video_file
+from kcal.cli.demo_practice import TRUTH, practice_site
+from kcal.cli.demo_score import next_step, practice_score
+from kcal.cli.main import app
+from kcal.cli.practice_files import STEPS
+from kcal.errors import FileError
+from kcal.lens.mounting import Origin
+from kcal.locate.geodesy import enu_to_geodetic
+from kcal.report.practice_score import score_positions, score_tracks
+
+pytest.importorskip("av", reason="the extra `video` is not installed")
+FRAMES = 4
+
+
+def make(folder: Path, seed: int = 1) -> None:
+    practice_site(folder, seed, views=2, frames=FRAMES, scale=0.25)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("practice") / "site"
+    make(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "site"))
+
+
+@pytest.fixture
+def truth(made: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((made / TRUTH).read_text())
+    return found
+
+
+def test_what_is_there_is_kept_and_what_is_missing_is_made(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(folder)
+    assert {"README.txt", "survey.csv", "site/left.png", "boards/right/02.png", "video/right.mp4"} < set(before)
+    (folder / "site" / "right.png").unlink()
+    (folder / "survey.csv").write_text("mine")
+    make(folder)
+    assert "wrote 1 files" in capsys.readouterr().out
+    assert contents(folder) == {**before, "survey.csv": b"mine"}
+
+
+def test_other_folders_are_refused(folder: Path, tmp_path: Path) -> None:
+    before = contents(folder)
+    with pytest.raises(FileError, match=r"the site of seed 1; give --seed 1"):
+        make(folder, 2)
+    assert contents(folder) == before
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work" / "thesis.tex").write_text("years")
+    with pytest.raises(FileError, match="other files"):
+        make(tmp_path / "work")
+    assert [path.name for path in (tmp_path / "work").iterdir()] == ["thesis.tex"]
+    with pytest.raises(FileError, match=r"no practice site.*kcal demo --practice"):
+        practice_score(tmp_path / "work")
+
+
+def test_an_interrupted_run_is_continued(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    count = 0
+
+    def interrupted(*arguments: Any, whole: Any = kcal.io.images.encode_png) -> bytes:
+        nonlocal count
+        count += 1
+        if count == 4:
+            raise KeyboardInterrupt
+        return bytes(whole(*arguments))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(kcal.io.images, "encode_png", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            make(tmp_path / "site")
+    partly = contents(tmp_path / "site")
+    assert 0 < len(partly) < len(contents(made))
+    assert not [name for name in partly if name.endswith(".part")]
+    make(tmp_path / "site")
+    # The same bytes, but for last digits: where memory lies decides the order of sums.
+    again, first = contents(tmp_path / "site"), contents(made)
+    assert set(again) == set(first)
+    close = {str(TRUTH), "site/sketch.png"}
+    assert [name for name in first if name not in close and again[name] != first[name]] == []
+
+
+def test_what_comes_next_is_said_step_by_step(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    practice_score(folder)
+    said = capsys.readouterr().out
+    assert "kcal detect boards/left --board 9x6 --square 60mm -o left.obs.json" in said
+    for step in STEPS:
+        assert next_step(folder) == step
+        for name in step.makes:
+            (folder / name).touch()
+    assert next_step(folder) is None
+    # Marks may have other names; positions and tracks do not stand for each other.
+    for name in ("marks.csv", "left.obs.json"):
+        (folder / name).unlink()
+    assert next_step(folder) is None
+    (folder / "positions.geojson").unlink()
+    assert next_step(folder) == STEPS[4]
+
+
+def test_without_the_extra_for_videos_the_rest_is_made(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def missing(*arguments: Any) -> None:
+        raise ImportError(name="av")
+
+    (folder / "video" / "left.mp4").unlink()
+    (folder / "survey.csv").unlink()
+    monkeypatch.setattr(kcal.io.video_file, "write_video", missing)
+    make(folder)
+    said = capsys.readouterr()
+    assert "wrote 1 files" in said.out
+    assert "video/left.mp4 needs av, which is not installed: pip install 'kcal[video]'" in said.err
+    assert (folder / "survey.csv").exists()
+
+
+def table(truth: dict[str, Any], rows: list[tuple[str, list[float], float | None]], shift: float) -> str:
+    """Positions as `kcal locate` writes them, all `shift` meters too far north, with intervals of 10 m each way."""
+    lines = ["name,status,lat,lon,height_ellipsoidal_m,range_m,range_low_m,range_high_m,time_s"]
+    for name, place, time in rows:
+        east, north, up = place
+        at = torch.tensor([east, north + shift, up], dtype=torch.float64)
+        lat, lon, height = enu_to_geodetic(at, Origin(**truth["origin"])).tolist()
+        far = float(at.norm())
+        lines.append(f"{name},ok,{lat!r},{lon!r},{height!r},{far},{far - 10},{far + 10},{'' if time is None else time}")
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("shift", [0.0, 3.0, 40.0])
+def test_positions_are_compared_with_the_truth(tmp_path: Path, truth: dict[str, Any], shift: float) -> None:
+    rows = [(name.upper(), place, None) for name, place in truth["targets"].items()]
+    (tmp_path / "p.csv").write_text(table(truth, rows, shift).replace(",time_s", "").replace(",\n", "\n"))
+    scores = score_positions(tmp_path / "p.csv", truth)
+    assert [score.name for score in scores] == [name.upper() for name in truth["targets"]]
+    np.testing.assert_allclose([score.level for score in scores], shift, atol=1e-6)
+    for score in scores:
+        place = np.array(truth["targets"][score.name.lower()])
+        expected = np.linalg.norm(place + np.array([0.0, shift, 0.0])) - np.linalg.norm(place)
+        assert score.range_off == pytest.approx(expected, abs=1e-6)
+        assert score.contains == (abs(expected) <= 10)
+
+
+def test_tracks_are_compared_with_the_nearest_ship(tmp_path: Path, truth: dict[str, Any]) -> None:
+    times, ships = truth["ships"]["times"], truth["ships"]["places"]
+    rows = [("track 1", place, time) for time, place in zip(times, ships["trawler"], strict=True)][: FRAMES // 2]
+    rows += [("track 2", place, time) for time, place in zip(times, ships["coaster"], strict=True)]
+    rows += [("track 3", [100.0, 9000.0, 0.0], time) for time in times]
+    (tmp_path / "t.csv").write_text(table(truth, rows, 2.0))
+    scores, strays = score_tracks(tmp_path / "t.csv", truth)
+    found = {score.name: score for score in scores}
+    assert strays == 1
+    assert (found["trawler"].followed, found["coaster"].followed, found["patrol boat"].followed) == (0.5, 1.0, 0.0)
+    assert found["trawler"].level == pytest.approx(2.0, abs=1e-6)
+    assert (found["coaster"].tracks, found["coaster"].contained) == (1, 1.0)
+
+
+def test_options_that_exclude_each_other(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["demo", "--practice", str(tmp_path / "a"), "--score", str(tmp_path / "a")])
+    assert done.exit_code == 2
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.slow
+def test_the_walk_of_a_stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All commands of README.txt; marks are made from the truth with 0.3 px of noise, in the session of `kcal mark`."""
+    folder = tmp_path / "site"
+    practice_site(folder, 1, views=12, frames=40, scale=0.5)
+    monkeypatch.chdir(folder)
+    readme = Path("README.txt").read_text()
+    for step in STEPS:
+        if step.name == "mark":
+            mark_practice(folder)
+            continue
+        for command in step.commands:
+            assert command in readme
+            done = CliRunner().invoke(app, shlex.split(command)[1:], catch_exceptions=False)
+            assert done.exit_code == 0, done.output
+    done = CliRunner().invoke(app, ["demo", "--score", "."], catch_exceptions=False)
+    assert "All steps are done." in done.output
+    truth = json.loads(TRUTH.read_text())
+    scores = score_positions(Path("positions.geojson"), truth)
+    assert len(scores) == 7
+    # Of seven intervals of 95 %, five or more contain the truth in 99.6 % of cases.
+    assert sum(score.contains for score in scores) >= 5
+    assert abs(scores[0].range_off) < 5.0
+    ships, _ = score_tracks(Path("tracks.csv"), truth)
+    assert max(ship.followed for ship in ships) > 0.5
