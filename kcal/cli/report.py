@@ -205,6 +205,10 @@ def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...]
     mark_sigma = pixel_sigma_of(pixel_sigma, rig)
     if observations and len(observations) != 2:
         raise InputError("a rig needs --observations twice: left, then right")
+    if observations:
+        from kcal.corners.observations import Observations
+
+        check_views_of((rig.left, rig.right), [Observations.load(file) for file in observations], observations)
     return judged_rig(rig, observations, needs, mark_sigma=mark_sigma, name=path.name.split(".")[0])
 
 
@@ -251,7 +255,6 @@ def _pairs(rig: StereoRig, observations: Sequence[Path]) -> tuple[tuple[Tensor, 
     from kcal.corners.observations import Observations
 
     left, right = (Observations.load(file) for file in observations)
-    check_views_of((rig.left, rig.right), (left, right), observations)
     try:
         boards = paired_boards((rig.left, rig.right), (left, right), pair_by_name(left.names, right.names))
     except InputError as error:
