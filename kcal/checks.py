@@ -3,41 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Any
 
-import pydantic
 import torch
 from torch import Tensor, nn
 
 from kcal.errors import InputError
 
-# Of one image. The largest sensors of 2025 have about 410 megapixels.
-MOST_PIXELS = 500_000_000
-
-
 # Pixels: a telescope of 100 m has 1e8.
 MOST_FOCAL = 1e8
-
-
-def check_pixel_count(size: tuple[int, int]) -> tuple[int, int]:
-    """Return (width, height) unless no camera has so many pixels.
-
-    Raises:
-        ValueError: more than 500 megapixels.
-
-    Example:
-        >>> check_pixel_count((1920, 1080))
-        (1920, 1080)
-    """
-    width, height = size
-    if width * height > MOST_PIXELS:
-        shown = f"{width}x{height}" if max(size) < 1e12 else "more than 1e12"
-        raise ValueError(f"{shown} pixels; an image may have at most {MOST_PIXELS // 10**6} megapixels")
-    return size
-
-
-# (width, height) in pixels, in kcal's files.
-ImageSize = Annotated[tuple[pydantic.PositiveInt, pydantic.PositiveInt], pydantic.AfterValidator(check_pixel_count)]
 
 
 def as_points(name: str, value: Tensor, last: int) -> Tensor:

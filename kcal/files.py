@@ -104,6 +104,18 @@ def check_writable(path: str | Path, *inputs: str | Path) -> Path:
     return path
 
 
+def check_picture(path: str | Path) -> None:
+    """Raise an error now if `path` could not be written as a picture later.
+
+    Raises:
+        InputError: a suffix other than .png and .svg.
+        FileError: the file cannot be written.
+    """
+    if Path(path).suffix.lower() not in (".png", ".svg"):
+        raise InputError(f"{path}: the name of a picture must end with .png or .svg")
+    check_writable(path)
+
+
 def make_folder(path: str | Path) -> Path:
     """Make a folder, with those that it is in, unless it is there.
 

@@ -7,8 +7,8 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from kcal.checks import MOST_PIXELS, check_pixel_count
 from kcal.errors import FileError
+from kcal.image_size import MOST_PIXELS, check_pixel_count
 
 Size = tuple[int, int]
 
@@ -40,6 +40,20 @@ def check_image_header(data: bytes, source: str | Path) -> None:
         check_pixel_count(size)
     except ValueError as error:
         raise FileError(f"{source}: {error}") from error
+
+
+def is_image(data: bytes) -> bool:
+    """Whether bytes begin like an image of a known format."""
+    start, size_of = next(((start, of) for start, of in _FORMATS.items() if data.startswith(start)), (b"", None))
+    if size_of is None:
+        return False
+    if len(start) > 2 or size_of is _jpeg:
+        return True
+    try:
+        # Two letters begin many a text.
+        return all(0 < side < 2**20 for side in size_of(data))
+    except (struct.error, IndexError, TypeError, ValueError):
+        return False
 
 
 def _png(data: bytes) -> Size:

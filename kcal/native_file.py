@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +13,12 @@ import pydantic
 from kcal.errors import FileError, InputError
 from kcal.files import dump_json, read_bytes, write_atomic
 from kcal.strict_json import MOST_BYTES, read_json
+
+
+def digest(content: Mapping[str, Any]) -> str:
+    """Sixteen hex digits that change with any value in a file's content; its head and its `summary` do not count."""
+    rest = {key: value for key, value in content.items() if key not in ("kcal", "version", "summary")}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()[:16]
 
 
 class NativeFile(pydantic.BaseModel):

@@ -32,7 +32,7 @@ SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
          "batches", "gpu"),
     ),
     ("Explanation", "explanation", ("which-lens", "rms", "relative-yaw", "intervals", "camera", "corners", "paper")),
-    ("Reference", "reference", ("commands", "warnings", "conventions")),
+    ("Reference", "reference", ("commands", "warnings", "conventions", "columns")),
     (
         "Measured",
         "measured",

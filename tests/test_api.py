@@ -18,8 +18,10 @@ import numpy as np
 import numpy.typing
 import pydantic
 import pytest
+import torch
 
 import kcal
+from kcal.lens.information import CameraInformation
 from kcal.locate.max_likelihood import PointFit
 from kcal.old_names import GONE, PLACES
 
@@ -229,8 +231,9 @@ def signature_types(value: object) -> set[type]:
         dataclasses.is_dataclass(value) or issubclass(value, (tuple, pydantic.BaseModel))
     ):
         value = value.__init__
-    # What lens/images imports for type checkers only.
-    hints = typing.get_type_hints(value, localns={"NDArray": numpy.typing.NDArray, "np": np})
+    # What is imported for type checkers only.
+    known = {"NDArray": numpy.typing.NDArray, "np": np, "Tensor": torch.Tensor, "CameraInformation": CameraInformation}
+    hints = typing.get_type_hints(value, localns=known)
     return set().union(*(named_types(hint) for name, hint in hints.items() if not name.startswith("_")))
 
 

@@ -17,6 +17,7 @@ from typer.main import get_command
 
 from kcal import Board, Camera, Observations, View, load_rig, save_camera
 from kcal.cli.main import app
+from kcal.cli.settings import SETTINGS, defaults_of
 from kcal.lens.pose import rotation_from_vector
 
 ROOT = Path(__file__).parents[1]
@@ -100,15 +101,6 @@ def test_python_passes_a_strict_type_check(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def commands() -> Iterator[Any]:
-    """Lines of the pages' shell blocks that call kcal."""
-    for block in blocks("sh"):
-        for line in block.values[0].replace("\\\n", " ").splitlines():
-            words = shlex.split(line, comments=True)
-            if words[:1] == ["kcal"]:
-                yield pytest.param(words[1:], id=f"{block.id}:{' '.join(words[1:3])}")
-
-
 def resolve(words: list[str]) -> tuple[Any, list[str]]:
     """The command that a line calls, and its arguments; the first command of a group runs where none is named."""
     command, rest = get_command(app), list(words)
@@ -119,10 +111,27 @@ def resolve(words: list[str]) -> tuple[Any, list[str]]:
     return command, rest
 
 
-@pytest.mark.parametrize("words", list(commands()))
-def test_a_command_is_accepted(words: list[str]) -> None:
+def commands() -> Iterator[Any]:
+    """Lines of the pages' shell blocks that call kcal, with what a `kcal init` before them on the page wrote."""
+    page, settings = "", {}
+    for block in blocks("sh"):
+        if (here := str(block.id).partition(":")[0]) != page:
+            page, settings = here, {}
+        for line in block.values[0].replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            if words[:1] == ["kcal"]:
+                if words[1] == "init":
+                    context = resolve(words[1:])[0].make_context("init", words[2:])
+                    settings = {key: context.params[key] for key in SETTINGS if context.params[key] is not None}
+                yield pytest.param(words[1:], settings, id=f"{block.id}:{' '.join(words[1:3])}")
+
+
+@pytest.mark.parametrize(("words", "settings"), list(commands()))
+def test_a_command_is_accepted(words: list[str], settings: dict[str, Any]) -> None:
     command, arguments = resolve(words)
-    command.make_context(command.name, arguments)  # parses all options and values, and runs nothing
+    defaults = defaults_of(settings).get(words[0], {})
+    # Parses all options and values, and runs nothing.
+    command.make_context(command.name, arguments, default_map=defaults.get(command.name, defaults))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])

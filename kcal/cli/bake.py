@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from kcal.cli.console import out, print_wrote
+from kcal.cli.console import out, print_wrote, steps
+from kcal.cli.inputs import CAMERA
 from kcal.files import check_writable
 
 
 def bake_command(
-    camera: Annotated[Path, typer.Argument(help="Camera file from `kcal calibrate`.", show_default=False)],
+    camera: Annotated[Path, typer.Argument(help="Camera file from `kcal calibrate`.", show_default=False), CAMERA],
     output: Annotated[
         Path | None,
         typer.Option(
@@ -35,11 +36,12 @@ def bake_command(
     name = camera.name.removesuffix(".json").removesuffix(".camera")
     path = check_writable(output or camera.with_name(f"{name}_lookup.npz"), camera)
 
-    from kcal.io.camera_file import load_camera
+    from kcal.cli.camera_sources import calibrated_camera
     from kcal.io.lookup_file import save_lookup
     from kcal.lens.baking import bake
 
-    lookup = bake(load_camera(camera), tolerance)
+    with steps("baking", None):
+        lookup = bake(calibrated_camera(camera), tolerance)
     save_lookup(lookup, path)
     for which, table, bound, coverage in zip(
         ("pixels to rays", "rays to pixels"),

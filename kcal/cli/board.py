@@ -9,17 +9,19 @@ from typing import Annotated
 import typer
 
 from kcal.cli.board_options import BoardSize, SquareSide
+from kcal.cli.commands import Command
 from kcal.cli.console import out, print_wrote, steps, warn, with_json
 from kcal.cli.groups import group_with_default
+from kcal.cli.inputs import OBSERVATIONS, with_inputs
 from kcal.errors import InputError
-from kcal.files import check_writable, write_atomic
+from kcal.files import check_picture, check_writable, write_atomic
 
 app = typer.Typer(
     cls=group_with_default("print"), rich_markup_mode="markdown", help="Draw a board to print, and measure it later."
 )
 
 
-@app.command("print")
+@app.command("print", cls=Command)
 @with_json
 def print_command(
     size: BoardSize,
@@ -76,11 +78,12 @@ def print_command(
         out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
 
 
-@app.command("measure")
+@app.command("measure", cls=Command)
 @with_json
+@with_inputs
 def measure_command(
     observations: Annotated[
-        list[Path], typer.Argument(metavar="OBS...", help="Observations files of one or several cameras.")
+        list[Path], typer.Argument(metavar="OBS...", help="Observations files of one or several cameras."), OBSERVATIONS
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Board file to write.")],
     picture: Annotated[
@@ -101,7 +104,6 @@ def measure_command(
     from kcal.calibrate.hybrid.measured_board import save_measured_board
     from kcal.corners.observations import Observations
     from kcal.report.board import board_text, save_board_picture
-    from kcal.report.figures import check_picture
 
     check_writable(output, *observations)
     if picture is not None:

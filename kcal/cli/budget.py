@@ -8,7 +8,10 @@ from typing import Annotated
 import typer
 
 from kcal.cli.console import out, print_table, print_wrote
+from kcal.cli.inputs import RIG
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.errors import InputError
+from kcal.files import check_picture
 
 # Ranges in the table, if none are given.
 _BASELINES = (10.0, 25.0, 50.0, 100.0, 250.0, 500.0)
@@ -16,7 +19,7 @@ _BASELINES = (10.0, 25.0, 50.0, 100.0, 250.0, 500.0)
 
 def budget_command(
     rig: Annotated[
-        Path | None, typer.Argument(help="Rig file; the planned rig of --focal and --baseline if not given.")
+        Path | None, typer.Argument(help="Rig file; the planned rig of --focal and --baseline if not given."), RIG
     ] = None,
     focal: Annotated[float, typer.Option(metavar="PX", help="Focal length of the planned rig, pixels.")] = 1600.0,
     baseline: Annotated[
@@ -26,7 +29,7 @@ def budget_command(
         str | None,
         typer.Option(metavar="M,M,...", help="Ranges in the table, meters; 10 to 500 baselines if not given."),
     ] = None,
-    disparity: Annotated[float, typer.Option(metavar="PX", help="Disparity error, pixels.", min=0)] = 0.1,
+    pixel_sigma: PixelSigma = None,
     yaw: Annotated[float, typer.Option(metavar="DEG", help="Relative yaw error, degrees.", min=0)] = 0.01,
     baseline_error: Annotated[float, typer.Option(metavar="M", help="Baseline error, meters.", min=0)] = 0.001,
     timing: Annotated[float, typer.Option(metavar="S", help="Time between the two images, seconds.", min=0)] = 0.01,
@@ -59,7 +62,7 @@ def budget_command(
 
     `kcal budget`
 
-    `kcal budget --focal 2400 --baseline 4 --disparity 0.2 --picture budget.png`
+    `kcal budget --focal 2400 --baseline 4 --pixel-sigma 0.2 --picture budget.png`
 
     `kcal budget rig.json --distances 500,1000,2000`
     """
@@ -69,22 +72,22 @@ def budget_command(
     from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
     from kcal.locate.range_sigmas import range_sigmas, usual_ranges
     from kcal.quantities import length_text, range_text
-    from kcal.report.budget import plotted_ranges, save_budget_picture
-    from kcal.report.figures import check_picture
     from kcal.report.tables import range_sigma_rows
 
     if picture is not None:
         check_picture(picture)
+    chosen = planned_rig(focal_px=focal, baseline_m=baseline) if rig is None else load_rig(rig)
+    noise = pixel_sigma_of(pixel_sigma, None if rig is None else chosen)
+    disparity = math.sqrt(2.0) * noise
     errors = BudgetErrors(
         disparity_px=disparity, yaw_deg=yaw, baseline_m=baseline_error, timing_s=timing, speed_mps=speed
     )
-    chosen = planned_rig(focal_px=focal, baseline_m=baseline) if rig is None else load_rig(rig)
     try:
         far = [float(value) for value in distances.split(",")] if distances else usual_ranges(chosen, _BASELINES)
     except ValueError:
         raise InputError(f"distances {distances!r}: write numbers of meters, for example 250,1000,5000") from None
     labels = {
-        "disparity": f"disparity {disparity:g} px",
+        "disparity": f"disparity {disparity:.3g} px",
         "yaw": f"relative yaw {yaw:g}°",
         "baseline": f"baseline {range_text(baseline_error)}",
         "timing": f"{1000 * timing:g} ms apart at {speed:g} m/s",
@@ -100,9 +103,9 @@ def budget_command(
             cells = (length_text(float(value[i]), sign=True) for value in error)
             rows.append([range_text(distance), labels[name], *cells])
     print_table(rows, left=(1,))
-    if chosen.covariance is not None and disparity:
-        out.print(f"\nWhat the rig file knows, and {disparity:g} px of disparity as a standard deviation:")
-        print_table(range_sigma_rows(range_sigmas(chosen, far, pixel_sigma=disparity / math.sqrt(2.0))))
+    if chosen.covariance is not None:
+        out.print(f"\nWhat the rig file knows, and {noise:g} px of noise in each mark:")
+        print_table(range_sigma_rows(range_sigmas(chosen, far, pixel_sigma=noise)))
     if stars:
         from kcal.cli.budget_stars import print_star_budget
 
@@ -111,6 +114,8 @@ def budget_command(
             clock_sigma,
         )  # fmt: skip
     if picture is not None:
+        from kcal.report.budget import plotted_ranges, save_budget_picture
+
         sweep = plotted_ranges(far)
         save_budget_picture(picture, sweep, range_errors(chosen, sweep, errors), labels)
     print_wrote(picture)

@@ -12,10 +12,12 @@ from rich.markup import escape
 from kcal.cli.calibrate_result import calibration_numbers, print_calibration
 from kcal.cli.calibrate_stars import by_night
 from kcal.cli.console import out, print_wrote, steps, tell, warn
+from kcal.cli.inputs import BOARD, CAMERA, OBSERVATIONS, check_file
 from kcal.cli.night_images import TIME_HELP
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
 from kcal.errors import DegenerateError, InputError, KcalError
-from kcal.files import check_writable, make_folder
+from kcal.files import check_picture, check_writable, make_folder
 
 if TYPE_CHECKING:
     from kcal.corners.board import Board
@@ -33,19 +35,15 @@ def calibrate_command(
     observations: Annotated[
         list[Path] | None,
         typer.Argument(metavar="OBS...", help="Observations file of each camera, from `kcal detect`."),
+        OBSERVATIONS,
     ] = None,
     stars: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="IMAGES",
-            help="Night images in place of observations: a file, folder or quoted wildcard (several times if need be). "
-            "The camera is calibrated at infinity by the stars.",
-        ),
+        typer.Option(metavar="IMAGES", help="Night images in place of observations: the lens at infinity, by stars."),
     ] = None,
     star_time: Annotated[str | None, typer.Option("--time", metavar="TIME", help=f"Of --stars. {TIME_HELP}")] = None,
     star_place: Annotated[
-        str | None,
-        typer.Option("--place", metavar="LAT,LON,HEIGHT", help="Of --stars: with the time, refraction is taken out."),
+        str | None, typer.Option("--place", metavar="LAT,LON,HEIGHT", help="Of --stars, for refraction.")
     ] = None,
     picture: Annotated[
         Path | None,
@@ -54,19 +52,16 @@ def calibrate_command(
             "cameras, NAME.png in this folder."
         ),
     ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Print every parameter with its σ.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Print every parameter with its σ.", hidden=True)] = False,
     board: Annotated[
         str,
         typer.Option(
+            "--board-shape",
             metavar="KIND",
             help="printed: bending and print errors are estimated. exact: a metrology plate. Or the file of a "
             "board that `kcal board measure` wrote.",
         ),
     ] = "printed",
-    analog: Annotated[
-        bool,
-        typer.Option("--analog", hidden=True, help="Not needed: the views tell whether pixels are square."),
-    ] = False,
     one_type: Annotated[
         bool,
         typer.Option("--one-type", help="The cameras, four or more, are of one type: each learns from the others."),
@@ -75,12 +70,16 @@ def calibrate_command(
         bool, typer.Option("--reject", help="Leave out and list corners and views that noise cannot explain.")
     ] = False,
     reject_limit: Annotated[
-        float, typer.Option(metavar="SHARE", help="Largest share of all corners that --reject may leave out.")
+        float,
+        typer.Option(metavar="SHARE", help="Largest share of all corners that --reject may leave out.", hidden=True),
     ] = 0.1,
     temperature: Annotated[
-        float | None, typer.Option(metavar="°C", help="Of the camera when the views were taken; kept in its file.")
+        float | None,
+        typer.Option(metavar="°C", help="Of the camera when the views were taken; kept in its file.", hidden=True),
     ] = None,
-    name: Annotated[str, typer.Option(help="Name of the camera; the name of the observations file if not given.")] = "",
+    name: Annotated[
+        str, typer.Option(help="Name of the camera; the name of the observations file if not given.", hidden=True)
+    ] = "",
     model: Annotated[
         str,
         typer.Option(
@@ -102,25 +101,30 @@ def calibrate_command(
     ] = None,
     baseline: Annotated[
         float,
-        typer.Option(metavar="M", help="Distance to a second camera like this one.", min=1e-3, rich_help_panel=_USE),
+        typer.Option(
+            metavar="M", help="Distance to a second camera like this one.", min=1e-3, rich_help_panel=_USE, hidden=True
+        ),
     ] = 10.0,
-    mark_sigma: Annotated[
-        float, typer.Option(metavar="PX", help="Noise of marks along each axis.", min=0, rich_help_panel=_USE)
-    ] = 0.3,
+    pixel_sigma: PixelSigma = None,
     focal: Annotated[
         float | None,
-        typer.Option(metavar="PX", help="Rough focal length to start from, in pixels; estimated if not given."),
+        typer.Option(
+            metavar="PX", help="Rough focal length to start from, in pixels; estimated if not given.", hidden=True
+        ),
     ] = None,
     fov: Annotated[
         float | None,
         typer.Option(
             metavar="DEG",
             help="Rough horizontal field of view to start from, instead of --focal; a fisheye may have 180 and more.",
+            hidden=True,
         ),
     ] = None,
     board_warp: Annotated[
         bool,
-        typer.Option("--board-warp", help="Parametric: estimate how the board bends.", rich_help_panel=_PARAMETRIC),
+        typer.Option(
+            "--board-warp", help="Parametric: estimate how the board bends.", rich_help_panel=_PARAMETRIC, hidden=True
+        ),
     ] = False,
     fix: Annotated[
         list[str] | None,
@@ -128,18 +132,25 @@ def calibrate_command(
             metavar="NAME[=VALUE]",
             help="Hold a parameter at a value; without one, cx and cy at the image center, all others at 0.",
             rich_help_panel=_PARAMETRIC,
+            hidden=True,
         ),
     ] = None,
     tie: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=NAME", help="Keep parameters equal, for example fx=fy.", rich_help_panel=_PARAMETRIC
+            metavar="NAME=NAME",
+            help="Keep parameters equal, for example fx=fy.",
+            rich_help_panel=_PARAMETRIC,
+            hidden=True,
         ),
     ] = None,
     free: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME", help="Estimate a parameter that is held by default, as skew.", rich_help_panel=_PARAMETRIC
+            metavar="NAME",
+            help="Estimate a parameter that is held by default, as skew.",
+            rich_help_panel=_PARAMETRIC,
+            hidden=True,
         ),
     ] = None,
     prior: Annotated[
@@ -148,6 +159,7 @@ def calibrate_command(
             metavar="NAME=VALUE±SIGMA",
             help="Gaussian prior of a parameter; +- may be typed for ±.",
             rich_help_panel=_PARAMETRIC,
+            hidden=True,
         ),
     ] = None,
     weak_prior: Annotated[
@@ -157,6 +169,7 @@ def calibrate_command(
             min=0.0,
             help="How far a rich lens is expected to be from a pinhole; 0: no such prior, as in OpenCV.",
             rich_help_panel=_PARAMETRIC,
+            hidden=True,
         ),
     ] = 0.3,
     camera: Annotated[
@@ -164,7 +177,9 @@ def calibrate_command(
         typer.Option(
             help="Camera file with known parameters; only board poses and what --free names are estimated.",
             rich_help_panel=_PARAMETRIC,
+            hidden=True,
         ),
+        CAMERA,
     ] = None,
     loss: Annotated[
         str | None,
@@ -172,11 +187,14 @@ def calibrate_command(
             metavar="KIND",
             help="Robust loss against wrong corners: huber, cauchy or tukey.",
             rich_help_panel=_PARAMETRIC,
+            hidden=True,
         ),
     ] = None,
     loss_scale: Annotated[
         float,
-        typer.Option(metavar="PX", help="Residual at which the robust loss sets in.", rich_help_panel=_PARAMETRIC),
+        typer.Option(
+            metavar="PX", help="Residual at which the robust loss sets in.", rich_help_panel=_PARAMETRIC, hidden=True
+        ),
     ] = 1.0,
 ) -> None:
     """Calibrate a camera, or several: intrinsics, lens and error bars.
@@ -206,20 +224,20 @@ def calibrate_command(
     """
     from kcal.lens.model import LensModel
 
-    if analog:
-        warn("--analog is not needed any more and will go: the views tell whether pixels are square")
     if stars or not observations:
         by_night(stars, observations, star_time, star_place, output, name)
         return
     needs = required(require)
+    if board not in ("printed", "exact"):
+        check_file("--board-shape", board, BOARD)
     places = _camera_files(observations, output, picture, report, name)
     if model != "hybrid":
         LensModel.named(model)
     known = None
     if camera is not None:
-        from kcal.io.camera_file import load_camera
+        from kcal.cli.camera_sources import calibrated_camera
 
-        known = load_camera(camera)
+        known = calibrated_camera(camera)
 
     from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.camera.outliers import OutlierRejection
@@ -276,7 +294,9 @@ def calibrate_command(
         print_wrote(place.output, place.picture)
         figures[place.name] = calibration_numbers(result)
         if needs or place.report is not None:
-            found = judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=place.name)
+            found = judged(
+                result, options, needs, baseline=baseline, mark_sigma=pixel_sigma_of(pixel_sigma), name=place.name
+            )
             figures[place.name]["verdict"] = found[0].to_dict()
             usable = told_usable(*found, place.report) and usable
     tell(cameras=figures)
@@ -342,8 +362,6 @@ def _camera_files(
         if place.report is not None:
             check_writable(place.report, *observations)
         if place.picture is not None:
-            from kcal.report.figures import check_picture
-
             check_picture(place.picture)
     return places
 

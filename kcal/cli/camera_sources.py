@@ -45,6 +45,26 @@ def single_camera(source: str) -> Camera:
     return picked(import_cameras(path), name, source)
 
 
+def calibrated_camera(source: str | Path) -> Camera:
+    """The camera of a file of kcal, or one of a rig of kcal: `rig.json:left`.
+
+    Raises:
+        FileError: no such file.
+        InputError: the rig has no camera of that name.
+    """
+    path, name = named_source(str(source))
+    if name is None:
+        from kcal.io.camera_file import load_camera
+
+        return load_camera(path)
+    if name not in ("left", "right"):
+        raise InputError(f"{source}: a rig has the cameras left and right, and none named {name!r}")
+    from kcal.io.rig_file import load_rig
+
+    rig = load_rig(path)
+    return rig.left if name == "left" else rig.right
+
+
 def parse_size(text: str | None) -> tuple[int, int] | None:
     """Read `1920x1080`.
 

@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 
 from kcal.cli.console import out, print_table, steps, warn
+from kcal.cli.inputs import OBSERVATIONS
 from kcal.errors import InputError
 
 
 def compare_command(
-    observations: Annotated[Path, typer.Argument(help="Observations file from `kcal detect`.")],
+    observations: Annotated[Path, typer.Argument(help="Observations file from `kcal detect`."), OBSERVATIONS],
     models: Annotated[list[str] | None, typer.Argument(metavar="[MODEL]...", help="More models.")] = None,
     model: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Models to compare, for example hybrid opencv5 opencv14.")

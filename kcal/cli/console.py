@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import gc
 import inspect
-import os
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,10 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
-from typer.models import ArgumentInfo
 
-from kcal.errors import FileError
-from kcal.sources import is_stream
 from kcal.texts import one_line, visible
 
 
@@ -77,48 +73,6 @@ def with_json(command: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
-
-
-# Arguments of these names are files, or what `_is_there` lists.
-_FILES = ("CAMERA", "FILE", "IMAGES")
-
-
-def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, which refuses files among its arguments that are missing before it loads anything."""
-    signature = inspect.signature(command, eval_str=True)
-    names = {}
-    for name, parameter in signature.parameters.items():
-        about = next((part for part in getattr(parameter.annotation, "__metadata__", ())), None)
-        if isinstance(about, ArgumentInfo):
-            kind = parameter.annotation.__origin__
-            names[name] = kind in (Path, list[Path]) or about.metavar in _FILES
-
-    @functools.wraps(command)
-    def run(*arguments: Any, **options: Any) -> None:
-        given = signature.bind(*arguments, **options).arguments
-        outputs = given.get("output") or []
-        outputs = outputs if isinstance(outputs, list) else [outputs]
-        # Where nothing can be written, the command says so first.
-        if not all(Path(path).parent.is_dir() for path in outputs):
-            return command(*arguments, **options)
-        for name, checked in names.items():
-            value = given.get(name)
-            paths = value if isinstance(value, list | tuple) else [value]
-            # Beside a stream no files are allowed at all, which the command says.
-            for path in [] if any(is_stream(str(path)) for path in paths) else paths:
-                if checked and path is not None and not _is_there(str(path)):
-                    what = "no such file or folder" if name == "images" else "cannot read: No such file or directory"
-                    raise FileError(f"{path}: {what}")
-        return command(*arguments, **options)
-
-    run.__signature__ = signature  # type: ignore[attr-defined]
-    return run
-
-
-def _is_there(text: str) -> bool:
-    """Whether a text names a file or folder, a wildcard, or a camera of a file (`RIG.json:left`)."""
-    elsewhere = text == "-" or any(c in text for c in "*?[")
-    return elsewhere or os.path.lexists(text) or os.path.lexists(text.rpartition(":")[0])
 
 
 def warn(text: str) -> None:

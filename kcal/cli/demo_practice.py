@@ -73,7 +73,7 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
 
     scene = practice_scene(seed, views, scale)
     site = PracticeSite(scene)
-    parts = list(_parts(site, frames))
+    parts = list(_practice_parts(site, frames))
     missing = [(path, work, write) for path, work, write in parts if not (folder / path).exists()]
     done = 0
     with steps("rendering", sum(work for _, work, _ in missing) or None) as advance:
@@ -134,7 +134,7 @@ def read_truth_file(folder: Path) -> dict[str, Any]:
 _Write = Callable[[Path, Callable[[], None]], object]
 
 
-def _parts(site: PracticeSite, frames: int) -> Iterator[tuple[Path, int, _Write]]:
+def _practice_parts(site: PracticeSite, frames: int) -> Iterator[tuple[Path, int, _Write]]:
     """Each file with the steps of its bar, and what writes it; the truth first, which says whose folder it is."""
     from kcal.cli.practice_files import readme_text, survey_text, targets_text
     from kcal.sim.practice import SIDES

@@ -47,7 +47,7 @@ def simulated_site(output: Path, seed: int) -> None:
     write_marks(output / "landmarks.csv", Marks(scene.landmarks.names, marks.left, marks.right))
     run(
         "rig", *(output / f"{side}.camera.json" for side in SIDES),
-        "--landmarks", output / "survey.csv", "--marks", output / "landmarks.csv", "--mark-sigma", scene.mark_sigma,
+        "--landmarks", output / "survey.csv", "--marks", output / "landmarks.csv", "--pixel-sigma", scene.mark_sigma,
         f"--origin={scene.lat},{scene.lon},{scene.height}", "-o", output / "rig.json", "--picture", output / "rig.png",
         # The simulated light goes straight.
         "--refraction=0", "--refraction-sigma=0",
@@ -73,7 +73,7 @@ def simulated_site(output: Path, seed: int) -> None:
     )
     chance += f" {_more_draws(scene, rig)}"
     out.print(chance, markup=False)
-    run("report", output / "rig.json", "--require", REQUIREMENT, "--mark-sigma", scene.mark_sigma)
+    run("report", output / "rig.json", "--require", REQUIREMENT, "--pixel-sigma", scene.mark_sigma)
     save_site_summary(output, scene, rows, chance, command)
     out.print(f"Time: {clock.text()}.")
     print_results(output, command)

@@ -11,8 +11,9 @@ from rich.markup import escape
 
 from kcal.cli.board_options import BoardSize, Refine, RefineMethod, SquareSide
 from kcal.cli.console import err, out, steps, tell, warn
+from kcal.cli.inputs import IMAGES
 from kcal.errors import FileError, InputError
-from kcal.files import check_writable
+from kcal.files import check_picture, check_writable
 
 
 def detect_command(
@@ -24,6 +25,7 @@ def detect_command(
             "camera:0).",
             show_default=False,
         ),
+        IMAGES,
     ],
     size: BoardSize,
     output: Annotated[Path, typer.Option("-o", "--output", help="Observations file to write.")],
@@ -67,8 +69,6 @@ def detect_command(
 
     pictures = [path for path in (gallery, coverage) if path is not None]
     if pictures:
-        from kcal.report.figures import check_picture
-
         for path in pictures:
             check_picture(path)
     check_writable(output)

@@ -10,14 +10,20 @@ import typer
 
 from kcal.cli.camera_sources import single_camera
 from kcal.cli.console import out, print_wrote, tell
+from kcal.cli.inputs import ANY_CAMERA
+from kcal.files import check_picture
 
 if TYPE_CHECKING:
     from kcal.lens.camera import Camera
 
 
 def diff_command(
-    first: Annotated[str, typer.Argument(metavar="CAMERA", help="Camera file of kcal or of another program.")],
-    second: Annotated[str, typer.Argument(metavar="CAMERA", help="Another one; RIG.json:left is a camera of a rig.")],
+    first: Annotated[
+        str, typer.Argument(metavar="CAMERA", help="Camera file of kcal or of another program."), ANY_CAMERA
+    ],
+    second: Annotated[
+        str, typer.Argument(metavar="CAMERA", help="Another one; RIG.json:left is a camera of a rig."), ANY_CAMERA
+    ],
     at: Annotated[
         float, typer.Option("--at", min=1e-3, metavar="METERS", help="Distance of what is seen; infinity if not given.")
     ] = math.inf,
@@ -40,8 +46,7 @@ def diff_command(
     import torch
 
     from kcal.lens.difference import camera_difference
-    from kcal.report.difference import difference_text, save_difference_picture
-    from kcal.report.figures import check_picture
+    from kcal.report.difference_text import difference_text
 
     if picture is not None:
         check_picture(picture)
@@ -65,6 +70,8 @@ def diff_command(
     for line in difference_text(found):
         out.print(line, markup=False)
     if picture is not None:
+        from kcal.report.difference import save_difference_picture
+
         print_wrote(save_difference_picture(picture, found, title=f"{first} and {second}"))
 
 

@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 
 from kcal.cli.camera_sources import named_source, parse_size, picked
-from kcal.cli.console import out, print_wrote, warn
+from kcal.cli.console import out, print_wrote, steps, warn
+from kcal.cli.inputs import CAMERA_OR_RIG, FOREIGN
 from kcal.errors import InputError
-from kcal.files import check_writable
+from kcal.files import check_picture, check_writable
 
 # Pixels (RMS) beyond which a lens model does not stand for a lens.
 _FAR = 0.5
@@ -21,6 +22,7 @@ def export_command(
     source: Annotated[
         str,
         typer.Argument(metavar="FILE", help="Camera or rig of kcal; RIG.json:left is one of its cameras."),
+        CAMERA_OR_RIG,
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="File to write.")],
     format: Annotated[
@@ -54,16 +56,14 @@ def export_command(
 
     from kcal.calibrate.camera.export import export_cameras
     from kcal.io.formats import import_cameras
-    from kcal.report.difference import save_difference_picture
-    from kcal.report.figures import check_picture
 
     if picture is not None:
         check_picture(picture)
     found = import_cameras(path)
     subject = _subject(path, name)
-    done = export_cameras(
-        subject if subject is not None else picked(found, name, source), output, format=format, model=model
-    )
+    chosen = subject if subject is not None else picked(found, name, source)
+    with steps("fitting what the format holds", None):
+        done = export_cameras(chosen, output, format=format, model=model)
     names = found.names if subject is not None else (name or found.names[0],)
     for camera, model_name, misfit in zip(names, done.models, done.misfits, strict=True):
         label = f"{camera or 'camera'}: {model_name}"
@@ -83,6 +83,8 @@ def export_command(
         out.print(f"not in the file: {', '.join(done.lost)}")
     fitted = [(camera, misfit) for camera, misfit in zip(names, done.misfits, strict=True) if misfit is not None]
     if picture is not None and fitted:
+        from kcal.report.difference import save_difference_picture
+
         camera, misfit = max(fitted, key=lambda each: each[1].largest)
         title = f"{source}: {camera}" if len(names) > 1 else source
         print_wrote(save_difference_picture(picture, misfit, title=title))
@@ -107,7 +109,9 @@ def _subject(path: Path, name: str | None):  # type: ignore[no-untyped-def]
 
 
 def import_command(
-    sources: Annotated[list[Path], typer.Argument(metavar="FILE...", help="File of another program; two of a pair.")],
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="File of another program; two of a pair."), FOREIGN
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Camera or rig file to write.")],
     format: Annotated[
         str | None,

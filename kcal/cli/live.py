@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.console import err, steps
+from kcal.cli.inputs import RIG, VIDEO
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
+from kcal.cli.settings import taken
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,13 +30,14 @@ if TYPE_CHECKING:
 
 
 def live_command(
-    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
+    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`."), RIG],
     output: Annotated[
         list[Path], typer.Option("-o", "--output", help="File that grows: .geojsonl, .csv or .cot; may be repeated.")
     ],
     videos: Annotated[
         list[str] | None,
         typer.Argument(metavar="[LEFT RIGHT]", help="Two video files or addresses (rtsp://...), with --detector."),
+        VIDEO,
     ] = None,
     detector: Annotated[
         str | None,
@@ -58,10 +62,11 @@ def live_command(
     ] = None,
     port: Annotated[
         int | None,
-        typer.Option("--map", metavar="PORT", help="Serve the live map to this machine's browser; 0: any free port."),
+        typer.Option("--port", metavar="PORT", help="Serve the live map to this machine's browser; 0: any free port."),
     ] = None,
     journal: Annotated[
-        Path | None, typer.Option(help="Remembers what was written; the first output with .journal if not given.")
+        Path | None,
+        typer.Option(help="Remembers what was written; the first output with .journal if not given.", hidden=True),
     ] = None,
     origin: Annotated[
         str | None,
@@ -70,14 +75,19 @@ def live_command(
     heading: Annotated[
         float | None, typer.Option(metavar="DEG", help="Azimuth of the left camera's axis; needed with --origin.")
     ] = None,
-    pixel_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of pairs that state none, each axis.")] = 0.3,
-    box_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of the middle of a box, each axis.")] = 2.0,
+    pixel_sigma: PixelSigma = None,
+    box_sigma: Annotated[
+        float, typer.Option(metavar="PX", help="Noise of the middle of a box, each axis.", hidden=True)
+    ] = 2.0,
     match_sigma: Annotated[
         float,
-        typer.Option(metavar="PX", help="Error of matched images that compression of the videos adds, each axis."),
+        typer.Option(
+            metavar="PX", help="Error of matched images that compression of the videos adds, each axis.", hidden=True
+        ),
     ] = 0.06,
     clock_offset: Annotated[
-        float, typer.Option(metavar="S", help="Seconds by which the right images are later than their times.")
+        float,
+        typer.Option(metavar="S", help="Seconds by which the right images are later than their times.", hidden=True),
     ] = 0.0,
     clock_sigma: Annotated[
         float,
@@ -87,11 +97,15 @@ def live_command(
     ] = 0.0,
     compiled: Annotated[
         bool,
-        typer.Option("--compile", help="Translate the filter to C++ first, which takes minutes; for many targets."),
+        typer.Option(
+            "--compile", help="Translate the filter to C++ first, which takes minutes; for many targets.", hidden=True
+        ),
     ] = False,
     start: Annotated[
         str | None,
-        typer.Option(metavar="ISO", help="Calendar time of second 0, if times are not Unix seconds; for events."),
+        typer.Option(
+            metavar="ISO", help="Calendar time of second 0, if times are not Unix seconds; for events.", hidden=True
+        ),
     ] = None,
 ) -> None:
     """Follow what two cameras see: tracks with latitude, longitude, velocity and honest errors, written as they come.
@@ -144,7 +158,12 @@ def live_command(
     clock = ClockPrior(offset_s=clock_offset, offset_sigma_s=clock_sigma, drift_sigma=clock_sigma / 3600.0)
     options = AssociationOptions(box_sigma=box_sigma)
     place = None if origin is None else Origin.parse(origin)
-    locate = Locator(load_rig(rig), origin=place, heading_deg=heading, pixel_sigma=pixel_sigma)
+    known = load_rig(rig)
+    noise = pixel_sigma_of(pixel_sigma, known)
+    if known.mounting is not None and {"origin", "heading"} <= taken:
+        place = heading = None
+        err.print("the position of the rig is that in its file, not that in kcal.toml")
+    locate = Locator(known, origin=place, heading_deg=heading, pixel_sigma=noise)
     solved = locate.localize.rig
 
     if compiled:
@@ -152,7 +171,7 @@ def live_command(
     follow = TrackOptions.for_video(match_sigma) if videos else None
     tracker = Tracker(locate.localize, follow, clock=clock, compiled=compiled)
     pairs = _video_pairs(videos, detector, tracker, options, match_sigma) if videos and detector else None
-    source = pairs or lines_of(lines, lambda line: read_moment(line, solved, options, pixel_sigma))
+    source = pairs or lines_of(lines, lambda line: read_moment(line, solved, options, noise))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
     with steps("live", lines.stat().st_size if lines is not None and lines.is_file() else None) as advance:
         stream = Stream(
@@ -244,7 +263,7 @@ def _live_map(run: Located, port: int) -> LiveMap:
     try:
         from kcal.pipeline.live_map import LiveMap
     except ImportError as error:
-        raise InputError(f"--map needs {error.name}; install it with: pip install 'kcal[mark]'") from error
+        raise InputError(f"--port needs {error.name}; install it with: pip install 'kcal[mark]'") from error
     page = LiveMap(run, port)
     err.print(f"live map: {page.address}", markup=False)
     return page

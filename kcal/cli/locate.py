@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
+from kcal.cli.inputs import MARKS, RIG, SURVEY
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_and_source
+from kcal.cli.settings import taken
 from kcal.errors import DegenerateError, InputError
-from kcal.files import check_writable
+from kcal.files import check_picture, check_writable
 from kcal.texts import one_line
 
 if TYPE_CHECKING:
@@ -20,12 +23,13 @@ if TYPE_CHECKING:
 
 
 def locate_command(
-    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
+    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`."), RIG],
     points: Annotated[
         Path,
         typer.Argument(
             help="CSV with the columns name,left_u,left_v,right_u,right_v; others are carried into GeoJSON and CSV."
         ),
+        MARKS,
     ],
     origin: Annotated[
         str | None,
@@ -42,33 +46,38 @@ def locate_command(
         ),
     ] = None,
     pitch: Annotated[
-        float, typer.Option(metavar="DEG", help="Elevation of the left camera's axis, positive up.")
+        float, typer.Option(metavar="DEG", help="Elevation of the left camera's axis, positive up.", hidden=True)
     ] = 0.0,
     roll: Annotated[
-        float, typer.Option(metavar="DEG", help="Roll of the left camera, clockwise as seen from behind it.")
+        float,
+        typer.Option(metavar="DEG", help="Roll of the left camera, clockwise as seen from behind it.", hidden=True),
     ] = 0.0,
     grid: Annotated[
         str | None,
         typer.Option(
             metavar="CRS",
             help="Map whose grid north --heading counts from, for example EPSG:32643; true north if not given.",
+            hidden=True,
         ),
     ] = None,
-    pixel_sigma: Annotated[
-        float,
-        typer.Option(metavar="PX", help="Standard deviation of the marks along each axis, where the CSV has none."),
-    ] = 0.3,
+    pixel_sigma: PixelSigma = None,
     yaw_sigma: Annotated[
         float,
         typer.Option(metavar="DEG", help="Standard deviation of the relative yaw, added to the rig file's.", min=0),
     ] = 0.0,
     heading_sigma: Annotated[
-        float, typer.Option(metavar="DEG", help="Standard deviation of the heading, added to the rig file's.", min=0)
+        float,
+        typer.Option(
+            metavar="DEG", help="Standard deviation of the heading, added to the rig file's.", min=0, hidden=True
+        ),
     ] = 0.0,
     origin_sigma: Annotated[
         float,
         typer.Option(
-            metavar="M", help="Standard deviation of the origin along each axis, added to the rig file's.", min=0
+            metavar="M",
+            help="Standard deviation of the origin along each axis, added to the rig file's.",
+            min=0,
+            hidden=True,
         ),
     ] = 0.0,
     refraction: Annotated[
@@ -77,22 +86,27 @@ def locate_command(
             metavar="K",
             help="Refraction: 0.13, the default, lowers a point at 5 km by 0.26 m; 0 for straight lines. A rig solved "
             "from landmarks has its own.",
+            hidden=True,
         ),
     ] = None,
     refraction_sigma: Annotated[
         float | None,
         typer.Option(
-            metavar="K", help="Its standard deviation, 0.1; 0.5 for lines of sight near hot or cold ground.", min=0
+            metavar="K",
+            help="Its standard deviation, 0.1; 0.5 for lines of sight near hot or cold ground.",
+            min=0,
+            hidden=True,
         ),
     ] = None,
     geoid: Annotated[
-        Path | None, typer.Option(help="Geoid grid file (.tif, .gtx); one that PROJ finds if not given.")
+        Path | None, typer.Option(help="Geoid grid file (.tif, .gtx); one that PROJ finds if not given.", hidden=True)
     ] = None,
     truth: Annotated[
         Path | None,
         typer.Option(
             metavar="CSV", help="True positions, name,lat,lon,height, to show errors in the table and on the maps."
         ),
+        SURVEY,
     ] = None,
     output: Annotated[
         list[Path] | None,
@@ -103,7 +117,10 @@ def locate_command(
         ),
     ] = None,
     stream_format: Annotated[
-        str, typer.Option("--format", metavar="NAME", help="Format of `-o -`: csv, geojson, geojsonl, kml or cot.")
+        str,
+        typer.Option(
+            "--format", metavar="NAME", help="Format of `-o -`: csv, geojson, geojsonl, kml or cot.", hidden=True
+        ),
     ] = "csv",
     as_json: Annotated[bool, typer.Option("--json", help="Print a summary as JSON in place of the table.")] = False,
     picture: Annotated[Path | None, typer.Option(help="PNG file to write: the map and the intervals.")] = None,
@@ -111,11 +128,14 @@ def locate_command(
         Path | None, typer.Option("--map", help="HTML file to write: an interactive map that needs no network.")
     ] = None,
     tiles: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="With --map: folder of tiles FOLDER/zoom/x/y.png to embed.")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="With --map: folder of tiles FOLDER/zoom/x/y.png to embed.", hidden=True),
     ] = None,
-    image: Annotated[Path | None, typer.Option(metavar="TIF", help="With --map: GeoTIFF to embed.")] = None,
+    image: Annotated[
+        Path | None, typer.Option(metavar="TIF", help="With --map: GeoTIFF to embed.", hidden=True)
+    ] = None,
     online: Annotated[
-        bool, typer.Option("--online", help="With --map: let the page load tiles of OpenStreetMap.")
+        bool, typer.Option("--online", help="With --map: let the page load tiles of OpenStreetMap.", hidden=True)
     ] = False,
 ) -> None:
     """Locate points that were marked in both images: latitude, longitude, height and a 95 % range interval.
@@ -160,9 +180,6 @@ def locate_command(
     from kcal.locate.survey import read_survey
     from kcal.locate.tabulate import Locator
     from kcal.locate.truth import read_truth
-    from kcal.report.figures import check_picture
-    from kcal.report.map_page import check_map_format, save_map
-    from kcal.report.positions import save_positions_picture
 
     outputs = output or []
     streamed = STREAM in outputs
@@ -178,6 +195,8 @@ def locate_command(
     if picture is not None:
         check_picture(picture)
     if web_map is not None:
+        from kcal.report.map_page import check_map_format
+
         check_map_format(web_map)
         check_writable(web_map)
     if (origin is None) != (heading is None):
@@ -187,6 +206,11 @@ def locate_command(
     # Parsed before the rig is read, so that a wrong option is reported first.
     place = None if origin is None else Origin.parse(origin)
     solved = load_rig(rig)
+    noise, note = pixel_sigma_and_source(pixel_sigma, solved)
+    if solved.mounting is not None and {"origin", "heading"} <= taken:
+        # What the rig was solved with is better known.
+        place = heading = None
+        err.print("the position of the rig is that in its file, not that in kcal.toml")
     doubts = solved.calibration.warnings if solved.calibration else ()
     for text in doubts:
         warn(f"{rig}: {text}")
@@ -203,9 +227,11 @@ def locate_command(
     )
     locate = Locator(
         solved, geoid=find_geoid(geoid), origin=place, heading_deg=heading, pitch_deg=pitch, roll_deg=roll,
-        pixel_sigma=pixel_sigma, calibration=errors.calibration, mounting=errors.mounting, link=errors.link,
+        pixel_sigma=noise, calibration=errors.calibration, mounting=errors.mounting, link=errors.link,
         refraction=refraction, refraction_sigma=refraction_sigma,
     )  # fmt: skip
+    if note:
+        err.print(note)
     survey = None if truth is None else read_survey(truth, locate.localize.origin, measured=False)
     sample = PositionSample(frozenset(survey.names if survey else ()))
     written: list[Path] = []
@@ -214,7 +240,7 @@ def locate_command(
         with open_writers(outputs, located_by(locate), suffix) as writers, steps("locating", size) as advance:
             read, stated = 0, False
             for chunk in read_mark_chunks(points):
-                cov = filled(chunk.covariance, pixel_sigma)
+                cov = filled(chunk.covariance, noise)
                 stated = stated or cov is not None
                 columns = locate(chunk.names, chunk.pixels, cov, chunk.extras)
                 for writer in writers:
@@ -226,8 +252,12 @@ def locate_command(
             true = None if truth is None else read_truth(truth, located)
         written += [path for path in outputs if path != STREAM]
         if picture is not None:
+            from kcal.report.positions import save_positions_picture
+
             written.append(save_positions_picture(picture, located, true))
         if web_map is not None:
+            from kcal.report.map_page import save_map
+
             written.append(save_map(web_map, located, true, tiles=tiles, image=image, online=online))
     except KeyboardInterrupt:
         kept = ", ".join(map(str, written)) or "nothing"
@@ -241,7 +271,7 @@ def locate_command(
             "rows": sample.count,
             "statuses": sample.statuses,
             "warnings": list(doubts),
-            "pixel_sigma": pixel_sigma,
+            "pixel_sigma": noise,
             "interval": located.interval_note,
             "geoid": located.geoid,
             "written": list(map(str, written)),

@@ -13,23 +13,29 @@ from rich.markup import escape
 from typer.core import TyperGroup
 
 import kcal
+from kcal.cli import inputs
 from kcal.cli.bake import bake_command
 from kcal.cli.batch import batch_command
 from kcal.cli.board import app as board
 from kcal.cli.budget import budget_command
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
+from kcal.cli.commands import Command
 from kcal.cli.compare import compare_command
-from kcal.cli.console import err, with_inputs, with_json
+from kcal.cli.console import err, warn, with_json
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.diff import diff_command
 from kcal.cli.exchange import export_command, import_command
+from kcal.cli.init import init_command
+from kcal.cli.inputs import with_inputs
 from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
+from kcal.cli.old_flags import with_new_names
 from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
+from kcal.cli.settings import defaults_of, read_settings
 from kcal.cli.show import show_command
 from kcal.cli.stars import stars_command
 from kcal.cli.undistort import undistort_command
@@ -52,8 +58,15 @@ def usage_errors_shown() -> Iterator[None]:
 
 class _Commands(TyperGroup):
     def make_context(self, *arguments: Any, **options: Any) -> Any:
+        name, words, *rest = *arguments, *(options.pop(key) for key in ("info_name", "args") if key in options)
+        words, notes = with_new_names(list(words))
+        for note in notes:
+            warn(note)
+        inputs.typed[:] = words
+        if words[:1] != ["init"] and not {"--help", "--help-all"} & set(words):
+            options.setdefault("default_map", defaults_of(read_settings()))
         with usage_errors_shown():
-            return super().make_context(*arguments, **options)
+            return super().make_context(name, words, *rest, **options)
 
     def invoke(self, ctx: Any) -> Any:
         # Typer ends an interrupted command without a word.
@@ -99,26 +112,27 @@ def _global_options(
     pass
 
 
-app.command("demo")(with_json(demo_command))
+app.command("demo", cls=Command)(with_json(demo_command))
+app.command("init", cls=Command)(with_json(init_command))
 app.add_typer(board, name="board")
-app.command("capture")(capture_command)
-app.command("detect")(with_json(with_inputs(detect_command)))
-app.command("calibrate")(with_json(with_inputs(calibrate_command)))
-app.command("compare")(with_json(with_inputs(compare_command)))
-app.command("batch")(with_json(with_inputs(batch_command)))
-app.command("mark")(with_inputs(mark_command))
+app.command("capture", cls=Command)(with_inputs(capture_command))
+app.command("detect", cls=Command)(with_json(with_inputs(detect_command)))
+app.command("calibrate", cls=Command)(with_json(with_inputs(calibrate_command)))
+app.command("compare", cls=Command)(with_json(with_inputs(compare_command)))
+app.command("batch", cls=Command)(with_json(with_inputs(batch_command)))
+app.command("mark", cls=Command)(with_inputs(mark_command))
 app.add_typer(rig, name="rig")
-app.command("stars")(with_json(with_inputs(stars_command)))
-app.command("locate")(with_inputs(locate_command))
-app.command("live")(with_inputs(live_command))
-app.command("budget")(with_json(budget_command))
-app.command("undistort")(with_json(with_inputs(undistort_command)))
-app.command("bake")(with_json(with_inputs(bake_command)))
-app.command("export")(with_json(with_inputs(export_command)))
-app.command("import")(with_json(with_inputs(import_command)))
-app.command("show")(with_json(with_inputs(show_command)))
-app.command("diff")(with_json(with_inputs(diff_command)))
-app.command("report")(with_json(with_inputs(report_command)))
+app.command("stars", cls=Command)(with_json(with_inputs(stars_command)))
+app.command("locate", cls=Command)(with_inputs(locate_command))
+app.command("live", cls=Command)(with_inputs(live_command))
+app.command("budget", cls=Command)(with_json(with_inputs(budget_command)))
+app.command("undistort", cls=Command)(with_json(with_inputs(undistort_command)))
+app.command("bake", cls=Command)(with_json(with_inputs(bake_command)))
+app.command("export", cls=Command)(with_json(with_inputs(export_command)))
+app.command("import", cls=Command)(with_json(with_inputs(import_command)))
+app.command("show", cls=Command)(with_json(with_inputs(show_command)))
+app.command("diff", cls=Command)(with_json(with_inputs(diff_command)))
+app.command("report", cls=Command)(with_json(with_inputs(report_command)))
 
 
 def main() -> None:

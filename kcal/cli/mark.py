@@ -8,32 +8,39 @@ from typing import Annotated
 import typer
 
 from kcal.cli.console import err, out, warn
+from kcal.cli.inputs import CALIBRATED, IMAGES, MARKS, RIG, SURVEY
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.errors import InputError
 
 _PORT = 8347
 
 
 def mark_command(
-    left: Annotated[Path, typer.Argument(help="Image of the left camera, a folder of them, or a video.")],
-    right: Annotated[Path, typer.Argument(help="The same of the right camera.")],
+    left: Annotated[Path, typer.Argument(help="Image of the left camera, a folder of them, or a video."), IMAGES],
+    right: Annotated[Path, typer.Argument(help="The same of the right camera."), IMAGES],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="CSV", help="Marks of landmarks; the other files lie beside it.")
     ],
-    rig: Annotated[Path | None, typer.Option(help="Rig file: cameras, and the relative pose as known so far.")] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="Rig file: cameras, and the relative pose as known so far."), RIG
+    ] = None,
     cameras: Annotated[
         tuple[Path, Path] | None,
         typer.Option(metavar="LEFT RIGHT", help="Camera files, if there is no rig yet: landmarks will give one."),
+        CALIBRATED,
     ] = None,
     landmarks: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Surveyed places: name,lat,lon,height,sigma or east,north,up.")
+        Path | None,
+        typer.Option(metavar="CSV", help="Surveyed places: name,lat,lon,height,sigma or east,north,up."),
+        SURVEY,
     ] = None,
     reference: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Marks in old images, to be found again in these.")
+        Path | None, typer.Option(metavar="CSV", help="Marks in old images, to be found again in these."), MARKS
     ] = None,
     reference_images: Annotated[
-        tuple[Path, Path] | None, typer.Option(metavar="LEFT RIGHT", help="With --reference: the old images.")
+        tuple[Path, Path] | None, typer.Option(metavar="LEFT RIGHT", help="With --reference: the old images."), IMAGES
     ] = None,
-    mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks placed by hand, each axis.")] = 0.3,
+    pixel_sigma: PixelSigma = None,
     port: Annotated[int, typer.Option(help="Of the local address; 0 for any that is free.", min=0, max=65535)] = _PORT,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
 ) -> None:
@@ -73,13 +80,11 @@ def mark_command(
         raise InputError("give --rig or --cameras, not both: a rig file contains its cameras")
     if (reference is None) != (reference_images is None):
         raise InputError("--reference and --reference-images belong together: old marks, and the images they are in")
-    if not 0 < mark_sigma < 100:
-        raise InputError(f"--mark-sigma {mark_sigma}: a positive number of pixels is needed")
     pictures = open_pictures(left, right)
     known = None if rig is None else load_rig(rig)
     own = None if cameras is None else (load_camera(cameras[0]), load_camera(cameras[1]))
     old = None if reference is None or reference_images is None else Reference(reference, *reference_images)
-    session = Session(output, landmarks, mark_sigma)
+    session = Session(output, landmarks, pixel_sigma_of(pixel_sigma, known))
     desk = Desk(pictures, session, own, known, old)
     try:
         desk.check_sizes()

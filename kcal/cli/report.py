@@ -10,6 +10,9 @@ import typer
 
 from kcal.cli.camera_sources import single_camera
 from kcal.cli.console import out, print_wrote, steps, tell
+from kcal.cli.inputs import CAMERA_OR_RIG, OBSERVATIONS
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
+from kcal.cli.sides import check_views_of
 from kcal.errors import InputError
 from kcal.files import check_writable, read_bytes
 from kcal.strict_json import MOST_BYTES, read_json
@@ -31,7 +34,7 @@ REQUIRE_HELP = "What you need: ranges and the largest σ of each, for example 5k
 
 
 def report_command(
-    subject: Annotated[Path, typer.Argument(metavar="CAMERA-OR-RIG", help="Camera or rig file.")],
+    subject: Annotated[Path, typer.Argument(metavar="CAMERA-OR-RIG", help="Camera or rig file."), CAMERA_OR_RIG],
     observations: Annotated[
         list[Path] | None,
         typer.Option(
@@ -40,12 +43,13 @@ def report_command(
             help="Views that it was calibrated from; for a rig once for left, once for right. Faults of lens model and "
             "board can only be found with them.",
         ),
+        OBSERVATIONS,
     ] = None,
     require: Annotated[str, typer.Option(metavar="RANGE:ERROR", help=REQUIRE_HELP)] = "",
     baseline: Annotated[
         float, typer.Option(metavar="M", help="For a camera: distance to a second one like it.", min=1e-3)
     ] = 10.0,
-    mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks along each axis.", min=0)] = 0.3,
+    pixel_sigma: PixelSigma = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="HTML page to write.")] = None,
 ) -> None:
     """May I use this camera or rig? Yes or no for each range, one reason, and the next picture to take.
@@ -61,16 +65,16 @@ def report_command(
 
     `kcal report left.camera.json --observations left.obs.json --require 5km:10% -o report.html`
 
-    `kcal report rig.json --require 800m:2%,5km:10% --mark-sigma 0.1 -o report.html`
+    `kcal report rig.json --require 800m:2%,5km:10% --pixel-sigma 0.1 -o report.html`
     """
     needs = required(require)
     given = observations or []
     if output is not None:
         check_writable(output, subject, *given)
     found = (
-        _of_rig(subject, given, needs, mark_sigma)
+        _of_rig(subject, given, needs, pixel_sigma)
         if _is_rig(subject)
-        else _of_camera(subject, given, needs, baseline, mark_sigma)
+        else _of_camera(subject, given, needs, baseline, pixel_sigma_of(pixel_sigma))
     )
     tell(verdict=found[0].to_dict())
     if not told_usable(*found, output, warned=()):
@@ -188,22 +192,24 @@ def _judged_again(
     from kcal.corners.observations import Observations
 
     seen, options = Observations.load(observations), stored_options(camera)
-    if camera.size != tuple(seen.image_size):
-        raise InputError(
-            f"{observations}: images of {seen.image_size[0]}x{seen.image_size[1]}, but those of {name} are of "
-            f"{camera.size[0]}x{camera.size[1]}: are the files mixed up?"
-        )
+    check_views_of([camera], [seen], [observations])
     with steps(f"calibrating {name}", None) as advance:
         result = calibrate_camera(seen, options, advance)
     return judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=name, stored=camera)
 
 
-def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], mark_sigma: float) -> Judged:
+def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], pixel_sigma: float | None) -> Judged:
     from kcal.io.rig_file import load_rig
 
+    rig = load_rig(path)
+    mark_sigma = pixel_sigma_of(pixel_sigma, rig)
     if observations and len(observations) != 2:
         raise InputError("a rig needs --observations twice: left, then right")
-    return judged_rig(load_rig(path), observations, needs, mark_sigma=mark_sigma, name=path.name.split(".")[0])
+    if observations:
+        from kcal.corners.observations import Observations
+
+        check_views_of((rig.left, rig.right), [Observations.load(file) for file in observations], observations)
+    return judged_rig(rig, observations, needs, mark_sigma=mark_sigma, name=path.name.split(".")[0])
 
 
 def judged_rig(

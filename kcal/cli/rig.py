@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from kcal.cli.console import with_inputs, with_json
+from kcal.cli.commands import Command
+from kcal.cli.console import with_json
 from kcal.cli.groups import group_with_default
+from kcal.cli.inputs import CALIBRATED, MARKS, OBSERVATIONS, SURVEY, TABLE, with_inputs
 from kcal.cli.night_images import TIME_HELP
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
 from kcal.cli.rig_check import check
 from kcal.errors import InputError
@@ -24,16 +28,20 @@ app = typer.Typer(cls=group_with_default("solve"), rich_markup_mode="markdown", 
 
 
 def solve_command(
-    left: Annotated[Path, typer.Argument(help="Camera file of the left camera.")],
-    right: Annotated[Path, typer.Argument(help="Camera file of the right camera.")],
+    left: Annotated[Path, typer.Argument(help="Camera file of the left camera."), CALIBRATED],
+    right: Annotated[Path, typer.Argument(help="Camera file of the right camera."), CALIBRATED],
     output: Annotated[Path, typer.Option("-o", "--output", help="Rig file to write.")],
     pairs: Annotated[
         tuple[Path, Path] | None,
         typer.Option("--pairs", metavar="LEFT.obs.json RIGHT.obs.json", help="Observations of boards seen by both."),
+        OBSERVATIONS,
     ] = None,
     match: Annotated[
         Path | None,
-        typer.Option(metavar="CSV", help="Which views belong together: columns left,right. By name if not given."),
+        typer.Option(
+            metavar="CSV", help="Which views belong together: columns left,right. By name if not given.", hidden=True
+        ),
+        TABLE,
     ] = None,
     landmarks: Annotated[
         Path | None,
@@ -41,10 +49,12 @@ def solve_command(
             metavar="FILE",
             help="Surveyed places: CSV (name,lat,lon,height,sigma or name,east,north,up,sigma), GeoJSON, GPX.",
         ),
+        SURVEY,
     ] = None,
     marks: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="Where they are in the images: name,left_u,left_v,right_u,right_v."),
+        MARKS,
     ] = None,
     features: Annotated[
         Path | None,
@@ -53,25 +63,33 @@ def solve_command(
             help="Far things matched between the images: left_u,left_v,right_u,right_v and range,range_sigma or "
             "beyond (meters), if known.",
         ),
+        MARKS,
     ] = None,
     positions: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="Measured camera positions (GNSS): as --landmarks, names left and right."),
+        SURVEY,
     ] = None,
     baseline: Annotated[
         str | None, typer.Option(metavar="M±SIGMA", help="Measured distance between the cameras, e.g. 10.02±0.005.")
     ] = None,
     origin: Annotated[
         str | None,
-        typer.Option(metavar="LAT,LON,HEIGHT", help="Of the local frame; the first surveyed place if not given."),
+        typer.Option(
+            metavar="LAT,LON,HEIGHT", help="Of the local frame; the first surveyed place if not given.", hidden=True
+        ),
     ] = None,
     survey_sigma: Annotated[
         float | None,
-        typer.Option(metavar="M", help="How well places of GeoJSON and GPX files are known, where these do not say."),
+        typer.Option(
+            metavar="M", help="How well places of GeoJSON and GPX files are known, where these do not say.", hidden=True
+        ),
     ] = None,
     geoid: Annotated[
         float | None,
-        typer.Option(metavar="M", help="Height of the geoid above the WGS84 ellipsoid, added to elevations of GPX."),
+        typer.Option(
+            metavar="M", help="Height of the geoid above the WGS84 ellipsoid, added to elevations of GPX.", hidden=True
+        ),
     ] = None,
     stars: Annotated[
         tuple[str, str] | None,
@@ -95,22 +113,28 @@ def solve_command(
         str, typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.")
     ] = "",
     report: Annotated[Path | None, typer.Option(help="HTML page to write: may it be used, and why not.")] = None,
-    mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks and matches along each axis.")] = 0.3,
+    pixel_sigma: PixelSigma = None,
     intrinsics: Annotated[
         Literal["prior", "fixed", "free"],
         typer.Option(
             help="Refine the cameras within what their calibrations know, hold them as if they were exact, or let them "
-            "free."
+            "free.",
+            hidden=True,
         ),
     ] = "prior",
     refraction: Annotated[
-        float, typer.Option(metavar="K", help="Refraction of light from landmarks beforehand; 0 for straight lines.")
+        float,
+        typer.Option(
+            metavar="K", help="Refraction of light from landmarks beforehand; 0 for straight lines.", hidden=True
+        ),
     ] = 0.13,
     refraction_sigma: Annotated[
-        float, typer.Option(metavar="K", help="Its standard deviation; 0 holds it.", min=0)
+        float, typer.Option(metavar="K", help="Its standard deviation; 0 holds it.", min=0, hidden=True)
     ] = 0.1,
-    keep_all: Annotated[bool, typer.Option("--keep-all", help="Leave nothing out; only warn.")] = False,
-    board_warp: Annotated[bool, typer.Option("--board-warp", help="Also estimate how the board bends.")] = False,
+    keep_all: Annotated[bool, typer.Option("--keep-all", help="Leave nothing out; only warn.", hidden=True)] = False,
+    board_warp: Annotated[
+        bool, typer.Option("--board-warp", help="Also estimate how the board bends.", hidden=True)
+    ] = False,
     picture: Annotated[Path | None, typer.Option(help="A .png or .svg file: a plan, and residuals.")] = None,
 ) -> None:
     """Solve a stereo rig: where the right camera stands from the left, and where both stand on the Earth.
@@ -140,13 +164,15 @@ def solve_command(
     from kcal.cli.console import print_table, print_wrote, steps, tell, warn
     from kcal.cli.rig_sources import Sources, read_sources
     from kcal.cli.rig_stars import NightOptions
-    from kcal.files import check_writable
+    from kcal.cli.sides import check_sides
+    from kcal.files import check_picture, check_writable
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
     from kcal.locate.mounting import placed_rig
     from kcal.locate.range_sigmas import range_sigmas
     from kcal.report.tables import range_sigma_rows
 
+    noise = pixel_sigma_of(pixel_sigma)
     night = None
     if stars is not None:
         night = NightOptions(
@@ -154,7 +180,7 @@ def solve_command(
         )
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
-        baseline=baseline, origin=origin, mark_sigma=mark_sigma, survey_sigma=survey_sigma, geoid=geoid,
+        baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
         stars=night,
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
@@ -162,8 +188,6 @@ def solve_command(
     if report is not None:
         check_writable(report, left, right, *sources.files)
     if picture is not None:
-        from kcal.report.figures import check_picture
-
         check_picture(picture)
     if not any((pairs, landmarks, marks, features, positions, baseline, stars)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
@@ -171,11 +195,15 @@ def solve_command(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
         refraction_sigma=refraction_sigma,
     )  # fmt: skip
-    data, frame, unpaired, notes = read_sources((load_camera(left), load_camera(right)), sources)
+    calibrated = load_camera(left), load_camera(right)
+    check_sides(calibrated, (left, right))
+    data, frame, unpaired, notes = read_sources(calibrated, sources)
     with steps("solving the rig", 1) as advance:
         result = solve_rig(data, options)
         advance("done")
     rig = result.stereo() if frame is None else placed_rig(result, frame)
+    if rig.calibration is not None and pixel_sigma is not None:
+        rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=pixel_sigma)
     # Everything that can fail comes before the file.
     lines = rig_lines(result, rig, unpaired)
     tell(
@@ -193,7 +221,7 @@ def solve_command(
         save_rig_picture(picture, result)
     print_rig(result, [*lines, *notes])
     try:
-        print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=mark_sigma), rig.covariance is not None))
+        print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
     except InputError as error:
         warn(f"range errors are not split: {error}")
     print_wrote(output, picture)
@@ -203,9 +231,9 @@ def solve_command(
         from kcal.report.rig import rig_figure
         from kcal.report.verdict_pictures import png_bytes
 
-        cameras = judged_sides(rig, pairs, mark_sigma) if pairs is not None and _calibrated_from(rig, pairs) else []
+        cameras = judged_sides(rig, pairs, noise) if pairs is not None and _calibrated_from(rig, pairs) else []
         verdict = rig_verdict(
-            rig, needs, mark_sigma=mark_sigma, result=result, cameras=[found[0] for found in cameras],
+            rig, needs, mark_sigma=noise, result=result, cameras=[found[0] for found in cameras],
             subject=output.name.split(".")[0],
         )  # fmt: skip
         tables = stored_tables(rig)
@@ -295,5 +323,5 @@ def print_rig(result: RigResult, lines: list[str]) -> None:
         err.print("[yellow]warning:[/]", text)
 
 
-app.command("solve", hidden=True)(with_json(with_inputs(solve_command)))
-app.command("check")(with_json(with_inputs(check)))
+app.command("solve", hidden=True, cls=Command)(with_json(with_inputs(solve_command)))
+app.command("check", cls=Command)(with_json(with_inputs(check)))

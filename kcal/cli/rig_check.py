@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kcal.cli.console import err, out, print_table, print_wrote, warn
+from kcal.cli.inputs import MARKS, RIG, SURVEY
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,18 +23,19 @@ _DRIFTED = 3
 
 
 def check(
-    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`.")],
+    rig: Annotated[Path, typer.Argument(help="Rig file from `kcal rig`."), RIG],
     marks: Annotated[
-        Path, typer.Option(metavar="CSV", help="Marks in new images: name,left_u,left_v,right_u,right_v.")
+        Path, typer.Option(metavar="CSV", help="Marks in new images: name,left_u,left_v,right_u,right_v."), MARKS
     ],
     reference: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="The same static things, marked in images from when the rig was solved."),
+        MARKS,
     ] = None,
     landmarks: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Surveyed places among the marks, as for `kcal rig`.")
+        Path | None, typer.Option(metavar="CSV", help="Surveyed places among the marks, as for `kcal rig`."), SURVEY
     ] = None,
-    mark_sigma: Annotated[float, typer.Option(metavar="PX", help="Noise of marks along each axis.")] = 0.3,
+    pixel_sigma: PixelSigma = None,
     relock: Annotated[
         bool,
         typer.Option("--relock", help="If it has turned, write the corrected rig in its place; the old one is kept."),
@@ -69,9 +72,10 @@ def check(
     if relock:
         check_writable(rig, marks, *(path for path in (reference, landmarks) if path is not None))
     old = load_rig(rig)
+    noise = pixel_sigma_of(pixel_sigma, old)
     now = read_marks(marks, single=True)
-    features = None if reference is None else seen_again(read_marks(reference, single=True), now, mark_sigma)
-    surveyed = None if landmarks is None else _landmarks(old, landmarks, now, mark_sigma)
+    features = None if reference is None else seen_again(read_marks(reference, single=True), now, noise)
+    surveyed = None if landmarks is None else _landmarks(old, landmarks, now, noise)
     drift = check_rig(old, features=features, landmarks=surveyed)
     _print_turns(old, drift)
     for item in drift.left_out:

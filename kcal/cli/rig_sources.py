@@ -73,6 +73,7 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
     from kcal.calibrate.rig.pairs import pair_by_name, paired_boards, read_pairs
     from kcal.calibrate.rig.sources import RigData
     from kcal.cli.console import err
+    from kcal.cli.sides import check_views_of
     from kcal.corners.observations import Observations
     from kcal.lens.mounting import Origin
     from kcal.locate.marks import read_marks
@@ -101,6 +102,7 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
                 err.print(f"[yellow]warning:[/] {text}:", ", ".join(names), markup=True)
     if sources.pairs is not None:
         seen = Observations.load(sources.pairs[0]), Observations.load(sources.pairs[1])
+        check_views_of(cameras, seen, sources.pairs)
         views = seen[0].names, seen[1].names
         matched = pair_by_name(*views) if sources.match is None else read_pairs(sources.match, *views)
         boards, unpaired = paired_boards(cameras, seen, matched), len(views[0]) + len(views[1]) - 2 * len(matched)

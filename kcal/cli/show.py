@@ -1,16 +1,25 @@
-"""`kcal show`: what is in a file of kcal or of another program."""
+"""`kcal show`: what is in a file of kcal or of another program.
+
+Files of kcal have a summary of what would have to be computed, so that they are shown without loading torch.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import datetime
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from kcal.cli.console import out, print_table
+from kcal.cli.inputs import SHOWN
 from kcal.errors import FileError
+from kcal.file_kind import file_kind
 from kcal.files import read_bytes
+from kcal.native_file import digest
+from kcal.quantities import number_text
 from kcal.strict_json import MOST_BYTES, read_json
 
 if TYPE_CHECKING:
@@ -19,10 +28,40 @@ if TYPE_CHECKING:
 
 # Parameters of hybrid lenses that are shown; their hundreds of weights say nothing one by one.
 _SHOWN = 26
+_INTRINSICS = ("fx", "fy", "cx", "cy", "skew")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _CameraFacts:
+    """What is shown of a camera: from its file, or computed."""
+
+    name: str
+    size: tuple[int, int]
+    model: str
+    covers_image: bool
+    hybrid: bool
+    focal_length: str
+    values: Mapping[str, float]
+    sigma: Mapping[str, float | None]
+    sigma_px: tuple[float, float] | None
+    record: Mapping[str, Any] | None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _PoseFacts:
+    """What is shown of the relative pose of a rig."""
+
+    baseline: float
+    translation: tuple[float, ...]
+    turn: tuple[float, ...]
+    sigma_m: tuple[float, ...] | None
+    sigma_deg: tuple[float, ...] | None
+    mounting: Mapping[str, Any] | None
+    record: Mapping[str, Any] | None
 
 
 def show_command(
-    file: Annotated[Path, typer.Argument(help="Camera, rig or observations of kcal, or a foreign camera file.")],
+    file: Annotated[Path, typer.Argument(help="Camera, rig or observations of kcal, or a foreign camera file."), SHOWN],
 ) -> None:
     """Print what is in a file: cameras with their error bars and history, rigs, observations.
 
@@ -30,130 +69,191 @@ def show_command(
 
     `kcal show left.camera.json`
     """
-    from kcal.io.formats import import_cameras, recognized
-
-    kind = recognized(file)
-    if kind != "kcal":
-        found = import_cameras(file)
-        out.print(f"{file}: {found.format}, {len(found.cameras)} cameras", markup=False)
-        for note in found.notes:
-            out.print(f"  {note}", markup=False)
-        for camera in found.cameras:
-            _show_camera(camera)
-        if found.is_rig():
-            _show_pose(found.rig())
+    if file_kind(file) not in ("camera", "rig", "observations"):
+        _show_foreign(file)
         return
     content = read_json(read_bytes(file, MOST_BYTES), str(file))
     out.print(f"{file}: kcal {content['kcal']} file, version {content.get('version')}", markup=False)
-    shown = {"camera": _show_camera_file, "rig": _show_rig_file, "observations": _show_observations}
-    if content["kcal"] not in shown:
-        raise FileError(f"{file}: kcal show knows camera, rig and observations files, not {content['kcal']} files")
-    shown[content["kcal"]](file)
+    if content["kcal"] == "observations":
+        _show_observations(file)
+        return
+    cameras, pose = _stored_facts(content) or _computed(file, content["kcal"])
+    for camera in cameras:
+        _show_camera(camera)
+    if pose is not None:
+        _show_pose(pose)
 
 
-def _show_camera_file(file: Path) -> None:
-    from kcal.io.camera_file import load_camera
+def _show_foreign(file: Path) -> None:
+    from kcal.io.formats import import_cameras, recognized
 
-    _show_camera(load_camera(file))
+    if recognized(file) == "kcal":
+        kind = file_kind(file)
+        raise FileError(f"{file}: kcal show knows camera, rig and observations files, not {kind} files")
+    found = import_cameras(file)
+    out.print(f"{file}: {found.format}, {len(found.cameras)} cameras", markup=False)
+    for note in found.notes:
+        out.print(f"  {note}", markup=False)
+    for camera in found.cameras:
+        _show_camera(_facts_of(camera))
+    if found.is_rig():
+        _show_pose(_pose_of(found.rig()))
 
 
-def _show_rig_file(file: Path) -> None:
+def _stored_facts(content: dict[str, Any]) -> tuple[list[_CameraFacts], _PoseFacts | None] | None:
+    """What a file says of itself; None where it has no summary, or was changed after that was written."""
+    try:
+        if content["kcal"] == "camera":
+            camera = _stored_camera(content)
+            return None if camera is None else ([camera], None)
+        brief = content["summary"]
+        # The rig knows more of its cameras than each of them knew before it was solved.
+        cameras = [_stored_camera(content[side] | {"summary": brief[side]}) for side in ("left", "right")]
+        rest = {key: value for key, value in content.items() if key not in ("left", "right")}
+        if brief is None or brief["of"] != digest(rest) or None in cameras:
+            return None
+        pose = _PoseFacts(
+            baseline=brief["baseline_m"],
+            translation=content["right_from_left"]["translation"],
+            turn=brief["rotation_vector_deg"],
+            sigma_m=brief["sigma_m"],
+            sigma_deg=brief["sigma_deg"],
+            mounting=content["mounting"],
+            record=content["calibration"],
+        )
+        return [camera for camera in cameras if camera is not None], pose
+    except (KeyError, TypeError, AttributeError):
+        # No such file was written by kcal: its reader says what is wrong.
+        return None
+
+
+def _stored_camera(content: dict[str, Any]) -> _CameraFacts | None:
+    brief = content["summary"]
+    if brief is None or brief["of"] != digest(content):
+        return None
+    record = content["calibration"]
+    return _CameraFacts(
+        name=content["name"],
+        size=content["image_size"],
+        model=brief["model"],
+        covers_image=brief["covers_image"],
+        hybrid=content["model"].get("hybrid") is not None,
+        focal_length=brief["focal_length"],
+        values={name: content["intrinsics"][name] for name in _INTRINSICS} | content["coefficients"],
+        sigma=brief["sigma"],
+        sigma_px=brief["sigma_px"],
+        record=record and record | {"board": brief["board"]},
+    )
+
+
+def _computed(file: Path, kind: str) -> tuple[list[_CameraFacts], _PoseFacts | None]:
+    if kind == "camera":
+        from kcal.io.camera_file import load_camera
+
+        return [_facts_of(load_camera(file))], None
+    from kcal.io.file_summary import take_joint_errors
     from kcal.io.rig_file import load_rig
 
     rig = load_rig(file)
-    _take_joint_errors(rig)
-    _show_camera(rig.left)
-    _show_camera(rig.right)
-    _show_pose(rig)
+    take_joint_errors(rig)
+    return [_facts_of(rig.left), _facts_of(rig.right)], _pose_of(rig)
 
 
-def _take_joint_errors(rig: StereoRig) -> None:
-    """Give the cameras the error bars that the rig has of them: those of each alone are of before it was solved."""
-    from kcal.lens.calibration import CameraCalibration
+def _facts_of(camera: Camera) -> _CameraFacts:
+    from kcal.io.file_summary import sigma_of, sigma_over_image
+    from kcal.lens.paraxial import paraxial_focal
 
-    if rig.covariance is None:
-        return
-    first = 0
-    for camera in (rig.left, rig.right):
-        size = camera.params.shape[-1]
-        half = rig.covariance.half[:, first : first + size]
-        known = camera.calibration or CameraCalibration()
-        camera.calibration = dataclasses.replace(known, sigma=None, information=None, covariance=half.T @ half)
-        first += size
-
-
-def _show_camera(camera: Camera) -> None:
     known = camera.calibration
-    out.print(f"\ncamera {known.name if known and known.name else ''}".rstrip(), markup=False)
-    share = "the whole image" if bool(camera.covers_image()) else "part of the image"
+    return _CameraFacts(
+        name=known.name if known else "",
+        size=camera.size,
+        model=str(camera.model),
+        covers_image=bool(camera.covers_image()),
+        hybrid=camera.model.hybrid is not None,
+        focal_length=str(paraxial_focal(camera)),
+        values=dict(zip(camera.names, camera.params.detach().tolist(), strict=True)),
+        sigma=sigma_of(camera),
+        sigma_px=sigma_over_image(camera),
+        record=_fields(known.record) if known else None,
+    )
+
+
+def _pose_of(rig: StereoRig) -> _PoseFacts:
+    from kcal.io.file_summary import RigSummary
+
+    brief = RigSummary.made(rig, {})
+    mounting = None
+    if rig.mounting is not None:
+        mounting = {**dataclasses.asdict(rig.mounting.origin), "heading_deg": rig.mounting.heading_deg}
+    return _PoseFacts(
+        baseline=brief.baseline_m,
+        translation=tuple(rig.right_from_left_translation.tolist()),
+        turn=brief.rotation_vector_deg,
+        sigma_m=brief.sigma_m,
+        sigma_deg=brief.sigma_deg,
+        mounting=mounting,
+        record=_fields(rig.calibration),
+    )
+
+
+def _fields(record: Any) -> dict[str, Any] | None:
+    return None if record is None else {each.name: getattr(record, each.name) for each in dataclasses.fields(record)}
+
+
+def _when(record: Mapping[str, Any]) -> str:
+    created = record["created"]
+    moment = datetime.datetime.fromisoformat(created) if isinstance(created, str) else created
+    return f"{moment:%Y-%m-%d %H:%M %Z}"
+
+
+def _show_camera(camera: _CameraFacts) -> None:
+    out.print(f"\ncamera {camera.name}".rstrip(), markup=False)
+    share = "the whole image" if camera.covers_image else "part of the image"
     out.print(f"{camera.size[0]}x{camera.size[1]} px, {camera.model}, valid in {share}", markup=False)
-    record = known.record if known else None
-    if record:
+    if record := camera.record:
         out.print(
-            f"calibrated {record.created:%Y-%m-%d %H:%M %Z} by kcal {record.kcal_version}: RMS {record.rms:.4f} px, "
-            f"{record.views} views, {record.points} corners, board {record.board}, {len(record.excluded)} left out",
+            f"calibrated {_when(record)} by kcal {record['kcal_version']}: RMS {record['rms']:.4f} px, "
+            f"{record['views']} views, {record['points']} corners, board {record['board']}, "
+            f"{len(record['excluded'])} left out",
             markup=False,
         )
-        if record.temperature is not None:
-            out.print(f"at {record.temperature:g} °C")
-    from kcal.lens.paraxial import paraxial_focal
-    from kcal.quantities import number_text
-
-    hybrid = ", on its axis; fx and fy below are parameters of the base projection alone" if camera.model.hybrid else ""
-    out.print(f"focal length {paraxial_focal(camera)}{hybrid}", markup=False)
-    sigma = _sigmas(camera)
-    values = camera.params.detach().tolist()
+        if record["temperature"] is not None:
+            out.print(f"at {record['temperature']:g} °C")
+    hybrid = ", on its axis; fx and fy below are parameters of the base projection alone" if camera.hybrid else ""
+    out.print(f"focal length {camera.focal_length}{hybrid}", markup=False)
     rows = [["parameter", "value", "sigma"]]
-    for name, value, error in list(zip(camera.names, values, sigma, strict=True))[:_SHOWN]:
+    for name, value in list(camera.values.items())[:_SHOWN]:
+        error = camera.sigma.get(name)
         rows.append([name, number_text(value, error, digits=8), "" if error is None else number_text(error, error)])
     print_table(rows)
-    if len(values) > _SHOWN:
-        out.print(f"and {len(values) - _SHOWN} more weights of the field")
-    if known is not None and known.covariance is not None:
-        from kcal.lens.uncertainty import image_sigma
-
-        spread = image_sigma(camera)
-        spread = spread[spread.isfinite()]
-        out.print(
-            f"sigma in the image: {float(spread.median()):.3g} px (median), {float(spread.max()):.3g} px (largest)"
-        )
-    elif not any(sigma):
+    if len(camera.values) > _SHOWN:
+        out.print(f"and {len(camera.values) - _SHOWN} more weights of the field")
+    if camera.sigma_px is not None:
+        median, largest = camera.sigma_px
+        out.print(f"sigma in the image: {median:.3g} px (median), {largest:.3g} px (largest)")
+    elif not any(camera.sigma.values()):
         out.print("no error bars")
 
 
-def _sigmas(camera: Camera) -> list[float | None]:
-    known = camera.calibration
-    if known is None:
-        return [None] * len(camera.names)
-    if known.sigma is not None:
-        return [known.sigma.get(name) for name in camera.names]
-    if known.covariance is None:
-        return [None] * len(camera.names)
-    return [value**0.5 if value > 0 else None for value in known.covariance.diagonal().tolist()]
-
-
-def _show_pose(rig: StereoRig) -> None:
-    from kcal.lens.pose import vector_from_rotation
-
-    x, y, z = rig.right_from_left_translation.tolist()
-    turn = vector_from_rotation(rig.right_from_left_rotation).rad2deg().tolist()
-    out.print(f"\nbaseline {float(rig.baseline):.6g} m, translation {x:.6g}, {y:.6g}, {z:.6g} m")
+def _show_pose(pose: _PoseFacts) -> None:
+    x, y, z = pose.translation
+    turn = pose.turn
+    out.print(f"\nbaseline {pose.baseline:.6g} m, translation {x:.6g}, {y:.6g}, {z:.6g} m")
     out.print(f"rotation vector of the right camera {turn[0]:.6g}, {turn[1]:.6g}, {turn[2]:.6g}°")
-    if rig.covariance is not None:
-        errors = rig.covariance.matrix.diagonal()[-6:].sqrt().tolist()
+    if pose.sigma_m is not None and pose.sigma_deg is not None:
         out.print(
-            f"sigma of it {' '.join(f'{1e3 * e:.3g}' for e in errors[3:])} mm, "
-            f"{' '.join(f'{57.29577951 * e:.2g}' for e in errors[:3])}°"
+            f"sigma of it {' '.join(f'{1e3 * error:.3g}' for error in pose.sigma_m)} mm, "
+            f"{' '.join(f'{error:.2g}' for error in pose.sigma_deg)}°"
         )
-    if rig.mounting is not None:
-        place: Any = rig.mounting.origin
-        out.print(f"at {place.lat:.7f}, {place.lon:.7f}, {place.height:.2f} m, heading {rig.mounting.heading_deg:.3f}°")
-    if rig.calibration is not None:
-        record = rig.calibration
+    if place := pose.mounting:
         out.print(
-            f"solved {record.created:%Y-%m-%d %H:%M %Z}: RMS {record.rms:.4f} px, {record.pairs} pairs", markup=False
+            f"at {place['lat']:.7f}, {place['lon']:.7f}, {place['height']:.2f} m, heading {place['heading_deg']:.3f}°"
         )
-        for text in record.warnings:
+    if record := pose.record:
+        out.print(f"solved {_when(record)}: RMS {record['rms']:.4f} px, {record['pairs']} pairs", markup=False)
+        if record.get("pixel_sigma") is not None:
+            out.print(f"noise of marks {record['pixel_sigma']:g} px along each axis")
+        for text in record["warnings"]:
             out.print(f"warning: {text}", markup=False)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.inputs import IMAGES
 from kcal.cli.night_images import TIME_HELP, sky_view
 from kcal.errors import InputError, KcalError
 from kcal.files import check_writable
@@ -26,6 +27,7 @@ def stars_command(
             "whose frames are summed.",
             show_default=False,
         ),
+        IMAGES,
     ],
     camera: Annotated[
         str | None,

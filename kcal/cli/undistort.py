@@ -9,6 +9,7 @@ import typer
 from rich.markup import escape
 
 from kcal.cli.console import err, out, print_wrote, steps
+from kcal.cli.inputs import CAMERA, IMAGES
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, make_folder, read_bytes
 
@@ -22,8 +23,9 @@ def undistort_command(
         typer.Argument(
             metavar="IMAGES", help="Images of one camera: files, folders or quoted wildcards.", show_default=False
         ),
+        IMAGES,
     ],
-    camera: Annotated[Path, typer.Argument(help="Camera file from `kcal calibrate`.", show_default=False)],
+    camera: Annotated[Path, typer.Argument(help="Camera file from `kcal calibrate`.", show_default=False), CAMERA],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder to write to.")],
     alpha: Annotated[
         float,
@@ -59,12 +61,13 @@ def undistort_command(
     camera_path, mask_path = output / f"{name}_undistorted.json", output / f"{name}_mask.png"
     outputs = _outputs(paths, output, [camera_path, *([mask_path] if mask else [])])
 
-    from kcal.io.camera_file import load_camera, save_camera
+    from kcal.cli.camera_sources import calibrated_camera
+    from kcal.io.camera_file import save_camera
     from kcal.io.images import write_png
     from kcal.lens.images import Undistort
     from kcal.lens.pinhole import new_pinhole
 
-    old = load_camera(camera)
+    old = calibrated_camera(camera)
     _prepare(output, [*outputs, camera_path, mask_path])
     failures: list[str] = []
     with steps("undistorting", 1 + len(paths)) as advance:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import pydantic
-import torch
-from torch import Tensor
 
 from kcal.corners.board_text import DICTIONARIES, MOST, board_fields
 from kcal.corners.kalibr_target import target_fields
 from kcal.errors import FileError, InputError
 from kcal.lens.calibration import BoardRecord
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Pattern = Literal["checkerboard", "circles", "asymmetric", "aprilgrid"]
 TAGS = "apriltag_36h11"  # the dictionary of an AprilGrid
@@ -170,6 +171,8 @@ class Board(pydantic.BaseModel):
     @property
     def points(self) -> Tensor:
         """Positions of the points on the flat board, (corners, 3) float64 meters, row by row."""
+        import torch
+
         rows, columns = (torch.arange(count, dtype=torch.float64) for count in (self.rows, self.columns))
         y, x = torch.cartesian_prod(rows, columns).unbind(-1)
         if self.pattern == "asymmetric":

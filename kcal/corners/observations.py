@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import pydantic
-import torch
-from torch import Tensor
 
-from kcal.checks import ImageSize
 from kcal.corners.board import Board
 from kcal.errors import InputError
+from kcal.image_size import ImageSize
 from kcal.native_file import NativeFile
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 # Sides of images have at most 65535 pixels in most formats; far beyond, squares and products overflow.
 Coordinate = Annotated[float, pydantic.Field(ge=-1e6, le=1e6)]
@@ -123,6 +124,8 @@ class Observations(NativeFile):
         """
         if not self.views:
             raise InputError("no view with a board; check the board's size and the images")
+        import torch
+
         nowhere = (float("nan"), float("nan"))
         return torch.tensor(
             [[nowhere if pixel is None else pixel for pixel in view.pixels] for view in self.views],
@@ -133,6 +136,8 @@ class Observations(NativeFile):
         """Covariances as (views, corners, 2, 2) px²; NaN where not seen, None unless all views have them."""
         if not self.views or any(view.covariance is None for view in self.views):
             return None
+        import torch
+
         nothing = (float("nan"),) * 3
         packed = torch.tensor(
             [[spread or nothing for spread in view.covariance or ()] for view in self.views], dtype=torch.float64

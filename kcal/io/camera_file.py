@@ -15,8 +15,10 @@ import pydantic
 import torch
 
 import kcal
-from kcal.checks import MOST_FOCAL, ImageSize
+from kcal.checks import MOST_FOCAL
 from kcal.errors import InputError
+from kcal.image_size import ImageSize
+from kcal.io.file_summary import CameraSummary
 from kcal.io.information_record import InformationRecord
 from kcal.io.lens_record import LensOrders
 from kcal.io.record import CovarianceRecord, Record
@@ -77,6 +79,7 @@ class CameraFile(NativeFile):
             computed.
         valid_region: where the lens is valid; None if whoever wrote the file did not say.
         calibration: how the camera was calibrated, if it was.
+        summary: what `kcal show` prints of it without computing.
 
     Example:
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080),
@@ -103,6 +106,7 @@ class CameraFile(NativeFile):
     information: InformationRecord | None = None
     valid_region: ValidRegion | None = None
     calibration: CalibrationRecord | None = None
+    summary: CameraSummary | None = None
 
     @pydantic.field_validator("coefficients", "standard_deviations")
     @classmethod
@@ -231,7 +235,7 @@ def camera_to_file(
             raise InputError(f"standard deviation of {unknown[0]!r}: the camera has {', '.join(camera.names)}")
     stored = dict(zip(camera.names, values.tolist(), strict=True))
     try:
-        return CameraFile(
+        file = CameraFile(
             name=known.name if name is None else name,
             image_size=camera.size,
             model=LensOrders.of(camera.model),
@@ -250,6 +254,7 @@ def camera_to_file(
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise InputError(f"this camera cannot be stored: {where}: {first['msg']}") from error
+    return file.model_copy(update={"summary": CameraSummary.made(camera, file.model_dump(mode="json"))})
 
 
 def save_camera(camera: Camera, path: str | Path, *, name: str | None = None) -> Path:

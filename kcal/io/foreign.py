@@ -16,9 +16,10 @@ import torch
 import yaml
 from torch import Tensor
 
-from kcal.checks import MOST_FOCAL, check_pixel_count
+from kcal.checks import MOST_FOCAL
 from kcal.errors import FileError, InputError, KcalError
 from kcal.files import read_text
+from kcal.image_size import check_pixel_count
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel

@@ -37,9 +37,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kcal.checks import check_pixel_count
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes, write_atomic
+from kcal.image_size import check_pixel_count
 from kcal.lens.lookup import LookupCamera
 from kcal.lens.spline import Spline
 

@@ -20,6 +20,7 @@ from torch import Tensor
 from kcal.checks import as_covariance
 from kcal.errors import InputError
 from kcal.io.camera_file import RETIRED_FIELDS, CameraFile, camera_to_file
+from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed, Record
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
@@ -142,6 +143,7 @@ class RigFile(NativeFile):
         half: (K, P) root of it: halfᵀ half is the covariance.
         mounting: where the rig stands on the Earth, if that was solved.
         calibration: how the rig was solved, if it was.
+        summary: what `kcal show` prints of the relative pose without computing.
 
     Example:
         >>> from kcal import Camera
@@ -163,6 +165,7 @@ class RigFile(NativeFile):
     half: Packed | None = None
     mounting: RigMounting | None = None
     calibration: RigCalibration | None = None
+    summary: RigSummary | None = None
 
     @pydantic.model_validator(mode="after")
     def _measured(self) -> RigFile:
@@ -221,7 +224,7 @@ def rig_to_file(rig: StereoRig) -> RigFile:
     """
     covariance, mounting = rig.covariance, rig.mounting
     try:
-        return RigFile(
+        file = RigFile(
             left=_camera_to_file(rig.left, "left"),
             right=_camera_to_file(rig.right, "right"),
             right_from_left=RigPose.model_validate(
@@ -237,6 +240,7 @@ def rig_to_file(rig: StereoRig) -> RigFile:
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"this rig cannot be stored: {first['msg']}") from error
+    return file.model_copy(update={"summary": RigSummary.made(rig, file.model_dump(mode="json"))})
 
 
 def _camera_to_file(camera: Camera, name: str) -> CameraFile:

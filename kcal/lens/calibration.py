@@ -9,13 +9,14 @@ import dataclasses
 import datetime
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
-from torch import Tensor
-
-from kcal.checks import as_covariance
 from kcal.errors import InputError
-from kcal.lens.information import CameraInformation
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kcal.lens.information import CameraInformation
 
 
 def _refuse_negative(where: object, names: Iterable[str]) -> None:
@@ -163,6 +164,8 @@ class CameraCalibration:
     def check(self, count: int) -> None:
         """Raise `InputError` unless covariance and information are those of `count` parameters."""
         if self.information is None:
+            from kcal.checks import as_covariance
+
             as_covariance("the camera's covariance", self.covariance, count)
         elif len(self.information.slots) != count:
             raise InputError(f"information on {len(self.information.slots)} parameters; the camera has {count}")
@@ -171,6 +174,8 @@ class CameraCalibration:
         """What is known of a camera with these parameters (5 + P,): its information, or that of its covariance."""
         if self.information is not None or self.covariance is None:
             return self.information
+        from kcal.lens.information import CameraInformation
+
         return CameraInformation.from_covariance(params, self.covariance)
 
 
@@ -203,6 +208,8 @@ class RigCalibration:
         excluded: pairs, landmarks and matches left out, with the reason.
         sources: what the rig was solved from, where that is more than boards.
         warnings: what should be doubted of it, a sentence each, for example that its geometry is weak.
+        pixel_sigma: noise of marks along each axis, pixels, as stated when the rig was solved; None if nobody did.
+    =======
         contradictions: which source contradicts the others beyond reasonable doubt, a sentence each.
         relocked: when only the cameras' attitudes were solved again, and from what.
         baseline_m: distance between the cameras' centers, meters; must be the length of the translation.
@@ -220,6 +227,7 @@ class RigCalibration:
     excluded: tuple[Exclusion, ...] = ()
     sources: tuple[RigSource, ...] = ()
     warnings: tuple[str, ...] = ()
+    pixel_sigma: float | None = None
     contradictions: tuple[str, ...] = ()
     relocked: str | None = None
     baseline_m: float

@@ -8,7 +8,6 @@ from kcal.errors import InputError
 from kcal.lens.calibration import CameraCalibration, UntilChanged
 from kcal.lens.camera_parameters import CameraParameters
 from kcal.lens.image_transform import ImageTransform
-from kcal.lens.kornia_cameras import kornia_camera, parameters_from_kornia
 
 
 class ConvertibleCamera(CameraParameters):
@@ -63,6 +62,8 @@ class ConvertibleCamera(CameraParameters):
             >>> type(camera.to_kornia()).__name__
             'CameraModel'
         """
+        from kcal.lens.kornia_cameras import kornia_camera  # kornia takes long to load
+
         return kornia_camera(self)
 
     @classmethod
@@ -78,5 +79,7 @@ class ConvertibleCamera(CameraParameters):
             >>> str(Camera.from_kornia(camera.to_kornia()).model)
             'opencv8'
         """
+        from kcal.lens.kornia_cameras import parameters_from_kornia
+
         parameters, size, model = parameters_from_kornia(camera)
         return cls(parameters, size=size, model=model)

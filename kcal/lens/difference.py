@@ -10,7 +10,6 @@ import dataclasses
 import math
 
 import torch
-from scipy.stats import chi2
 from torch import Tensor
 
 from kcal.errors import DegenerateError, InputError
@@ -238,8 +237,11 @@ def _judged(
     found = float((weight[:, None] * torch.where(weight[:, None] > 0, away, 0.0).square()).sum())
     if not expected > 0:
         return sigma, None, None
+    # Here, because SciPy takes long to load.
+    from scipy.special import chdtrc
+
     # The weighted sum of squares of normal errors has nearly a scaled χ² distribution (Satterthwaite 1946).
     scale, degrees = squared / expected, expected**2 / squared
-    probability = float(chi2.sf(found / scale, degrees))
+    probability = float(chdtrc(degrees, found / scale))
     sigma = torch.where(weight > 0, sigma, torch.nan)
     return sigma, math.sqrt(found / expected), probability

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
-from kornia.geometry.transform import remap
 from torch import Tensor, nn
 
 from kcal.errors import InputError
@@ -145,6 +144,8 @@ class Undistort(nn.Module):
             return image.new_zeros((*lead, channels, *mask.shape[-2:])), mask
         source = image.to(precision).expand(*lead, *image.shape[-3:]).reshape(count, *image.shape[-3:])
         x, y = (grid.expand(mask.shape).reshape(count, *mask.shape[-2:]) for grid in (grid_x, grid_y))
+        from kornia.geometry.transform import remap  # which takes long to load
+
         sampled = remap(source, x, y, mode="bilinear", align_corners=True, normalized_coordinates=True)
         if image.dtype in _INTEGERS:
             sampled = sampled.round()

@@ -6,7 +6,6 @@ A step is six numbers: a rotation vector ω (radians) and a translation v (meter
 from __future__ import annotations
 
 import torch
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 from torch import Tensor
 
 
@@ -17,6 +16,9 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
         >>> rotation_from_vector(torch.zeros(3)).diagonal().tolist()
         [1.0, 1.0, 1.0]
     """
+    # Here and below: kornia takes long to load.
+    from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
     flat: Tensor = axis_angle_to_rotation_matrix(vector.reshape(-1, 3))
     return flat.reshape(*vector.shape, 3)
 
@@ -28,6 +30,8 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
         >>> vector_from_rotation(torch.eye(3)).tolist()
         [0.0, 0.0, 0.0]
     """
+    from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+
     flat: Tensor = rotation_matrix_to_axis_angle(rotation.reshape(-1, 3, 3))
     return flat.reshape(*rotation.shape[:-2], 3)
 

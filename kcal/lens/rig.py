@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from kornia.geometry.epipolar import cross_product_matrix, fundamental_from_essential
 from torch import Tensor, nn
 
 from kcal.checks import as_covariance, as_points, keep_float64, require_finite
@@ -88,6 +87,8 @@ class StereoRig(nn.Module):
 
         With `Camera.normalize` it serves the functions of `kornia.geometry.epipolar`, whatever the lenses are.
         """
+        from kornia.geometry.epipolar import cross_product_matrix
+
         skewed = cross_product_matrix(self.right_from_left_translation[None])[0]
         return skewed @ self.right_from_left_rotation
 
@@ -105,6 +106,8 @@ class StereoRig(nn.Module):
                     f"the {word} lens distorts, so that epipolar lines are curves and there is no fundamental matrix; "
                     "use rig.essential with camera.normalize(pixels)"
                 )
+        from kornia.geometry.epipolar import fundamental_from_essential
+
         return fundamental_from_essential(self.essential[None], self.left.matrix[None], self.right.matrix[None])[0]
 
     def right_from_left(self, points_left: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from kcal.locate.marks import PIXELS, Marks, pixel_of
 from kcal.locate.tables import TableRow, read_rows
 
 EARTH, LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
+FEATURE_COLUMNS = ("name", *PIXELS, "range", "range_sigma", "beyond", "note")
 PLACE_COLUMNS = ("name", *EARTH, *LOCAL, "sigma", "sigma_up", "note")
 # 1/m: how well the inverse range of a star is known.
 _INFINITY_SIGMA = 1e-12
@@ -163,8 +164,7 @@ def read_features(path: str | Path, pixel_sigma: float) -> Features:
         ...     read_features(path, 0.1).inverse_range.tolist()
         [2.5e-05, 0.0]
     """
-    columns = ("name", *PIXELS, "range", "range_sigma", "beyond", "note")
-    rows = read_rows(path, "name,left_u,left_v,right_u,right_v,range,range_sigma", columns, PIXELS)
+    rows = read_rows(path, "name,left_u,left_v,right_u,right_v,range,range_sigma", FEATURE_COLUMNS, PIXELS)
     pixels = [[pixel_of(row, side, False) for side in ("left", "right")] for row in rows]
     known = torch.tensor([_inverse_range(row) for row in rows], dtype=torch.float64)
     return Features(

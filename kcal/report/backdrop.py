@@ -19,9 +19,9 @@ from PIL import Image
 from PIL.TiffImagePlugin import TiffImageFile
 from pyproj.exceptions import ProjError
 
-from kcal.checks import check_pixel_count
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
+from kcal.image_size import check_pixel_count
 
 _KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
 # Limits that keep a page easy to send: bytes of tiles (finer levels are left out), pixels of an image's longer side.

@@ -11,7 +11,8 @@ from matplotlib.ticker import MaxNLocator
 
 from kcal.calibrate.hybrid.measured_board import Measured, MeasuredBoard
 from kcal.quantities import measured_text
-from kcal.report.figures import GRAY, INK, draw_arrows, new_figure, save_picture
+from kcal.report.colors import GRAY, INK
+from kcal.report.figures import draw_arrows, new_figure, save_picture
 
 _ACROSS = 160
 # What is below this (mm) is not worth full colors and long arrows.

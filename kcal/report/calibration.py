@@ -14,18 +14,8 @@ from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.corners.observations import Observations
 from kcal.lens.uncertainty import image_sigma
-from kcal.report.figures import (
-    ACCENT,
-    FAINT,
-    HALO,
-    INK,
-    WARN,
-    draw_arrows,
-    frame_image,
-    new_figure,
-    save_picture,
-    shortened,
-)
+from kcal.report.colors import ACCENT, FAINT, INK, WARN
+from kcal.report.figures import HALO, draw_arrows, frame_image, new_figure, save_picture, shortened
 
 # Of the width of axes: their color bar and the gap before it.
 COLORBAR_SHARE = 0.055

@@ -21,12 +21,9 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import ArrayLike, NDArray
 
-from kcal.errors import InputError
-from kcal.files import check_writable, write_atomic
+from kcal.files import check_picture, write_atomic
 from kcal.texts import visible
 
-INK, GRAY, FAINT, ACCENT, WARN = "#111827", "#4b5563", "#9aa3af", "#2b6cb0", "#c02a6b"
-CAMERA_COLORS = ("#2b6cb0", "#dd7a1f", "#0f766e", "#7c3aed")
 # White around text that lies on lines.
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
@@ -119,18 +116,6 @@ def draw_arrows(
     across, down = np.moveaxis(scale * arrows, -1, 0)
     axes.quiver(places[..., 0], places[..., 1], across, down, *colors, angles="xy", scale_units="xy", scale=1, **style)
     return scale
-
-
-def check_picture(path: str | Path) -> None:
-    """Raise an error now if `path` could not be written as a picture later.
-
-    Raises:
-        InputError: a suffix other than .png and .svg.
-        FileError: the file cannot be written.
-    """
-    if Path(path).suffix.lower() not in (".png", ".svg"):
-        raise InputError(f"{path}: the name of a picture must end with .png or .svg")
-    check_writable(path)
 
 
 def save_picture(path: str | Path, figure: Figure) -> Path:

@@ -18,7 +18,8 @@ from kcal.calibrate.camera.advice import reached, unreached_share
 from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError
-from kcal.report.figures import ACCENT, INK, WARN, frame_image, new_figure, save_picture
+from kcal.report.colors import ACCENT, INK, WARN
+from kcal.report.figures import frame_image, new_figure, save_picture
 
 _MOST_VIEWS = 24  # views in a gallery
 _MOST_FAILED = 8  # failed images in it

@@ -16,7 +16,8 @@ from kcal.errors import InputError
 from kcal.locate.positions import Located, Position
 from kcal.locate.stereo import PositionStatus
 from kcal.quantities import Unit, length_text, range_text
-from kcal.report.figures import CAMERA_COLORS, FAINT, GRAY, HALO, INK, WARN, new_figure, save_picture
+from kcal.report.colors import CAMERA_COLORS, FAINT, GRAY, INK, WARN
+from kcal.report.figures import HALO, new_figure, save_picture
 from kcal.report.tables import range_sigma, range_unit
 
 Array = NDArray[np.float64]

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kcal.report.figures import ACCENT, HALO, WARN, new_figure, save_picture
+from kcal.report.colors import ACCENT, WARN
+from kcal.report.figures import HALO, new_figure, save_picture
 
 Named = tuple[list[str], NDArray[np.float64]]
 

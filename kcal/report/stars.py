@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from kcal.corners.images import to_8bit
-from kcal.report.figures import ACCENT, INK, WARN, draw_arrows, frame_image, new_figure, save_picture
+from kcal.report.colors import ACCENT, INK, WARN
+from kcal.report.figures import draw_arrows, frame_image, new_figure, save_picture
 
 # Names of more stars would cover each other.
 _MOST_NAMES = 30

@@ -18,16 +18,8 @@ from kcal.lens.difference import CameraDifference
 from kcal.quantities import range_text
 from kcal.report.board import board_figure
 from kcal.report.calibration import draw_coverage, draw_residuals, draw_uncertainty, draw_view_rms
-from kcal.report.figures import (
-    ACCENT,
-    FAINT,
-    GRAY,
-    INK,
-    WARN,
-    draw_arrows,
-    frame_image,
-    new_figure,
-)
+from kcal.report.colors import ACCENT, FAINT, GRAY, INK, WARN
+from kcal.report.figures import draw_arrows, frame_image, new_figure
 from kcal.report.verdict import FAULTS, RangeAnswer
 
 _PART_COLORS = {"marks": ACCENT, "lenses": "#dd7a1f", "relative pose": "#0f766e", FAULTS: WARN}

@@ -120,9 +120,12 @@ def test_nothing_located_is_a_failure_with_its_reasons(
     [
         (["rig.json", "points.csv", "--origin", "151.2,-33.9,10", "--heading", "0"], "longitude came first"),
         (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "nan"], "heading nan"),
-        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--pixel-sigma", "0"], "pixel_sigma"),
+        (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--pixel-sigma", "0"], "--pixel-sigma 0.0"),
         (["rig.json", "nothing.csv", "--origin", ORIGIN, "--heading", "0"], "nothing.csv: cannot read"),
-        (["points.csv", "points.csv", "--origin", ORIGIN, "--heading", "0"], "points.csv: not a JSON file"),
+        (
+            ["points.csv", "points.csv", "--origin", ORIGIN, "--heading", "0"],
+            "points.csv: this is a table of marks; a kcal rig file is needed",
+        ),
         (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "-o", "a.shp"], "a.shp: unknown format"),
         (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "-o", "no/a.csv"], "does not exist"),
         (["rig.json", "points.csv", "--origin", ORIGIN, "--heading", "0", "--picture", "a.pdf"], "end with .png"),

@@ -99,7 +99,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return code if isinstance(code, int) else 0
 
 
-SOLVE = ["rig", "left.json", "right.json", "--landmarks", "survey.csv", "--marks", "marks.csv", "--mark-sigma", "0.1"]
+SOLVE = ["rig", "left.json", "right.json", "--landmarks", "survey.csv", "--marks", "marks.csv", "--pixel-sigma", "0.1"]
 
 
 def test_from_survey_to_positions(
@@ -172,7 +172,7 @@ def test_check_and_relock(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
     before = (site / "rig.json").read_bytes()
     capsys.readouterr()
-    check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "now.csv", "--mark-sigma", "0.1"]
+    check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "now.csv", "--pixel-sigma", "0.1"]
     assert run(monkeypatch, *check) == 3
     printed = capsys.readouterr()
     assert "left out: s3: it has moved by" in printed.err
@@ -205,7 +205,7 @@ def test_check_of_equal_marks(site: Path, monkeypatch: pytest.MonkeyPatch, capsy
     files = {path.name: path.read_bytes() for path in site.iterdir()}
     check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "then.csv", "--relock"]
     # With a hundredth of their true noise, errors of the rig would be seen.
-    assert run(monkeypatch, *check, "--mark-sigma", "0.001") == 0
+    assert run(monkeypatch, *check, "--pixel-sigma", "0.001") == 0
     printed = capsys.readouterr()
     assert printed.err == ""
     for part in ("left camera", "right camera", "right from left"):
@@ -224,7 +224,7 @@ def test_check_without_a_drift(site: Path, monkeypatch: pytest.MonkeyPatch, caps
     marks_table(site / "now.csv", "s", marked(points(25, 400.0, 6000.0, 33), 8))
     capsys.readouterr()
     for *source, now in (("--reference", "then.csv", "now.csv"), ("--landmarks", "survey.csv", "marks.csv")):
-        check = ["rig", "check", "rig.json", *source, "--marks", now, "--mark-sigma", "0.1", "--relock"]
+        check = ["rig", "check", "rig.json", *source, "--marks", now, "--pixel-sigma", "0.1", "--relock"]
         assert run(monkeypatch, *check) == 0
         printed = capsys.readouterr()
         assert "nothing was written" in printed.out
@@ -246,7 +246,7 @@ def test_check_of_a_rig_that_turned_as_a_whole(
     now = torch.stack(sides, 1)
     noise = torch.Generator().manual_seed(8)
     marks_table(site / "now.csv", "s", now + 0.1 * torch.randn(now.shape, dtype=torch.float64, generator=noise))
-    check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "now.csv", "--mark-sigma", "0.1"]
+    check = ["rig", "check", "rig.json", "--reference", "then.csv", "--marks", "now.csv", "--pixel-sigma", "0.1"]
     capsys.readouterr()
     assert run(monkeypatch, *check, "--relock") == 3
     printed = capsys.readouterr()
@@ -258,7 +258,17 @@ def test_check_of_a_rig_that_turned_as_a_whole(
 def test_check_by_landmarks(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(monkeypatch, *SOLVE, "-o", "rig.json") == 0
     capsys.readouterr()
-    arguments = ["rig", "check", "rig.json", "--landmarks", "survey.csv", "--marks", "later.csv", "--mark-sigma", "0.1"]
+    arguments = [
+        "rig",
+        "check",
+        "rig.json",
+        "--landmarks",
+        "survey.csv",
+        "--marks",
+        "later.csv",
+        "--pixel-sigma",
+        "0.1",
+    ]
     assert run(monkeypatch, *arguments, "--relock") == 3
     printed = capsys.readouterr()
     line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))

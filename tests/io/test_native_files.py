@@ -25,6 +25,7 @@ from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibrat
 from kcal.lens.camera import Camera
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.rig import StereoRig
+from kcal.native_file import digest
 
 
 def awkward_camera(model: str | LensModel) -> Camera:
@@ -165,7 +166,9 @@ class TestCamera:
     def test_stored_form(self) -> None:
         # The format, spelled out: whoever reads these files elsewhere depends on it.
         camera = Camera.build(focal=(800, 801), center=(320, 240), size=(640, 480), coefficients=[0.1], model="opencv4")
-        assert camera_to_file(camera, name="left").dump() == {
+        content = camera_to_file(camera, name="left").dump()
+        assert content.pop("summary")["of"] == digest(content)
+        assert content == {
             "kcal": "camera",
             "version": 2,
             "name": "left",

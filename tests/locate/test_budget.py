@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -84,26 +85,26 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run(monkeypatch, "--disparity", "2", "--picture", "budget.png") == 0
+    assert run(monkeypatch, "--pixel-sigma", "1.414213562373095", "--picture", "budget.png") == 0
     printed = capsys.readouterr().out
     assert "f B 16000 px m" in printed
-    line = next(line for line in printed.splitlines() if line.split()[:2] == ["5000", "disparity"])
-    assert line.split()[-3:] == ["-1923.1", "+8333.3", "+3125.0"]
+    line = next(line for line in printed.splitlines() if line.split()[:2] == ["5", "km"])
+    assert line.split()[-6:] == ["-1920", "m", "+8330", "m", "+3120", "m"]
     assert Path("budget.png").read_bytes().startswith(b"\x89PNG")
     save_rig(real_rig(), "rig.json")
     assert run(monkeypatch, "rig.json", "--distances", "500") == 0
     assert "rig.json: baseline 10.0" in capsys.readouterr().out
     assert run(monkeypatch, str(SAMPLE), "--distances", "1000,5000") == 0
-    table = capsys.readouterr().out.split("What the rig file knows, and 0.1 px of disparity")[1].splitlines()
-    assert table[1].split("  ")[0] == "at m"
-    distance, total, marks, lenses, pose, sideways = map(float, table[3].split())
-    assert (distance, marks) == (5000.0, pytest.approx(0.1 * 5000**2 / 16_000, rel=0.1))
-    assert total == pytest.approx(math.hypot(marks, lenses, pose), abs=1.0)
+    table = capsys.readouterr().out.split("What the rig file knows, and 0.1 px of noise in each mark:")[1].splitlines()
+    assert table[3].startswith("5 km ")
+    total, marks, lenses, pose, sideways = map(float, re.findall(r"(\S+) m", table[3].removeprefix("5 km")))
+    assert marks == pytest.approx(math.sqrt(2) * 0.1 * 5000**2 / 16_000, rel=0.1)
+    assert total == pytest.approx(math.hypot(marks, lenses, pose), rel=0.03)
     assert min(pose, sideways) > 0
-    assert run(monkeypatch, str(SAMPLE), "--disparity", "0") == 0
-    assert "What the rig file knows" not in capsys.readouterr().out
+    assert run(monkeypatch, str(SAMPLE), "--pixel-sigma", "0") == 1
+    assert "a positive number of pixels" in capsys.readouterr().err
     assert run(monkeypatch, "--baseline", "0.08") == 0
-    ranges = [line.split()[0] for line in capsys.readouterr().out.splitlines() if "disparity" in line]
-    assert ranges == ["1", "2.5", "5", "10", "25", "50"]
+    ranges = [line.strip().split("  ")[0] for line in capsys.readouterr().out.splitlines() if "disparity" in line]
+    assert [float(text.removesuffix(" m")) for text in ranges] == [1, 2.5, 5, 10, 25, 50]
     assert run(monkeypatch, "--distances", "near") == 1
     assert "distances 'near'" in capsys.readouterr().err

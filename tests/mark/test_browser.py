@@ -128,7 +128,7 @@ def test_a_whole_site_while_the_server_is_killed(site: tuple[Path, MarkingSite],
         app,
         ["rig", *(str(folder / f"{side}.camera.json") for side in ("left", "right")), "--landmarks",
          str(tmp_path / "marks.landmarks.csv"), "--marks", str(tmp_path / "marks.csv"), "--origin", "40,-113,1280",
-         "--mark-sigma", str(solved["sigma"]), "-o", str(output)],
+         "--pixel-sigma", str(solved["sigma"]), "-o", str(output)],
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     baseline = float(load_rig(output).baseline)

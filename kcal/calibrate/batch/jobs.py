@@ -20,7 +20,6 @@ from typing import ClassVar
 import kcal
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.options import HYBRID
-from kcal.checks import ImageSize
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, view_of
 from kcal.corners.images import decode_gray, expand_images, unique_names
@@ -29,6 +28,7 @@ from kcal.corners.refine import Refinement
 from kcal.corners.sizes import common_size, rescaled
 from kcal.errors import FileError, InputError, KcalError
 from kcal.files import read_bytes
+from kcal.image_size import ImageSize
 from kcal.io.camera_file import CameraFile
 from kcal.native_file import NativeFile
 

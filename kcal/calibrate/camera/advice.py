@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from kcal.corners.observations import Observations
@@ -35,6 +34,8 @@ def reached(observations: Observations, columns: int, rows: int) -> Tensor:
         >>> 0.45 < float(reached(seen, 100, 100).double().mean()) < 0.55
         True
     """
+    from scipy.spatial import ConvexHull  # which takes long to load
+
     width, height = observations.image_size
     x = (np.arange(columns) + 0.5) * (width / columns) - 0.5
     y = (np.arange(rows) + 0.5) * (height / rows) - 0.5

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import KNOWN, BoardModes
@@ -170,5 +169,8 @@ def printed_board(
         return 0.5 * float(z @ z) - log_evidence, slope + z / deviation
 
     bounds = list(zip(mean - 5 * deviation, mean + 5 * deviation, strict=True))
+    # Here, because SciPy takes long to load.
+    from scipy.optimize import minimize as lbfgs
+
     found = lbfgs(objective, mean, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60, "gtol": 1e-3})
     return printed_prior(modes, torch.from_numpy(found.x.copy())), -float(found.fun)

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.optimize import minimize as lbfgs
 from torch import Tensor
 
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies, typical_hyperprior
@@ -137,6 +136,9 @@ def maximize_evidence(
     count = len(prior.mean)
     log_variance = math.log(variance)
     bounds = hyper_bounds(prior, len(ratios), log_variance)
+    # Here, because SciPy takes long to load.
+    from scipy.optimize import minimize as lbfgs
+
     found = lbfgs(
         EvidenceLoss(data, families, prior, tempering),
         np.concatenate([h.numpy(), ratios, [log_variance]]),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from kornia.geometry.homography import find_homography_dlt
 from torch import Tensor
 
 from kcal.lens.pose import nearest_rotation
@@ -23,6 +22,8 @@ def homographies(board_points: Tensor, pixels: Tensor) -> Tensor:
     board = board_points[:, :2].expand(len(pixels), -1, -1)
     middle = torch.nanmean(pixels, 1, keepdim=True)
     filled = torch.where(seen[..., None], pixels, middle)
+    from kornia.geometry.homography import find_homography_dlt  # kornia takes long to load
+
     result: Tensor = find_homography_dlt(board, filled, seen.to(pixels.dtype), solver="svd")
     return result
 

@@ -1,0 +1,259 @@
+"""Check what was given before anything is loaded: is each file there, and is it what the command needs there?"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import itertools
+import os
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from typer.models import ArgumentInfo, OptionInfo
+
+from kcal.cli.camera_sources import named_source
+from kcal.errors import FileError
+from kcal.file_kind import WORDS, file_kind
+from kcal.sources import is_stream
+
+
+@dataclasses.dataclass(frozen=True)
+class Wanted:
+    """What a file must be: stands in the annotation of a command's parameter, after its `typer.Argument`.
+
+    Args:
+        words: what is needed, for the message.
+        kinds: of `kcal.file_kind.WORDS`, all that will do.
+        make: the command that makes such a file; `{given}` is what was given, `{name}` its name without suffixes.
+        instead: such commands for some of the kinds that may be given in its place.
+        part: whether `RIG.json:left` will do, one of a file's cameras.
+    """
+
+    words: str
+    kinds: frozenset[str]
+    make: str
+    instead: tuple[tuple[str, str], ...] = ()
+    part: bool = False
+
+    def cure(self, given: Path, kind: str) -> str:
+        """The command that makes what is needed, from what was given if that is possible."""
+        text = dict(self.instead).get(kind, self.make)
+        name = given.name.split(".")[0] or "left"
+        return text.format(given=shlex.quote(str(given)), name=shlex.quote(str(given.with_name(name))))
+
+
+_DETECT = "kcal detect {given} --board 9x6 --square 25mm -o {name}.obs.json"
+_CALIBRATE = "kcal calibrate {given} -o {name}.camera.json"
+_FROM_IMAGES = (("folder", _DETECT), ("image", _DETECT), ("video", _DETECT))
+_SOLVE = "kcal rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv -o rig.json"
+
+CAMERA = Wanted(
+    "a kcal camera file",
+    frozenset({"camera"}),
+    "kcal calibrate left.obs.json -o left.camera.json",
+    (*_FROM_IMAGES, ("observations", _CALIBRATE), ("foreign", "kcal import {given} -o {name}.camera.json"),
+     ("json", "kcal import {given} -o {name}.camera.json")),
+    part=True,
+)  # fmt: skip
+# A rig is solved from cameras as they were calibrated, not from those that another solution has refined.
+CALIBRATED = dataclasses.replace(CAMERA, part=False)
+# A camera in a file of any program, or one of a rig.
+ANY_CAMERA = dataclasses.replace(
+    CAMERA,
+    words="a file with a camera",
+    kinds=frozenset({"camera", "rig", "foreign", "json", "unknown", "table"}),
+)
+RIG = Wanted(
+    "a kcal rig file",
+    frozenset({"rig"}),
+    _SOLVE,
+    (("camera", "kcal rig {given} right.camera.json --landmarks survey.csv --marks marks.csv -o rig.json"),
+     ("observations", "kcal calibrate left.obs.json right.obs.json -o cameras"),
+     ("foreign", "kcal import {given} -o rig.json"), ("json", "kcal import {given} -o rig.json")),
+)  # fmt: skip
+CAMERA_OR_RIG = dataclasses.replace(
+    ANY_CAMERA, words="a camera or rig file", kinds=frozenset({"camera", "rig", "foreign", "json", "unknown"})
+)
+OBSERVATIONS = Wanted(
+    "a kcal observations file",
+    frozenset({"observations"}),
+    "kcal detect images/ --board 9x6 --square 25mm -o left.obs.json",
+    _FROM_IMAGES,
+)
+SHOWN = dataclasses.replace(
+    ANY_CAMERA,
+    words="a camera, rig or observations file",
+    kinds=ANY_CAMERA.kinds | {"observations"},
+)
+BOARD = Wanted(
+    "a kcal board file",
+    frozenset({"board"}),
+    "kcal board measure left.obs.json right.obs.json -o plate.board.json",
+    (("observations", "kcal board measure {given} -o {name}.board.json"),),
+)
+_MARK = "kcal mark left.png right.png --landmarks survey.csv -o marks.csv"
+MARKS = Wanted("a table of marks (name,left_u,left_v,right_u,right_v)", frozenset({"marks", "table"}), _MARK)
+SURVEY = Wanted(
+    "a table of places (name,lat,lon,height,sigma), GeoJSON or GPX",
+    frozenset({"survey", "table", "geojson", "gpx", "json"}),
+    "kcal import places.gpx --sigma 0.02 --geoid -67.3 -o survey.csv",
+)
+TABLE = Wanted("a table (CSV)", frozenset({"table", "marks", "survey"}), _MARK)
+IMAGES = Wanted(
+    "an image, a folder of images or a video",
+    frozenset({"image", "folder", "video", "device", "empty", "unknown", "foreign"}),
+    "kcal detect images/ --board 9x6 --square 25mm -o left.obs.json",
+    (("observations", _CALIBRATE),),
+)
+VIDEO = dataclasses.replace(
+    IMAGES, words="a video", kinds=frozenset({"video", "device", "unknown", "foreign"}), make="kcal live --help"
+)
+FOREIGN = Wanted(
+    "a file of another program",
+    frozenset({"camera", "rig", "foreign", "json", "unknown", "table", "survey", "marks", "geojson", "gpx"}),
+    "kcal import left.yaml -o left.camera.json",
+    (("observations", _CALIBRATE),),
+)
+
+# As it was typed, after `kcal`; set by `kcal.cli.main`.
+typed: list[str] = []
+
+
+class _Given(NamedTuple):
+    """One file on the command line."""
+
+    label: str
+    text: str
+    wanted: Wanted
+
+    @property
+    def path(self) -> Path:
+        path, name = named_source(self.text)
+        return path if name else Path(self.text)
+
+    def fits(self, text: str) -> bool:
+        """Whether that file would do here."""
+        path, name = named_source(text)
+        return self.wanted.part if name else file_kind(path) in self.wanted.kinds or _unseen(text)
+
+
+def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
+    """The command, which refuses files that are missing, or not what is `Wanted`, before it loads anything."""
+    signature = inspect.signature(command, eval_str=True)
+    files = {}
+    for name, parameter in signature.parameters.items():
+        about = getattr(parameter.annotation, "__metadata__", ())
+        wanted = next((part for part in about if isinstance(part, Wanted)), None)
+        if wanted is not None:
+            files[name] = _parameter_label(name, about), wanted
+
+    @functools.wraps(command)
+    def run(*arguments: Any, **options: Any) -> None:
+        given = signature.bind(*arguments, **options).arguments
+        outputs = given.get("output") or []
+        outputs = outputs if isinstance(outputs, list) else [outputs]
+        # Where nothing can be written, the command says so first.
+        if all(Path(path).parent.is_dir() for path in outputs):
+            found = [
+                _Given(label, text, wanted)
+                for name, (label, wanted) in files.items()
+                for text in _checked_inputs(wanted, given.get(name))
+            ]
+            # Beside a stream no files are allowed at all, which the command says.
+            if not any(is_stream(one.text) for one in found if not one.label.startswith("-")):
+                for one in found:
+                    if file_kind(one.path) == "missing" and not _unseen(one.text):
+                        images = one.wanted is IMAGES
+                        what = "no such file or folder" if images else "cannot read: No such file or directory"
+                        raise FileError(f"{one.text}: {what}")
+                check_kinds(found)
+        return command(*arguments, **options)
+
+    run.__signature__ = signature  # type: ignore[attr-defined]
+    return run
+
+
+def check_file(label: str, text: str, wanted: Wanted) -> None:
+    """The same for one file, whose option takes other words as well."""
+    if file_kind(text) != "missing":
+        check_kinds([_Given(label, text, wanted)])
+
+
+def check_kinds(found: Sequence[_Given]) -> None:
+    """Refuse the first file that is not what is wanted, with the command that would be right.
+
+    Raises:
+        FileError: it names the file, what it is, what is needed and where, and the command.
+    """
+    wrong = next((one for one in found if not one.fits(one.text)), None)
+    if wrong is None:
+        return
+    kind = file_kind(wrong.path)
+    what = WORDS.get(kind, f"a kcal {kind} file")
+    text = f"{wrong.text}: this is {what}; {wrong.wanted.words} is needed here ({wrong.label})"
+    other = next((one for one in found if one is not wrong and one.fits(wrong.text) and wrong.fits(one.text)), None)
+    if other is not None and typed:
+        exchange = {wrong.text: other.text, other.text: wrong.text}
+        raise FileError(f"{text}. The files are in each other's place: {typed_with(exchange)}")
+    inside = next(_candidates(wrong, kind), None)
+    if inside is not None and typed:
+        raise FileError(f"{text}. Perhaps: {typed_with({wrong.text: inside})}")
+    raise FileError(f"{text}. To make one: {wrong.wanted.cure(wrong.path, kind)}")
+
+
+def typed_with(exchange: dict[str, str]) -> str:
+    """The command as it was typed, with other files: it can be pasted."""
+    words = []
+    for word in typed:
+        option, equals, value = word.partition("=")
+        if equals and word.startswith("--"):
+            words.append(f"{option}={exchange.get(value, value)}")
+        else:
+            words.append(exchange.get(word, word))
+    return f"kcal {shlex.join(words)}"
+
+
+def _candidates(wrong: _Given, kind: str) -> Iterator[str]:
+    """What may have been meant: a camera of the rig, or the only such file in the folder."""
+    if kind == "rig" and wrong.wanted.part:
+        side = "right" if "right" in wrong.label.lower() else "left"
+        yield f"{wrong.text}:{side}"
+    if kind == "folder":
+        try:
+            names = sorted(itertools.islice(os.listdir(wrong.path), 1000))
+        except OSError:
+            names = []
+        fitting = [str(wrong.path / name) for name in names if wrong.fits(str(wrong.path / name))]
+        if len(fitting) == 1:
+            yield fitting[0]
+
+
+def _checked_inputs(wanted: Wanted, value: Any) -> list[str]:
+    """The files that are checked: of a list of images, one that is none is listed by the command and stops nothing."""
+    texts = _file_texts(value)
+    if wanted is not IMAGES or not isinstance(value, list):
+        return texts
+    kinds = {text: file_kind(text) for text in texts}
+    fine = [text for text in texts if kinds[text] in wanted.kinds]
+    return [text for text in texts if kinds[text] == "missing"] or fine or texts
+
+
+def _file_texts(value: Any) -> list[str]:
+    values = value if isinstance(value, list | tuple) else [value]
+    return [str(one) for one in values if one is not None]
+
+
+def _parameter_label(name: str, about: Sequence[Any]) -> str:
+    for part in about:
+        if isinstance(part, OptionInfo):
+            named = [text for text in (part.default, *(part.param_decls or ())) if str(text).startswith("--")]
+            return str(named[0]) if named else f"--{name.replace('_', '-')}"
+    return next((part.metavar for part in about if isinstance(part, ArgumentInfo) and part.metavar), name.upper())
+
+
+def _unseen(text: str) -> bool:
+    """Whether a text names no file to look into: the standard input, a wildcard or a stream."""
+    return text in ("-", "") or is_stream(text) or (any(c in text for c in "*?[") and not os.path.lexists(text))

@@ -1,0 +1,85 @@
+"""CPU seconds and large libraries of each command: `python -m scripts.bench.startup`.
+
+`--help` of every command, and commands on small files that compute little. Seconds are those of user and system of the
+child process, because wall time depends on what else the machine does.
+"""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import kcal
+from kcal.cli.main import app
+
+LARGE = ("torch", "kornia", "cv2", "scipy", "matplotlib", "pyproj")
+ROOT = Path(kcal.__file__).parents[1]
+SAMPLE = ROOT / "assets" / "sample-rig.json"
+_BEGIN = "import sys; from kcal.cli.main import app, main\n"
+_END = "\nprint(*{names} & sys.modules.keys(), file=sys.stderr)"
+
+
+def measure(arguments: list[str], folder: Path, code: str = "try: main()") -> tuple[float, int, list[str]]:
+    """CPU seconds of a command, its exit code, and which of the large libraries it loaded."""
+    end = _END.format(names=set(LARGE))
+    code = f"{_BEGIN}{code}\nfinally:{end.replace(chr(10), ' ')}" if code.startswith("try") else _BEGIN + code + end
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run([sys.executable, "-c", code, *arguments], cwd=folder, capture_output=True, text=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return seconds, done.returncode, sorted(done.stderr.splitlines()[-1].split())
+
+
+def helps() -> list[list[str]]:
+    """`--help` of every command and of subcommands."""
+    import typer
+
+    found = []
+    for name, command in typer.main.get_command(app).commands.items():  # type: ignore[attr-defined]
+        found += [[name, "--help"], *([name, part, "--help"] for part in getattr(command, "commands", {}))]
+    return [["--help"], *found]
+
+
+def commands(folder: Path) -> list[list[str]]:
+    """Commands on files that this writes into the folder."""
+    from kcal import Camera, load_rig, save_camera, save_rig
+
+    rig = load_rig(SAMPLE)
+    save_rig(rig, folder / "rig.json")
+    save_camera(rig.left, folder / "left.json")
+    save_camera(rig.right, folder / "right.json")
+    plain = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), coefficients=[-0.1, 0.01, 0, 0])
+    save_camera(plain, folder / "plain.json")
+    return [
+        ["show", "plain.json"],
+        ["show", "left.json"],
+        ["show", "rig.json"],
+        ["diff", "left.json", "right.json"],
+        ["diff", "plain.json", "plain.json"],
+        ["export", "plain.json", "-o", "plain.yaml"],
+        ["show", "plain.yaml"],
+        ["import", "plain.yaml", "-o", "back.json"],
+        ["budget"],
+        ["budget", "rig.json"],
+        ["report", "left.json"],
+        ["report", "rig.json"],
+        ["locate", "rig.json", str(ROOT / "assets" / "sample-points.csv")],
+        ["board", "--board", "9x6", "--square", "25mm", "-o", "board.svg"],
+    ]
+
+
+def main() -> None:
+    """Print the table."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        print("CPU s  exit  command  (large libraries that it loaded)")
+        for arguments in [*helps(), *commands(folder)]:
+            seconds, code, loaded = measure(arguments, folder)
+            print(f"{seconds:5.2f}  {code:4}  {' '.join(map(str, arguments))}  ({', '.join(loaded)})", flush=True)
+
+
+if __name__ == "__main__":
+    main()
