@@ -109,7 +109,7 @@ def calibrate_by_stars(
     progress("names")
     lens: StarLens | None = None
     for _ in range(3):
-        fields, star, pixels, kept = _fields(images, views, camera, rotations, catalog)
+        fields, star, pixels, kept = _star_fields(images, views, camera, rotations, catalog)
         lens = fit_star_lens(fields, [rotation for _, rotation in kept], size, float(camera.params[0]))
         camera = lens.camera
         rotations = {n: found.numpy() for (n, _), found in zip(kept, lens.rotations, strict=True)}
@@ -187,7 +187,7 @@ def _from_middle_outward(
     camera = _pinhole(focal, size)
     for share in (0.6, 0.8, 1.0, 1.2):
         near = {n: _near_middle(images[n], size, share) for n in rotations}
-        fields, _, _, kept = _fields(near, views, camera, rotations, catalog)
+        fields, _, _, kept = _star_fields(near, views, camera, rotations, catalog)
         lens = fit_star_lens(fields, [rotation for _, rotation in kept], size, float(camera.params[0]))
         camera = lens.camera
         rotations = {n: found.numpy() for (n, _), found in zip(kept, lens.rotations, strict=True)}
@@ -200,7 +200,7 @@ def _near_middle(found: DetectedStars, size: tuple[int, int], share: float) -> D
     return found._replace(pixels=found.pixels[use], sigma=found.sigma[use], flux=found.flux[use])
 
 
-def _fields(
+def _star_fields(
     images: Sequence[DetectedStars] | dict[int, DetectedStars],
     views: Sequence[SkyView],
     camera: Camera,
