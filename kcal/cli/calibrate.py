@@ -41,9 +41,11 @@ def calibrate_command(
         list[str] | None,
         typer.Option(metavar="IMAGES", help="Night images in place of observations: the lens at infinity, by stars."),
     ] = None,
-    star_time: Annotated[str | None, typer.Option("--time", metavar="TIME", help=f"Of --stars. {TIME_HELP}")] = None,
+    star_time: Annotated[
+        str | None, typer.Option("--time", metavar="TIME", help=f"Of --stars. {TIME_HELP}", hidden=True)
+    ] = None,
     star_place: Annotated[
-        str | None, typer.Option("--place", metavar="LAT,LON,HEIGHT", help="Of --stars, for refraction.")
+        str | None, typer.Option("--place", metavar="LAT,LON,HEIGHT", help="Of --stars, for refraction.", hidden=True)
     ] = None,
     picture: Annotated[
         Path | None,

@@ -99,16 +99,23 @@ def solve_command(
             "the cameras are turned, yaw included; with --origin and --star-time also on the Earth.",
         ),
     ] = None,
-    star_time: Annotated[str | None, typer.Option("--star-time", metavar="TIME", help=TIME_HELP)] = None,
+    star_time: Annotated[str | None, typer.Option("--star-time", metavar="TIME", help=TIME_HELP, hidden=True)] = None,
     clock_sigma: Annotated[
         float,
         typer.Option(
-            metavar="S", help="Of the offset between the two cameras' clocks: 1 s is 2.3 % of a range of 5 km.", min=0
+            metavar="S",
+            help="Of the offset between the two cameras' clocks: 1 s is 2.3 % of a range of 5 km.",
+            min=0,
+            hidden=True,
         ),
     ] = 0.1,
-    celsius: Annotated[float | None, typer.Option(metavar="C", help="Temperature at night, for stars.")] = None,
-    hectopascal: Annotated[float | None, typer.Option(metavar="HPA", help="Pressure there, for stars.")] = None,
-    dut1: Annotated[float | None, typer.Option(metavar="S", help="UT1 - UTC at night, if known.")] = None,
+    celsius: Annotated[
+        float | None, typer.Option(metavar="C", help="Temperature at night, for stars.", hidden=True)
+    ] = None,
+    hectopascal: Annotated[
+        float | None, typer.Option(metavar="HPA", help="Pressure there, for stars.", hidden=True)
+    ] = None,
+    dut1: Annotated[float | None, typer.Option(metavar="S", help="UT1 - UTC at night, if known.", hidden=True)] = None,
     require: Annotated[
         str, typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.")
     ] = "",
@@ -135,7 +142,9 @@ def solve_command(
     board_warp: Annotated[
         bool, typer.Option("--board-warp", help="Also estimate how the board bends.", hidden=True)
     ] = False,
-    picture: Annotated[Path | None, typer.Option(help="A .png or .svg file: a plan, and residuals.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="A .png or .svg file: a plan, and residuals.", hidden=True)
+    ] = None,
 ) -> None:
     """Solve a stereo rig: where the right camera stands from the left, and where both stand on the Earth.
 
