@@ -10,8 +10,10 @@ import typer
 from rich.markup import escape
 
 from kcal.cli.calibrate_result import calibration_numbers, print_calibration
+from kcal.cli.calibrate_stars import by_night
 from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.inputs import BOARD, CAMERA, OBSERVATIONS, check_file
+from kcal.cli.night_images import TIME_HELP
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
 from kcal.errors import DegenerateError, InputError, KcalError
@@ -24,17 +26,27 @@ _PARAMETRIC, _USE = "Options of parametric models", "May it be used?"
 
 
 def calibrate_command(
-    observations: Annotated[
-        list[Path],
-        typer.Argument(metavar="OBS...", help="Observations file of each camera, from `kcal detect`."),
-        OBSERVATIONS,
-    ],
     output: Annotated[
         Path,
         typer.Option(
             "-o", "--output", help="Camera file to write; of several cameras a folder, for a NAME.camera.json of each."
         ),
     ],
+    observations: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="OBS...", help="Observations file of each camera, from `kcal detect`."),
+        OBSERVATIONS,
+    ] = None,
+    stars: Annotated[
+        list[str] | None,
+        typer.Option(metavar="IMAGES", help="Night images in place of observations: the lens at infinity, by stars."),
+    ] = None,
+    star_time: Annotated[
+        str | None, typer.Option("--time", metavar="TIME", help=f"Of --stars. {TIME_HELP}", hidden=True)
+    ] = None,
+    star_place: Annotated[
+        str | None, typer.Option("--place", metavar="LAT,LON,HEIGHT", help="Of --stars, for refraction.", hidden=True)
+    ] = None,
     picture: Annotated[
         Path | None,
         typer.Option(
@@ -193,6 +205,9 @@ def calibrate_command(
     pupil's movement and of the board's bending and print errors there is. A small RMS does not prove an accurate
     camera; read the uncertainty of far directions, in pixels, and what to photograph next.
 
+    With --stars no board is needed, and nothing need be known of the camera: tilt it up by 30° on some clear nights'
+    images. The camera is right at infinity, and has no entrance pupil.
+
     Calibrate both cameras of a rig in one call: those that saw one printed board measure its errors together.
 
     **Examples**
@@ -205,10 +220,15 @@ def calibrate_command(
 
     `kcal calibrate left.obs.json -o left.camera.json --require 5km:10% --report left.html`: exit code 3 for a no.
 
+    `kcal calibrate --stars night/ --time name:Z --place 40.762,-113.896,1282 -o left.camera.json`
+
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14`: for exchange with OpenCV.
     """
     from kcal.lens.model import LensModel
 
+    if stars or not observations:
+        by_night(stars, observations, star_time, star_place, output, name)
+        return
     needs = required(require)
     if board not in ("printed", "exact"):
         check_file("--board-shape", board, BOARD)

@@ -13,6 +13,7 @@ from kcal.cli.commands import Command
 from kcal.cli.console import with_json
 from kcal.cli.groups import group_with_default
 from kcal.cli.inputs import CALIBRATED, MARKS, OBSERVATIONS, SURVEY, TABLE, with_inputs
+from kcal.cli.night_images import TIME_HELP
 from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
 from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
 from kcal.cli.rig_check import check
@@ -90,6 +91,31 @@ def solve_command(
             metavar="M", help="Height of the geoid above the WGS84 ellipsoid, added to elevations of GPX.", hidden=True
         ),
     ] = None,
+    stars: Annotated[
+        tuple[str, str] | None,
+        typer.Option(
+            metavar="LEFT RIGHT",
+            help="Night images of each camera (folder or quoted wildcard), paired by their times: they determine how "
+            "the cameras are turned, yaw included; with --origin and --star-time also on the Earth.",
+        ),
+    ] = None,
+    star_time: Annotated[str | None, typer.Option("--star-time", metavar="TIME", help=TIME_HELP, hidden=True)] = None,
+    clock_sigma: Annotated[
+        float,
+        typer.Option(
+            metavar="S",
+            help="Of the offset between the two cameras' clocks: 1 s is 2.3 % of a range of 5 km.",
+            min=0,
+            hidden=True,
+        ),
+    ] = 0.1,
+    celsius: Annotated[
+        float | None, typer.Option(metavar="C", help="Temperature at night, for stars.", hidden=True)
+    ] = None,
+    hectopascal: Annotated[
+        float | None, typer.Option(metavar="HPA", help="Pressure there, for stars.", hidden=True)
+    ] = None,
+    dut1: Annotated[float | None, typer.Option(metavar="S", help="UT1 - UTC at night, if known.", hidden=True)] = None,
     require: Annotated[
         str, typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.")
     ] = "",
@@ -116,7 +142,9 @@ def solve_command(
     board_warp: Annotated[
         bool, typer.Option("--board-warp", help="Also estimate how the board bends.", hidden=True)
     ] = False,
-    picture: Annotated[Path | None, typer.Option(help="A .png or .svg file: a plan, and residuals.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="A .png or .svg file: a plan, and residuals.", hidden=True)
+    ] = None,
 ) -> None:
     """Solve a stereo rig: where the right camera stands from the left, and where both stand on the Earth.
 
@@ -128,6 +156,9 @@ def solve_command(
     of ranges by what to improve: marks; lenses (more views of the board, near the image's borders); relative pose
     (landmarks and far features, which determine the yaw better than boards do: 0.01° of it is 436 m at 5 km with a
     baseline of 10 m).
+
+    Stars (--stars) need no survey: pairs of night images and a taped baseline determine ranges once matches of unknown
+    range (--features) or measured positions tell the baseline's direction.
 
     `kcal rig check` tells later whether the cameras have turned since.
 
@@ -141,6 +172,7 @@ def solve_command(
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
     from kcal.cli.console import print_table, print_wrote, steps, tell, warn
     from kcal.cli.rig_sources import Sources, read_sources
+    from kcal.cli.rig_stars import NightOptions
     from kcal.cli.sides import check_sides
     from kcal.files import check_picture, check_writable
     from kcal.io.camera_file import load_camera
@@ -150,9 +182,15 @@ def solve_command(
     from kcal.report.tables import range_sigma_rows
 
     noise = pixel_sigma_of(pixel_sigma)
+    night = None
+    if stars is not None:
+        night = NightOptions(
+            images=stars, time=star_time, clock_sigma=clock_sigma, celsius=celsius, hectopascal=hectopascal, dut1=dut1
+        )
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=noise, survey_sigma=survey_sigma, geoid=geoid,
+        stars=night,
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     needs = required(require)
@@ -160,7 +198,7 @@ def solve_command(
         check_writable(report, left, right, *sources.files)
     if picture is not None:
         check_picture(picture)
-    if not any((pairs, landmarks, marks, features, positions, baseline)):
+    if not any((pairs, landmarks, marks, features, positions, baseline, stars)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = RigOptions(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
@@ -168,7 +206,7 @@ def solve_command(
     )  # fmt: skip
     calibrated = load_camera(left), load_camera(right)
     check_sides(calibrated, (left, right))
-    data, frame, unpaired = read_sources(calibrated, sources)
+    data, frame, unpaired, notes = read_sources(calibrated, sources)
     with steps("solving the rig", 1) as advance:
         result = solve_rig(data, options)
         advance("done")
@@ -190,7 +228,7 @@ def solve_command(
         from kcal.report.rig import save_rig_picture
 
         save_rig_picture(picture, result)
-    print_rig(result, lines)
+    print_rig(result, [*lines, *notes])
     try:
         print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
     except InputError as error:

@@ -1,0 +1,224 @@
+"""Stars: real images, identification of random points, and simulated rigs, as `docs/howto/stars.md` states them.
+
+    python -m scripts.check.stars real
+    python -m scripts.check.stars random 10000
+    python -m scripts.check.stars rigs 30
+    python -m scripts.check.stars lens 3
+
+Real images are those of `KCAL_DATA/stars` (six of one camera; esa/tetra3). `real` compares with cedar-solve or tetra3
+where one of them is installed.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from kcal.lens.camera import Camera
+from kcal.lens.mounting import Origin
+from kcal.lens.rig import StereoRig
+from kcal.stars.attitude import fit_attitude
+from kcal.stars.catalog import StarCatalog
+from kcal.stars.detect import detect_stars
+from kcal.stars.identification import identify
+from kcal.stars.lens import StarCamera, calibrate_by_stars
+from kcal.stars.night import SkyView, name_stars
+from kcal.stars.night_image import read_night, time_of
+from scripts.shared.page import write_section
+
+DELFT = Origin(lat=52.0, lon=4.37, height=0.0)
+_said: list[str] = []
+_ABOUT = {
+    "rigs": ": draws of noise and of the clock (± 20 ms); exact pinhole cameras of f 1600 px, 10 m apart, 40 stars an "
+    "image of 0.1 px, twelve matches of unknown range, a baseline ± 2 mm, and with named stars positions ± 1 cm",
+    "lens": ": twenty images of a lens of 61° with barrel distortion, stars of 0.1 px, nothing known before",
+}
+SIZES = {(1600.0, (1920, 1080)), (5110.0, (1024, 768)), (900.0, (1280, 800))}
+
+
+def say(text: str, flush: bool = True) -> None:
+    """Print a line of the page."""
+    print(text, flush=flush)
+    _said.append(text)
+
+
+def real() -> None:
+    """Six real images: names, times, one lens, residuals by magnitude, and each image predicted by the others."""
+    files = sorted(Path(os.environ["KCAL_DATA"], "stars").glob("*.png"))
+    views = [SkyView(time=time_of("name:Z", path), origin=DELFT) for path in files]
+    images, seconds = [], []
+    for path in files:
+        image = read_night(path)
+        begin = time.process_time()
+        images.append(detect_stars(image))
+        seconds.append(time.process_time() - begin)
+    size = (1024, 768)
+    begin = time.process_time()
+    whole = calibrate_by_stars(images, views, size)
+    say(f"detection {np.mean(seconds):.2f} CPU s an image; lens and names {time.process_time() - begin:.0f}")
+    lens = whole.lens
+    say(f"{len(whole.images)} of {len(files)} images, {sum(int(u.sum()) for u in lens.used)} stars, "
+          f"{sum(int((~u).sum()) for u in lens.used)} left out, RMS along an axis {lens.rms_px:.4f} px, "
+          f"{lens.effective:.1f} effective unknowns, f {float(lens.camera.params[0]):.2f} px")  # fmt: skip
+    say("\n| image | stars | named | RMS px | detect and name, CPU s |\n|---|---|---|---|---|")
+    for path, view in zip(files, views, strict=True):
+        image = read_night(path)
+        begin = time.process_time()
+        found = name_stars(image, lens.camera, view)
+        spent = time.process_time() - begin
+        stars = found.attitude
+        say(f"| {path.stem} | {len(found.detected.pixels)} | {stars.count} | {stars.rms_px:.3f} | {spent:.2f} |")
+    say("\n| magnitude | stars | RMS along an axis, px |\n|---|---|---|")
+    by_magnitude(whole)
+    say("")
+    held_out(images, views, size, float(lens.camera.params[0]))
+    peer(files)
+
+
+def by_magnitude(whole: StarCamera) -> None:
+    """RMS residual of the stars of each magnitude."""
+    magnitude = np.concatenate([StarCatalog.bundled().magnitude[star] for star in whole.stars])
+    error = torch.cat(whole.lens.residuals).numpy()
+    for low, high in ((-2, 4), (4, 5), (5, 6), (6, 8)):
+        some = (magnitude >= low) & (magnitude < high)
+        if some.any():
+            rms = np.sqrt((error[some] ** 2).mean())
+            say(f"| {low} to {high} | {some.sum()} | {rms:.3f} |")
+
+
+def held_out(images: list, views: list, size: tuple[int, int], focal: float) -> None:
+    """One lens of five images predicts the sixth: its attitude by every other star, residuals of the others."""
+    catalog, errors = StarCatalog.bundled(), []
+    for out in range(len(images)):
+        rest = [k for k in range(len(images)) if k != out]
+        camera = calibrate_by_stars([images[k] for k in rest], [views[k] for k in rest], size, focal=focal).lens.camera
+        named = name_stars(images[out], camera, views[out])
+        use = np.flatnonzero(named.attitude.star >= 0)
+        directions = named.directions
+        for half in (0, 1):
+            ours, theirs = use[half::2], use[1 - half :: 2]
+            best = fit_attitude(
+                images[out].pixels[ours], images[out].sigma[ours], directions, catalog.magnitude, camera,
+                named.attitude.rotation.numpy(),
+            )  # fmt: skip
+            if best is None:
+                continue
+            at, _ = camera.project(1e9 * torch.from_numpy(directions[named.attitude.star[theirs]]) @ best.rotation.T)
+            errors.append(at.numpy() - images[out].pixels[theirs])
+    error = np.concatenate(errors)
+    rms = np.sqrt((error**2).mean())
+    say(f"held out: {len(error)} stars of {len(images)} images, RMS along an axis {rms:.3f} px, "
+          f"median distance {np.median(np.linalg.norm(error, axis=1)):.3f} px")  # fmt: skip
+
+
+def peer(files: list[Path]) -> None:
+    """cedar-solve or tetra3 on the same images."""
+    try:
+        import tetra3  # type: ignore[import-not-found, unused-ignore]
+    except ImportError:
+        say("cedar-solve and tetra3 are not installed: not compared")
+        return
+    from PIL import Image
+
+    np.math = math  # type: ignore[attr-defined]  # cedar-solve 0.5 uses what numpy 2 does not have
+    solver = tetra3.Tetra3()
+    for path in files:
+        begin = time.process_time()
+        found = solver.solve_from_image(Image.open(path), fov_estimate=11.4, fov_max_error=1.0)
+        spent = time.process_time() - begin
+        say(f"tetra3 {path.stem}: {found.get('Matches')} stars, RMSE {found.get('RMSE')}″, {spent:.2f} CPU s")
+
+
+def random_points(count: int) -> None:
+    """False names of random points: of 4 to 20 points each, seen by three cameras in turn."""
+    generator, wrong, begin = np.random.default_rng(34), 0, time.process_time()
+    cameras = sorted(SIZES)
+    for number in range(count):
+        focal, size = cameras[number % len(cameras)]
+        pixels = generator.random((int(generator.integers(4, 21)), 2)) * size
+        rays = np.c_[(pixels - np.array(size) / 2) / focal, np.ones(len(pixels))]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        field = 2 * math.atan(math.hypot(*size) / 2 / focal)
+        wrong += identify(rays, 2.5 / focal, field=field) is not None
+        if (number + 1) % 500 == 0:
+            print(number + 1, wrong, flush=True)
+    spent = (time.process_time() - begin) / count
+    say(f"{count} fields of 4 to 20 random points: {wrong} with names; {spent:.2f} CPU s each")
+
+
+def rigs(count: int) -> None:
+    """Coverage of 95 % intervals of range, and errors, of simulated rigs from stars, a baseline and matches."""
+    from kcal.calibrate.rig.solve import RigOptions, solve_rig
+    from kcal.locate.range_sigmas import range_sigmas
+    from scripts.shared.night_scenes import night_camera
+    from scripts.shared.star_rigs import star_rig
+
+    camera: Camera = night_camera(1600.0, (1920, 1080))
+    options = RigOptions(refraction=0.0, refraction_sigma=0.0)
+    say(
+        "| stars | pairs | σ of range % at 1, 2, 5 km | error % | inside 95 % | χ² of attitude / 3 |\n"
+        "|---|---|---|---|---|---|"
+    )
+    for named, pairs in ((True, 1), (False, 1), (True, 20)):
+        sigma, error, chi = [], [], []
+        for seed in range(count):
+            late = float(np.random.default_rng(1000 + seed).normal(0, 0.02))
+            data, rotation, center = star_rig(
+                camera, seed=seed, named=named, positions=named, moments=pairs, clock=late, clock_sigma=0.02
+            )
+            found = solve_rig(data, options)
+            rig = found.stereo()
+            far = torch.tensor([1000.0, 2000.0, 5000.0], dtype=torch.float64)
+            split = range_sigmas(rig, far.tolist(), pixel_sigma=0.1)
+            sigma.append((split.lenses**2 + split.pose**2).sqrt() / split.distance)
+            error.append(_range_errors(rig, camera, rotation, center, split.distance))
+            turn = _turn(found.rotation, rotation)
+            chi.append(float(turn @ torch.linalg.solve(found.relative_covariance()[:3, :3], turn)) / 3)
+        s, e = torch.stack(sigma), torch.stack(error)
+        inside = (e.abs() < 1.96 * s).double().mean(0)
+        text = [
+            " / ".join(f"{100 * float(v):.2f}" for v in row) for row in (s.mean(0), e.square().mean(0).sqrt(), inside)
+        ]
+        say(f"| {'named' if named else 'unnamed'} | {pairs} | {' | '.join(text)} | {np.mean(chi):.2f} |", flush=True)
+
+
+def _turn(found: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    from kcal.lens.pose import vector_from_rotation
+
+    return vector_from_rotation((found[1] @ found[0].T) @ (truth[1] @ truth[0].T).T)
+
+
+def _range_errors(
+    rig: StereoRig, camera: Camera, rotation: torch.Tensor, center: torch.Tensor, distance: torch.Tensor
+) -> torch.Tensor:
+    """Share by which inverse ranges of exact marks in the middle of the image are wrong."""
+    from kcal.locate.triangulate import Triangulate
+
+    points = torch.stack([torch.zeros_like(distance), torch.zeros_like(distance), distance], -1) @ rotation[0]
+    marks = [camera.project((points - c) @ r.T)[0] for r, c in zip(rotation, center, strict=True)]
+    found = Triangulate(rig)(*marks)
+    return distance * found.inverse_range - 1.0
+
+
+def lens(count: int) -> None:
+    """A lens from simulated stars: errors at infinity over the image, level and tilted by 30°."""
+    from scripts.shared.star_lenses import lens_error
+
+    for tilt in (5.0, 30.0):
+        for seed in range(count):
+            say(f"tilt {tilt:g}°, seed {seed}: {lens_error(tilt, seed)}", flush=True)
+
+
+if __name__ == "__main__":
+    what, number = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 30
+    {"real": real, "random": lambda: random_points(number), "rigs": lambda: rigs(number), "lens": lambda: lens(number)}[
+        what
+    ]()
+    made = f"Made by `python -m scripts.check.stars {what}`{_ABOUT.get(what, '')}."
+    write_section("stars.md", what, made + "\n\n" + "\n".join(_said))
