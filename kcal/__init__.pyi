@@ -54,5 +54,6 @@ from kcal import locate as locate
 from kcal import track as track
 from kcal import report as report
 from kcal import solve as solve
+from kcal import stars as stars
 
 __version__: str

@@ -73,6 +73,10 @@ PUBLIC = {
         save_difference_picture save_gallery save_map save_positions_picture save_rig_picture save_verdict_page
         stored_verdict
     """,
+    "kcal.stars": """
+        Air Attitude DetectedStars Identification NamedStars SkyView StarCatalog celestial_directions detect_stars
+        identify moments_of name_stars observed_directions parse_time star_source StarEffect StarSource
+    """,
     "kcal.solve": """
         LMOptions LevenbergMarquardt RobustLoss SolverStatus
     """,
@@ -80,11 +84,20 @@ PUBLIC = {
 NAMES = [(door, name) for door, names in PUBLIC.items() for name in names.split()]
 NAMESPACES = {door.removeprefix("kcal.") for door in PUBLIC} - {"kcal"}
 # Names that were not in `kcal` itself before there were namespaces.
-NEW_NAMES = {"PositionColumns", "calibrate_views", "detect", "rotation_from_vector", "vector_from_rotation"}
+NEW_NAMES = {"PositionColumns", "calibrate_views", "detect", "rotation_from_vector", "vector_from_rotation"} | set(
+    PUBLIC["kcal.stars"].split()
+)
 # Types of attributes in which only those look who work on kcal.
 INSIDE = {"FieldModes", "HybridFit", "BoardState", "Spline"}
 # What functions return, and blocks of files: examples are those of the functions.
 RECORDS = {
+    "Attitude",
+    "DetectedStars",
+    "Identification",
+    "NamedStars",
+    "StarEffect",
+    "StarSource",
+    "moments_of",
     "Examination",
     "Finding",
     "HalvesDifference",

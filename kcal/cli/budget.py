@@ -34,6 +34,16 @@ def budget_command(
         float, typer.Option(metavar="M/S", help="Speed of the target along the baseline, meters a second.", min=0)
     ] = 20.0,
     picture: Annotated[Path | None, typer.Option(help="PNG file to write: a plot of the errors.")] = None,
+    stars: Annotated[bool, typer.Option("--stars", help="Also: how many stars, and what they give.")] = False,
+    aperture: Annotated[
+        float, typer.Option(metavar="MM", help="Of --stars: diameter of the lens's opening, focal length / f-number.")
+    ] = 2.9,
+    altitude: Annotated[
+        float, typer.Option(metavar="DEG", help="Of --stars: of the middle of the image; 0 for a level camera.")
+    ] = 0.0,
+    clock_sigma: Annotated[
+        float, typer.Option(metavar="S", help="Of --stars: of the offset between the cameras' clocks.", min=0)
+    ] = 0.01,
 ) -> None:
     """Print range errors from disparity, relative yaw, baseline and timing, each alone, at several ranges.
 
@@ -91,6 +101,13 @@ def budget_command(
     if chosen.covariance is not None and disparity:
         out.print(f"\nWhat the rig file knows, and {disparity:g} px of disparity as a standard deviation, in meters:")
         print_table(range_sigma_rows(range_sigmas(chosen, far, pixel_sigma=disparity / math.sqrt(2.0))))
+    if stars:
+        from kcal.cli.budget_stars import print_star_budget
+
+        print_star_budget(
+            float(chosen.left.params[0]), chosen.left.size, float(chosen.baseline), 5000.0, aperture, altitude,
+            clock_sigma,
+        )  # fmt: skip
     if picture is not None:
         sweep = plotted_ranges(far)
         save_budget_picture(picture, sweep, range_errors(chosen, sweep, errors), labels)

@@ -10,8 +10,10 @@ import typer
 from rich.markup import escape
 
 from kcal.cli.calibrate_result import calibration_numbers, print_calibration
+from kcal.cli.calibrate_stars import by_night
 from kcal.cli.console import out, print_wrote, steps, tell, warn
 from kcal.cli.report import NO, REQUIRE_HELP, judged, required, told_usable
+from kcal.cli.stars import TIME_HELP
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_writable, make_folder
 
@@ -22,16 +24,29 @@ _PARAMETRIC, _USE = "Options of parametric models", "May it be used?"
 
 
 def calibrate_command(
-    observations: Annotated[
-        list[Path],
-        typer.Argument(metavar="OBS...", help="Observations file of each camera, from `kcal detect`."),
-    ],
     output: Annotated[
         Path,
         typer.Option(
             "-o", "--output", help="Camera file to write; of several cameras a folder, for a NAME.camera.json of each."
         ),
     ],
+    observations: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="OBS...", help="Observations file of each camera, from `kcal detect`."),
+    ] = None,
+    stars: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="IMAGES",
+            help="Night images in place of observations: a file, folder or quoted wildcard (several times if need be). "
+            "The camera is calibrated at infinity by the stars.",
+        ),
+    ] = None,
+    star_time: Annotated[str | None, typer.Option("--time", metavar="TIME", help=f"Of --stars. {TIME_HELP}")] = None,
+    star_place: Annotated[
+        str | None,
+        typer.Option("--place", metavar="LAT,LON,HEIGHT", help="Of --stars: with the time, refraction is taken out."),
+    ] = None,
     picture: Annotated[
         Path | None,
         typer.Option(
@@ -170,6 +185,9 @@ def calibrate_command(
     pupil's movement and of the board's bending and print errors there is. A small RMS does not prove an accurate
     camera; read the uncertainty of far directions, in pixels, and what to photograph next.
 
+    With --stars no board is needed, and nothing need be known of the camera: tilt it up by 30° on some clear nights'
+    images. The camera is right at infinity, and has no entrance pupil.
+
     Calibrate both cameras of a rig in one call: those that saw one printed board measure its errors together.
 
     **Examples**
@@ -182,12 +200,17 @@ def calibrate_command(
 
     `kcal calibrate left.obs.json -o left.camera.json --require 5km:10% --report left.html`: exit code 3 for a no.
 
+    `kcal calibrate --stars night/ --time name:Z --place 40.762,-113.896,1282 -o left.camera.json`
+
     `kcal calibrate left.obs.json -o left.camera.json --model opencv14`: for exchange with OpenCV.
     """
     from kcal.lens.model import LensModel
 
     if analog:
         warn("--analog is not needed any more and will go: the views tell whether pixels are square")
+    if stars or not observations:
+        by_night(stars, observations, star_time, star_place, output, name)
+        return
     needs = required(require)
     places = _camera_files(observations, output, picture, report, name)
     if model != "hybrid":

@@ -31,6 +31,7 @@ from kcal.cli.mark import mark_command
 from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
 from kcal.cli.show import show_command
+from kcal.cli.stars import stars_command
 from kcal.cli.undistort import undistort_command
 from kcal.errors import KcalError
 from kcal.files import written_files
@@ -107,6 +108,7 @@ app.command("compare")(with_json(with_inputs(compare_command)))
 app.command("batch")(with_json(with_inputs(batch_command)))
 app.command("mark")(with_inputs(mark_command))
 app.add_typer(rig, name="rig")
+app.command("stars")(with_json(with_inputs(stars_command)))
 app.command("locate")(with_inputs(locate_command))
 app.command("live")(with_inputs(live_command))
 app.command("budget")(with_json(budget_command))

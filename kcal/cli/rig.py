@@ -12,6 +12,7 @@ from kcal.cli.console import with_inputs, with_json
 from kcal.cli.groups import group_with_default
 from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
 from kcal.cli.rig_check import check
+from kcal.cli.stars import TIME_HELP
 from kcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,6 +73,24 @@ def solve_command(
         float | None,
         typer.Option(metavar="M", help="Height of the geoid above the WGS84 ellipsoid, added to elevations of GPX."),
     ] = None,
+    stars: Annotated[
+        tuple[str, str] | None,
+        typer.Option(
+            metavar="LEFT RIGHT",
+            help="Night images of each camera (folder or quoted wildcard), paired by their times: they determine how "
+            "the cameras are turned, yaw included; with --origin and --star-time also on the Earth.",
+        ),
+    ] = None,
+    star_time: Annotated[str | None, typer.Option("--star-time", metavar="TIME", help=TIME_HELP)] = None,
+    clock_sigma: Annotated[
+        float,
+        typer.Option(
+            metavar="S", help="Of the offset between the two cameras' clocks: 1 s is 2.3 % of a range of 5 km.", min=0
+        ),
+    ] = 0.1,
+    celsius: Annotated[float | None, typer.Option(metavar="C", help="Temperature at night, for stars.")] = None,
+    hectopascal: Annotated[float | None, typer.Option(metavar="HPA", help="Pressure there, for stars.")] = None,
+    dut1: Annotated[float | None, typer.Option(metavar="S", help="UT1 - UTC at night, if known.")] = None,
     require: Annotated[
         str, typer.Option(metavar="RANGE:ERROR", help=f"{REQUIRE_HELP} Exit code 3 if it is not met.")
     ] = "",
@@ -105,6 +124,9 @@ def solve_command(
     (landmarks and far features, which determine the yaw better than boards do: 0.01° of it is 436 m at 5 km with a
     baseline of 10 m).
 
+    Stars (--stars) need no survey: pairs of night images and a taped baseline determine ranges once matches of unknown
+    range (--features) or measured positions tell the baseline's direction.
+
     `kcal rig check` tells later whether the cameras have turned since.
 
     **Examples**
@@ -117,6 +139,7 @@ def solve_command(
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
     from kcal.cli.console import print_table, print_wrote, steps, tell, warn
     from kcal.cli.rig_sources import Sources, read_sources
+    from kcal.cli.rig_stars import NightOptions
     from kcal.files import check_writable
     from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
@@ -124,9 +147,15 @@ def solve_command(
     from kcal.locate.range_sigmas import range_sigmas
     from kcal.report.tables import range_sigma_rows
 
+    night = None
+    if stars is not None:
+        night = NightOptions(
+            images=stars, time=star_time, clock_sigma=clock_sigma, celsius=celsius, hectopascal=hectopascal, dut1=dut1
+        )
     sources = Sources(
         pairs=pairs, match=match, landmarks=landmarks, marks=marks, features=features, positions=positions,
         baseline=baseline, origin=origin, mark_sigma=mark_sigma, survey_sigma=survey_sigma, geoid=geoid,
+        stars=night,
     )  # fmt: skip
     check_writable(output, left, right, *sources.files)
     needs = required(require)
@@ -136,13 +165,13 @@ def solve_command(
         from kcal.report.figures import check_picture
 
         check_picture(picture)
-    if not any((pairs, landmarks, marks, features, positions, baseline)):
+    if not any((pairs, landmarks, marks, features, positions, baseline, stars)):
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = RigOptions(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=refraction,
         refraction_sigma=refraction_sigma,
     )  # fmt: skip
-    data, frame, unpaired = read_sources((load_camera(left), load_camera(right)), sources)
+    data, frame, unpaired, notes = read_sources((load_camera(left), load_camera(right)), sources)
     with steps("solving the rig", 1) as advance:
         result = solve_rig(data, options)
         advance("done")
@@ -162,7 +191,7 @@ def solve_command(
         from kcal.report.rig import save_rig_picture
 
         save_rig_picture(picture, result)
-    print_rig(result, lines)
+    print_rig(result, [*lines, *notes])
     try:
         print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=mark_sigma)))
     except InputError as error:

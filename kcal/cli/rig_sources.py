@@ -10,6 +10,7 @@ from kcal.errors import InputError
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.sources import Baseline, MeasuredPosition, RigData
+    from kcal.cli.rig_stars import NightOptions
     from kcal.lens.camera import Camera
     from kcal.lens.mounting import Origin
 
@@ -31,6 +32,7 @@ class Sources:
     mark_sigma: float = 0.3
     survey_sigma: float | None = None
     geoid: float | None = None
+    stars: NightOptions | None = None
 
     @property
     def files(self) -> list[Path]:
@@ -51,6 +53,7 @@ class RigInput(NamedTuple):
     data: RigData
     origin: Origin | None
     unpaired: int
+    notes: tuple[str, ...] = ()
 
 
 def parse_baseline(text: str) -> Baseline:
@@ -101,6 +104,11 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
         views = seen[0].names, seen[1].names
         matched = pair_by_name(*views) if sources.match is None else read_pairs(sources.match, *views)
         boards, unpaired = paired_boards(cameras, seen, matched), len(views[0]) + len(views[1]) - 2 * len(matched)
+    stars, notes = None, list[str]()
+    if sources.stars is not None:
+        from kcal.cli.rig_stars import read_stars
+
+        stars, positions, notes = read_stars(cameras, sources.stars, origin, positions, placed=landmarks is not None)
     data = RigData(
         cameras=cameras,
         names=CAMERAS,
@@ -109,5 +117,6 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
         features=None if sources.features is None else read_features(sources.features, sources.mark_sigma),
         baselines=() if sources.baseline is None else (parse_baseline(sources.baseline),),
         positions=positions,
+        stars=stars,
     )
-    return RigInput(data, origin, unpaired)
+    return RigInput(data, origin, unpaired, tuple(notes))

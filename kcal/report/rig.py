@@ -24,6 +24,7 @@ _COLORS = {
     "boards": "#4b5563",
     "landmarks": "#2b6cb0",
     "features": "#0f766e",
+    "stars": "#b7791f",
     "baselines": "#7c3aed",
     "positions": "#dd7a1f",
 }

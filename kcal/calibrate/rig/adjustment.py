@@ -14,6 +14,7 @@ from kcal.calibrate.rig.initial_poses import Start
 from kcal.calibrate.rig.motion import BoardMotion, SeenBoards, board_motion
 from kcal.calibrate.rig.problem import DistanceTerm, PlaceTerm, RigProblem, SharedTerm
 from kcal.calibrate.rig.sources import Features, Landmarks, RigData
+from kcal.calibrate.rig.star_block import StarBlock
 from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.calibrate.rig.unknowns import held as nothing
 from kcal.solve.lm import LMOptions, minimize
@@ -81,7 +82,9 @@ class Adjustment:
             points=data.landmarks.points if data.landmarks else torch.empty(0, 3, dtype=torch.float64),
             direction=direction,
             inverse_range=inverse_range,
+            star=_star_start(data, start),
         )
+        self._effects = unknowns.by_effects
 
     def problem(self, masks: PerKind, loss: RobustLoss | None = None, *, held: bool = False) -> RigProblem:
         """The problem of the items in the masks; `held`: of these alone, with cameras and board as they are."""
@@ -106,7 +109,20 @@ class Adjustment:
         if data.features and masks.features.any():
             known = data.features.inverse_range[masks.features], data.features.inverse_range_sigma[masks.features]
             found.append(FeatureBlock(*_weighted(data.features, masks.features), *known, self.anchor))
+        if data.stars and masks.stars.any():
+            found.append(self._star_block(masks.stars, unknowns))
         return found
+
+    def _star_block(self, mask: Tensor, unknowns: SharedUnknowns) -> StarBlock:
+        stars = self.data.stars
+        assert stars is not None
+        white = torch.eye(2, dtype=torch.float64) / stars.pixel_sigma[mask][..., None, None]
+        known = stars.direction[mask], stars.direction_sigma[mask]
+        effects = (
+            self._effects if self._effects is not None else self.state.unknown.new_zeros(0, len(self.state.unknown))
+        )
+        moves = stars.by_effects(), stars.shifts()[:, mask]
+        return StarBlock(stars.pixels[mask], white, *known, *moves, effects, unknowns.by_effects)
 
     def names(self, kind: Kind) -> tuple[str, ...]:
         """Names of all items of a kind."""
@@ -120,7 +136,8 @@ class Adjustment:
 
     def none(self) -> PerKind:
         """Masks without any item."""
-        counts = len(self.state.board_rotation), len(self.state.points), len(self.state.direction)
+        state = self.state
+        counts = (len(state.board_rotation), len(state.points), len(state.direction), len(state.star))
         return PerKind(*(torch.zeros(count, dtype=torch.bool) for count in counts))
 
     def part(self, masks: PerKind) -> RigState:
@@ -222,8 +239,8 @@ class Adjustment:
 
 def _masks_of_fields(masks: PerKind) -> RigState:
     """For each tensor of a state the mask of its items; None for what all items share."""
-    boards, landmarks, features = masks
-    return RigState(None, None, None, None, None, None, boards, boards, landmarks, features, features)  # type: ignore[arg-type]
+    boards, landmarks, features, stars = masks
+    return RigState(None, None, None, None, None, None, boards, boards, landmarks, features, features, stars)  # type: ignore[arg-type]
 
 
 def _weighted(source: Landmarks | Features, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -246,6 +263,20 @@ def typical_ratio(squares: Tensor, freedom: Tensor) -> float:
     if int(known.sum()) < 4:
         return 1.0
     return float((squares[known] / chi2_quantile(freedom[known].double(), 0.5)).median())
+
+
+def _star_start(data: RigData, start: Start) -> Tensor:
+    """Directions (S, 3) of the catalogue; without a name, along the ray of the first camera that has one."""
+    stars = data.stars
+    if stars is None:
+        return torch.empty(0, 3, dtype=torch.float64)
+    direction = torch.zeros(len(stars.names), 3, dtype=torch.float64)
+    direction[:, 2] = 1.0
+    for c in reversed(range(len(data.cameras))):
+        rays, valid = data.cameras[c].unproject(stars.pixels[:, c])
+        direction = torch.where(valid[:, None], rays @ start.rotation[c], direction)
+    direction = torch.where(stars.named[:, None], stars.direction, direction)
+    return direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
 
 
 def _feature_start(data: RigData, start: Start, anchor: Tensor) -> tuple[Tensor, Tensor]:

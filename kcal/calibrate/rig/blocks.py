@@ -26,8 +26,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import Projection, project_components
 
-Kind = Literal["boards", "landmarks", "features"]
-KINDS: tuple[Kind, ...] = ("boards", "landmarks", "features")
+Kind = Literal["boards", "landmarks", "features", "stars"]
+KINDS: tuple[Kind, ...] = ("boards", "landmarks", "features", "stars")
 # Unknowns of the largest block, a board's pose.
 LOCAL_SIZE = 6
 # 1/m: half the curvature of the Earth, of the mean radius (IUGG) everywhere: a third of a percent of the bending.
@@ -41,6 +41,7 @@ class PerKind(NamedTuple):
     boards: Tensor
     landmarks: Tensor
     features: Tensor
+    stars: Tensor = torch.zeros(0, dtype=torch.bool)
 
 
 class RigState(NamedTuple):
@@ -58,6 +59,7 @@ class RigState(NamedTuple):
         points: (L, 3) meters, adjusted positions of landmarks.
         direction: (F, 3) unit vectors towards features.
         inverse_range: (F,) 1/m, of features from the block's anchor.
+        star: (S, 3) unit vectors towards stars.
     """
 
     parameters: Tensor
@@ -71,6 +73,7 @@ class RigState(NamedTuple):
     points: Tensor
     direction: Tensor
     inverse_range: Tensor
+    star: Tensor = torch.zeros(0, 3, dtype=torch.float64)
 
 
 class PosedCamera(NamedTuple):
@@ -130,17 +133,18 @@ class Block(ABC):
     def retract(self, state: RigState, step: Tensor) -> RigState:
         """Apply a step (V, L) to this block's part of the state."""
 
-    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor | None:
+    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor, camera: int) -> Tensor | None:
         """Derivatives (V, K, 2, N) of pixels by the unknowns through board or air; None where they have none.
 
         Args:
             state: where.
             by_q: (V, 3, 2, N) of pixels by q in the world.
             offset: (V, 3, N) straight from the camera.
+            camera: number of the camera.
         """
         return None
 
-    def _bent(self, state: RigState, offset: Tensor) -> Tensor:
+    def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
         """Where things are seen (V, 3, N) that stand at `offset` from the camera."""
         return offset
 
@@ -162,7 +166,7 @@ class Block(ABC):
         y, w = self._place(state)
         for c, posed in enumerate(cameras):
             offset = y - w * posed.center[:, None]
-            q = posed.rotation @ self._bent(state, offset)
+            q = posed.rotation @ self._bent(state, offset, c)
             wanted = posed.by_unknown.any(1).nonzero()[:, 0].tolist() if derivatives else None
             found = project_components(q, posed.parameters, posed.camera.model, wanted, w[..., 0])
             # NaN where a seen point has no projection, so that such a pose is never accepted.
@@ -194,7 +198,7 @@ class Block(ABC):
             if count:
                 wanted = posed.by_unknown.any(1)
                 shared[:, :count] = torch.einsum("vpun,pk->vkun", found.by_camera, posed.by_unknown[wanted])
-                besides = self._by_board_or_air(state, by_q, offset)
+                besides = self._by_board_or_air(state, by_q, offset, c)
                 if besides is not None:
                     shared[:, :count] += besides
             if posed.turn is not None:
@@ -261,7 +265,7 @@ class BoardBlock(Block):
         # By ω through ω × (R x), then by v.
         return step_rows(by_q, state.board_rotation @ self.shaped(state))
 
-    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor | None:
+    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor, camera: int) -> Tensor | None:
         if self._shapes is None or self._by_unknown is None or not self._by_unknown.any():
             return None
         moved = torch.einsum("bk,bln->kln", self._by_unknown, self._shapes)
@@ -300,7 +304,7 @@ class LandmarkBlock(Block):
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         return state.points[..., None], state.points.new_ones(len(self), 1, 1)
 
-    def _bent(self, state: RigState, offset: Tensor) -> Tensor:
+    def _bent(self, state: RigState, offset: Tensor, camera: int) -> Tensor:
         level, up = offset[:, :_UP], offset[:, _UP:]
         return torch.cat([level, up + state.refraction * _HALF_CURVATURE * level.square().sum(1, keepdim=True)], 1)
 
@@ -308,7 +312,7 @@ class LandmarkBlock(Block):
         slope = 2.0 * state.refraction * _HALF_CURVATURE * offset[:, :_UP, None]
         return torch.cat([by_q[:, :_UP] + slope * by_q[:, _UP:], by_q[:, _UP:]], 1)
 
-    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor) -> Tensor | None:
+    def _by_board_or_air(self, state: RigState, by_q: Tensor, offset: Tensor, camera: int) -> Tensor | None:
         if self._by_refraction is None:
             return None
         lift = _HALF_CURVATURE * offset[:, :_UP, None].square().sum(1, keepdim=True)

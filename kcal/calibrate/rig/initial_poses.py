@@ -76,7 +76,7 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
     Raises:
         DegenerateError: nothing connects a camera with the others; it is named.
     """
-    known, views = _from_landmarks(data), _BoardViews(data, solver)
+    known, views = _from_landmarks(data) or _from_named_stars(data), _BoardViews(data, solver)
     placed = bool(known)
     starts = None if placed else _level_starts(data)
     if starts is None:
@@ -116,7 +116,7 @@ def _stacked(known: _Known) -> tuple[Tensor, Tensor]:
 def _level_starts(data: RigData) -> list[Start] | None:
     """Starts for cameras whose positions are all measured and that only features connect: level, in eight headings."""
     places = {p.camera: p.point for p in reversed(data.positions)}
-    if data.features is None or data.boards is not None or len(places) < len(data.cameras):
+    if _far_pixels(data) is None or data.boards is not None or len(places) < len(data.cameras):
         return None
     known = {0: _at_origin()}
     for _ in data.cameras:
@@ -150,11 +150,11 @@ def _from_landmarks(data: RigData) -> _Known:
 
 def _from_features(data: RigData, camera: int, known: _Known, tried: list[int], *, placed: bool) -> bool:
     """Rotation from features shared with a known camera; the center from its position, or at a distance to be tried."""
-    if data.features is None:
+    pixels = _far_pixels(data)
+    if pixels is None:
         return False
     # Until landmarks have placed a camera, the frame is that of the first camera, not of measured positions.
     center = _position(data, camera) if placed else None
-    pixels = data.features.pixels
     for other in sorted(known):
         rays, valid = data.cameras[camera].unproject(pixels[:, camera])
         far, seen = data.cameras[other].unproject(pixels[:, other])
@@ -172,6 +172,24 @@ def _from_features(data: RigData, camera: int, known: _Known, tried: list[int], 
         known[camera] = Poses.at(rotation, center)
         return True
     return False
+
+
+def _far_pixels(data: RigData) -> Tensor | None:
+    """(N, C, 2) marks of features and stars, which tell how cameras are turned; None without any."""
+    far = [source.pixels for source in (data.features, data.stars) if source is not None]
+    return torch.cat(far) if far else None
+
+
+def _from_named_stars(data: RigData) -> _Known:
+    """Poses of the cameras that see stars with names and whose positions are measured."""
+    known: _Known = {}
+    for c, camera in enumerate(data.cameras if data.stars else ()):
+        assert data.stars is not None
+        rays, valid = camera.unproject(data.stars.pixels[:, c])
+        use, place = valid & data.stars.named, _position(data, c)
+        if place is not None and int(use.sum()) >= 2:
+            known[c] = Poses.at(consensus_rotation(rays[use], data.stars.direction[use])[0], place)
+    return known
 
 
 def _baseline(data: RigData, one: int, other: int) -> float | None:

@@ -55,7 +55,7 @@ def without_wrong(work: Adjustment, masks: PerKind, solver: LMOptions) -> PerKin
         work.fit_corners(kept)
         # Each item by the fall of χ² without it, which sees leverage, but against what is typical of the plain χ².
         found = over_limit(work, kept, work.deletions(kept))
-        worst = max(range(3), key=lambda k: float(found[k].max()) if len(found[k]) else 0.0)
+        worst = max(range(len(found)), key=lambda k: float(found[k].max()) if len(found[k]) else 0.0)
         if len(found[worst]) and float(found[worst].max()) > 1.0:
             kept[worst][int(found[worst].argmax())] = False
             _refuse_many(work, kept, masks)

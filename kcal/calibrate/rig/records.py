@@ -18,7 +18,7 @@ from kcal.solve.lm import LMOptions
 # Reasons for leaving items out, by their indices.
 Reasons = Mapping[Kind, Mapping[int, str]]
 # Fewest marks of an item whose residuals say anything about it.
-_MARKS: Mapping[Kind, int] = {"boards": 4, "landmarks": 1, "features": 2}
+_MARKS: Mapping[Kind, int] = {"boards": 4, "landmarks": 1, "features": 2, "stars": 1}
 # 1/m: features are drawn no farther away than 100 km.
 _LEAST_INVERSE_RANGE = 1e-5
 
@@ -136,6 +136,8 @@ def _contradiction(work: Adjustment, kind: Kind, pixels: Sequence[float | None],
         return f"its marks are off the surveyed place by {text} ({sigmas:.0f} sigma): a wrong mark or survey"
     if kind == "features":
         return f"its marks do not meet: off by {text} ({sigmas:.0f} sigma): not the same thing, or it moved"
+    if kind == "stars":
+        return f"off by {text} ({sigmas:.0f} sigma): not that star, or an aircraft or satellite"
     why = "it moved between the views, or a lens differs from its model"
     return f"it does not fit the other boards: off by {text} ({sigmas:.1f} sigma): {why}"
 

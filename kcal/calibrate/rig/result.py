@@ -21,7 +21,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import RigCovariance, StereoRig
 from kcal.solve.result import SolverStatus
 
-Source = Literal["boards", "landmarks", "features", "baselines", "positions"]
+Source = Literal["boards", "landmarks", "features", "stars", "baselines", "positions"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

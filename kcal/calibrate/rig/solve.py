@@ -109,7 +109,7 @@ def solve_rig(data: RigData, options: RigOptions | None = None) -> RigResult:
         (10.0, ())
     """
     options = options or RigOptions()
-    if not any((data.boards, data.landmarks, data.features, data.positions)):
+    if not any((data.boards, data.landmarks, data.features, data.positions, data.stars)):
         raise InputError("a rig needs boards, landmarks or features; there is nothing to solve it from")
     if options.board_warp and data.boards is None:
         raise InputError("the board's warp cannot be estimated without boards")
@@ -176,15 +176,18 @@ def _first_masks(initial: InitialPoses, *, reject: bool) -> tuple[PerKind, Reaso
     data = initial.data
     marks = [
         torch.zeros(0) if source is None else torch.isfinite(source.pixels).all(-1).sum(-1)
-        for source in (data.landmarks, data.features)
+        for source in (data.landmarks, data.features, data.stars)
     ]
     boards = initial.usable.clone()
     foreign = initial.foreign if reject else {}
     boards[list(foreign)] = False
-    masks = PerKind(boards, marks[0] >= 1, marks[1] >= 2)
+    # A star without a name tells only how two cameras are turned against each other.
+    enough = marks[2] >= (2 if data.stars is None else 2 - data.stars.named.long())
+    masks = PerKind(boards, marks[0] >= 1, marks[1] >= 2, enough)
     texts = (
         "fewer than two cameras see enough of it",
         "no camera has a mark of it",
+        "fewer than two cameras have a mark of it",
         "fewer than two cameras have a mark of it",
     )
     reasons = {
@@ -216,6 +219,8 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
         unknowns = unknowns.and_warp(boards.points)
     if data.absolute:
         unknowns = unknowns.and_refraction(options.refraction, options.refraction_sigma)
+    if data.stars is not None and data.stars.effects:
+        unknowns = unknowns.and_effects(*(effect.name for effect in data.stars.effects))
     return data, unknowns
 
 
@@ -288,10 +293,18 @@ def _rig_result(
     for second in range(1, len(data.cameras)):
         if not bool(covariance.of(relative_rows(problem, state, 0, second))[1].all()):
             what = "; ".join(undetermined[:3]) + (" and more" if len(undetermined) > 3 else "")
+            cure = (
+                "add boards seen by both, surveyed landmarks, far features of known range, a measured baseline or "
+                "measured positions"
+            )
+            if data.stars is not None:
+                cure = (
+                    "stars and a baseline tell nothing of the baseline's direction: add matches of unknown range "
+                    "(features), or the measured positions of both cameras (GNSS)"
+                )
             raise DegenerateError(
                 f"the data do not determine how {data.names[second]} stands from {data.names[0]}: {what} could be "
-                "anything; add boards seen by both, surveyed landmarks, far features of known range, a measured "
-                "baseline or measured positions"
+                f"anything; {cure}"
             )
     widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
     if widen > 1.0:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.problem.weights import whitening
+from kcal.calibrate.rig.star_source import StarSource
 from kcal.checks import as_points, require_finite
 from kcal.corners.board import Board
 from kcal.errors import InputError
@@ -216,6 +217,7 @@ class RigData:
         features: see `Features`.
         baselines: see `Baseline`.
         positions: see `MeasuredPosition`.
+        stars: see `StarSource`.
 
     Raises:
         InputError: names or shapes that do not fit each other, fewer than two cameras.
@@ -233,6 +235,7 @@ class RigData:
     features: Features | None = None
     baselines: tuple[Baseline, ...] = ()
     positions: tuple[MeasuredPosition, ...] = ()
+    stars: StarSource | None = None
 
     def __post_init__(self) -> None:
         count = len(self.cameras)
@@ -241,9 +244,16 @@ class RigData:
         _names("cameras", self.names, count)
         if not all(isinstance(camera, Camera) and camera.params.ndim == 1 for camera in self.cameras):
             raise InputError("a rig is made of single cameras")
-        for kind, source in (("boards", self.boards), ("landmarks", self.landmarks), ("features", self.features)):
+        for kind, source in (
+            ("boards", self.boards),
+            ("landmarks", self.landmarks),
+            ("features", self.features),
+            ("stars", self.stars),
+        ):
             if source is not None and source.pixels.shape[1] != count:
                 raise InputError(f"{kind}: pixels of {source.pixels.shape[1]} cameras, the rig has {count}")
+        if self.stars is not None and bool(self.stars.named.any()) and not self.absolute:
+            raise InputError("stars with names need a frame on the Earth: landmarks, or a camera's measured position")
         numbers = [n for b in self.baselines for n in (b.first, b.second)] + [p.camera for p in self.positions]
         if any(not 0 <= number < count for number in numbers):
             raise InputError(f"baselines and positions name cameras 0 to {count - 1}")

@@ -28,6 +28,7 @@ class SharedUnknowns:
         labels: (K,) names of those that have one.
         refraction: coefficient of refraction of light for the unknowns as they begin.
         by_refraction: (K,) of it by each unknown; None: it is held.
+        by_effects: (E, K) of what shifts the stars together (`StarEffect`) by each unknown; None: there is nothing.
     """
 
     cameras: tuple[Tensor, ...]
@@ -38,6 +39,7 @@ class SharedUnknowns:
     labels: tuple[str, ...]
     refraction: float = 0.0
     by_refraction: Tensor | None = None
+    by_effects: Tensor | None = None
 
     @property
     def refine_lenses(self) -> bool:
@@ -65,6 +67,14 @@ class SharedUnknowns:
         slope[-1] = sigma
         return dataclasses.replace(more, refraction=refraction, by_refraction=slope)
 
+    def and_effects(self, *names: str) -> SharedUnknowns:
+        """These, and amounts of what shifts all stars together, in standard deviations."""
+        more = self._and(*names, known=True)
+        count = len(names)
+        select = torch.zeros(count, len(more), dtype=torch.float64)
+        select[:, len(more) - count :] = torch.eye(count, dtype=torch.float64)
+        return dataclasses.replace(more, by_effects=select)
+
     def _and(self, *labels: str, known: bool) -> SharedUnknowns:
         """These, and more that change nothing yet."""
 
@@ -80,6 +90,7 @@ class SharedUnknowns:
             labels=(*self.labels, *labels),
             refraction=self.refraction,
             by_refraction=None if self.by_refraction is None else wider(self.by_refraction),
+            by_effects=None if self.by_effects is None else wider(self.by_effects),
         )
 
 

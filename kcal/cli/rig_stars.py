@@ -1,0 +1,111 @@
+"""Night images of both cameras of a rig, for `kcal rig --stars`."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+from kcal.errors import InputError, KcalError
+
+if TYPE_CHECKING:
+    from kcal.calibrate.rig.sources import MeasuredPosition
+    from kcal.calibrate.rig.star_source import StarSource
+    from kcal.lens.camera import Camera
+    from kcal.lens.mounting import Origin
+    from kcal.stars.night import NamedStars
+
+# m: how well the place of `--origin` is known to be that of the left camera, along each axis.
+_PLACE_SIGMA = 3.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NightOptions:
+    """What the user gave of night images, as on the command line."""
+
+    images: tuple[str, str]
+    time: str | None = None
+    clock_sigma: float = 0.1
+    celsius: float | None = None
+    hectopascal: float | None = None
+    dut1: float | None = None
+
+
+def read_stars(
+    cameras: tuple[Camera, Camera],
+    night: NightOptions,
+    origin: Origin | None,
+    positions: tuple[MeasuredPosition, ...],
+    *,
+    placed: bool,
+) -> tuple[StarSource, tuple[MeasuredPosition, ...], list[str]]:
+    """The stars of both cameras' images, the positions with that of the left camera, and lines that say what was found.
+
+    Args:
+        cameras: left and right.
+        night: what the user gave.
+        origin: of the rig's frame; None if nothing is known on the Earth.
+        positions: measured ones.
+        placed: whether landmarks or anything else places the rig already.
+    """
+    import torch
+
+    from kcal.calibrate.rig.sources import MeasuredPosition
+    from kcal.stars.rig_stars import moments_of, star_source
+
+    images = [_named_images(side, given, camera, night, origin)
+              for side, given, camera in zip(("left", "right"), night.images, cameras, strict=True)]  # fmt: skip
+    moments, alone = moments_of(images)
+    if not any(len(moment) == 2 for moment in moments):
+        raise InputError(
+            "--stars: no image of the left camera was taken at the time of one of the right; pairs are of one moment"
+        )
+    on_earth = all(image.on_earth for own in images for image in own)
+    if on_earth and not placed and not positions:
+        there = torch.zeros(3, dtype=torch.float64)
+        positions = (MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, _PLACE_SIGMA)),)
+    frame = origin if placed or positions else None
+    source = star_source(moments, cameras, clock_sigma=night.clock_sigma, origin=frame)
+    named = int(source.named.sum())
+    lines = [
+        f"stars: {len(moments)} moments, {len(source.names)} stars, {named} with a direction on the Earth"
+        + (f"; {alone} images without partner" if alone else ""),
+        f"clocks of the cameras against each other: ± {night.clock_sigma:g} s, which no residual shows: up to "
+        f"{math.degrees(7.292e-5 * night.clock_sigma):.5f}° of relative attitude, and part of every σ below",
+    ]
+    if on_earth and night.dut1 is None:
+        lines.append("UT1 - UTC is not known (--dut1): 8″ of heading, part of its σ")
+    return source, positions, lines
+
+
+def _named_images(
+    side: str, given: str, camera: Camera, night: NightOptions, origin: Origin | None
+) -> list[NamedStars]:
+    from kcal.cli.console import steps, warn
+    from kcal.cli.stars import sky_view
+    from kcal.stars.night import name_stars
+    from kcal.stars.night_image import expand_nights, read_night
+
+    files = expand_nights([given])
+    found: list[NamedStars] = []
+    # A place without a time tells nothing.
+    place = origin if night.time is not None else None
+    where = (None, None, 0.0) if place is None else (place.lat, place.lon, place.height)
+    with steps(f"naming stars of {side}", len(files)) as advance:
+        for path in files:
+            view = sky_view(
+                path, night.time, *where, dut1=night.dut1, celsius=night.celsius,
+                pressure=night.hectopascal,
+            )  # fmt: skip
+            try:
+                image = name_stars(read_night(path), camera, view)
+            except KcalError as error:
+                warn(f"{side} {path.name}: {error}; left out")
+            else:
+                for text in image.warnings:
+                    warn(f"{side} {path.name}: {text}")
+                found.append(image)
+            advance(path.name)
+    if not found:
+        raise InputError(f"--stars: in none of the {len(files)} images of {side} stars have names")
+    return found

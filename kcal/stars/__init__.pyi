@@ -1,0 +1,25 @@
+# ruff: noqa: I001
+# Where each name is defined, for type checkers and for `door`; a comment begins a group of the reference page.
+
+# Find and name stars
+from kcal.stars.detect import detect_stars as detect_stars
+from kcal.stars.detect import DetectedStars as DetectedStars
+from kcal.stars.identification import identify as identify
+from kcal.stars.identification import Identification as Identification
+from kcal.stars.night import name_stars as name_stars
+from kcal.stars.night import NamedStars as NamedStars
+from kcal.stars.attitude import Attitude as Attitude
+
+# Catalogue and sky
+from kcal.stars.catalog import StarCatalog as StarCatalog
+from kcal.stars.night import SkyView as SkyView
+from kcal.stars.sky import Air as Air
+from kcal.stars.sky import observed_directions as observed_directions
+from kcal.stars.sky import celestial_directions as celestial_directions
+from kcal.stars.sky import parse_time as parse_time
+
+# What rigs are solved from
+from kcal.stars.rig_stars import star_source as star_source
+from kcal.stars.rig_stars import moments_of as moments_of
+from kcal.calibrate.rig.star_source import StarSource as StarSource
+from kcal.calibrate.rig.star_source import StarEffect as StarEffect

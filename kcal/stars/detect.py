@@ -1,0 +1,185 @@
+"""Find stars in an image to a small part of a pixel, each with its own standard deviation.
+
+Centers are means under a Gaussian window that moves with the star (the windowed centroid of SExtractor, Bertin and
+Arnouts 1996). Points of light that are no stars are left out and counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from kcal.errors import InputError
+
+# px: width of the window; stars are 0.5 to 2 px wide.
+_WIDTH = 1.3
+_TILE = 32
+# px: below this, seeing, the sensor and the lens's color errors decide, whatever a star's brightness is.
+_LEAST_SIGMA = 0.04
+# Bounds of a star's variance under the window over that of the window: below a hot pixel, above a lamp or a cloud.
+_NARROWEST, _WIDEST = 0.06, 0.85
+# A pixel all of whose neighbors have less than this share of it did not see a star.
+_LONE_PIXEL = 0.12
+_LEAST_ROUND = 0.5
+# px: a second star so near pulls the center.
+_CROWDED = 5.0
+
+Floats = NDArray[np.float64]
+
+
+class DetectedStars(NamedTuple):
+    """Stars in an image, the brightest first.
+
+    Attributes:
+        pixels: (N, 2) centers.
+        sigma: (N,) of a center along an axis, px.
+        flux: (N,) gray levels over the background.
+        background: median gray level of the image over the largest that its type has.
+        left_out: how many points of light are no stars, or bad ones, by reason.
+    """
+
+    pixels: Floats
+    sigma: Floats
+    flux: Floats
+    background: float
+    left_out: Mapping[str, int]
+
+
+def detect_stars(image: NDArray[Any], *, threshold: float = 6.0, most: int = 400) -> DetectedStars:
+    """Find the stars of a night image, with the center of each and its standard deviation.
+
+    Left out and counted by `left_out`: hot pixels, streaks (satellites, aircraft), what is wider than a star (clouds,
+    lamps), saturated stars and stars beside another one.
+
+    Args:
+        image: (H, W) gray levels, integers of any depth or floating point; frames of a video may be summed.
+        threshold: least signal over the noise of the smoothed image.
+        most: stop after so many stars.
+
+    Raises:
+        InputError: not an image (H, W) of 16 pixels or more, or values that are not finite.
+
+    Example:
+        >>> rows, columns = np.mgrid[0:64, 0:96]
+        >>> star = 400 * np.exp(-((columns - 40.25) ** 2 + (rows - 20.5) ** 2) / (2 * 1.2**2))
+        >>> night = 50 + star + np.random.default_rng(0).normal(0, 2, star.shape)
+        >>> detect_stars(night).pixels.round(1).tolist()
+        [[40.2, 20.5]]
+    """
+    if image.ndim != 2 or min(image.shape) < 16:
+        raise InputError(f"a gray image (H, W) of 16 pixels or more is needed, got {image.shape}")
+    levels = image.astype(np.float64)
+    if not np.isfinite(levels).all():
+        raise InputError("the image has values that are not finite")
+    integer = np.issubdtype(image.dtype, np.integer)
+    full = float(np.iinfo(image.dtype).max) if integer else float(levels.max())
+    level, noise = _night_sky(levels, quantum=1.0 if integer else 0.0)
+    flat = levels - level
+    smooth = ndimage.gaussian_filter(flat, _WIDTH)
+    signal = smooth / (noise / (2 * np.sqrt(np.pi) * _WIDTH))
+    half = int(np.ceil(4 * _WIDTH)) + 1
+    top = (smooth == ndimage.maximum_filter(smooth, 7)) & (signal > threshold)
+    at = np.argwhere(top)
+    at = at[((at >= half) & (at < np.array(levels.shape) - half)).all(1)]
+    at = at[np.argsort(-smooth[tuple(at.T)])][: 2 * most]
+    background = float(np.median(levels)) / max(full, 1e-9)
+    if not len(at):
+        return DetectedStars(np.empty((0, 2)), np.empty(0), np.empty(0), background, {})
+    around = np.arange(-half, half + 1)
+    boxes = flat[at[:, 0, None, None] + around[:, None], at[:, 1, None, None] + around]
+    shift, moments = _windowed(boxes, around)
+    brightest = levels[at[:, 0, None, None] + around[:, None], at[:, 1, None, None] + around].max((1, 2))
+    why = _reasons(boxes, half, shift, moments, brightest >= 0.98 * full if integer else np.zeros(len(at), bool))
+    pixels = at[:, ::-1] + shift
+    lone = _uncrowded(pixels, boxes.max((1, 2)))
+    why = np.where((why == "") & ~lone, "beside another star", why)
+    good = why == ""
+    found = signal[tuple(at.T)][good]
+    sigma = np.hypot(_LEAST_SIGMA, _WIDTH * np.sqrt(2.0) / found)
+    distance = (around[:, None] - shift[good, 1, None, None]) ** 2 + (around - shift[good, 0, None, None]) ** 2
+    flux = np.where(distance < (3 * _WIDTH) ** 2, boxes[good], 0.0).sum((1, 2))
+    order = np.argsort(-flux)[:most]
+    reasons, counts = np.unique(why[~good], return_counts=True)
+    left_out = dict(zip(reasons.tolist(), counts.tolist(), strict=True))
+    return DetectedStars(pixels[good][order], sigma[order], flux[order], background, left_out)
+
+
+def _night_sky(levels: Floats, *, quantum: float) -> tuple[Floats, Floats]:
+    """Level and noise (H, W) of the sky, from the medians of tiles."""
+    height, width = levels.shape
+    rows, columns = -(-height // _TILE), -(-width // _TILE)
+    padded = np.pad(levels, ((0, rows * _TILE - height), (0, columns * _TILE - width)), mode="reflect")
+    tiles = padded.reshape(rows, _TILE, columns, _TILE)
+    level = np.median(tiles, (1, 3))
+    spread = 1.4826 * np.median(np.abs(tiles - level[:, None, :, None]), (1, 3))
+    spread = np.hypot(np.maximum(spread, 0.3 * np.median(spread)), quantum / np.sqrt(12.0))
+    where = np.meshgrid(*[(np.arange(n) - (_TILE - 1) / 2) / _TILE for n in (height, width)], indexing="ij")
+    smooth = [
+        ndimage.map_coordinates(ndimage.median_filter(values, 3), where, order=1, mode="nearest")
+        for values in (level, spread)
+    ]
+    return smooth[0], np.maximum(smooth[1], 1e-9)
+
+
+def _windowed(boxes: Floats, around: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Centers (N, 2) x, y from the middle of each box, NaN without one, and variances (N, 3) xx, yy, xy."""
+    shift = np.zeros((len(boxes), 2))
+    moments = np.zeros((len(boxes), 3))
+    with np.errstate(all="ignore"):
+        for _ in range(20):
+            across, down = around - shift[:, 0, None], around - shift[:, 1, None]
+            window = np.exp(-(down[:, :, None] ** 2 + across[:, None, :] ** 2) / (2 * _WIDTH**2)) * boxes
+            total = window.sum((1, 2))
+            mean = np.stack([(window.sum(1) * across).sum(1), (window.sum(2) * down).sum(1)], 1) / total[:, None]
+            bad = (total <= 0) | (np.abs(shift) > 2).any(1)
+            shift = np.where(bad[:, None], np.nan, shift + 2 * mean)
+            if not (np.abs(mean[~bad]).sum(1) > 1e-4).any():
+                break
+        across, down = around - shift[:, 0, None], around - shift[:, 1, None]
+        moments[:, 0] = (window.sum(1) * across**2).sum(1) / total
+        moments[:, 1] = (window.sum(2) * down**2).sum(1) / total
+        moments[:, 2] = (window * down[:, :, None] * across[:, None, :]).sum((1, 2)) / total
+    return shift, moments
+
+
+def _reasons(
+    boxes: Floats, half: int, shift: Floats, moments: Floats, saturated: NDArray[np.bool_]
+) -> NDArray[np.str_]:
+    """(N,) why each is not a good star; empty for those that are."""
+    with np.errstate(all="ignore"):
+        mean = (moments[:, 0] + moments[:, 1]) / 2
+        difference = np.hypot((moments[:, 0] - moments[:, 1]) / 2, moments[:, 2])
+        narrow = np.where(mean > difference, (mean - difference) / (mean + difference), 0.0)
+    middle = boxes[:, half - 1 : half + 2, half - 1 : half + 2].reshape(len(boxes), 9)
+    ordered = np.sort(middle, 1)
+    lone = ordered[:, -2] < _LONE_PIXEL * ordered[:, -1]
+    share = mean / _WIDTH**2
+    # In a long exposure all stars are streaks.
+    streak = narrow < min(_LEAST_ROUND, 0.5 * float(np.nanmedian(narrow[:40]))) if len(narrow) else narrow < 0
+    why = np.full(len(boxes), "", dtype="<U24")
+    why[~(share <= _WIDEST)] = "wider than a star"
+    why[streak] = "streaks"
+    why[lone | (share < _NARROWEST)] = "hot pixels"
+    why[saturated & (why == "")] = "saturated"
+    why[~np.isfinite(shift).all(1)] = "wider than a star"
+    return why
+
+
+def _uncrowded(pixels: Floats, peak: Floats) -> NDArray[np.bool_]:
+    """(N,) whether no other point of light of a twentieth of the brightness or more is near."""
+    from scipy.spatial import cKDTree
+
+    known = np.isfinite(pixels).all(1)
+    alone = np.ones(len(pixels), bool)
+    index = np.flatnonzero(known)
+    if len(index) < 2:
+        return alone
+    pairs = cKDTree(pixels[index]).query_pairs(_CROWDED, output_type="ndarray")
+    for first, second in ((pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])):
+        near = index[first][peak[index[second]] > 0.05 * peak[index[first]]]
+        alone[near] = False
+    return alone

@@ -1,0 +1,228 @@
+"""From named stars of night images of several cameras to what a rig is solved from."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from kcal.calibrate.rig.star_source import StarEffect, StarSource
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.mounting import Origin
+from kcal.stars.attitude import FAR
+from kcal.stars.catalog import StarCatalog
+from kcal.stars.night import NamedStars
+from kcal.stars.sky import EARTH_RATE, pole_in_enu, refraction_sigma
+
+# Radians: of the Yale catalogue along an axis, 1 second of arc.
+_CATALOG_SIGMA = math.radians(1.0 / 3600)
+# px: stars without a name are matched within this distance of where the named ones put them.
+_MATCH = 2.0
+# s: images of one moment.
+_SAME_TIME = 1e-3
+
+# Images of one moment: NamedStars by the number of the camera.
+Moment = Mapping[int, NamedStars]
+
+
+def star_source(
+    moments: Sequence[Moment],
+    cameras: Sequence[Camera],
+    *,
+    clock_sigma: float = 0.1,
+    origin: Origin | None = None,
+    catalog: StarCatalog | None = None,
+) -> StarSource:
+    """What night images tell of a rig: stars with directions on the Earth, or without.
+
+    If all images have their attitude on the Earth (`NamedStars.on_earth`), named stars are known in east, north, up,
+    and the clock, UT1 and the air's temperature and pressure are unknowns with their sigmas. Otherwise stars only tell
+    how the cameras are turned against each other. In both cases the offset between the cameras' clocks is an unknown:
+    no residual shows it, and a second of it is 15 seconds of arc.
+
+    Args:
+        moments: images of each moment by the number of their camera.
+        cameras: of the rig.
+        clock_sigma: of the offset between the clock of each camera and that of the first, seconds.
+        origin: of the rig's frame, if that is one on the Earth.
+        catalog: the stars; kcal's own if left out.
+
+    Raises:
+        InputError: no stars, or a clock_sigma that is no number of seconds.
+
+    Example:
+        >>> camera = Camera.build(focal=(900, 900), center=(479.5, 299.5), size=(960, 600), model="pinhole")
+        >>> star_source([], (camera, camera))
+        Traceback (most recent call last):
+        kcal.errors.InputError: no stars were named in two cameras at the same moment
+    """
+    if not 0 <= clock_sigma < math.inf:
+        raise InputError(f"clock_sigma {clock_sigma}: seconds, not below 0, are needed")
+    catalog = catalog or StarCatalog.bundled()
+    images = [image for moment in moments for image in moment.values()]
+    on_earth = bool(images) and all(image.on_earth for image in images)
+    rows = _Rows(len(cameras))
+    for number, moment in enumerate(moments):
+        _add_named(rows, moment, catalog, number, on_earth=on_earth)
+        _add_nameless(rows, moment, cameras, number)
+    if not rows.names:
+        raise InputError("no stars were named in two cameras at the same moment")
+    direction = torch.from_numpy(np.array(rows.direction))
+    altitude = torch.arcsin(direction[:, 2].clamp(-1, 1)).numpy()
+    sigma = torch.from_numpy(np.hypot(_CATALOG_SIGMA, refraction_sigma(np.nan_to_num(altitude, nan=1.0))))
+    sigma[direction.isnan().any(-1)] = math.inf
+    return StarSource(
+        names=tuple(rows.names),
+        pixels=torch.from_numpy(np.array(rows.pixels)),
+        pixel_sigma=torch.from_numpy(np.array(rows.sigma)),
+        direction=direction,
+        direction_sigma=sigma,
+        effects=tuple(_effects(moments, len(cameras), rows, clock_sigma, origin, catalog, on_earth=on_earth)),
+    )
+
+
+def moments_of(
+    images: Sequence[Sequence[NamedStars]], *, tolerance: float = _SAME_TIME
+) -> tuple[list[dict[int, NamedStars]], int]:
+    """Images of each camera put together by their times; without times, in their order.
+
+    Args:
+        images: of each camera.
+        tolerance: seconds.
+
+    Returns:
+        the moments, and how many images have no partner. On the Earth these are moments of their own.
+
+    Raises:
+        InputError: images without times that are not as many for each camera.
+    """
+    timed = all(image.view.time is not None for own in images for image in own)
+    if not timed:
+        if len({len(own) for own in images}) > 1:
+            raise InputError("images without times are paired in their order: as many are needed for each camera")
+        return [dict(enumerate(pair)) for pair in zip(*images, strict=True)], 0
+    found: list[tuple[datetime.datetime, dict[int, NamedStars]]] = []
+    for camera, own in enumerate(images):
+        for image in own:
+            time = image.view.time
+            assert time is not None
+            here = next((m for t, m in found if abs((t - time).total_seconds()) <= tolerance and camera not in m), None)
+            if here is None:
+                found.append((time, {camera: image}))
+            else:
+                here[camera] = image
+    moments = [moment for _, moment in sorted(found, key=lambda one: one[0])]
+    alone = sum(len(moment) == 1 for moment in moments)
+    on_earth = all(image.on_earth for own in images for image in own)
+    return [moment for moment in moments if on_earth or len(moment) > 1], alone
+
+
+class _Rows:
+    """Stars as they are gathered: one entry for each star of each moment."""
+
+    def __init__(self, cameras: int) -> None:
+        self.names: list[str] = []
+        self.pixels: list[NDArray[np.float64]] = []
+        self.sigma: list[NDArray[np.float64]] = []
+        self.direction: list[NDArray[np.float64]] = []
+        self.moment: list[int] = []
+        self.star: list[int] = []
+        self._cameras = cameras
+
+    def add(self, name: str, moment: int, star: int, direction: NDArray[np.float64] | None) -> None:
+        self.names.append(name)
+        self.moment.append(moment)
+        self.star.append(star)
+        self.pixels.append(np.full((self._cameras, 2), np.nan))
+        self.sigma.append(np.full(self._cameras, np.nan))
+        self.direction.append(np.full(3, np.nan) if direction is None else direction)
+
+
+def _add_named(rows: _Rows, moment: Moment, catalog: StarCatalog, number: int, *, on_earth: bool) -> None:
+    seen: dict[int, dict[int, int]] = {}
+    for camera, image in moment.items():
+        for place, star in enumerate(image.attitude.star.tolist()):
+            if star >= 0:
+                seen.setdefault(star, {})[camera] = place
+    for star, places in seen.items():
+        if not on_earth and len(places) < 2:
+            continue
+        some = moment[next(iter(places))]
+        name = f"{catalog.name_of(int(catalog.number[star]))} at {number + 1}"
+        rows.add(name, number, star, some.directions[star] if on_earth else None)
+        for camera, place in places.items():
+            rows.pixels[-1][camera] = moment[camera].detected.pixels[place]
+            rows.sigma[-1][camera] = moment[camera].detected.sigma[place]
+
+
+def _add_nameless(rows: _Rows, moment: Moment, cameras: Sequence[Camera], number: int) -> None:
+    """Stars that the catalogue does not have, seen by the first and another camera where the named ones put them."""
+    first = min(moment)
+    here = moment[first]
+    free = np.flatnonzero(here.attitude.star < 0)
+    for camera in sorted(set(moment) - {first}):
+        there = moment[camera]
+        others = np.flatnonzero(there.attitude.star < 0)
+        if not len(free) or not len(others):
+            continue
+        rays, valid = cameras[first].unproject(torch.from_numpy(here.detected.pixels[free]))
+        rays = rays / rays.norm(dim=-1, keepdim=True)
+        expected, seen = cameras[camera].project(FAR * rays @ (there.attitude.rotation @ here.attitude.rotation.T).T)
+        expected = torch.where((valid & seen)[:, None], expected, 1e9)
+        tree = cKDTree(there.detected.pixels[others])
+        distance, match = tree.query(expected.numpy(), distance_upper_bound=_MATCH)
+        back = cKDTree(expected.numpy()).query(there.detected.pixels[others])[1]
+        for k in np.flatnonzero(np.isfinite(distance)):
+            if back[match[k]] != k:
+                continue
+            rows.add(f"light {free[k]} at {number + 1}, {camera}", number, -1, None)
+            for c, image, place in ((first, here, free[k]), (camera, there, others[match[k]])):
+                rows.pixels[-1][c], rows.sigma[-1][c] = image.detected.pixels[place], image.detected.sigma[place]
+
+
+def _effects(
+    moments: Sequence[Moment],
+    cameras: int,
+    rows: _Rows,
+    clock_sigma: float,
+    origin: Origin | None,
+    catalog: StarCatalog,
+    *,
+    on_earth: bool,
+) -> list[StarEffect]:
+    """Clocks against each other, the clock against UT1, and the air."""
+    some = next(iter(moments[0].values()))
+    if origin is not None:
+        pole = torch.from_numpy(pole_in_enu(origin.lat))
+    else:
+        # In the first camera's frame, which is that of the rig; the pole of J2000 is near enough.
+        pole = (moments[0].get(0, some)).attitude.rotation[:, 2]
+    found = []
+    # An hour later the sky has turned from east to west: against the axis that points north.
+    second = -EARTH_RATE * pole
+    for camera in range(1, cameras):
+        if clock_sigma > 0:
+            turn = torch.zeros(cameras, 3, dtype=torch.float64)
+            turn[camera] = clock_sigma * second
+            found.append(StarEffect(name=f"the clock of camera {camera + 1} against that of the first", turn=turn))
+    if not on_earth:
+        return found
+    turn = (some.view.clock_sigma * second).expand(cameras, 3)
+    found.append(StarEffect(name="the clocks against UT1", turn=turn))
+    shifts: dict[str, Tensor] = {}
+    for number, moment in enumerate(moments):
+        at = [k for k, (m, star) in enumerate(zip(rows.moment, rows.star, strict=True)) if m == number and star >= 0]
+        if not at:
+            continue
+        view = next(iter(moment.values())).view
+        for name, shift in view.by_air(catalog, np.array([rows.star[k] for k in at])):
+            whole = shifts.setdefault(name, torch.zeros(len(rows.names), 3, dtype=torch.float64))
+            whole[at] = torch.from_numpy(shift)
+    return found + [StarEffect(name=name, shift=shift) for name, shift in shifts.items()]

@@ -1,0 +1,106 @@
+"""Simulated rigs under the stars: two cameras 10 m apart, marks of stars, matches of unknown range, a baseline."""
+
+from __future__ import annotations
+
+import datetime
+import math
+
+import numpy as np
+import torch
+from night_scenes import PLACE, TIME
+from torch import Tensor
+
+from kcal.calibrate.rig.sources import Baseline, Features, MeasuredPosition, RigData
+from kcal.calibrate.rig.star_source import StarEffect, StarSource
+from kcal.lens.camera import Camera
+from kcal.locate.geodesy import enu_from_cam
+from kcal.stars.attitude import FAR
+from kcal.stars.catalog import StarCatalog
+from kcal.stars.sky import EARTH_RATE, observed_directions, pole_in_enu
+
+BASELINE = 10.0
+LOOKS = ((40.0, 12.0, 1.0), (41.5, 12.5, -0.5))
+
+
+def star_rig(
+    camera: Camera,
+    *,
+    seed: int,
+    named: bool,
+    moments: int = 1,
+    sigma: float = 0.1,
+    clock: float = 0.0,
+    clock_sigma: float = 0.02,
+    faintest: float = 5.0,
+    positions: bool = True,
+    matches: int = 12,
+) -> tuple[RigData, Tensor, Tensor]:
+    """Data of a rig, and the true rotations (2, 3, 3) and centers (2, 3) in east, north, up.
+
+    Args:
+        camera: both.
+        seed: of all noise.
+        named: stars with directions, or without.
+        moments: pairs of images, 25 minutes apart.
+        sigma: of a star, px.
+        clock: seconds by which the second camera's images are late.
+        clock_sigma: as stated.
+        faintest: magnitude.
+        positions: whether the cameras' positions are measured, to 1 cm.
+        matches: features of unknown range.
+    """
+    draw = np.random.default_rng(seed)
+    rotation = torch.stack([enu_from_cam(*look).T for look in LOOKS])
+    center = torch.stack([torch.zeros(3).double(), BASELINE * enu_from_cam(*LOOKS[0])[:, 0]])
+    catalog, names, pixels, direction = StarCatalog.bundled(), [], [], []
+    for moment in range(moments):
+        time = TIME + datetime.timedelta(minutes=25 * moment)
+        seen = [observed_directions(catalog, time + datetime.timedelta(seconds=s), PLACE) for s in (0.0, clock)]
+        index = np.flatnonzero((catalog.magnitude < faintest) & (seen[0][:, 2] > math.sin(math.radians(6.0))))
+        marks = [
+            camera.project(FAR * torch.from_numpy(one[index]) @ turn.T)
+            for one, turn in zip(seen, rotation, strict=True)
+        ]
+        good = torch.stack([valid & camera.inside(at) for at, valid in marks]).all(0)
+        pixels.append(torch.stack([at[good] for at, _ in marks], 1))
+        direction.append(torch.from_numpy(seen[0][index])[good])
+        names += [f"HR {catalog.number[i]} at {moment}" for i in index[good.numpy()]]
+    clean, known = torch.cat(pixels), torch.cat(direction)
+    turn = -EARTH_RATE * clock_sigma * torch.from_numpy(pole_in_enu(PLACE.lat))
+    effect = StarEffect(name="the clock of the second camera", turn=torch.stack([torch.zeros_like(turn), turn]))
+    stars = StarSource(
+        names=tuple(names),
+        pixels=clean + torch.from_numpy(draw.normal(0, sigma, clean.shape)),
+        pixel_sigma=torch.full(clean.shape[:2], sigma).double(),
+        direction=known if named else torch.full_like(known, torch.nan),
+        direction_sigma=torch.full((len(names),), 5e-6 if named else math.inf).double(),
+        effects=(effect,),
+    )
+    features = None
+    if matches:
+        way = draw.uniform((-0.4, -0.2), (0.4, 0.2), (matches, 2))
+        rays = torch.nn.functional.pad(torch.from_numpy(way), (0, 1), value=1.0)
+        points = torch.from_numpy(draw.uniform(100, 1500, (matches, 1))) * rays @ rotation[0]
+        at = torch.stack([camera.project((points - c) @ r.T)[0] for r, c in zip(rotation, center, strict=True)], 1)
+        features = Features(
+            names=tuple(f"match {k}" for k in range(matches)),
+            pixels=at + torch.from_numpy(draw.normal(0, 0.1, at.shape)),
+            inverse_range=torch.zeros(matches).double(),
+            inverse_range_sigma=torch.full((matches,), math.inf).double(),
+            pixel_sigma=0.1,
+        )
+    places = [
+        MeasuredPosition(
+            camera=c, point=center[c] + torch.from_numpy(draw.normal(0, 0.01, 3)), sigma=torch.full((3,), 0.01).double()
+        )
+        for c in (0, 1)
+    ]
+    data = RigData(
+        cameras=(camera, camera),
+        names=("left", "right"),
+        stars=stars,
+        features=features,
+        baselines=(Baseline(first=0, second=1, length=BASELINE + draw.normal(0, 0.002), sigma=0.002),),
+        positions=tuple(places) if positions else (),
+    )
+    return data, rotation, center

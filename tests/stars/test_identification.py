@@ -1,0 +1,169 @@
+"""Stars found in rendered images, named without pointing, and what is refused."""
+
+from __future__ import annotations
+
+import builtins
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
+
+from kcal.errors import InputError
+from kcal.lens.camera import Camera
+from kcal.lens.mounting import Origin
+from kcal.stars.attitude import field_angle
+from kcal.stars.catalog import StarCatalog
+from kcal.stars.detect import detect_stars
+from kcal.stars.identification import identify
+from kcal.stars.night import SkyView, name_stars
+from kcal.stars.pair_table import cache_folder, pair_table
+
+CATALOG = StarCatalog.bundled()
+CAMERA = night_camera()
+LOOK = (130.0, 35.0, 2.0)
+
+
+@pytest.fixture(scope="module")
+def night() -> np.ndarray[Any, Any]:
+    pixels, index = star_pixels(CAMERA, LOOK)
+    return rendered(CAMERA, pixels, CATALOG.magnitude[index])
+
+
+def test_centers_and_their_sigmas() -> None:
+    pixels, index = star_pixels(CAMERA, LOOK, faintest=5.5)
+    errors, sigmas = [], []
+    for seed in range(3):
+        found = detect_stars(rendered(CAMERA, pixels, CATALOG.magnitude[index], seed=seed))
+        apart = np.linalg.norm(found.pixels[:, None] - pixels, axis=-1)
+        near = apart.min(1) < 1.0
+        errors.append((found.pixels - pixels[apart.argmin(1)])[near])
+        sigmas.append(found.sigma[near])
+    error, sigma = np.concatenate(errors), np.concatenate(sigmas)
+    assert len(error) > 150
+    # By the median: a few stars have a neighbor that is too faint to be seen by itself.
+    assert 0.4 < np.median(np.abs(error / sigma[:, None])) / 0.6745 < 1.2
+    faint = sigma > 0.06
+    assert faint.sum() > 20
+    by_noise = np.sqrt(sigma[faint] ** 2 - 0.04**2)  # without what no image of pure noise has
+    assert 0.7 < np.median(np.abs(error[faint] / by_noise[:, None])) / 0.6745 < 1.3
+
+
+def test_what_is_no_star_is_counted(night: Any) -> None:
+    image = night.astype(np.float64)
+    generator = np.random.default_rng(5)
+    for row, column in generator.integers(30, 560, (12, 2)):
+        image[row, column] += 4000.0  # hot pixels
+    along = np.arange(200)
+    for shift in range(-1, 2):
+        image[300 + shift + along // 3, 400 + along] += 900.0 / (1 + shift**2)  # a satellite
+    rows, columns = np.mgrid[0:600, 0:960]
+    image += 3000.0 * np.exp(-((rows - 480) ** 2 + (columns - 200) ** 2) / (2 * 6.0**2))  # a lamp
+    image += 250.0 * np.exp(-((rows - 100) ** 2 + (columns - 700) ** 2) / (2 * 80.0**2))  # a cloud
+    found = name_stars(np.clip(image, 0, 65535).astype(np.uint16), CAMERA, SkyView(time=TIME, origin=PLACE))
+    assert found.detected.left_out["hot pixels"] >= 9
+    assert found.detected.left_out["streaks"] >= 5
+    assert found.detected.left_out["wider than a star"] >= 1
+    assert found.heading_pitch_roll == pytest.approx(LOOK, abs=0.01)
+
+
+def test_attitude_on_earth_within_its_sigma(night: Any) -> None:
+    found = name_stars(night, CAMERA, SkyView(time=TIME, origin=PLACE, dut1=0.0, time_sigma=0.0))
+    assert found.attitude.count > 30
+    assert found.attitude.rms_px < 0.12
+    heading, pitch, roll = found.heading_pitch_roll or (0.0, 0.0, 0.0)
+    assert heading == pytest.approx(LOOK[0], abs=0.004)
+    assert pitch == pytest.approx(LOOK[1], abs=0.004)
+    assert roll == pytest.approx(LOOK[2], abs=0.008)
+    assert max(found.sigma_deg) < 0.004
+    unknown = name_stars(night, CAMERA, SkyView(time=TIME, origin=PLACE))
+    # 0.52 s of UT1 by 15 seconds of arc, times the sine of the latitude about the vertical.
+    grown = np.sqrt(unknown.sigma_deg[2] ** 2 - found.sigma_deg[2] ** 2)
+    assert grown == pytest.approx(np.hypot(0.52, 0.1) * 15.04 / 3600 * np.sin(np.radians(PLACE.lat)), rel=0.02)
+
+
+def test_eight_bits_name_stars_too(night: Any) -> None:
+    image = np.clip((night.astype(float) - 400) / 30.0, 0, 255).astype(np.uint8)
+    found = name_stars(image, CAMERA)
+    assert found.attitude.count > 20
+    assert found.right_ascension_declination is not None
+
+
+def test_fewer_stars_than_tell_have_no_name() -> None:
+    pixels, _ = star_pixels(CAMERA, LOOK)
+    rays = CAMERA.unproject(torch.from_numpy(pixels[:4]))[0].numpy()
+    assert identify(rays / np.linalg.norm(rays, axis=1, keepdims=True), 1e-3, field=field_angle(CAMERA)) is None
+
+
+@pytest.mark.parametrize("focal", [900.0, 5000.0])
+def test_random_points_have_no_names(focal: float) -> None:
+    generator = np.random.default_rng(int(focal))
+    camera = night_camera(focal)
+    for _ in range(8):
+        pixels = generator.random((int(generator.integers(4, 21)), 2)) * camera.size
+        rays = np.c_[(pixels - camera.params[2:4].numpy()) / focal, np.ones(len(pixels))]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        assert identify(rays, 2.5 / focal, field=field_angle(camera)) is None
+
+
+def test_mirrored(night: Any) -> None:
+    with pytest.raises(InputError, match="the image is mirrored"):
+        name_stars(np.ascontiguousarray(night[:, ::-1]), CAMERA)
+
+
+def test_wrong_time_is_stated(night: Any) -> None:
+    antipode = Origin(lat=-PLACE.lat, lon=PLACE.lon + 180.0, height=0.0)
+    found = name_stars(night, CAMERA, SkyView(time=TIME, origin=antipode))
+    assert found.attitude.count > 30
+    assert not found.on_earth
+    assert "would stand below the horizon" in found.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.full((600, 960), 3, np.uint8), "is the lens cap on"),
+        (np.full((600, 960), 250, np.uint8), "bright as day"),
+        (np.random.default_rng(0).normal(600, 20, (600, 960)).astype(np.uint16), "no stars"),
+        (np.zeros((600, 900), np.uint8), "900x600 pixels, the camera 960x600"),
+    ],
+)
+def test_what_is_no_night(image: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        name_stars(image, CAMERA)
+
+
+def test_the_table_is_cached_and_a_broken_one_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KCAL_CACHE", str(tmp_path / "made"))
+    made = pair_table(CATALOG, 0.05)
+    (file,) = cache_folder().iterdir()
+    before = file.stat().st_mtime_ns
+    again = pair_table(CATALOG, 0.05)
+    assert file.stat().st_mtime_ns == before
+    assert np.array_equal(made.pairs, again.pairs)
+    file.write_bytes(file.read_bytes()[:1000])
+    assert np.array_equal(made.angle, pair_table(CATALOG, 0.05).angle)
+    assert file.stat().st_size > 1000
+
+
+def test_without_pyerfa(monkeypatch: pytest.MonkeyPatch, night: Any) -> None:
+    real = builtins.__import__
+
+    def without(name: str, *rest: Any, **more: Any) -> Any:
+        if name == "erfa":
+            raise ImportError(name)
+        return real(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(InputError, match=r"pip install 'kcal\[stars\]'"):
+        name_stars(night, CAMERA, SkyView(time=TIME, origin=PLACE))
+
+
+def test_wrong_camera() -> None:
+    pixels, index = star_pixels(CAMERA, LOOK)
+    image = rendered(CAMERA, pixels, CATALOG.magnitude[index])
+    other = Camera.build(focal=(1500, 1500), center=(479.5, 299.5), size=(960, 600), model="pinhole")
+    with pytest.raises(InputError, match="the camera file is of another lens"):
+        name_stars(image, other)

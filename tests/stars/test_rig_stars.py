@@ -1,0 +1,172 @@
+"""Rigs solved from stars: recovery, coverage, clocks, and what stars leave open."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
+from star_rigs import LOOKS, star_rig
+from typer.testing import CliRunner
+
+from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.cli.main import app
+from kcal.errors import DegenerateError, InputError
+from kcal.io.camera_file import save_camera
+from kcal.io.images import write_png
+from kcal.io.rig_file import load_rig
+from kcal.lens.pose import vector_from_rotation
+from kcal.locate.geodesy import enu_from_cam
+from kcal.stars.catalog import StarCatalog
+from kcal.stars.night import NamedStars, SkyView, name_stars
+from kcal.stars.rig_stars import moments_of, star_source
+
+CAMERA = night_camera(1600.0, (1920, 1080))
+STRAIGHT = RigOptions(refraction=0.0, refraction_sigma=0.0)
+
+
+def turn_error(found: Any, truth: torch.Tensor) -> torch.Tensor:
+    relative = found.rotation[1] @ found.rotation[0].T
+    return vector_from_rotation(relative @ (truth[1] @ truth[0].T).T)
+
+
+@pytest.mark.parametrize(("named", "seeds", "least", "most"), [(True, 12, 16, 66), (False, 2, 0.3, 23)])
+def test_the_relative_attitude_has_its_sigma(named: bool, seeds: int, least: float, most: float) -> None:
+    """χ² of the relative rotation over 3 degrees of freedom, the clock being drawn from its sigma."""
+    squares = []
+    for seed in range(seeds):
+        late = float(np.random.default_rng(1000 + seed).normal(0, 0.5))
+        data, truth, _ = star_rig(
+            CAMERA, seed=seed, named=named, positions=named, clock=late, clock_sigma=0.5, faintest=4.5
+        )
+        found = solve_rig(data, STRAIGHT)
+        error = turn_error(found, truth)
+        squares.append(float(error @ torch.linalg.solve(found.relative_covariance()[:3, :3], error)))
+        assert not found.left_out
+    # χ² of 36 and of 6 degrees of freedom, all but one of a thousand times.
+    assert least < sum(squares) < most
+
+
+def test_an_offset_of_a_clock_is_in_the_sigma() -> None:
+    sigmas = {}
+    for stated in (0.0001, 1.0):
+        data, _, _ = star_rig(CAMERA, seed=1, named=True, clock_sigma=stated)
+        sigmas[stated] = solve_rig(data, STRAIGHT).sigma_rotation.norm()
+    grown = math.sqrt(float(sigmas[1.0] ** 2 - sigmas[0.0001] ** 2))
+    assert grown == pytest.approx(7.292e-5, rel=0.5)  # of a second; positions and matches tell some of it
+
+
+def test_stars_alone_say_what_is_missing() -> None:
+    data, _, _ = star_rig(CAMERA, seed=1, named=False, positions=False, matches=0)
+    with pytest.raises(DegenerateError, match="add matches of unknown range"):
+        solve_rig(data, STRAIGHT)
+
+
+def test_named_stars_need_a_frame_on_the_earth() -> None:
+    with pytest.raises(InputError, match="need a frame on the Earth"):
+        star_rig(CAMERA, seed=1, named=True, positions=False)
+
+
+def test_wrong_names_and_an_aircraft_are_left_out() -> None:
+    data, truth, _ = star_rig(CAMERA, seed=3, named=True)
+    assert data.stars is not None
+    direction, pixels = data.stars.direction.clone(), data.stars.pixels.clone()
+    direction[[4, 9]] = direction[[9, 4]]
+    pixels[20, 1] += torch.tensor([3.0, -2.0])
+    data = dataclasses.replace(data, stars=dataclasses.replace(data.stars, direction=direction, pixels=pixels))
+    found = solve_rig(data, STRAIGHT)
+    assert {item.name for item in found.left_out} == {data.stars.names[i] for i in (4, 9, 20)}
+    assert all(item.source == "stars" for item in found.left_out)
+    assert float(turn_error(found, truth).norm()) < 4 * float(found.sigma_rotation.norm())
+
+
+@pytest.fixture(scope="module")
+def nights() -> list[list[NamedStars]]:
+    """Two pairs of rendered images, ten minutes apart."""
+    catalog, camera = StarCatalog.bundled(), night_camera(1100.0, (1280, 800))
+    found: list[list[NamedStars]] = [[], []]
+    for minute in (0, 10):
+        time = TIME + datetime.timedelta(minutes=minute)
+        for side, look in enumerate(LOOKS):
+            pixels, index = star_pixels(camera, look, time, faintest=6.0)
+            image = rendered(camera, pixels, catalog.magnitude[index], seed=10 * side + minute)
+            found[side].append(name_stars(image, camera, SkyView(time=time, origin=PLACE, dut1=0.0)))
+    return found
+
+
+def test_images_become_a_source(nights: list[list[NamedStars]]) -> None:
+    camera = night_camera(1100.0, (1280, 800))
+    moments, alone = moments_of(nights)
+    assert (len(moments), alone) == (2, 0)
+    source = star_source(moments, (camera, camera), origin=PLACE)
+    assert int(source.named.sum()) > 60
+    names = [effect.name for effect in source.effects]
+    assert names[1:] == ["the clocks against UT1", "the air's temperature", "the air's pressure"]
+    one_second = source.effects[0].turn
+    assert one_second is not None
+    assert float(one_second[1].norm()) == pytest.approx(0.1 * 7.292e-5, rel=1e-3)
+    # A warmer air bends less: stars sink.
+    shift = source.effects[2].shift
+    assert shift is not None
+    assert bool((shift[source.named][:, 2] < 0).all())
+
+
+def test_moments_of_unlike_times(nights: list[list[NamedStars]]) -> None:
+    later = [dataclasses.replace(one, view=dataclasses.replace(one.view, time=TIME + datetime.timedelta(hours=1)))
+             for one in nights[1]]  # fmt: skip
+    moments, alone = moments_of([nights[0], later])
+    assert alone == len(moments) == 4
+
+
+@pytest.mark.slow
+def test_the_command(tmp_path: Path) -> None:
+    """Two pairs of rendered images, matches of unknown range and a taped baseline, on the Earth and without a place."""
+    cameras = [night_camera(1100.0, (1280, 800)), night_camera(1101.0, (1280, 800))]
+    catalog, files = StarCatalog.bundled(), [str(tmp_path / f"{side}.camera.json") for side in ("left", "right")]
+    truth = torch.stack([enu_from_cam(*look).T for look in LOOKS])
+    center = torch.stack([torch.zeros(3).double(), 10.0 * enu_from_cam(*LOOKS[0])[:, 0]])
+    for side, camera in enumerate(cameras):
+        save_camera(camera, files[side])
+        folder = tmp_path / ("left", "right")[side]
+        folder.mkdir()
+        for minute in (0, 10):
+            time = TIME + datetime.timedelta(minutes=minute)
+            pixels, index = star_pixels(camera, LOOKS[side], time, faintest=6.0)
+            image = rendered(camera, pixels, catalog.magnitude[index], seed=10 * side + minute)
+            write_png(folder / f"{time:%Y-%m-%dT%H%M%S}.png", image)
+    draw = np.random.default_rng(1)
+    rays = torch.nn.functional.pad(torch.from_numpy(draw.uniform((-0.4, -0.2), (0.4, 0.2), (12, 2))), (0, 1), value=1.0)
+    points = torch.from_numpy(draw.uniform(100, 1500, (12, 1))) * rays @ truth[0]
+    at = torch.cat(
+        [camera.project((points - c) @ r.T)[0] for camera, r, c in zip(cameras, truth, center, strict=True)], 1
+    )
+    lines = [",".join(map(str, row)) for row in (at + 0.1 * torch.from_numpy(draw.normal(size=at.shape))).tolist()]
+    (tmp_path / "far.csv").write_text("\n".join(["left_u,left_v,right_u,right_v", *lines]))
+    common = [
+        "rig", *files, "--features", str(tmp_path / "far.csv"), "--baseline", "10.000±0.002", "--mark-sigma", "0.1",
+        "--refraction", "0", "--refraction-sigma", "0",
+    ]  # fmt: skip
+    stars = ["--stars", str(tmp_path / "left"), str(tmp_path / "right"), "--json"]
+    place = ["--star-time", "name:Z", "--origin", f"{PLACE.lat},{PLACE.lon},{PLACE.height}", "--dut1", "0"]
+    for more in (place, []):
+        done = CliRunner().invoke(app, [*common, *stars, *more, "-o", str(tmp_path / "rig.json")])
+        assert done.exit_code == 0, done.output
+        rig = load_rig(tmp_path / "rig.json")
+        error = vector_from_rotation(rig.right_from_left_rotation @ (truth[1] @ truth[0].T).T)
+        assert rig.covariance is not None
+        known = rig.covariance.matrix[-6:-3, -6:-3]
+        assert float(error @ torch.linalg.solve(known, error)) < 16
+        assert float(error.norm()) < 1e-4
+        assert (rig.mounting is not None) == bool(more)
+        if more:
+            assert rig.mounting is not None
+            assert rig.mounting.heading_deg == pytest.approx(LOOKS[0][0], abs=0.004)
+    done = CliRunner().invoke(app, [*common[:3], "--baseline", "10±0.002", *stars, "-o", str(tmp_path / "no.json")])
+    assert "add matches of unknown range" in str(done.exception)
+    assert not (tmp_path / "no.json").exists()
