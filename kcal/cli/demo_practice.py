@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,6 +25,8 @@ TRUTH = Path(".truth") / "truth.json"
 # A board's picture takes as long as so many frames of the film, a picture of the site as so many.
 _BOARD_STEPS, _PICTURE_STEPS = 15, 100
 _DETECTION_SIGMA = 0.2  # px
+# What parts of a site need beyond kcal itself, and the extra that brings it along.
+_EXTRAS = {"av": "video", "erfa": "stars"}
 
 _DETECTOR = '''"""A detector for `kcal live`: what differs from the picture of the site without ships.
 
@@ -91,10 +94,9 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
             try:
                 write(folder / path, step)
             except ImportError as error:
-                err.print(
-                    f"{path} needs {error.name}, which is not installed: pip install 'kcal[video]', and run this again",
-                    markup=False,
-                )
+                extra = _EXTRAS.get(error.name or "", "video")
+                cure = f"pip install 'kcal[{extra}]', and run this again"
+                err.print(f"{path} needs {error.name}, which is not installed: {cure}", markup=False)
                 continue
             done += 1
             advance(said, left)
@@ -136,7 +138,7 @@ _Write = Callable[[Path, Callable[[], None]], object]
 
 def _practice_parts(site: PracticeSite, frames: int) -> Iterator[tuple[Path, int, _Write]]:
     """Each file with the steps of its bar, and what writes it; the truth first, which says whose folder it is."""
-    from kcal.cli.practice_files import readme_text, survey_text, targets_text
+    from kcal.cli.practice_files import night_name, readme_text, survey_text, targets_text
     from kcal.sim.practice import SIDES
     from kcal.sim.practice_truth import practice_truth
 
@@ -144,13 +146,14 @@ def _practice_parts(site: PracticeSite, frames: int) -> Iterator[tuple[Path, int
         return lambda path, _: write_atomic(path, make())
 
     yield TRUTH, 1, text(lambda: dump_json(practice_truth(site, frames)))
-    yield Path("README.txt"), 1, text(readme_text)
+    yield Path("README.txt"), 1, text(lambda: readme_text(site.scene))
     yield Path("survey.csv"), 1, text(lambda: survey_text(site.scene))
     yield Path("targets.csv"), 1, text(targets_text)
     yield Path("find_ships.py"), 1, text(lambda: _DETECTOR)
     yield from _board_parts(site)
     for side in SIDES:
         yield Path("site", f"{side}.png"), _PICTURE_STEPS, functools.partial(_picture, site, side)
+    yield from ((Path("night", night_name(side)), 1, functools.partial(_night, site, side)) for side in SIDES)
     yield Path("site", "sketch.png"), 1, functools.partial(_sketch, site)
     yield Path("video", "detections.jsonl"), 1, text(lambda: _detections(site, frames))
     for side in SIDES:
@@ -177,6 +180,20 @@ def _picture(site: PracticeSite, side: Side, path: Path, _: Callable[[], None]) 
     from kcal.io.images import write_png
 
     write_png(path, site.picture(side))
+
+
+def _night(site: PracticeSite, side: Side, path: Path, _: Callable[[], None]) -> None:
+    importlib.import_module("erfa")
+    from kcal.cli.practice_files import NIGHT
+    from kcal.io.images import write_png
+    from kcal.lens.mounting import Origin
+    from kcal.sim.practice_night import night_picture
+    from kcal.stars.catalog import StarCatalog
+    from kcal.stars.night import SkyView
+
+    scene, catalog = site.scene, StarCatalog.bundled()
+    view = SkyView(time=NIGHT, origin=Origin(lat=scene.lat, lon=scene.lon, height=scene.height))
+    write_png(path, night_picture(site, side, view.directions(catalog), catalog.magnitude))
 
 
 def _sketch(site: PracticeSite, path: Path, _: Callable[[], None]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -41,12 +42,22 @@ STEPS = (
 )  # fmt: skip
 
 
-def readme_text() -> str:
+# When the night's pictures were taken.
+NIGHT = datetime.datetime(2026, 11, 24, 20, 47, 26, tzinfo=datetime.UTC)
+
+
+def night_name(side: str) -> str:
+    """Name of a night's picture, which says when it was taken, in UTC."""
+    return f"{side}-{NIGHT:%Y-%m-%dT%H%M%S}.png"
+
+
+def readme_text(scene: DemoScene) -> str:
     """What is in the folder, and the commands."""
     commands = "\n".join(
         f"{number}. {step.name}\n" + "\n".join(f"   {command}" for command in step.commands)
         for number, step in enumerate(STEPS, 1)
     )
+    place = f"--lat {scene.lat:g} --lon {scene.lon:g} --height {scene.height:g}"
     return f"""A site to practise on
 =====================
 
@@ -55,6 +66,7 @@ Two cameras stand 10 m apart on masts above a harbor. Everything is rendered, so
 boards/left, boards/right   photographs of a printed board: 9x6 inner corners, squares of 60 mm
 site/left.png, right.png    the site as both cameras see it, to be marked
 site/sketch.png             the surveyor's sketch: which landmark is which, and the targets
+night/                      the stars over both cameras; times in the names are UTC
 survey.csv                  surveyed places of the landmarks, with their sigma
 targets.csv                 what to locate, and which point of it is meant; use these names
 video/left.mp4, right.mp4   two minutes with ships that move
@@ -67,6 +79,9 @@ Run the commands in this folder:
 
    Without the extra `video`:
    kcal live rig.json --detections video/detections.jsonl -o tracks.csv
+
+   How do the cameras look, by the stars?
+   kcal stars night/{night_name("left")} --camera left.camera.json --time name:Z {place}
 
 How well did you do? This may be asked after each step:
    kcal demo --score .

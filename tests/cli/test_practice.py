@@ -19,7 +19,7 @@ import kcal.io.video_file
 from kcal.cli.demo_practice import TRUTH, practice_site
 from kcal.cli.demo_score import next_step, practice_score
 from kcal.cli.main import app
-from kcal.cli.practice_files import STEPS
+from kcal.cli.practice_files import STEPS, night_name
 from kcal.errors import FileError
 from kcal.lens.mounting import Origin
 from kcal.locate.geodesy import enu_to_geodetic
@@ -63,6 +63,12 @@ def test_what_is_there_is_kept_and_what_is_missing_is_made(folder: Path, capsys:
     make(folder)
     assert "wrote 1 files" in capsys.readouterr().out
     assert contents(folder) == {**before, "survey.csv": b"mine"}
+
+
+def test_stars_say_how_the_camera_looks(made: Path, truth: dict[str, Any]) -> None:
+    pytest.importorskip("erfa", reason="the extra `stars` is not installed")
+    assert (made / "night" / night_name("left")).exists()
+    assert night_name("left") in (made / "README.txt").read_text()
 
 
 def test_other_folders_are_refused(folder: Path, tmp_path: Path) -> None:
