@@ -230,8 +230,6 @@ def locate_command(
         pixel_sigma=noise, calibration=errors.calibration, mounting=errors.mounting, link=errors.link,
         refraction=refraction, refraction_sigma=refraction_sigma,
     )  # fmt: skip
-    if note:
-        err.print(note)
     survey = None if truth is None else read_survey(truth, locate.localize.origin, measured=False)
     sample = PositionSample(frozenset(survey.names if survey else ()))
     written: list[Path] = []
@@ -248,6 +246,8 @@ def locate_command(
                 sample.add(columns)
                 advance(f"{sample.count:,} rows", chunk.bytes_read - read)
                 read = chunk.bytes_read
+            if note and not stated:
+                err.print(note)
             located = sample.located(locate)
             true = None if truth is None else read_truth(truth, located)
         written += [path for path in outputs if path != STREAM]

@@ -105,7 +105,7 @@ def _landmarks(rig: StereoRig, path: Path, now: Marks, sigma: float) -> Landmark
 
     if rig.mounting is None:
         raise InputError("the rig file does not say where the rig stands; solve it with landmarks, or use --reference")
-    return match_landmarks(read_survey(path, rig.mounting.origin), now, sigma).landmarks
+    return match_landmarks(read_survey(path, rig.mounting.origin), now, now.sigmas(sigma)).landmarks
 
 
 def _print_turns(rig: StereoRig, drift: Drift) -> None:

@@ -95,7 +95,8 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
         if sources.positions is not None and survey.origin != origin:
             raise InputError("landmarks and positions: one has latitudes, the other local meters; give an --origin")
         origin = survey.origin
-        found = match_landmarks(survey, read_marks(sources.marks, single=True), sources.mark_sigma)
+        marks = read_marks(sources.marks, single=True)
+        found = match_landmarks(survey, marks, marks.sigmas(sources.mark_sigma))
         landmarks = found.landmarks
         for names, text in ((found.unmarked, "surveyed, but not marked"), (found.unsurveyed, "marked, not surveyed")):
             if names:

@@ -22,6 +22,8 @@ _UPPER = tuple((i, j) for i in range(4) for j in range(i, 4))
 COVARIANCE = tuple(f"cov_{i}{j}" for i, j in _UPPER)
 _HEADER = f"name,{','.join(PIXELS)}"
 _PIXEL = "a pixel coordinate"
+# px: a survey's and a lens's errors are not smaller, whatever marks say of themselves.
+_LEAST_SIGMA = 0.05
 
 
 class Marks(NamedTuple):
@@ -48,6 +50,20 @@ class Marks(NamedTuple):
     def covariance_or(self, sigma: float) -> Tensor | None:
         """See `filled`."""
         return filled(self.covariance, sigma)
+
+    def sigmas(self, sigma: float) -> Tensor:
+        """(N, 2) standard deviation of each mark along an axis, px: `sigma` where none is stated, NaN without a mark.
+
+        Example:
+            >>> one = Marks(("a",), torch.tensor([[10.0, 20.0]]), torch.full((1, 2), torch.nan))
+            >>> one.sigmas(0.3).tolist()
+            [[0.3, nan]]
+        """
+        variance = torch.full((len(self.names), 2), sigma**2, dtype=torch.float64)
+        if self.covariance is not None:
+            stated = self.covariance.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 2)).mean(-1)
+            variance = torch.where(stated.isfinite(), stated, variance)
+        return torch.where(self.pixels.isfinite().all(-1), variance.sqrt().clamp_min(_LEAST_SIGMA), math.nan)
 
 
 def filled(covariance: Tensor | None, sigma: float) -> Tensor | None:

@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
 from kcal.calibrate.rig.result import ItemResidual
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
@@ -23,7 +22,6 @@ from kcal.locate.survey import Survey, match_landmarks
 from kcal.quantities import range_text
 
 LEAST_LANDMARKS = 4
-_LEAST_SIGMA = 0.05  # px: a survey's and a lens's errors are not smaller, whatever marks say of themselves
 NOWHERE = Origin(lat=0.0, lon=0.0, height=0.0)
 
 
@@ -87,7 +85,7 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
         missing = LEAST_LANDMARKS - count
         return nothing._replace(text=f"{missing} more landmark{'s' if missing > 1 else ''} in both images for a rig")
     try:
-        landmarks = match_landmarks(survey, marks, mark_sigmas(marks, hand_sigma)).landmarks
+        landmarks = match_landmarks(survey, marks, marks.sigmas(hand_sigma)).landmarks
         result = solve_rig(RigData(cameras=cameras, names=("left", "right"), landmarks=landmarks), RigOptions())
         rig = placed_rig(result, survey.origin or NOWHERE)
     except KcalError as error:
@@ -104,24 +102,9 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
     return LiveRig(rig, survey.origin, items, promises, count, sigma, text, enough, result.warnings)
 
 
-def mark_sigmas(marks: Marks, hand_sigma: float) -> Tensor:
-    """(N, 2) standard deviation of each mark along an axis, px; NaN where an image has none.
-
-    Example:
-        >>> one = Marks(("a",), torch.tensor([[10.0, 20.0]]), torch.full((1, 2), torch.nan))
-        >>> mark_sigmas(one, 0.3).tolist()
-        [[0.3, nan]]
-    """
-    variance = torch.full((len(marks.names), 2), hand_sigma**2, dtype=torch.float64)
-    if marks.covariance is not None:
-        stated = marks.covariance.diagonal(dim1=-2, dim2=-1).unflatten(-1, (2, 2)).mean(-1)
-        variance = torch.where(stated.isfinite(), stated, variance)
-    return torch.where(marks.pixels.isfinite().all(-1), variance.sqrt().clamp_min(_LEAST_SIGMA), math.nan)
-
-
 def marks_sigma(marks: Marks, hand_sigma: float) -> float:
     """The root mean square of the marks' standard deviations along an axis, px; marks that are missing do not count."""
-    sigmas = mark_sigmas(marks, hand_sigma)
+    sigmas = marks.sigmas(hand_sigma)
     known = sigmas[sigmas.isfinite()]
     return float(known.square().mean().sqrt()) if len(known) else hand_sigma
 

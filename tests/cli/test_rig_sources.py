@@ -13,12 +13,14 @@ import torch
 from torch import Tensor
 
 from kcal.cli.main import main
+from kcal.cli.rig_sources import Sources, read_sources
 from kcal.io.camera_file import camera_to_file
 from kcal.io.rig_file import RigFile
 from kcal.lens.camera import Camera
 from kcal.lens.mounting import Origin
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
+from kcal.locate.marks import read_marks, write_marks
 
 ORIGIN = Origin(lat=-17.5, lon=179.9999, height=40.0)
 CAMERAS = [
@@ -310,3 +312,17 @@ def test_usage(site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     assert "not both" in capsys.readouterr().err
     assert run(monkeypatch, "locate", "rig.json", "points.csv", "--origin", "1,2,3") == 2
     assert run(monkeypatch, "locate", "rig.json", "points.csv", "--pitch", "1") == 2
+
+
+def test_marks_count_with_their_own_noise(site: Path) -> None:
+    marks = read_marks(site / "marks.csv")
+    spread = torch.full((12, 4), 0.2**2, dtype=torch.float64)
+    spread[3], spread[5] = 0.4**2, math.nan
+    write_marks(site / "own.csv", marks._replace(covariance=torch.diag_embed(spread)))
+    sources = Sources(landmarks=site / "survey.csv", marks=site / "own.csv", mark_sigma=0.1)
+    found = read_sources((CAMERAS[0], CAMERAS[1]), sources).data.landmarks
+    assert found is not None
+    expected = torch.full((12, 2), 0.2, dtype=torch.float64)
+    # Of one mark nothing is stated: it has the noise of the option.
+    expected[3], expected[5] = 0.4, 0.1
+    torch.testing.assert_close(found.pixel_sigma, expected)

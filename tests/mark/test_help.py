@@ -22,7 +22,7 @@ from kcal.locate.relock import check_rig, seen_again
 from kcal.locate.survey import Survey
 from kcal.mark.guide import RigBand, at_shape, propose
 from kcal.mark.items import Add, Mark, Place, Put, Side, SurveyPlace
-from kcal.mark.live import Promise, mark_sigmas, marks_sigma, solve_live, verdict
+from kcal.mark.live import Promise, marks_sigma, solve_live, verdict
 from kcal.mark.marking_service import Desk
 from kcal.mark.overview import map_content
 from kcal.mark.pictures import open_pictures
@@ -267,7 +267,7 @@ class TestLiveRig:
     def test_marks_have_their_own_sigmas(self) -> None:
         right = torch.tensor([[1.0, 1.0], [math.nan, math.nan]])
         variances = torch.tensor([[0.04, 0.02, 0.25, 0.25], [0.01, 0.01, math.nan, math.nan]]).double()
-        found = mark_sigmas(Marks(("a", "b"), torch.zeros(2, 2), right, torch.diag_embed(variances)), 0.3)
+        found = Marks(("a", "b"), torch.zeros(2, 2), right, torch.diag_embed(variances)).sigmas(0.3)
         torch.testing.assert_close(found[0], torch.tensor([math.sqrt(0.03), 0.5]).double())
         assert float(found[1, 0]) == pytest.approx(0.1)
         assert math.isnan(float(found[1, 1]))
