@@ -14,7 +14,7 @@ from kcal.cli.console import with_json
 from kcal.cli.groups import group_with_default
 from kcal.cli.inputs import CALIBRATED, MARKS, OBSERVATIONS, SURVEY, TABLE, with_inputs
 from kcal.cli.night_images import TIME_HELP
-from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_of
+from kcal.cli.pixel_sigma import PixelSigma, pixel_sigma_and_source
 from kcal.cli.report import NO, REQUIRE_HELP, required, told_usable
 from kcal.cli.rig_check import check
 from kcal.errors import InputError
@@ -170,7 +170,7 @@ def solve_command(
     --baseline 10.02±0.005 -o rig.json --require 5km:10% --report rig.html`
     """
     from kcal.calibrate.rig.solve import RigOptions, solve_rig
-    from kcal.cli.console import print_table, print_wrote, steps, tell, warn
+    from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
     from kcal.cli.rig_sources import Sources, read_sources
     from kcal.cli.rig_stars import NightOptions
     from kcal.cli.sides import check_sides
@@ -181,7 +181,7 @@ def solve_command(
     from kcal.locate.range_sigmas import range_sigmas
     from kcal.report.tables import range_sigma_rows
 
-    noise = pixel_sigma_of(pixel_sigma)
+    noise, _ = pixel_sigma_and_source(pixel_sigma)
     night = None
     if stars is not None:
         night = NightOptions(
@@ -206,13 +206,15 @@ def solve_command(
     )  # fmt: skip
     calibrated = load_camera(left), load_camera(right)
     check_sides(calibrated, (left, right))
-    data, frame, unpaired, notes = read_sources(calibrated, sources)
+    data, frame, unpaired, notes, stated = read_sources(calibrated, sources)
     with steps("solving the rig", 1) as advance:
         result = solve_rig(data, options)
         advance("done")
     rig = result.stereo() if frame is None else placed_rig(result, frame)
-    if rig.calibration is not None and pixel_sigma is not None:
-        rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=pixel_sigma)
+    known = stated if pixel_sigma is None else pixel_sigma
+    if rig.calibration is not None and known is not None:
+        rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=known)
+    noise, note = pixel_sigma_and_source(pixel_sigma, rig)
     # Everything that can fail comes before the file.
     lines = rig_lines(result, rig, unpaired)
     tell(
@@ -231,6 +233,8 @@ def solve_command(
     print_rig(result, [*lines, *notes])
     try:
         print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
+        if note:
+            out.print(note)
     except InputError as error:
         warn(f"range errors are not split: {error}")
     print_wrote(output, picture)

@@ -48,12 +48,15 @@ class RigInput(NamedTuple):
         data: everything in one frame.
         origin: of the frame; None where no latitude is known.
         unpaired: how many views of the boards have no partner.
+        notes: what else there is to say of the sources.
+        pixel_sigma: px, the typical noise of marks along an axis, where the file of the marks states it.
     """
 
     data: RigData
     origin: Origin | None
     unpaired: int
     notes: tuple[str, ...] = ()
+    pixel_sigma: float | None = None
 
 
 def parse_baseline(text: str) -> Baseline:
@@ -85,7 +88,7 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
     if cameras[0].fingerprint == cameras[1].fingerprint:
         raise InputError("both camera files hold the same camera: this is the same camera twice; give two cameras")
     origin = None if sources.origin is None else Origin.parse(sources.origin)
-    boards, landmarks, unpaired = None, None, 0
+    boards, landmarks, unpaired, pixel_sigma = None, None, 0, None
     positions: tuple[MeasuredPosition, ...] = ()
     if sources.positions is not None:
         placed = import_survey(sources.positions, origin, sigma=sources.survey_sigma, geoid=sources.geoid)
@@ -98,6 +101,8 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
         marks = read_marks(sources.marks, single=True)
         found = match_landmarks(survey, marks, marks.sigmas(sources.mark_sigma))
         landmarks = found.landmarks
+        if marks.covariance is not None:
+            pixel_sigma = marks.typical_sigma(sources.mark_sigma)
         for names, text in ((found.unmarked, "surveyed, but not marked"), (found.unsurveyed, "marked, not surveyed")):
             if names:
                 err.print(f"[yellow]warning:[/] {text}:", ", ".join(names), markup=True)
@@ -122,4 +127,4 @@ def read_sources(cameras: tuple[Camera, Camera], sources: Sources) -> RigInput:
         positions=positions,
         stars=stars,
     )
-    return RigInput(data, origin, unpaired, tuple(notes))
+    return RigInput(data, origin, unpaired, tuple(notes), pixel_sigma)

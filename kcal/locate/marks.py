@@ -65,6 +65,12 @@ class Marks(NamedTuple):
             variance = torch.where(stated.isfinite(), stated, variance)
         return torch.where(self.pixels.isfinite().all(-1), variance.sqrt().clamp_min(_LEAST_SIGMA), math.nan)
 
+    def typical_sigma(self, sigma: float) -> float:
+        """The root mean square of `sigmas`, px; marks that are missing do not count. Without any: `sigma`."""
+        found = self.sigmas(sigma)
+        known = found[found.isfinite()]
+        return float(known.square().mean().sqrt()) if len(known) else sigma
+
 
 def filled(covariance: Tensor | None, sigma: float) -> Tensor | None:
     """(N, 4, 4) a covariance as in `Marks`, with `sigma` px along each axis where there is none; None: none at all.

@@ -79,7 +79,7 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
     both = torch.isfinite(marks.pixels).all(-1).all(-1)
     names = {name for name, seen in zip(marks.names, both.tolist(), strict=True) if seen}
     count = len(names & set(survey.names)) if survey is not None else 0
-    sigma = marks_sigma(marks, hand_sigma)
+    sigma = marks.typical_sigma(hand_sigma)
     nothing = LiveRig(None, None if survey is None else survey.origin, (), (), count, sigma, "")
     if survey is None or count < LEAST_LANDMARKS:
         missing = LEAST_LANDMARKS - count
@@ -100,13 +100,6 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
         enough = False
         text = f"{', '.join(wrong)} contradict{'s' if len(wrong) == 1 else ''} the other landmarks; {text}"
     return LiveRig(rig, survey.origin, items, promises, count, sigma, text, enough, result.warnings)
-
-
-def marks_sigma(marks: Marks, hand_sigma: float) -> float:
-    """The root mean square of the marks' standard deviations along an axis, px; marks that are missing do not count."""
-    sigmas = marks.sigmas(hand_sigma)
-    known = sigmas[sigmas.isfinite()]
-    return float(known.square().mean().sqrt()) if len(known) else hand_sigma
 
 
 def promised(rig: StereoRig, sigma: float) -> tuple[Promise, ...]:

@@ -17,7 +17,7 @@ from kcal.locate.stereo import PositionStatus
 from kcal.locate.survey import Survey, read_survey
 from kcal.mark.guide import Proposal, RigBand, at_shape, propose
 from kcal.mark.items import SIDES, Change, Item, Mark, MarkingState, Put, Side, Step, other_side
-from kcal.mark.live import LiveRig, located, marks_sigma, promised, solve_live
+from kcal.mark.live import LiveRig, located, promised, solve_live
 from kcal.mark.overview import map_content
 from kcal.mark.pictures import Pictures, top_level
 from kcal.mark.reference import Reference
@@ -245,7 +245,7 @@ class Desk:
         if self._cameras is not None:
             live = solve_live(self._cameras, self._survey(), marks, self.session.hand_sigma)
             if live.rig is None and self._given is not None:
-                live = live._replace(promises=promised(self._given, marks_sigma(marks, self.session.hand_sigma)))
+                live = live._replace(promises=promised(self._given, marks.typical_sigma(self.session.hand_sigma)))
             if live.rig is not None:
                 entry = {"count": live.marked, "promises": [p._asdict() for p in live.promises]}
                 self._history = [old for old in self._history if old["count"] < live.marked] + [entry]

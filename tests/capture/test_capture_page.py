@@ -31,7 +31,9 @@ def test_frames_are_shown_and_the_page_ends_it(tmp_path: Path) -> None:
     with chromium_page() as page:
         page.goto(server.address)
         page.wait_for_function("() => document.documentElement.dataset.views === '2'", timeout=60_000)
-        assert "Match the orange outline" in page.inner_text("#words")
+        # The first proposal comes from a thread of its own.
+        words = "document.getElementById('words').innerText"
+        page.wait_for_function(f"() => {words}.includes('Match the orange outline')", timeout=60_000)
         assert page.evaluate("document.querySelectorAll('#where polygon').length") == 3
         # The frame is on the canvas: it is not of one color.
         colors = page.evaluate(

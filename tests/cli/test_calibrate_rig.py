@@ -18,7 +18,7 @@ from kcal.cli.main import app, main
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import DegenerateError
-from kcal.io.camera_file import CameraFile
+from kcal.io.camera_file import CameraFile, camera_to_file
 from kcal.io.rig_file import RigFile
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
@@ -256,8 +256,8 @@ class TestCalibrate:
     @pytest.mark.parametrize(
         ("content", "message"),
         [
-            ("", "not a JSON file"),
-            ("[1, 2]", "not a kcal file; a kcal observations file is needed here"),
+            ("", "this is an empty file; a kcal observations file is needed here"),
+            ("[1, 2]", "this is not a kcal file, but other JSON; a kcal observations file is needed here"),
             ('{"kcal": "observations", "version": 9}', "version 9 of the observations format"),
             ('{"kcal": "observations", "version": 1}', "bad observations file: board: "),
         ],
@@ -397,7 +397,14 @@ class TestRig:
     ) -> None:
         """Cameras and observations agree; the right camera is on the left."""
         pairs = ["--pairs", "right.obs.json", "left.obs.json"]
-        assert run(monkeypatch, "rig", "right.camera.json", "left.camera.json", *pairs, "-o", "rig.json") == 0
+        both = ["right.camera.json", "left.camera.json"]
+        assert run(monkeypatch, "rig", *both, *pairs, "-o", "rig.json") == 1
+        assert "this camera is named 'right', and left.camera.json 'left'" in capsys.readouterr().err
+        # Names that do not tell: the solution does.
+        for name in both:
+            content = json.loads((cameras / name).read_text())
+            (cameras / name).write_text(json.dumps({**content, "name": "some"}))
+        assert run(monkeypatch, "rig", *both, *pairs, "-o", "rig.json") == 0
         assert "to the left of the left camera: left and right are swapped" in capsys.readouterr().err
 
     def test_pairs_from_a_csv(
@@ -451,8 +458,11 @@ class TestRig:
                 "this is a kcal camera file; a kcal observations file is needed here",
             ),
             (["none.json", "right.camera.json", *PAIRS], "none.json: cannot read"),
-            (["right.camera.json", "left.camera.json", *PAIRS], "swapped"),
-            (["left.camera.json", "right.camera.json", "--pairs", "right.obs.json", "left.obs.json"], "swapped"),
+            (["right.camera.json", "left.camera.json", *PAIRS], "left and right are exchanged"),
+            (
+                ["left.camera.json", "right.camera.json", "--pairs", "right.obs.json", "left.obs.json"],
+                "they are exchanged",
+            ),
             (["left.camera.json", "right.camera.json", *PAIRS, "--match", "none.csv"], "none.csv: cannot read"),
             (["left.camera.json", "left.camera.json", *PAIRS], "the same camera twice"),
             (["left.camera.json", "left.camera.json", "--pairs", "left.obs.json", "left.obs.json"], "camera twice"),
@@ -506,5 +516,9 @@ def test_missing_arguments_are_a_usage_error(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("a.json", "b.json"):
-        Path(name).write_text("{}")
+        if arguments[0] == "rig":
+            camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
+            camera_to_file(camera, name=name).save(Path(name))
+        else:
+            Path(name).write_text("{}")
     assert CliRunner().invoke(app, arguments).exit_code == 2

@@ -183,7 +183,9 @@ def test_a_detector_that_does_not_work(folder: Path, detector: str, message: str
     ],
 )
 def test_incomplete_commands(folder: Path, arguments: list[str]) -> None:
-    done = CliRunner().invoke(app, ["live", str(folder / "rig.json"), *arguments, "-o", str(folder / "t.csv")])
+    videos = {"a.mp4": "left.mp4", "b.mp4": "right.mp4"}
+    given = [str(folder / videos[word]) if word in videos else word for word in arguments]
+    done = CliRunner().invoke(app, ["live", str(folder / "rig.json"), *given, "-o", str(folder / "t.csv")])
     assert done.exit_code == 2
 
 

@@ -119,7 +119,9 @@ class TestRealImages:
         )
         assert code == 0
         # What its solution warned of travels with the rig.
-        assert all(line.startswith(("warning: r.json: board left", " ")) for line in error.splitlines()), error
+        *told, noise = error.splitlines()
+        assert all(line.startswith(("warning: r.json: board left", " ")) for line in told), error
+        assert noise == "noise of marks: 0.3 px, assumed; --pixel-sigma states it"
         rows = list(csv.DictReader(Path("p.csv").read_text().splitlines()))
         ends = [[float(row[f"{axis}_m"]) for axis in ("east", "north", "up")] for row in rows]
         assert math.isclose(math.dist(*ends), 0.025 * math.hypot(8, 5), rel_tol=5e-3)

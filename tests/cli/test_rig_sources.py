@@ -320,9 +320,29 @@ def test_marks_count_with_their_own_noise(site: Path) -> None:
     spread[3], spread[5] = 0.4**2, math.nan
     write_marks(site / "own.csv", marks._replace(covariance=torch.diag_embed(spread)))
     sources = Sources(landmarks=site / "survey.csv", marks=site / "own.csv", mark_sigma=0.1)
-    found = read_sources((CAMERAS[0], CAMERAS[1]), sources).data.landmarks
+    read = read_sources((CAMERAS[0], CAMERAS[1]), sources)
+    found = read.data.landmarks
     assert found is not None
     expected = torch.full((12, 2), 0.2, dtype=torch.float64)
     # Of one mark nothing is stated: it has the noise of the option.
     expected[3], expected[5] = 0.4, 0.1
     torch.testing.assert_close(found.pixel_sigma, expected)
+    assert read.pixel_sigma == pytest.approx(math.sqrt((10 * 0.2**2 + 0.4**2 + 0.1**2) / 12))
+
+
+def test_the_rig_file_states_the_noise_of_its_marks(
+    site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    marks = read_marks(site / "marks.csv")
+    write_marks(site / "own.csv", marks._replace(covariance=0.2**2 * torch.eye(4).double().expand(12, 4, 4)))
+    given = ["rig", "left.json", "right.json", "--landmarks", "survey.csv", "--marks"]
+    for marked_in, more, stated, said in (
+        ("own.csv", [], 0.2, "noise of marks: 0.2 px, from the rig's file"),
+        ("own.csv", ["--pixel-sigma", "0.15"], 0.15, ""),
+        ("marks.csv", [], None, "noise of marks: 0.3 px, assumed"),
+    ):
+        assert run(monkeypatch, *given, marked_in, *more, "-o", "rig.json") == 0
+        calibration = RigFile.load(site / "rig.json").calibration
+        assert calibration is not None
+        assert calibration.pixel_sigma == (None if stated is None else pytest.approx(stated))
+        assert said in capsys.readouterr().out

@@ -200,12 +200,15 @@ class TestPictures:
         assert "3 left out" in titles[0]
         assert "σ 0.200 px" in titles[1]
         texts = " ".join(text.get_text() for text in figure.texts)
-        assert "3 views, worst first" in texts
+        assert "3 views; the first 2 stand out" in texts
         assert "bad.png: too blurred" in texts
 
     def test_coverage_counts_what_was_reached(self):
         figure = coverage_figure(self.observations())
         (axes,) = figure.axes
         assert "3 views, 87 corners" in axes.get_title(loc="left")
-        assert len(axes.patches) > 10  # the border, which no corner reached
-        assert len(axes.collections[0].get_offsets()) == 87
+        assert "boards reached 17 % of the image, hatched: not" in axes.get_title(loc="left")
+        hatched, corners = axes.collections
+        assert hatched.hatches == ["///"]
+        assert len(hatched.get_paths()[0].vertices) > 10  # the border, which no corner reached
+        assert len(corners.get_offsets()) == 87

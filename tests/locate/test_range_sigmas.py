@@ -102,8 +102,8 @@ def test_rows_and_what_cannot_be_told() -> None:
     rig = planned_rig(baseline_m=0.5)
     known(rig, error(rig, yaw=0.09 / 1600))
     rows = range_sigma_rows(range_sigmas(rig, [100.0, 5000.0], pixel_sigma=0.1))
-    assert rows[1] == ["100", "2.1", "1.8", "0", "1.1", "0"]
-    assert rows[2] == ["5000", "bearing only", "", "", "", "0"]
+    assert rows[1] == ["100 m", "2.1 m", "1.8 m", "0", "1.1 m", "0"]
+    assert rows[2] == ["5 km", "bearing only", "", "", "", "0"]
     with pytest.raises(InputError, match="positive numbers"):
         range_sigmas(rig, [-1.0])
     with pytest.raises(InputError, match=r"does not see a point at 0\.1 m"):

@@ -22,7 +22,7 @@ from kcal.locate.relock import check_rig, seen_again
 from kcal.locate.survey import Survey
 from kcal.mark.guide import RigBand, at_shape, propose
 from kcal.mark.items import Add, Mark, Place, Put, Side, SurveyPlace
-from kcal.mark.live import Promise, marks_sigma, solve_live, verdict
+from kcal.mark.live import Promise, solve_live, verdict
 from kcal.mark.marking_service import Desk
 from kcal.mark.overview import map_content
 from kcal.mark.pictures import open_pictures
@@ -256,7 +256,7 @@ class TestLiveRig:
         one, missing = whole.covariance.clone(), whole.right.clone()
         one[7, 2:], one[7, :, 2:], missing[7] = math.nan, math.nan, math.nan
         half = Marks(whole.names, whole.left, missing, one)
-        assert marks_sigma(half, 0.3) == pytest.approx(0.05)
+        assert half.typical_sigma(0.3) == pytest.approx(0.05)
         by_hand = Marks(whole.names, whole.left, whole.right, whole.covariance.clone())
         assert by_hand.covariance is not None
         by_hand.covariance[7] = 0.3**2 * torch.eye(4)

@@ -23,6 +23,7 @@ from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.errors import DegenerateError, InputError
 from kcal.solve.schur import without_local
 
@@ -193,7 +194,7 @@ def _by_view(problem: BoardProblem, state: BoardState, variance: float) -> _ByVi
     fx, fy = state.parameters[0], state.parameters[1]
     scale = fx * rows[:, local] + fy * rows[:, local + 1]
     off = without_local(torch.cat([rows[:, :local], scale[:, None], rows[:, local + 2 :]], 1), local)
-    gram = off @ off.transpose(1, 2) / variance
+    gram = off @ off.transpose(1, 2) / max(variance, LEAST_NOISE**2)
     return _ByView(gram[:, :_SIZE, :_SIZE], gram[:, :_SIZE, _SIZE])
 
 
@@ -211,9 +212,11 @@ def _grouped(views: _ByView, size: tuple[int, int]) -> Tensor | None:
     if not bool(views.N.isfinite().all() and views.g.isfinite().all()):
         return None
     center = _SPREAD_CENTER * math.hypot(*size)
-    prior = torch.diag(torch.tensor([_SPREAD, center, center], dtype=torch.float64) ** -2)
-    each = -torch.linalg.solve(views.N + prior, views.g[..., None])[..., 0]
-    white = each @ torch.linalg.cholesky(views.N.mean(0) + prior)
+    # In units of the prior, so that it holds what a view leaves open even where the noise is as small as it may be.
+    unit = torch.tensor([_SPREAD, center, center], dtype=torch.float64)
+    scaled, one = views.N * unit * unit[:, None], torch.eye(_SIZE, dtype=torch.float64)
+    found = -torch.linalg.solve(scaled + one, (unit * views.g)[..., None])[..., 0]
+    each, white = unit * found, found @ torch.linalg.cholesky(scaled.mean(0) + one)
     _, axes = torch.linalg.eigh(torch.cov(white.T))
     order = torch.arange(len(each), dtype=torch.float64)
     lines = [order, order % 2, *(white @ axes).T, *each.T]
