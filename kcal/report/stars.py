@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from kcal.corners.images import to_8bit
 from kcal.report.colors import ACCENT, INK, WARN
 from kcal.report.figures import draw_arrows, frame_image, new_figure, save_picture
 
 # Names of more stars would cover each other.
 _MOST_NAMES = 30
+# Share of the width from which on names stand to the left of their stars.
+_NEAR_EDGE = 0.92
+# px over which the sky's brightness hardly changes.
+_BLOCK = 64
 
 
 def stars_figure(
@@ -37,8 +41,8 @@ def stars_figure(
     height, width = image.shape
     figure = new_figure(9.0, 9.0 * height / width + 0.9)
     axes = figure.add_axes((0.07, 0.07, 0.91, 0.86))
-    levels = to_8bit(image) if image.dtype in (np.uint8, np.uint16) else _sixteen_bits(image)
-    axes.imshow(255 - levels.astype(np.int64), cmap="gray", vmin=-60, vmax=255, interpolation="nearest")
+    # Turned over: stars are dark on a bright sky, so that marks and names can be read.
+    axes.imshow(-_above_sky(image), cmap="gray", vmin=-30.0, vmax=2.0, interpolation="nearest")
     frame_image(axes, (width, height))
     known = np.array([bool(name) for name in names], bool)
     axes.plot(*pixels[~known].T, "x", color=WARN, markersize=4, label=f"{int((~known).sum())} without a name")
@@ -46,7 +50,8 @@ def stars_figure(
         *pixels[known].T, "o", markersize=9, markerfacecolor="none", color=ACCENT, label=f"{int(known.sum())} named"
     )
     for place, name in [(at, name) for at, name in zip(pixels, names, strict=True) if name][:_MOST_NAMES]:
-        axes.annotate(name, place, (7, -3), textcoords="offset points", fontsize=7, color=INK)
+        beside = (7, "left") if place[0] < _NEAR_EDGE * width else (-7, "right")
+        axes.annotate(name, place, (beside[0], -3), textcoords="offset points", fontsize=7, color=INK, ha=beside[1])
     if known.any():
         longest = max(float(np.linalg.norm(residual[known], axis=1).max()), 1e-3)
         scale = draw_arrows(axes, pixels[known], residual[known], 0.04 * width / longest, color=WARN, width=0.0015)
@@ -55,9 +60,22 @@ def stars_figure(
     return figure
 
 
-def _sixteen_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
-    low, high = np.percentile(image, (0.1, 99.9))
-    return to_8bit(np.rint(np.clip((image - low) / max(high - low, 1e-9), 0, 1) * 65535).astype(np.uint16))
+def _above_sky(image: NDArray[Any]) -> NDArray[np.float64]:
+    """(H, W) gray levels above the sky, whose brightness changes slowly over the image, in units of its noise."""
+    levels = image.astype(np.float64)
+    sky = levels
+    for axis in (0, 1):
+        parts = np.array_split(sky, max(1, image.shape[axis] // _BLOCK), axis)
+        places = np.cumsum([0, *(part.shape[axis] for part in parts)])
+        middles = 0.5 * (places[:-1] + places[1:] - 1)
+        medians = np.stack([np.median(part, axis) for part in parts], axis)
+        sky = np.apply_along_axis(partial(_interpolated, middles, int(places[-1])), axis, medians)
+    above = levels - sky
+    return above / max(1.4826 * float(np.median(np.abs(above))), 1e-9)
+
+
+def _interpolated(places: NDArray[np.float64], count: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.interp(np.arange(count), places, values)
 
 
 def save_stars_picture(
