@@ -180,7 +180,7 @@ def test_images_of_two_cameras_are_noticed(
     poses: tuple[Tensor, Tensor], prefixed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A camera of an earlier version, which calibrated what is refused now.
-    monkeypatch.setattr("kcal.calibrate.camera.calibrate.refuse_two_cameras", lambda *_: None)
+    monkeypatch.setattr("kcal.calibrate.camera.calibrate.two_camera_warnings", lambda *_: ())
     one = camera("opencv5")
     values = one.params.clone()
     values[:2] *= 1.03

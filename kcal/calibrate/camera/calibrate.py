@@ -14,7 +14,7 @@ from kcal.calibrate.camera.parametric import calibrate_parametric
 from kcal.calibrate.camera.repeats import copied_views, copy_warnings, pose_warnings
 from kcal.calibrate.camera.result import CameraCalibrationResult, RejectedView
 from kcal.calibrate.camera.sharing import ALONE, sharing
-from kcal.calibrate.camera.two_cameras import refuse_two_cameras
+from kcal.calibrate.camera.two_cameras import two_camera_warnings
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError
 
@@ -90,7 +90,8 @@ def calibrate_camera(
         progress(f"{len(nearly)} views are copies of others; again without them")
         copied = nearly
         result = _calibrate(_without_copies(observations, copied), options, progress)
-    refuse_two_cameras(result, options, progress)
+    doubts = two_camera_warnings(result, options, progress)
+    result = dataclasses.replace(result, warnings=(*result.warnings, *doubts))
     return _complete(result, observations, copied)
 
 

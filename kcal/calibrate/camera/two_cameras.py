@@ -1,4 +1,6 @@
-"""Find views that another camera took, or the same one at another zoom or with another crop, and refuse them.
+"""Find views that another camera took, or the same one at another zoom or with another crop, and say so.
+
+Groups that no focusing lens makes are refused; smaller differences, as of an autofocus, are a warning.
 
 Two such groups differ in scale and principal point. Poses, and motions during the readout, hide most of that: the RMS
 of one camera for both is hardly larger than of two. So it is told by the evidence. Near the solution each view is a
@@ -36,8 +38,9 @@ _INDICES, _SIZE = (0, 1, 2, 3), 3
 _SPREAD, _SPREAD_CENTER = 0.1, 0.02
 # Nats beyond chance. Measured (scripts/check/faults.py): what groups of good captures bring stays 5 below chance.
 _BEYOND = 5.0
-# Share of the image's diagonal that corners must be apart: a lens that was touched moves by less.
-_APART = 0.002
+# Shares of the image's diagonal that corners must be apart: a lens that was touched moves by less than the first; an
+# autofocus scales images by one to three percent, so that only beyond the second views are certainly of two cameras.
+_APART, _CERTAIN = 0.002, 0.008
 # Before the camera is fitted again the quadratic forms must promise this share: motions take up the rest.
 _PROMISED = 0.4
 # How far motions are held back where groups are looked for: with them as wide as found, they hide the groups.
@@ -92,6 +95,10 @@ class TwoCameras:
     shift: Tensor
     nats: float
 
+    def certain(self, size: tuple[int, int]) -> bool:
+        """Whether the groups are farther apart than a lens that focuses brings them."""
+        return _apart(self.log_scale, self.shift, size) > _CERTAIN
+
     def text(self, names: Sequence[str]) -> str:
         """One sentence that names the views of the smaller group."""
         own = [names[i] for i in self.second.nonzero()[:, 0].tolist()]
@@ -106,11 +113,17 @@ class TwoCameras:
         )
 
 
-def refuse_two_cameras(result: CameraCalibrationResult, options: CalibrationOptions, progress: Progress) -> None:
-    """Raise `InputError` if the views of a result are not of one camera; the message names the smaller group."""
+def two_camera_warnings(
+    result: CameraCalibrationResult, options: CalibrationOptions, progress: Progress
+) -> tuple[str, ...]:
+    """A warning where views of a result are perhaps not of one camera; it names the smaller group.
+
+    Raises:
+        InputError: they certainly are not.
+    """
     used = result.per_view_rms.isfinite().nonzero()[:, 0].tolist()
     if len(used) < 2 * _FEWEST:
-        return
+        return ()
     seen = result.observations
     pixels = torch.where(result.residuals.isfinite(), seen.pixels(), torch.nan)[used]
     if result.hybrid is not None:
@@ -124,14 +137,18 @@ def refuse_two_cameras(result: CameraCalibrationResult, options: CalibrationOpti
         )
         problem = BoardProblem(result.board_points, pixels, result.camera.model, _INDICES)
         if _promising(_by_view(problem, state, result.noise**2), pixels, seen.image_size) is None:
-            return
+            return ()
         try:
             fit = fit_hybrid(seen.board.points, pixels, seen.image_size, board=options.board, motion=options.motion)
         except _FAILED:
-            return
+            return ()
     found = two_cameras(fit, seen.board.points, pixels, options, progress)
-    if found is not None:
-        raise InputError(found.text([seen.names[i] for i in used]))
+    if found is None:
+        return ()
+    text = found.text([seen.names[i] for i in used])
+    if found.certain(seen.image_size):
+        raise InputError(text)
+    return (f"{text}. A lens that focused by itself does this, too: switch the autofocus off",)
 
 
 def two_cameras(
@@ -241,9 +258,13 @@ def _chance(pixels: Tensor) -> float:
 
 
 def _far_apart(log_scale: float, shift: Tensor, size: tuple[int, int]) -> bool:
+    return _apart(log_scale, shift, size) > _APART
+
+
+def _apart(log_scale: float, shift: Tensor, size: tuple[int, int]) -> float:
+    """How far apart corners of two groups typically are, in shares of the image's diagonal."""
     # Half of the diagonal's half is a typical distance from the middle.
-    diagonal = math.hypot(*size)
-    return math.hypot(0.25 * diagonal * log_scale, float(shift.norm())) > _APART * diagonal
+    return math.hypot(0.25 * log_scale, float(shift.norm()) / math.hypot(*size))
 
 
 def _undone(pixels: Tensor, second: Tensor, theta: Tensor, center: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.calibrate.camera import two_cameras as module
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.options import CalibrationOptions
-from kcal.calibrate.camera.two_cameras import refuse_two_cameras
+from kcal.calibrate.camera.two_cameras import two_camera_warnings
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import InputError
@@ -98,6 +98,14 @@ class TestNotAccused:
         result = calibrate_camera(capture(lambda pixels: pixels + 0.7))
         assert result.rms < 0.1
 
+    def test_a_lens_that_focused_is_warned_of(self) -> None:
+        """Three percent of scale in every other view."""
+        middle = 0.5 * torch.tensor(SIZE, dtype=torch.float64)
+        result = calibrate_camera(capture(lambda pixels: (pixels - middle) * 1.03 + middle))
+        (text,) = [text for text in result.warnings if "not of one camera" in text]
+        assert "switch the autofocus off" in text
+        assert min(len(named(text, "(", ")") ^ group) for group in (SECOND, set(range(VIEWS)) - SECOND)) <= 2
+
     def test_too_few_views_to_tell(self) -> None:
         seen = capture(cropped).subset(["00", "02", "04", "06", "01"])
         assert math.isfinite(calibrate_camera(seen).rms)
@@ -120,4 +128,4 @@ def test_groups_from_quadratic_forms() -> None:
 
 def test_a_result_is_checked_once_more_by_hand() -> None:
     result = calibrate_camera(capture(seed=2))
-    refuse_two_cameras(result, CalibrationOptions(), lambda _: None)
+    assert two_camera_warnings(result, CalibrationOptions(), lambda _: None) == ()
