@@ -97,7 +97,7 @@ class TwoCameras:
 
     def certain(self, size: tuple[int, int]) -> bool:
         """Whether the groups are farther apart than a lens that focuses brings them."""
-        return _apart(self.log_scale, self.shift, size) > _CERTAIN
+        return _distance_apart(self.log_scale, self.shift, size) > _CERTAIN
 
     def text(self, names: Sequence[str]) -> str:
         """One sentence that names the views of the smaller group."""
@@ -258,10 +258,10 @@ def _chance(pixels: Tensor) -> float:
 
 
 def _far_apart(log_scale: float, shift: Tensor, size: tuple[int, int]) -> bool:
-    return _apart(log_scale, shift, size) > _APART
+    return _distance_apart(log_scale, shift, size) > _APART
 
 
-def _apart(log_scale: float, shift: Tensor, size: tuple[int, int]) -> float:
+def _distance_apart(log_scale: float, shift: Tensor, size: tuple[int, int]) -> float:
     """How far apart corners of two groups typically are, in shares of the image's diagonal."""
     # Half of the diagonal's half is a typical distance from the middle.
     return math.hypot(0.25 * log_scale, float(shift.norm()) / math.hypot(*size))
