@@ -62,7 +62,9 @@ class _Posterior(NamedTuple):
 
 
 def _best(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Best | None:
-    """None where priors are too wide for the precision of numbers."""
+    """None where priors are too wide for the precision of numbers, or noise is beyond them."""
+    if not log_variance < _HIGHEST:
+        return None
     K, g = data.K.numpy(), data.g.numpy()
     s2 = math.exp(log_variance)
     d = families.deviation(torch.from_numpy(h)).numpy()
@@ -188,7 +190,7 @@ class EvidenceLoss:
         h, ratio, log_variance = self._parts(v)
         integrated = self._data.integrated(ratio)
         tempered = integrated.data.tempered(self._tempering)
-        found = _posterior(tempered, self._families, h, log_variance) if log_variance < _HIGHEST else None
+        found = _posterior(tempered, self._families, h, log_variance)
         if found is None:
             # Priors are far too wide for this precision, or a first step was far too long: worse than any trial before,
             # so that a shorter step follows.
