@@ -17,9 +17,10 @@ from kcal.stars.attitude import fit_attitude
 from kcal.stars.catalog import StarCatalog
 from kcal.stars.detect import DetectedStars
 from kcal.stars.identification import Identification, identify, turn_between
-from kcal.stars.lens_fit import StarField, StarLens, fit_star_lens
+from kcal.stars.lens_fit import StarLens, fit_star_lens
 from kcal.stars.night import SkyView
 from kcal.stars.sky import celestial_directions
+from kcal.stars.star_problem import StarField
 
 # Degrees between opposite corners: the widest and narrowest lens that is looked for, and steps between.
 _WIDEST, _NARROWEST, _STEP = 115.0, 6.0, 1.02
